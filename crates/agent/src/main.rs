@@ -1,4 +1,5 @@
-//! The `task-agent` binary: parses the command line and hands over. It never holds logic of its own.
+//! The `task-agent` binary: parses the command line and hands over. It never holds logic of its
+//! own.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -1,5 +1,6 @@
-//! One tar entry: headers, long names and PAX records, parsed into a path and a kind that the tree can trust.
-//! It accepts what GNU tar, Python and the packer write, and nothing on which two readers could disagree.
+//! One tar entry: headers, long names and PAX records, parsed into a path and a kind that the tree
+//! can trust. It accepts what GNU tar, Python and the packer write, and nothing on which two
+//! readers could disagree.
 
 use std::io::Read;
 
@@ -15,9 +16,11 @@ const MAX_PAX_BYTES: u64 = 16 * 1024;
 /// Set-user-id, set-group-id and sticky.
 const SPECIAL_MODE_BITS: u32 = 0o7000;
 /// PAX records that say nothing about what is created: times and owners, which are the robot's own.
-const IGNORED_PAX_KEYS: [&[u8]; 8] = [b"atime", b"comment", b"ctime", b"gid", b"gname", b"mtime", b"uid", b"uname"];
+const IGNORED_PAX_KEYS: [&[u8]; 8] =
+    [b"atime", b"comment", b"ctime", b"gid", b"gname", b"mtime", b"uid", b"uname"];
 
-/// An entry whose path is relative, without `.`, `..` or empty components; empty for the root itself.
+/// An entry whose path is relative, without `.`, `..` or empty components; empty for the root
+/// itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     /// Where it belongs.
@@ -58,7 +61,10 @@ struct Extended {
 }
 
 /// The next entry; `None` at the end marker.
-pub(super) fn next<R: Read>(archive: &mut Blocks<R>, depth_limit: usize) -> Result<Option<Entry>, UnpackError> {
+pub(super) fn next<R: Read>(
+    archive: &mut Blocks<R>,
+    depth_limit: usize,
+) -> Result<Option<Entry>, UnpackError> {
     let mut extended = Extended::default();
     loop {
         let block = archive.block()?;
@@ -75,7 +81,8 @@ pub(super) fn next<R: Read>(archive: &mut Blocks<R>, depth_limit: usize) -> Resu
         if header.as_ustar().is_none() && header.as_gnu().is_none() {
             return Err(archive.damaged("a header is neither ustar nor GNU"));
         }
-        let size = header.entry_size().map_err(|_| archive.damaged("an entry's size is no number"))?;
+        let size =
+            header.entry_size().map_err(|_| archive.damaged("an entry's size is no number"))?;
         archive.check_entry(size)?;
         match header.entry_type().as_byte() {
             b'L' => extended.path(long_name(archive, size)?, archive)?,
@@ -102,14 +109,22 @@ impl Extended {
         }
     }
 
-    fn records<R: Read>(&mut self, records: Vec<Record>, archive: &Blocks<R>) -> Result<(), UnpackError> {
+    fn records<R: Read>(
+        &mut self,
+        records: Vec<Record>,
+        archive: &Blocks<R>,
+    ) -> Result<(), UnpackError> {
         for Record { key, value } in records {
             match &key[..] {
                 b"path" => self.path(value, archive)?,
                 b"linkpath" => self.link(value, archive)?,
                 key if IGNORED_PAX_KEYS.contains(&key) => {}
-                // Sizes and sparse maps that contradict the header are how archives look different to each reader.
-                key => return Err(archive.damaged(format!("PAX record {} is not accepted", super::shown(key)))),
+                // Sizes and sparse maps that contradict the header are how archives look different
+                // to each reader.
+                key => {
+                    return Err(archive
+                        .damaged(format!("PAX record {} is not accepted", super::shown(key))));
+                }
             }
         }
         Ok(())
@@ -119,13 +134,19 @@ impl Extended {
 fn global_records<R: Read>(records: Vec<Record>, archive: &Blocks<R>) -> Result<(), UnpackError> {
     match records.iter().find(|record| record.key != b"comment") {
         None => Ok(()),
-        Some(record) => {
-            Err(archive.damaged(format!("PAX record {} is not accepted for all entries", super::shown(&record.key))))
-        }
+        Some(record) => Err(archive.damaged(format!(
+            "PAX record {} is not accepted for all entries",
+            super::shown(&record.key)
+        ))),
     }
 }
 
-fn parse(header: &tar::Header, size: u64, extended: Extended, depth_limit: usize) -> Result<Entry, Refusal> {
+fn parse(
+    header: &tar::Header,
+    size: u64,
+    extended: Extended,
+    depth_limit: usize,
+) -> Result<Entry, Refusal> {
     let name = extended.path.unwrap_or_else(|| header.path_bytes().into_owned());
     let refuse = |reason: String| Refusal::entry(&name, reason);
     let kind = header.entry_type().as_byte();
@@ -145,14 +166,19 @@ fn parse(header: &tar::Header, size: u64, extended: Extended, depth_limit: usize
         return Err(refuse(format!("mode {mode:o} has set-id or sticky bits")));
     }
     let link = || {
-        let link = extended.link.clone().or_else(|| header.link_name_bytes().map(|bytes| bytes.into_owned()));
+        let link = extended
+            .link
+            .clone()
+            .or_else(|| header.link_name_bytes().map(|bytes| bytes.into_owned()));
         link.ok_or_else(|| refuse("its link target is missing".to_owned()))
     };
     let link_refused = |reason: String| refuse(format!("its link target: {reason}"));
     let kind = match kind {
         b'5' => Kind::Directory,
         b'2' => Kind::Symlink { target: text(&link()?).map_err(link_refused)?.to_owned() },
-        b'1' => Kind::HardLink { target: normal_path(&link()?, depth_limit).map_err(link_refused)? },
+        b'1' => {
+            Kind::HardLink { target: normal_path(&link()?, depth_limit).map_err(link_refused)? }
+        }
         _ if name.ends_with(b"/") => return Err(refuse("a file's name ends with '/'".to_owned())),
         _ => Kind::File { size, executable: mode & 0o111 != 0 },
     };
@@ -179,7 +205,10 @@ fn normal_path(path: &[u8], depth_limit: usize) -> Result<String, String> {
         return Err(format!("a name is longer than {MAX_COMPONENT_BYTES} bytes"));
     }
     if components.len() > depth_limit {
-        return Err(format!("the path has {} components, where at most {depth_limit} are allowed", components.len()));
+        return Err(format!(
+            "the path has {} components, where at most {depth_limit} are allowed",
+            components.len()
+        ));
     }
     Ok(components.join("/"))
 }
@@ -207,7 +236,9 @@ fn checksum(block: &[u8; BLOCK_BYTES]) -> u32 {
 
 fn long_name<R: Read>(archive: &mut Blocks<R>, size: u64) -> Result<Vec<u8>, UnpackError> {
     if size > MAX_CONTENT_PATH_BYTES as u64 + 1 {
-        return Err(archive.damaged(format!("a name is longer than {MAX_CONTENT_PATH_BYTES} bytes")));
+        return Err(
+            archive.damaged(format!("a name is longer than {MAX_CONTENT_PATH_BYTES} bytes"))
+        );
     }
     let mut name = archive.collect(size)?;
     if name.last() == Some(&0) {
@@ -229,7 +260,8 @@ fn pax_records<R: Read>(archive: &mut Blocks<R>, size: u64) -> Result<Vec<Record
     let mut rest = &bytes[..];
     let mut records = Vec::new();
     while !rest.is_empty() {
-        let (record, after) = split_record(rest).ok_or_else(|| archive.damaged("a PAX record is malformed"))?;
+        let (record, after) =
+            split_record(rest).ok_or_else(|| archive.damaged("a PAX record is malformed"))?;
         records.push(record);
         rest = after;
     }

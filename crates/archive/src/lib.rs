@@ -1,10 +1,12 @@
-//! From a package's archive to its entries, and to a tree in a directory, in one pass and in bounded memory. It refuses,
-//! and says why, whatever a packer would not write: the bytes may come from anyone until their digest is known.
+//! From a package's archive to its entries, and to a tree in a directory, in one pass and in
+//! bounded memory. It refuses, and says why, whatever a packer would not write: the bytes may come
+//! from anyone until their digest is known.
 //!
-//! Invariants: nothing is created outside the given directory, no symbolic link is ever followed, and no byte is
-//! written beyond what the task manifest announced, or the limits allow. [`check`] reads an archive by the same rules and
-//! writes nothing, so that a server that takes a package and a robot that unpacks it come to the same verdict. It never
-//! hashes the compressed bytes and never renames.
+//! Invariants: nothing is created outside the given directory, no symbolic link is ever followed,
+//! and no byte is written beyond what the task manifest announced, or the limits allow. [`check`]
+//! reads an archive by the same rules and writes nothing, so that a server that takes a package and
+//! a robot that unpacks it come to the same verdict. It never hashes the compressed bytes and never
+//! renames.
 
 mod entry;
 mod names;
@@ -17,8 +19,8 @@ use std::path::{Path, PathBuf};
 use task_proto::Digest;
 use task_proto::digest::Algorithm;
 use task_proto::manifest::{
-    CONTENT_RATIO_FREE_BYTES, ContentFacts, MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES, MAX_CONTENT_RATIO,
-    MAX_CONTENT_TAR_BYTES,
+    CONTENT_RATIO_FREE_BYTES, ContentFacts, MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES,
+    MAX_CONTENT_RATIO, MAX_CONTENT_TAR_BYTES,
 };
 
 pub use self::entry::{Entry, Kind};
@@ -37,7 +39,8 @@ pub struct Limits {
     pub entries: u64,
     /// Components of a path.
     pub depth: usize,
-    /// Uncompressed bytes for one compressed byte. Small packages may compress as well as they like: a bomb needs room.
+    /// Uncompressed bytes for one compressed byte. Small packages may compress as well as they
+    /// like: a bomb needs room.
     pub ratio: u64,
 }
 
@@ -71,7 +74,8 @@ pub enum UnpackError {
     },
 }
 
-/// What was found in an archive. Names are shown escaped and cut, so that a hostile one stays harmless in a log.
+/// What was found in an archive. Names are shown escaped and cut, so that a hostile one stays
+/// harmless in a log.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// A number of the archive is above a limit.
@@ -141,8 +145,9 @@ pub enum Compression {
     Zstd,
 }
 
-/// Unpacks `content`, which has `content_size` compressed bytes, into the new directory `staging`, whose parent is there. What
-/// it created is left in either case. Reads `content` to its end only if all is well.
+/// Unpacks `content`, which has `content_size` compressed bytes, into the new directory `staging`,
+/// whose parent is there. What it created is left in either case. Reads `content` to its end only
+/// if all is well.
 pub fn unpack(
     content: impl Read,
     content_size: u64,
@@ -163,12 +168,17 @@ pub fn unpack_unannounced(
     unpack_all(Entries::unannounced(content, compression, limits)?, limits, staging)
 }
 
-fn unpack_all<R: Read>(mut entries: Entries<R>, limits: &Limits, staging: &Path) -> Result<(), UnpackError> {
+fn unpack_all<R: Read>(
+    mut entries: Entries<R>,
+    limits: &Limits,
+    staging: &Path,
+) -> Result<(), UnpackError> {
     let mut tree = Tree::create(staging, limits)?;
     while let Some(entry) = entries.next()? {
         if let Some(mut file) = tree.add(&entry)? {
             entries.content(|bytes| {
-                file.write_all(bytes).map_err(|source| UnpackError::Disk { path: staging.join(&entry.path), source })
+                file.write_all(bytes)
+                    .map_err(|source| UnpackError::Disk { path: staging.join(&entry.path), source })
             })?;
         }
     }
@@ -176,7 +186,12 @@ fn unpack_all<R: Read>(mut entries: Entries<R>, limits: &Limits, staging: &Path)
 }
 
 /// Reads `content` as [`unpack`] does, to the same verdict, and writes nothing.
-pub fn check(content: impl Read, content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(), UnpackError> {
+pub fn check(
+    content: impl Read,
+    content_size: u64,
+    facts: &ContentFacts,
+    limits: &Limits,
+) -> Result<(), UnpackError> {
     let mut entries = Entries::announced(content, content_size, facts, limits)?;
     let mut names = Names::new(limits);
     while let Some(entry) = entries.next()? {
@@ -186,8 +201,8 @@ pub fn check(content: impl Read, content_size: u64, facts: &ContentFacts, limits
     Ok(())
 }
 
-/// An archive's entries, one after the other. What is between them is checked as they are read; whether a name comes twice, or
-/// a link leads out, is not.
+/// An archive's entries, one after the other. What is between them is checked as they are read;
+/// whether a name comes twice, or a link leads out, is not.
 pub struct Entries<R: Read> {
     blocks: Blocks<R>,
     depth: usize,
@@ -207,23 +222,38 @@ impl<R: Read> Entries<R> {
         limits: &Limits,
     ) -> Result<Self, UnpackError> {
         admit(content_size, facts, limits)?;
-        let blocks = Blocks::new(content, Compression::Zstd, Bound::Exactly(facts.tar_size), u64::MAX)?;
+        let blocks =
+            Blocks::new(content, Compression::Zstd, Bound::Exactly(facts.tar_size), u64::MAX)?;
         Ok(Self::new(blocks.with_digest(facts.tar_digest), limits, Bound::Exactly(facts.entries)))
     }
 
     /// Of an archive of which nothing is known.
-    pub fn unannounced(content: R, compression: Compression, limits: &Limits) -> Result<Self, UnpackError> {
+    pub fn unannounced(
+        content: R,
+        compression: Compression,
+        limits: &Limits,
+    ) -> Result<Self, UnpackError> {
         let blocks = Blocks::new(content, compression, Bound::AtMost(limits.bytes), limits.ratio)?;
         Ok(Self::new(blocks, limits, Bound::AtMost(limits.entries)))
     }
 
     fn new(blocks: Blocks<R>, limits: &Limits, bound: Bound) -> Self {
-        Self { blocks, depth: limits.depth, count: 0, bound, pending: 0, buffer: vec![0; COPY_BUFFER_BYTES] }
+        Self {
+            blocks,
+            depth: limits.depth,
+            count: 0,
+            bound,
+            pending: 0,
+            buffer: vec![0; COPY_BUFFER_BYTES],
+        }
     }
 
-    /// The next entry; what was left of the last one's content is passed over. `None` once the archive has been read to its end
-    /// and is whole.
-    #[expect(clippy::should_implement_trait, reason = "it can fail, and lends nothing that an iterator could give")]
+    /// The next entry; what was left of the last one's content is passed over. `None` once the
+    /// archive has been read to its end and is whole.
+    #[expect(
+        clippy::should_implement_trait,
+        reason = "it can fail, and lends nothing that an iterator could give"
+    )]
     pub fn next(&mut self) -> Result<Option<Entry>, UnpackError> {
         self.content(|_| Ok(()))?;
         let Some(entry) = entry::next(&mut self.blocks, self.depth)? else {
@@ -240,7 +270,10 @@ impl<R: Read> Entries<R> {
     }
 
     /// Hands on the last entry's content in pieces, if it is a file.
-    pub fn content(&mut self, take: impl FnMut(&[u8]) -> Result<(), UnpackError>) -> Result<(), UnpackError> {
+    pub fn content(
+        &mut self,
+        take: impl FnMut(&[u8]) -> Result<(), UnpackError>,
+    ) -> Result<(), UnpackError> {
         let size = std::mem::take(&mut self.pending);
         self.blocks.copy(size, &mut self.buffer, take)
     }

@@ -1,5 +1,5 @@
-//! The names in an archive: which entry may have which name, and where links lead. It is the one rule for those who unpack
-//! an archive and those who only read it, and touches no file.
+//! The names in an archive: which entry may have which name, and where links lead. It is the one
+//! rule for those who unpack an archive and those who only read it, and touches no file.
 
 use std::collections::BTreeMap;
 
@@ -33,7 +33,8 @@ impl Names {
         Self { nodes: BTreeMap::new(), nodes_limit: limits.entries, bytes: 0 }
     }
 
-    /// Takes an entry's name; gives the directories that there have to be for it and were not there, from the top.
+    /// Takes an entry's name; gives the directories that there have to be for it and were not
+    /// there, from the top.
     pub(super) fn add(&mut self, entry: &Entry) -> Result<Vec<String>, Refusal> {
         let Entry { path, kind } = entry;
         match kind {
@@ -45,14 +46,16 @@ impl Names {
                 self.claim(path, Node::Symlink { target: target.clone() })
             }
             Kind::HardLink { target } if !matches!(self.nodes.get(target), Some(Node::File)) => {
-                let reason = format!("a hard link must name an earlier file of the archive, not {target:?}");
+                let reason =
+                    format!("a hard link must name an earlier file of the archive, not {target:?}");
                 Err(Refusal::entry(path.as_bytes(), reason))
             }
             Kind::HardLink { .. } => self.claim(path, Node::File),
         }
     }
 
-    /// The symbolic links with their targets, once it is known that none of them leads out of the archive.
+    /// The symbolic links with their targets, once it is known that none of them leads out of the
+    /// archive.
     pub(super) fn symlinks(&self) -> Result<Vec<(&str, &str)>, Refusal> {
         let mut links = Vec::new();
         for (path, node) in &self.nodes {
@@ -115,8 +118,8 @@ impl Names {
         Ok(())
     }
 
-    /// Follows a link through the tree as the kernel would, other links included. What is not there counts as a
-    /// directory: a build may make it.
+    /// Follows a link through the tree as the kernel would, other links included. What is not there
+    /// counts as a directory: a build may make it.
     fn check_symlink(&self, path: &str, target: &str) -> Result<(), Refusal> {
         let mut at: Vec<&str> = split(path).0.split('/').filter(|part| !part.is_empty()).collect();
         let mut ahead: Vec<&str> = target.rsplit('/').collect();
@@ -124,7 +127,10 @@ impl Names {
         while let Some(part) = ahead.pop() {
             steps += 1;
             if steps > MAX_LINK_STEPS {
-                return Err(Refusal::entry(path.as_bytes(), "the symbolic link leads through too many others"));
+                return Err(Refusal::entry(
+                    path.as_bytes(),
+                    "the symbolic link leads through too many others",
+                ));
             }
             match part {
                 "" | "." => continue,

@@ -10,7 +10,8 @@ use zstd::stream::read::Decoder;
 use super::{COPY_BUFFER_BYTES, Compression, Refusal, UnpackError};
 
 pub(super) const BLOCK_BYTES: usize = 512;
-/// The decoder holds a frame's whole window in memory. 2^24 is what zstd's levels up to 19 need, and a little more.
+/// The decoder holds a frame's whole window in memory. 2^24 is what zstd's levels up to 19 need,
+/// and a little more.
 const WINDOW_LOG_MAX: u32 = 24;
 
 /// How many there may be of something.
@@ -32,7 +33,9 @@ impl Bound {
     /// Whether there may be `found` so far.
     pub(super) fn check(self, what: &'static str, found: u64) -> Result<(), Refusal> {
         match self {
-            Self::Exactly(announced) if found > announced => Err(Refusal::NotAsAnnounced { what, found, announced }),
+            Self::Exactly(announced) if found > announced => {
+                Err(Refusal::NotAsAnnounced { what, found, announced })
+            }
             Self::AtMost(limit) if found > limit => Err(Refusal::Limit { what, found, limit }),
             Self::Exactly(_) | Self::AtMost(_) => Ok(()),
         }
@@ -41,7 +44,9 @@ impl Bound {
     /// Whether there may be `found` of them in all.
     pub(super) fn check_end(self, what: &'static str, found: u64) -> Result<(), Refusal> {
         match self {
-            Self::Exactly(announced) if found != announced => Err(Refusal::NotAsAnnounced { what, found, announced }),
+            Self::Exactly(announced) if found != announced => {
+                Err(Refusal::NotAsAnnounced { what, found, announced })
+            }
             _ => self.check(what, found),
         }
     }
@@ -54,7 +59,8 @@ pub(super) struct Blocks<R: Read> {
     size: Bound,
     /// Uncompressed bytes for one compressed byte.
     ratio: u64,
-    /// What the uncompressed bytes hash to so far, and are to hash to in all, if that was announced.
+    /// What the uncompressed bytes hash to so far, and are to hash to in all, if that was
+    /// announced.
     digest: Option<(Sha256, Digest)>,
 }
 
@@ -73,7 +79,8 @@ struct Source<R> {
 impl<R: Read> Read for Source<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let result = self.content.read(buffer);
-        self.failed |= result.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::Interrupted);
+        self.failed |=
+            result.as_ref().is_err_and(|error| error.kind() != io::ErrorKind::Interrupted);
         self.taken += *result.as_ref().unwrap_or(&0) as u64;
         result
     }
@@ -104,12 +111,18 @@ impl<R: Read> Bytes<R> {
 }
 
 impl<R: Read> Blocks<R> {
-    pub(super) fn new(content: R, compression: Compression, size: Bound, ratio: u64) -> Result<Self, UnpackError> {
+    pub(super) fn new(
+        content: R,
+        compression: Compression,
+        size: Bound,
+        ratio: u64,
+    ) -> Result<Self, UnpackError> {
         let source = Source { content, taken: 0, failed: false };
         let bytes = match compression {
             Compression::None => Bytes::Plain(BufReader::with_capacity(COPY_BUFFER_BYTES, source)),
-            // RFC 8878 allows several frames, and skippable ones. The window's limit holds for each of them, since only one
-            // window is held at a time; all other limits are about the bytes of all frames together.
+            // RFC 8878 allows several frames, and skippable ones. The window's limit holds for each
+            // of them, since only one window is held at a time; all other limits are about the
+            // bytes of all frames together.
             Compression::Zstd => Decoder::new(source)
                 .and_then(|mut decoder| decoder.window_log_max(WINDOW_LOG_MAX).map(|()| decoder))
                 .map(Bytes::Zstd)
@@ -131,7 +144,9 @@ impl<R: Read> Blocks<R> {
             Bound::Exactly(_) if size > left => {
                 Err(self.damaged(format!("an entry of {size} bytes is longer than what is left")))
             }
-            Bound::AtMost(_) => Ok(self.size.check("uncompressed bytes", self.position.saturating_add(size))?),
+            Bound::AtMost(_) => {
+                Ok(self.size.check("uncompressed bytes", self.position.saturating_add(size))?)
+            }
             Bound::Exactly(_) => Ok(()),
         }
     }
@@ -152,7 +167,8 @@ impl<R: Read> Blocks<R> {
         };
         let found = self.position + count as u64;
         self.size.check("uncompressed bytes, so far", found)?;
-        let limit = self.bytes.source().taken.saturating_mul(self.ratio).max(CONTENT_RATIO_FREE_BYTES);
+        let limit =
+            self.bytes.source().taken.saturating_mul(self.ratio).max(CONTENT_RATIO_FREE_BYTES);
         Bound::AtMost(limit).check("uncompressed bytes for so few compressed ones", found)?;
         self.position = found;
         if let Some((hasher, _)) = &mut self.digest {
@@ -206,8 +222,8 @@ impl<R: Read> Blocks<R> {
         Ok(bytes)
     }
 
-    /// After the end marker there is nothing but zeros, in the announced number, and nothing behind them; and the whole has
-    /// the announced digest.
+    /// After the end marker there is nothing but zeros, in the announced number, and nothing behind
+    /// them; and the whole has the announced digest.
     pub(super) fn finish(&mut self, buffer: &mut [u8]) -> Result<(), UnpackError> {
         loop {
             match self.read(buffer)? {
@@ -223,7 +239,11 @@ impl<R: Read> Blocks<R> {
         if let Some((hasher, announced)) = self.digest.take() {
             let found = Digest::from_sha256(hasher.finalize().into());
             if found != announced {
-                return Err(Refusal::OtherDigest { found: found.into(), announced: announced.into() }.into());
+                return Err(Refusal::OtherDigest {
+                    found: found.into(),
+                    announced: announced.into(),
+                }
+                .into());
             }
         }
         Ok(())

@@ -1,5 +1,6 @@
-//! The tree that grows in a directory. Every path is reached from the root's descriptor, one component at a
-//! time and without following links; symbolic links come last, when nothing is written through them any more.
+//! The tree that grows in a directory. Every path is reached from the root's descriptor, one
+//! component at a time and without following links; symbolic links come last, when nothing is
+//! written through them any more.
 
 use std::fs::{File, Permissions};
 use std::io;
@@ -38,8 +39,8 @@ impl Tree {
         Ok(Self { root: root.to_owned(), root_fd, names: Names::new(limits), open: None })
     }
 
-    /// Makes what the entry is: directories, a second name of a file, or the file to write to. A symbolic link is only
-    /// noted.
+    /// Makes what the entry is: directories, a second name of a file, or the file to write to. A
+    /// symbolic link is only noted.
     pub(super) fn add(&mut self, entry: &Entry) -> Result<Option<File>, UnpackError> {
         for directory in self.names.add(entry)? {
             self.make_directory(&directory)?;
@@ -54,11 +55,14 @@ impl Tree {
     fn file(&mut self, path: &str, executable: bool) -> Result<File, UnpackError> {
         let mode = if executable { EXECUTABLE_MODE } else { FILE_MODE };
         let (parent, name) = split(path);
-        let flags = OFlag::O_WRONLY | OFlag::O_CREAT | OFlag::O_EXCL | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
-        let file = openat(self.open_directory(parent)?, name, flags, Mode::from_bits_truncate(mode));
+        let flags =
+            OFlag::O_WRONLY | OFlag::O_CREAT | OFlag::O_EXCL | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
+        let file =
+            openat(self.open_directory(parent)?, name, flags, Mode::from_bits_truncate(mode));
         let file = File::from(file.map_err(|errno| self.disk(path, errno))?);
         // The creation mode alone would depend on the umask.
-        file.set_permissions(Permissions::from_mode(mode)).map_err(|source| self.disk(path, source))?;
+        file.set_permissions(Permissions::from_mode(mode))
+            .map_err(|source| self.disk(path, source))?;
         Ok(file)
     }
 
@@ -66,14 +70,21 @@ impl Tree {
         let (target_parent, target_name) = split(target);
         let target_parent = self.walk(target_parent).map_err(|errno| self.disk(target, errno))?;
         let (parent, name) = split(path);
-        let made = linkat(target_parent, target_name, self.open_directory(parent)?, name, AtFlags::empty());
+        let made = linkat(
+            target_parent,
+            target_name,
+            self.open_directory(parent)?,
+            name,
+            AtFlags::empty(),
+        );
         made.map_err(|errno| self.disk(path, errno))
     }
 
     /// Makes the symbolic links, once it is known that none of them leads out of the tree.
     pub(super) fn finish(mut self) -> Result<(), UnpackError> {
         let links = self.names.symlinks()?;
-        let links: Vec<_> = links.into_iter().map(|(path, target)| (path.to_owned(), target.to_owned())).collect();
+        let links: Vec<_> =
+            links.into_iter().map(|(path, target)| (path.to_owned(), target.to_owned())).collect();
         for (path, target) in links {
             let (parent, name) = split(&path);
             let made = symlinkat(target.as_str(), self.open_directory(parent)?, name);
@@ -84,7 +95,8 @@ impl Tree {
 
     fn make_directory(&mut self, path: &str) -> Result<(), UnpackError> {
         let (parent, name) = split(path);
-        let made = mkdirat(self.open_directory(parent)?, name, Mode::from_bits_truncate(DIRECTORY_MODE));
+        let made =
+            mkdirat(self.open_directory(parent)?, name, Mode::from_bits_truncate(DIRECTORY_MODE));
         made.map_err(|errno| self.disk(path, errno))?;
         let directory = File::from(self.walk(path).map_err(|errno| self.disk(path, errno))?);
         let set = directory.set_permissions(Permissions::from_mode(DIRECTORY_MODE));

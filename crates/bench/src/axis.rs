@@ -43,7 +43,8 @@ impl Axis {
 
     /// Where a value lies: 0 at the least, 1 at the most.
     pub fn place(&self, value: f64) -> f64 {
-        let (least, most, value) = (self.scaled(self.least), self.scaled(self.most), self.scaled(value));
+        let (least, most, value) =
+            (self.scaled(self.least), self.scaled(self.most), self.scaled(value));
         ((value - least) / (most - least)).clamp(0.0, 1.0)
     }
 
@@ -61,13 +62,18 @@ impl Axis {
         let (first, last) = (self.least.log10().floor() as i32, self.most.log10().ceil() as i32);
         let few = self.scaled(self.most) - self.scaled(self.least) < FEW_DECADES;
         let steps: &[f64] = if few { &[1.0, 2.0, 5.0] } else { &[1.0] };
-        (first..=last).flat_map(|decade| steps.iter().map(move |step| step * 10_f64.powi(decade))).collect()
+        (first..=last)
+            .flat_map(|decade| steps.iter().map(move |step| step * 10_f64.powi(decade)))
+            .collect()
     }
 
     fn linear_ticks(&self) -> Vec<f64> {
         let rough = (self.most - self.least) / LINEAR_TICKS;
         let decade = 10_f64.powf(rough.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|factor| factor * decade).find(|step| *step >= rough);
+        let step = [1.0, 2.0, 5.0, 10.0]
+            .into_iter()
+            .map(|factor| factor * decade)
+            .find(|step| *step >= rough);
         let step = step.unwrap_or(rough);
         let first = (self.least / step).ceil() as i64;
         let last = (self.most / step).floor() as i64;
@@ -104,13 +110,18 @@ fn rounded(value: f64) -> String {
     let digits = if value == 0.0 { 0.0 } else { value.abs().log10().floor() };
     let places = (2.0 - digits).clamp(0.0, 9.0) as usize;
     let text = format!("{value:.places$}");
-    let trimmed = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    let trimmed =
+        if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
     trimmed.to_owned()
 }
 
 /// The unit that a setting's name ends with.
 pub fn unit_of_setting(name: &str) -> Unit {
-    let ends = [("_bytes_per_s", Unit::BytesPerSecond), ("_bytes", Unit::Bytes), ("_ms", Unit::Milliseconds)];
+    let ends = [
+        ("_bytes_per_s", Unit::BytesPerSecond),
+        ("_bytes", Unit::Bytes),
+        ("_ms", Unit::Milliseconds),
+    ];
     let found = ends.into_iter().find(|(end, _)| name.ends_with(end));
     found.map_or(if name.ends_with("_s") { Unit::Seconds } else { Unit::Number }, |(_, unit)| unit)
 }
@@ -145,7 +156,10 @@ mod tests {
         assert_eq!(axis.ticks(), [1e3, 1e4, 1e5, 1e6, 1e7, 1e8]);
         assert!(axis.place(1000.0) < axis.place(10_000.0) && axis.place(0.0) == 0.0);
         assert_eq!(Axis::over([1.0, 8.0], false).ticks(), [2.0, 4.0, 6.0, 8.0]);
-        assert_eq!(Axis::over([20.0, 100.0], false).from_zero().ticks(), [0.0, 20.0, 40.0, 60.0, 80.0, 100.0]);
+        assert_eq!(
+            Axis::over([20.0, 100.0], false).from_zero().ticks(),
+            [0.0, 20.0, 40.0, 60.0, 80.0, 100.0]
+        );
         // Nothing to show is no reason to fail.
         assert!(!Axis::over([], true).ticks().is_empty());
         assert!(Axis::over([5.0, 5.0], false).place(5.0) > 0.0);

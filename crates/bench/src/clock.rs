@@ -1,5 +1,5 @@
-//! The only place that reads the wall clock, by which a run says when it was made, and the clock that is compared between
-//! processes. Within one process `Instant` measures.
+//! The only place that reads the wall clock, by which a run says when it was made, and the clock
+//! that is compared between processes. Within one process `Instant` measures.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -13,7 +13,8 @@ pub fn wall_ms() -> u64 {
 /// Nanoseconds of the machine's monotonic clock, which all of its processes share.
 pub fn monotonic_ns() -> u64 {
     let mut now = libc::timespec { tv_sec: 0, tv_nsec: 0 };
-    // SAFETY: the kernel writes one timespec to the address of one that lives. Without this clock there is no Linux.
+    // SAFETY: the kernel writes one timespec to the address of one that lives. Without this clock
+    // there is no Linux.
     unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut now) };
     u64::try_from(now.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(now.tv_nsec).unwrap_or(0)
 }

@@ -1,5 +1,5 @@
-//! `taskbench compare`: what has changed between two results of the same scenario, quantity by quantity. Points belong
-//! together when their series and settings are the same.
+//! `taskbench compare`: what has changed between two results of the same scenario, quantity by
+//! quantity. Points belong together when their series and settings are the same.
 
 use std::path::PathBuf;
 
@@ -24,23 +24,37 @@ pub struct CompareFlags {
 pub fn compare(flags: &CompareFlags) -> anyhow::Result<String> {
     let read = |path: &PathBuf| Run::read(path).with_context(|| path.display().to_string());
     let (old, new) = (read(&flags.old)?, read(&flags.new)?);
-    ensure!(old.scenario == new.scenario, "a run of {} can't be compared with one of {}", old.scenario, new.scenario);
+    ensure!(
+        old.scenario == new.scenario,
+        "a run of {} can't be compared with one of {}",
+        old.scenario,
+        new.scenario
+    );
     Ok(table(&old, &new, flags.least))
 }
 
 fn table(old: &Run, new: &Run, least: f64) -> String {
-    let mut text = format!("{}: {} ({}) → {} ({})\n", old.scenario, old.commit, old.began, new.commit, new.began);
+    let mut text = format!(
+        "{}: {} ({}) → {} ({})\n",
+        old.scenario, old.commit, old.began, new.commit, new.began
+    );
     if old.machine != new.machine {
         text += "The machines differ: only ratios can be compared.\n";
     }
     for point in &new.points {
-        match old.points.iter().find(|other| other.series == point.series && other.settings == point.settings) {
+        match old
+            .points
+            .iter()
+            .find(|other| other.series == point.series && other.settings == point.settings)
+        {
             Some(before) => text += &rows(before, point, least),
             None => text += &format!("{}: only in the new run\n", title(point)),
         }
     }
     let is_gone = |point: &&Point| {
-        !new.points.iter().any(|other| other.series == point.series && other.settings == point.settings)
+        !new.points
+            .iter()
+            .any(|other| other.series == point.series && other.settings == point.settings)
     };
     for point in old.points.iter().filter(is_gone) {
         text += &format!("{}: only in the old run\n", title(point));
@@ -60,8 +74,13 @@ fn rows(old: &Point, new: &Point, least: f64) -> String {
             let change = percent(before, after, figure);
             if change.is_none_or(|change| change.abs() >= least) {
                 let change = change.map_or(String::new(), |change| format!("  {change:+.1} %"));
-                let (before, after, unit) = (before.figure(figure), after.figure(figure), after.unit.symbol());
-                rows += &format!("  {name} {label}: {} → {} {unit}{change}\n", number(before), number(after));
+                let (before, after, unit) =
+                    (before.figure(figure), after.figure(figure), after.unit.symbol());
+                rows += &format!(
+                    "  {name} {label}: {} → {} {unit}{change}\n",
+                    number(before),
+                    number(after)
+                );
             }
         }
     }
@@ -77,13 +96,15 @@ fn percent(before: &Quantity, after: &Quantity, figure: Figure) -> Option<f64> {
 }
 
 fn title(point: &Point) -> String {
-    let settings: Vec<String> = point.settings.iter().map(|(name, value)| format!("{name} {value}")).collect();
+    let settings: Vec<String> =
+        point.settings.iter().map(|(name, value)| format!("{name} {value}")).collect();
     format!("{}, {}", point.series, settings.join(", "))
 }
 
 /// Four digits that count.
 fn number(value: f64) -> String {
-    let digits = if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 9) };
+    let digits =
+        if value == 0.0 { 0 } else { (3 - value.abs().log10().floor() as i32).clamp(0, 9) };
     format!("{value:.*}", usize::try_from(digits).unwrap_or(0))
 }
 
@@ -109,16 +130,25 @@ mod tests {
 
     #[test]
     fn only_what_changed_enough_is_shown() {
-        let old = run(vec![point("a", 8.0, &[10.0]), point("a", 64.0, &[100.0, 200.0]), point("gone", 1.0, &[1.0])]);
+        let old = run(vec![
+            point("a", 8.0, &[10.0]),
+            point("a", 64.0, &[100.0, 200.0]),
+            point("gone", 1.0, &[1.0]),
+        ]);
         let mut failing = point("a", 64.0, &[101.0, 300.0]);
         failing.fail("lost");
         let new = run(vec![point("a", 8.0, &[20.0]), failing, point("fresh", 1.0, &[1.0])]);
         let text = table(&old, &new, 5.0);
-        assert!(text.contains("a, clients 8\n  delay median: 10.00 → 20.00 ms  +100.0 %\n"), "{text}");
+        assert!(
+            text.contains("a, clients 8\n  delay median: 10.00 → 20.00 ms  +100.0 %\n"),
+            "{text}"
+        );
         assert!(!text.contains("100.0 → 101.0"), "{text}");
         assert!(text.contains("delay p99: 200.0 → 300.0 ms  +50.0 %\n  failed: 0 → 1\n"), "{text}");
         assert!(
-            text.contains("fresh, clients 1: only in the new run\ngone, clients 1: only in the old run\n"),
+            text.contains(
+                "fresh, clients 1: only in the new run\ngone, clients 1: only in the old run\n"
+            ),
             "{text}"
         );
     }

@@ -1,6 +1,6 @@
-//! Many connections that fetch one path over and over, as cheaply as the kernel allows: the bytes are counted and thrown
-//! away unread, or decrypted where they are encrypted, so that what is measured is the server's work. It knows neither
-//! digests nor tokens.
+//! Many connections that fetch one path over and over, as cheaply as the kernel allows: the bytes
+//! are counted and thrown away unread, or decrypted where they are encrypted, so that what is
+//! measured is the server's work. It knows neither digests nor tokens.
 
 use std::io;
 use std::net::SocketAddr;
@@ -46,7 +46,10 @@ pub struct Target {
 
 impl Target {
     fn request(&self) -> Vec<u8> {
-        let token = self.token.as_ref().map_or(String::new(), |token| format!("Authorization: Bearer {token}\r\n"));
+        let token = self
+            .token
+            .as_ref()
+            .map_or(String::new(), |token| format!("Authorization: Bearer {token}\r\n"));
         format!("GET {} HTTP/1.1\r\nHost: {}\r\n{token}\r\n", self.path, self.address).into_bytes()
     }
 }
@@ -71,11 +74,17 @@ pub struct Got {
     pub wall: Duration,
 }
 
-/// Opens one connection for each of `targets` and fetches until all are done. `started` is called once all are open, right before the
-/// first request. One failed fetch fails the run: a server that refuses some has an easy life.
-pub async fn download(targets: &[Target], until: Until, started: impl FnOnce()) -> anyhow::Result<Got> {
+/// Opens one connection for each of `targets` and fetches until all are done. `started` is called
+/// once all are open, right before the first request. One failed fetch fails the run: a server that
+/// refuses some has an easy life.
+pub async fn download(
+    targets: &[Target],
+    until: Until,
+    started: impl FnOnce(),
+) -> anyhow::Result<Got> {
     let streams = connect_all(targets).await?;
-    let (start, stop) = (Arc::new(Barrier::new(targets.len() + 1)), Arc::new(AtomicBool::new(false)));
+    let (start, stop) =
+        (Arc::new(Barrier::new(targets.len() + 1)), Arc::new(AtomicBool::new(false)));
     let counts = Arc::new([AtomicU64::new(0), AtomicU64::new(0)]);
     let tasks: Vec<_> = streams
         .into_iter()
@@ -125,7 +134,9 @@ async fn connect(target: &Target) -> io::Result<Stream> {
         None => Stream::Plain(stream),
         Some(tls) => {
             let name = target.address.ip().into();
-            Stream::Encrypted(Box::new(TlsConnector::from(tls.clone()).connect(name, stream).await?))
+            Stream::Encrypted(Box::new(
+                TlsConnector::from(tls.clone()).connect(name, stream).await?,
+            ))
         }
     })
 }
@@ -134,7 +145,10 @@ async fn connect_all(targets: &[Target]) -> anyhow::Result<Vec<Stream>> {
     let mut streams = Vec::with_capacity(targets.len());
     for group in targets.chunks(CONNECTS_AT_ONCE) {
         let opening = futures_util::future::join_all(group.iter().map(connect));
-        for opened in tokio::time::timeout(PATIENCE, opening).await.context("the server accepts no connection")? {
+        for opened in tokio::time::timeout(PATIENCE, opening)
+            .await
+            .context("the server accepts no connection")?
+        {
             streams.push(opened.context("the server does not accept a connection")?);
         }
     }
@@ -159,7 +173,11 @@ async fn fetch(stream: &mut Stream, request: &[u8], size: u64) -> anyhow::Result
 }
 
 /// Gives how many bytes of the body are still to come.
-async fn ask<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S, request: &[u8], size: u64) -> anyhow::Result<u64> {
+async fn ask<S: AsyncRead + AsyncWrite + Unpin>(
+    stream: &mut S,
+    request: &[u8],
+    size: u64,
+) -> anyhow::Result<u64> {
     stream.write_all(request).await.context("the request could not be sent")?;
     stream.flush().await.context("the request could not be sent")?;
     let after_head = read_head(stream, size).await?;
@@ -203,7 +221,8 @@ async fn discard(stream: &TcpStream, mut left: u64) -> io::Result<()> {
         let most = usize::try_from(left).unwrap_or(DISCARD_BYTES).min(DISCARD_BYTES);
         let taken = stream
             .async_io(Interest::READABLE, || {
-                recv(stream.as_raw_fd(), &mut unused[..most], MsgFlags::MSG_TRUNC).map_err(io::Error::from)
+                recv(stream.as_raw_fd(), &mut unused[..most], MsgFlags::MSG_TRUNC)
+                    .map_err(io::Error::from)
             })
             .await?;
         if taken == 0 {
@@ -261,19 +280,25 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");
         let acceptor = certificate.map(|certificate| {
-            let chain = CertificateDer::pem_slice_iter(certificate.chain.as_bytes()).collect::<Result<_, _>>();
+            let chain = CertificateDer::pem_slice_iter(certificate.chain.as_bytes())
+                .collect::<Result<_, _>>();
             let key = PrivateKeyDer::from_pem_slice(certificate.key.as_bytes()).expect("a key");
             let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
-            let builder = builder.with_safe_default_protocol_versions().expect("suites").with_no_client_auth();
-            TlsAcceptor::from(Arc::new(builder.with_single_cert(chain.expect("a chain"), key).expect("a pair")))
+            let builder = builder
+                .with_safe_default_protocol_versions()
+                .expect("suites")
+                .with_no_client_auth();
+            TlsAcceptor::from(Arc::new(
+                builder.with_single_cert(chain.expect("a chain"), key).expect("a pair"),
+            ))
         });
         tokio::spawn(async move {
             while let Ok((stream, _)) = listener.accept().await {
                 match acceptor.clone() {
                     None => drop(tokio::spawn(answer(stream, body))),
-                    Some(tls) => {
-                        drop(tokio::spawn(async move { answer(tls.accept(stream).await.expect("TLS"), body).await }))
-                    }
+                    Some(tls) => drop(tokio::spawn(async move {
+                        answer(tls.accept(stream).await.expect("TLS"), body).await
+                    })),
                 }
             }
         });

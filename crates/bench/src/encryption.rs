@@ -1,4 +1,5 @@
-//! TLS of a run: how its clients connect, and a certificate for the program that taskd is measured beside.
+//! TLS of a run: how its clients connect, and a certificate for the program that taskd is measured
+//! beside.
 
 use anyhow::Context as _;
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
@@ -11,9 +12,11 @@ use task_transport::{Trust, pin_of};
 /// Servers that a client knows again.
 const SESSIONS: usize = 2;
 /// What a result says of itself.
-pub const ALL_IS_ENCRYPTED: &str = "Every connection is TLS 1.3, each client checks the server's certificate.";
+pub const ALL_IS_ENCRYPTED: &str =
+    "Every connection is TLS 1.3, each client checks the server's certificate.";
 
-/// How a client connects to a server whose authority has this pin; without one, the system's roots have to vouch for it.
+/// How a client connects to a server whose authority has this pin; without one, the system's roots
+/// have to vouch for it.
 pub fn client_config(pin: Option<CaPin>) -> ClientConfig {
     Trust::by(pin).client_config(clock::for_certificates())
 }

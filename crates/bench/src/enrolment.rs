@@ -1,4 +1,5 @@
-//! Robots of a server under measurement: enrolled through its API like any other, with nobody behind them.
+//! Robots of a server under measurement: enrolled through its API like any other, with nobody
+//! behind them.
 
 use anyhow::Context as _;
 use futures_util::{StreamExt as _, TryStreamExt as _};

@@ -1,5 +1,5 @@
-//! A run's view of its simulated robots: it registers them, starts the processes they live in, and hears from these who has
-//! verified what, when.
+//! A run's view of its simulated robots: it registers them, starts the processes they live in, and
+//! hears from these who has verified what, when.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -25,13 +25,16 @@ use crate::taskd::Taskd;
 
 /// Enrolments under way at a time.
 const REQUESTS_AT_ONCE: usize = 16;
-/// Robots in one process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant 20,000 and more.
+/// Robots in one process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant
+/// 20,000 and more.
 pub const ROBOTS_PER_PROCESS: usize = 2500;
-/// Open files a robot has at most: MQTT, which takes three where it is encrypted, HTTP connections, what it writes.
+/// Open files a robot has at most: MQTT, which takes three where it is encrypted, HTTP connections,
+/// what it writes.
 pub const FILES_PER_ROBOT: usize = 7;
 /// Words from the robots' processes that were not read yet.
 const QUEUED_WORDS: usize = 1024;
-/// Where robots have their data: memory, because every real robot has a disk of its own and here they would share one.
+/// Where robots have their data: memory, because every real robot has a disk of its own and here
+/// they would share one.
 const MEMORY: &str = "/dev/shm";
 /// What their processes say beside their words.
 const LOG: &str = "robots.log";
@@ -73,7 +76,12 @@ impl Arrivals {
 
 impl Fleet {
     /// Registers `robots` robots at `taskd` and puts them together; they do not run yet.
-    pub async fn assemble(taskd: &Taskd, robots: usize, poll: Duration, link: Option<&Link>) -> anyhow::Result<Self> {
+    pub async fn assemble(
+        taskd: &Taskd,
+        robots: usize,
+        poll: Duration,
+        link: Option<&Link>,
+    ) -> anyhow::Result<Self> {
         let (members, enrolments, key) = enrol(taskd, robots).await?;
         let dir = memory_directory("taskbench-robots-")?;
         let (said, words) = mpsc::channel(QUEUED_WORDS);
@@ -110,7 +118,12 @@ impl Fleet {
     }
 
     /// Starts a further process with these robots, which puts them together.
-    async fn add(&mut self, crew: &Crew, link: Option<&Link>, said: mpsc::Sender<Option<Word>>) -> anyhow::Result<()> {
+    async fn add(
+        &mut self,
+        crew: &Crew,
+        link: Option<&Link>,
+        said: mpsc::Sender<Option<Word>>,
+    ) -> anyhow::Result<()> {
         let mut program = Program::beside("taskbench", None)?.args(["robots"]);
         if let Some(link) = link {
             program = program.within(link.inside());
@@ -121,7 +134,8 @@ impl Fleet {
         self.tell(self.processes.len() - 1, &serde_json::to_vec(crew)?).await
     }
 
-    /// Lets all robots begin at once; gives each one's time until it keeps to the server's state and the server knows.
+    /// Lets all robots begin at once; gives each one's time until it keeps to the server's state
+    /// and the server knows.
     pub async fn start(&mut self, limit: Duration) -> anyhow::Result<Arrivals> {
         let begun_ns = monotonic_ns();
         let start = serde_json::to_vec(&Order::Start)?;
@@ -135,7 +149,8 @@ impl Fleet {
         self.hear(self.robots, begun_ns, limit, "is not connected and reconciled", news).await
     }
 
-    /// Waits until the first `robots` robots have verified `deployment`, which was ordered at `ordered_ns`, or have failed.
+    /// Waits until the first `robots` robots have verified `deployment`, which was ordered at
+    /// `ordered_ns`, or have failed.
     pub async fn verified(
         &mut self,
         deployment: &DeploymentId,
@@ -144,8 +159,12 @@ impl Fleet {
         limit: Duration,
     ) -> anyhow::Result<Arrivals> {
         let news = |word: Word| match word {
-            Word::Verified { robot, deployment: by, at_ns } if by == *deployment => Some((robot, Ok(at_ns))),
-            Word::Failed { robot, deployment: by, why } if by == *deployment => Some((robot, Err(why))),
+            Word::Verified { robot, deployment: by, at_ns } if by == *deployment => {
+                Some((robot, Ok(at_ns)))
+            }
+            Word::Failed { robot, deployment: by, why } if by == *deployment => {
+                Some((robot, Err(why)))
+            }
             _ => None,
         };
         self.hear(robots, ordered_ns, limit, "has not verified it", news).await
@@ -163,7 +182,9 @@ impl Fleet {
         let mut arrivals = Arrivals::default();
         let mut heard = vec![false; robots];
         while heard.contains(&false) {
-            let Ok(word) = tokio::time::timeout_at(deadline, self.words.recv()).await else { break };
+            let Ok(word) = tokio::time::timeout_at(deadline, self.words.recv()).await else {
+                break;
+            };
             let Some(word) = word.flatten() else { return Err(self.lost("ended")) };
             let Some((robot, outcome)) = news(word) else { continue };
             if heard.get(robot) != Some(&false) {
@@ -171,7 +192,9 @@ impl Fleet {
             }
             heard[robot] = true;
             match outcome {
-                Ok(at_ns) => arrivals.arrived.push((robot, at_ns.saturating_sub(since_ns) as f64 / 1e6)),
+                Ok(at_ns) => {
+                    arrivals.arrived.push((robot, at_ns.saturating_sub(since_ns) as f64 / 1e6))
+                }
                 Err(why) => arrivals.failures.push(why),
             }
         }
@@ -181,8 +204,14 @@ impl Fleet {
     }
 
     /// What the payload that robot `number` has unpacked hashes to.
-    pub fn payload(&self, number: usize, package: &TaskName, manifest: &Digest) -> anyhow::Result<Digest> {
-        let data = task_agent::system::layout::DataDir::new(&self.dir.path().join(number.to_string()))?;
+    pub fn payload(
+        &self,
+        number: usize,
+        package: &TaskName,
+        manifest: &Digest,
+    ) -> anyhow::Result<Digest> {
+        let data =
+            task_agent::system::layout::DataDir::new(&self.dir.path().join(number.to_string()))?;
         let path: PathBuf = data.task(package).version(manifest).src().join(PAYLOAD_FILE);
         let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
         Ok(Digest::of(&bytes))
@@ -217,7 +246,10 @@ impl Fleet {
 
     fn lost(&self, what: &str) -> anyhow::Error {
         let log = std::fs::read_to_string(self.dir.path().join(LOG)).unwrap_or_default();
-        anyhow!("a process of robots {what}: {}", log.trim().lines().next_back().unwrap_or("it said nothing"))
+        anyhow!(
+            "a process of robots {what}: {}",
+            log.trim().lines().next_back().unwrap_or("it said nothing")
+        )
     }
 }
 
@@ -249,7 +281,8 @@ async fn enrol(
 ) -> anyhow::Result<(Vec<Member>, Vec<Duration>, task_proto::envelope::PublicKey)> {
     let order = CreateEnrollmentToken { uses: Some(robots as u64), ..Default::default() };
     let token = taskd.server.create_enrollment_token(&order).await?.token;
-    let key = token.parse::<Token>()?.server_key().context("the enrolment token pins no key")?.clone();
+    let key =
+        token.parse::<Token>()?.server_key().context("the enrolment token pins no key")?.clone();
     let steps = (0..robots).map(|number| {
         let (server, token) = (&taskd.server, &token);
         async move {
@@ -257,8 +290,12 @@ async fn enrol(
             let [.., a, b, c] = u64::try_from(number)?.to_be_bytes();
             let mac = MacAddress::from_octets([0x02, 0, 0, a, b, c]).context("no MAC")?;
             let name = Some(name(number).parse()?);
-            let enrolled =
-                server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new(), client_key: None }).await?;
+            let enrolled = server
+                .enroll(
+                    token,
+                    &EnrollRequest { mac, name, labels: Labels::new(), client_key: None },
+                )
+                .await?;
             Ok((number, Member { mac, enrolled }, begun.elapsed()))
         }
     });
@@ -295,7 +332,8 @@ mod tests {
 
     #[test]
     fn arrivals_know_their_last() {
-        let arrivals = Arrivals { arrived: vec![(0, 3.0), (1, 9.0), (2, 5.0)], failures: Vec::new() };
+        let arrivals =
+            Arrivals { arrived: vec![(0, 3.0), (1, 9.0), (2, 5.0)], failures: Vec::new() };
         assert_eq!((arrivals.last_ms(), Arrivals::default().last_ms()), (Some(9.0), None));
     }
 }

@@ -1,6 +1,7 @@
-//! A link between the server and the robots as bad as is wanted: a network namespace for the robots, a pair of virtual
-//! interfaces, the rate limited on both ends, a delay where the kernel has one. All robots share it, as they share an
-//! access point. It is removed when it goes; what a killed run has left is removed by the next.
+//! A link between the server and the robots as bad as is wanted: a network namespace for the
+//! robots, a pair of virtual interfaces, the rate limited on both ends, a delay where the kernel
+//! has one. All robots share it, as they share an access point. It is removed when it goes; what a
+//! killed run has left is removed by the next.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
@@ -32,16 +33,20 @@ impl FromStr for LinkQuality {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let (rate, delay) = text.split_once(',').map_or((text, None), |(rate, delay)| (rate, Some(delay)));
+        let (rate, delay) =
+            text.split_once(',').map_or((text, None), |(rate, delay)| (rate, Some(delay)));
         let units = [("kbit", 1_000), ("mbit", 1_000_000), ("gbit", 1_000_000_000)];
         let number = units.into_iter().find_map(|(unit, factor)| {
             let number: f64 = rate.strip_suffix(unit)?.parse().ok()?;
             Some(number * f64::from(factor))
         });
         let bits_per_s = number.filter(|bits| (8_000.0..=100e9).contains(bits));
-        let bits_per_s =
-            bits_per_s.ok_or_else(|| format!("{rate:?} is not a rate: expected for example 20mbit"))? as u64;
-        let parse = |delay: &str| delay.strip_suffix("ms")?.parse().ok().filter(|ms| (1..=10_000).contains(ms));
+        let bits_per_s = bits_per_s
+            .ok_or_else(|| format!("{rate:?} is not a rate: expected for example 20mbit"))?
+            as u64;
+        let parse = |delay: &str| {
+            delay.strip_suffix("ms")?.parse().ok().filter(|ms| (1..=10_000).contains(ms))
+        };
         let wrong = |delay: &str| format!("{delay:?} is not a delay: expected for example 30ms");
         let delay_ms = delay.map(|delay| parse(delay).ok_or_else(|| wrong(delay))).transpose()?;
         Ok(Self { bits_per_s, delay_ms })
@@ -63,9 +68,12 @@ impl Link {
         let pid = std::process::id();
         let subnet = u8::try_from(pid % 254)?;
         // 198.18.0.0/15 is set aside for benchmarks: nothing else has these addresses.
-        let (server, robots) = (Ipv4Addr::new(198, 18, subnet, 1), Ipv4Addr::new(198, 18, subnet, 2));
-        let link = Self { namespace: format!("{PREFIX}{pid}"), interface: format!("tb{pid}"), server };
-        let (outer, inner, space) = (link.interface.as_str(), format!("tb{pid}r"), link.namespace.as_str());
+        let (server, robots) =
+            (Ipv4Addr::new(198, 18, subnet, 1), Ipv4Addr::new(198, 18, subnet, 2));
+        let link =
+            Self { namespace: format!("{PREFIX}{pid}"), interface: format!("tb{pid}"), server };
+        let (outer, inner, space) =
+            (link.interface.as_str(), format!("tb{pid}r"), link.namespace.as_str());
         ip(&["netns", "add", space]).await.context("--link needs root and the tool ip")?;
         ip(&["link", "add", outer, "type", "veth", "peer", "name", &inner, "netns", space]).await?;
         ip(&["addr", "add", &format!("{server}/30"), "dev", outer]).await?;
@@ -100,11 +108,13 @@ impl Drop for Link {
 
 async fn limit(quality: LinkQuality, namespace: Option<&str>, device: &str) -> anyhow::Result<()> {
     let tc = |arguments: &[&str]| {
-        let program = namespace.map_or(Program::named("tc"), |space| Program::named("tc").args(["-n", space]));
+        let program = namespace
+            .map_or(Program::named("tc"), |space| Program::named("tc").args(["-n", space]));
         program.args(["qdisc", "add", "dev", device]).args(arguments)
     };
     let rate = format!("{}bit", quality.bits_per_s);
-    // A tenth of a second's worth would be a free ride for small packages: a hundredth, if a segment fits.
+    // A tenth of a second's worth would be a free ride for small packages: a hundredth, if a
+    // segment fits.
     let burst = (quality.bits_per_s / 8 / 100).max(MIN_BURST_BYTES).to_string();
     tc(&["root", "handle", "1:", "tbf", "rate", &rate, "burst", &burst, "latency", MAX_WAIT])
         .output()
@@ -112,7 +122,10 @@ async fn limit(quality: LinkQuality, namespace: Option<&str>, device: &str) -> a
         .context("--link: the rate can't be limited")?;
     let Some(delay_ms) = quality.delay_ms else { return Ok(()) };
     let delay = format!("{delay_ms}ms");
-    match tc(&["parent", "1:1", "handle", "10:", "netem", "delay", &delay, "limit", "100000"]).output().await {
+    match tc(&["parent", "1:1", "handle", "10:", "netem", "delay", &delay, "limit", "100000"])
+        .output()
+        .await
+    {
         Ok(_) => Ok(()),
         Err(ProcessError::Failed { said, .. }) => bail!(
             "--link: this kernel has no delay (netem: {said}); leave it out, as in --link {}kbit",
@@ -146,8 +159,11 @@ mod tests {
         let link = |bits_per_s, delay_ms| Ok(LinkQuality { bits_per_s, delay_ms });
         assert_eq!("20mbit,30ms".parse(), link(20_000_000, Some(30)));
         assert_eq!("1.5gbit".parse(), link(1_500_000_000, None));
-        for (wrong, named) in [("20", "\"20\" is not a rate"), ("0mbit", "0mbit"), ("1mbit,3", "\"3\" is not a delay")]
-        {
+        for (wrong, named) in [
+            ("20", "\"20\" is not a rate"),
+            ("0mbit", "0mbit"),
+            ("1mbit,3", "\"3\" is not a delay"),
+        ] {
             let error = wrong.parse::<LinkQuality>().expect_err(wrong);
             assert!(error.contains(named), "{error}");
         }

@@ -1,5 +1,5 @@
-//! A load run: its flags, its phases in their order, and what it leaves behind. Every phase is bounded by
-//! [`PHASE_LIMIT`], and a phase in which nothing succeeds ends the run.
+//! A load run: its flags, its phases in their order, and what it leaves behind. Every phase is
+//! bounded by [`PHASE_LIMIT`], and a phase in which nothing succeeds ends the run.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, anyhow};
 use clap::Args;
 use reqwest::Url;
-use task_proto::api::{CreateDeployment, CreateEnrollmentToken, DeliveryChoice, EnrollRequest, PhaseCount};
+use task_proto::api::{
+    CreateDeployment, CreateEnrollmentToken, DeliveryChoice, EnrollRequest, PhaseCount,
+};
 use task_proto::id::Labels;
 use task_proto::report::Phase as TaskPhase;
 use task_proto::token::Token;
@@ -50,7 +52,8 @@ pub struct LoadFlags {
     /// How long to send steady reports, at most 3600
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
-    /// Steady reports per second, of all robots together; each changes its task's phase. At most 5000
+    /// Steady reports per second, of all robots together; each changes its task's phase. At most
+    /// 5000
     #[arg(long, value_name = "R", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=5000))]
     reports_per_s: u32,
     /// How to print the result
@@ -77,7 +80,8 @@ impl Load {
         allow_files(u64::from(flags.robots) + OTHER_FILES)?;
         let text = std::fs::read_to_string(&flags.token_file);
         let text = text.with_context(|| format!("--token-file {}", flags.token_file.display()))?;
-        let token: Token = text.parse().with_context(|| format!("--token-file {}", flags.token_file.display()))?;
+        let token: Token =
+            text.parse().with_context(|| format!("--token-file {}", flags.token_file.display()))?;
         let server = Server::new(flags.server.clone(), &token, None)?;
         let info = server.info().await.with_context(|| format!("--server {}", flags.server))?;
         let facts = Facts {
@@ -90,7 +94,13 @@ impl Load {
             cores: std::thread::available_parallelism().map_or(1, usize::from),
         };
         let report = LoadReport::begin(facts, flags.output);
-        Ok(Self { flags, server, run: format!("{:08x}", rand::random::<u32>()), manifest: None, report })
+        Ok(Self {
+            flags,
+            server,
+            run: format!("{:08x}", rand::random::<u32>()),
+            manifest: None,
+            report,
+        })
     }
 
     /// All phases but the last.
@@ -103,7 +113,8 @@ impl Load {
         self.add("connect", begun, every(CONNECTS_AT_ONCE, PHASE_LIMIT, steps).await)?;
 
         let begun = Instant::now();
-        let steps = robots.iter_mut().map(async |robot| Ok(robot.report(TaskPhase::Assigned).await?));
+        let steps =
+            robots.iter_mut().map(async |robot| Ok(robot.report(TaskPhase::Assigned).await?));
         self.add("first report", begun, every(count, PHASE_LIMIT, steps).await)?;
 
         self.order(&mut robots).await?;
@@ -158,7 +169,11 @@ impl Load {
             ..Default::default()
         };
         let token = self.server.create_enrollment_token(&order).await?.token;
-        let key = token.parse::<Token>()?.server_key().context("the enrolment token pins no key")?.clone();
+        let key = token
+            .parse::<Token>()?
+            .server_key()
+            .context("the enrolment token pins no key")?
+            .clone();
         // Locally administered addresses, apart from those of other runs.
         let [a, b] = rand::random();
         let (server, flags, run) = (&self.server, &self.flags, &self.run);
@@ -170,12 +185,23 @@ impl Load {
                 let [high, low] = number.to_be_bytes();
                 let mac = MacAddress::from_octets([0x02, a, b, 0, high, low]).context("no MAC")?;
                 let name = Some(format!("{NAME}-{run}-{number:05}").parse()?);
-                let enrolled =
-                    server.enroll(token, &EnrollRequest { mac, name, labels: Labels::new(), client_key: None }).await?;
-                let host = enrolled.mqtt.host.clone().or_else(|| flags.server.host_str().map(str::to_owned));
+                let enrolled = server
+                    .enroll(
+                        token,
+                        &EnrollRequest { mac, name, labels: Labels::new(), client_key: None },
+                    )
+                    .await?;
+                let host = enrolled
+                    .mqtt
+                    .host
+                    .clone()
+                    .or_else(|| flags.server.host_str().map(str::to_owned));
                 let default = (host.context("--server names no host")?, enrolled.mqtt.port);
                 let (host, port) = flags.mqtt.clone().unwrap_or(default);
-                Ok((Robot::new(Identity { enrolled, host, port, key: key.clone() }), begun.elapsed()))
+                Ok((
+                    Robot::new(Identity { enrolled, host, port, key: key.clone() }),
+                    begun.elapsed(),
+                ))
             }
         });
         let mut robots = Vec::new();
@@ -189,8 +215,8 @@ impl Load {
         Ok(robots)
     }
 
-    /// Orders a package for all robots, which report it through its phases until it runs. Both are measured from the
-    /// order on.
+    /// Orders a package for all robots, which report it through its phases until it runs. Both are
+    /// measured from the order on.
     async fn order(&mut self, robots: &mut [Robot]) -> anyhow::Result<()> {
         let (package, version): (TaskName, Version) = (NAME.parse()?, self.run.parse()?);
         let manifest = self.server.push_package(&package, &version).await?;
@@ -222,11 +248,15 @@ impl Load {
         let last = ordered.iter().flatten().max().copied().unwrap_or_default();
         self.report.add(Phase::new("order", last, ordered))?;
         let missing = self.missing(deployment, running.iter().flatten().count()).await?;
-        running.extend((0..missing).map(|_| Err(anyhow!("acknowledged, but the server does not show it running"))));
+        running.extend(
+            (0..missing)
+                .map(|_| Err(anyhow!("acknowledged, but the server does not show it running"))),
+        );
         self.add("order to running", begun, running)
     }
 
-    /// Waits until the server shows `expected` robots running; gives how many are missing when patience ends.
+    /// Waits until the server shows `expected` robots running; gives how many are missing when
+    /// patience ends.
     async fn missing(&self, deployment: &DeploymentId, expected: usize) -> anyhow::Result<usize> {
         let deadline = Instant::now() + PHASE_LIMIT;
         let mut tick = tokio::time::interval(ASK_INTERVAL);
@@ -242,8 +272,8 @@ impl Load {
         }
     }
 
-    /// Reports at a fixed rate, robot by robot. A report is measured from when it was due, so that a server that falls
-    /// behind shows.
+    /// Reports at a fixed rate, robot by robot. A report is measured from when it was due, so that
+    /// a server that falls behind shows.
     async fn steady(&mut self, robots: &mut [Robot]) -> anyhow::Result<()> {
         let (count, rate) = (robots.len(), f64::from(self.flags.reports_per_s));
         let total = usize::try_from(self.flags.seconds * u64::from(self.flags.reports_per_s))?;
@@ -253,14 +283,19 @@ impl Load {
             for number in (first..total).step_by(count) {
                 let due = begun + Duration::from_secs_f64(number as f64 / rate);
                 tokio::time::sleep_until(due.into()).await;
-                let phase = if samples.len().is_multiple_of(2) { TaskPhase::Starting } else { TaskPhase::Running };
+                let phase = if samples.len().is_multiple_of(2) {
+                    TaskPhase::Starting
+                } else {
+                    TaskPhase::Running
+                };
                 samples.push(robot.report(phase).await.map(|_| due.elapsed()).map_err(Into::into));
             }
             Ok(samples)
         });
         let limit = Duration::from_secs(self.flags.seconds) + PHASE_LIMIT;
         let steps = every(count, limit, steps).await;
-        let samples = steps.into_iter().flat_map(|step| step.unwrap_or_else(|error| vec![Err(error)]));
+        let samples =
+            steps.into_iter().flat_map(|step| step.unwrap_or_else(|error| vec![Err(error)]));
         self.add("steady reports", begun, samples)
     }
 

@@ -58,13 +58,16 @@ impl LoadReport {
         Self { facts, format, phases: Vec::new() }
     }
 
-    /// Adds a phase. A phase without any success is an error: what comes after it would measure nothing.
+    /// Adds a phase. A phase without any success is an error: what comes after it would measure
+    /// nothing.
     pub fn add(&mut self, phase: Phase) -> anyhow::Result<()> {
         if self.format == Format::Table {
             print(&row(&phase));
         }
         let failure = phase.failures.keys().next().filter(|_| phase.failed() == phase.count());
-        let outcome = failure.map_or(Ok(()), |text| Err(anyhow::anyhow!("{}: every step failed: {text}", phase.name)));
+        let outcome = failure.map_or(Ok(()), |text| {
+            Err(anyhow::anyhow!("{}: every step failed: {text}", phase.name))
+        });
         self.phases.push(phase);
         outcome
     }
@@ -82,8 +85,12 @@ impl LoadReport {
 fn row(phase: &Phase) -> String {
     let ms = |percent| phase.percentile_ms(percent).map_or("-".to_owned(), |ms| format!("{ms:.1}"));
     let (wall, p50, p99, max) = (phase.wall.as_secs_f64(), ms(50), ms(99), ms(100));
-    let mut row =
-        format!("{:<16} {:>7} {wall:>8.2} {p50:>9} {p99:>9} {max:>9} {:>7}", phase.name, phase.count(), phase.failed());
+    let mut row = format!(
+        "{:<16} {:>7} {wall:>8.2} {p50:>9} {p99:>9} {max:>9} {:>7}",
+        phase.name,
+        phase.count(),
+        phase.failed()
+    );
     for (text, count) in &phase.failures {
         row.push_str(&format!("\n  {count} × {text}"));
     }

@@ -1,5 +1,5 @@
-//! What a figure can't be read without: the machine and the commit it was measured with. What can't be found out is
-//! `unknown`, never an error. Also how much of the machine a run may use.
+//! What a figure can't be read without: the machine and the commit it was measured with. What can't
+//! be found out is `unknown`, never an error. Also how much of the machine a run may use.
 
 use std::path::Path;
 
@@ -33,22 +33,30 @@ impl Machine {
         let read = |path: &str| std::fs::read_to_string(Path::new(path)).unwrap_or_default();
         let kilobytes: Option<u64> = field(&read("/proc/meminfo"), "MemTotal", ':')
             .and_then(|text| text.split_whitespace().next()?.parse().ok());
-        let kernel = uname()
-            .ok()
-            .map(|name| format!("{} {}", name.sysname().to_string_lossy(), name.release().to_string_lossy()));
+        let kernel = uname().ok().map(|name| {
+            format!("{} {}", name.sysname().to_string_lossy(), name.release().to_string_lossy())
+        });
         Self {
-            cpu: field(&read("/proc/cpuinfo"), "model name", ':').unwrap_or_else(|| UNKNOWN.to_owned()),
+            cpu: field(&read("/proc/cpuinfo"), "model name", ':')
+                .unwrap_or_else(|| UNKNOWN.to_owned()),
             cores: std::thread::available_parallelism().map_or(1, usize::from),
             memory_bytes: kilobytes.unwrap_or(0) * 1024,
             kernel: kernel.unwrap_or_else(|| UNKNOWN.to_owned()),
-            system: field(&read("/etc/os-release"), "PRETTY_NAME", '=').unwrap_or_else(|| UNKNOWN.to_owned()),
+            system: field(&read("/etc/os-release"), "PRETTY_NAME", '=')
+                .unwrap_or_else(|| UNKNOWN.to_owned()),
         }
     }
 }
 
 /// The commit of the repository this program is run in, `-dirty` if files differ from it.
 pub async fn commit() -> String {
-    let git = Program::named("git").args(["describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]);
+    let git = Program::named("git").args([
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=12",
+        "--exclude=*",
+    ]);
     match git.output().await {
         Ok(text) => text.trim().to_owned(),
         Err(_) => UNKNOWN.to_owned(),
@@ -63,7 +71,8 @@ fn field(text: &str, name: &str, separator: char) -> Option<String> {
     })
 }
 
-/// Lets this program and its children have `needed` open files each: every connection is one, on both sides.
+/// Lets this program and its children have `needed` open files each: every connection is one, on
+/// both sides.
 pub fn allow_files(needed: u64) -> anyhow::Result<()> {
     let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
     if soft >= needed {
@@ -84,9 +93,18 @@ mod tests {
     #[test]
     fn a_machine_says_what_it_is() {
         let here = Machine::here();
-        assert!(here.cores > 0 && here.memory_bytes > 1 << 20 && here.kernel.starts_with("Linux "), "{here:?}");
-        assert_eq!(field("a : x\nmodel name\t: Fast 9\n", "model name", ':').as_deref(), Some("Fast 9"));
-        assert_eq!(field("PRETTY_NAME=\"A System\"\n", "PRETTY_NAME", '=').as_deref(), Some("A System"));
+        assert!(
+            here.cores > 0 && here.memory_bytes > 1 << 20 && here.kernel.starts_with("Linux "),
+            "{here:?}"
+        );
+        assert_eq!(
+            field("a : x\nmodel name\t: Fast 9\n", "model name", ':').as_deref(),
+            Some("Fast 9")
+        );
+        assert_eq!(
+            field("PRETTY_NAME=\"A System\"\n", "PRETTY_NAME", '=').as_deref(),
+            Some("A System")
+        );
         assert_eq!(field("", "x", ':'), None);
     }
 }

@@ -1,5 +1,5 @@
-//! The `taskbench` binary: parses the command line, runs a scenario until it ends or is interrupted, and always cleans
-//! up. It never measures anything.
+//! The `taskbench` binary: parses the command line, runs a scenario until it ends or is
+//! interrupted, and always cleans up. It never measures anything.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -22,9 +22,10 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Measures taskd
 ///
-/// Each scenario starts the real server as a child process, with a directory and ports of its own, and ends it
-/// afterwards. Results go to --out as JSON (everything: commit, machine, seed, versions, points), CSV (a row for each
-/// quantity) and one HTML file with plots that needs no network. Build the programs with `cargo build --release --bins`.
+/// Each scenario starts the real server as a child process, with a directory and ports of its own,
+/// and ends it afterwards. Results go to --out as JSON (everything: commit, machine, seed,
+/// versions, points), CSV (a row for each quantity) and one HTML file with plots that needs no
+/// network. Build the programs with `cargo build --release --bins`.
 #[derive(Parser)]
 #[command(name = "taskbench", version, propagate_version = true)]
 struct CommandLine {
@@ -36,19 +37,21 @@ struct CommandLine {
 enum Command {
     /// Enrol simulated robots, connect them over MQTT, deploy to them, and measure each step
     ///
-    /// The robots are one machine's TCP connections with the MQTT client of an independent implementation. They verify
-    /// and report what they are ordered like a real agent, but fetch and run nothing. In the end they are removed, and
-    /// so is the package that was ordered; the deployment stays in the server's history. The exit code is 0 if nothing
-    /// failed. Ctrl-C stops the run and cleans up; a second one ends it at once.
+    /// The robots are one machine's TCP connections with the MQTT client of an independent
+    /// implementation. They verify and report what they are ordered like a real agent, but fetch
+    /// and run nothing. In the end they are removed, and so is the package that was ordered; the
+    /// deployment stays in the server's history. The exit code is 0 if nothing failed. Ctrl-C stops
+    /// the run and cleans up; a second one ends it at once.
     #[command(after_help = "Example:\n  taskbench load --server http://localhost:8080 \
                             --token-file ~/.local/share/taskd/operator.token --robots 1000")]
     Load(LoadFlags),
 
-    /// The paper's measurements made again: payload and robots against delay, every mechanism side by side
+    /// The paper's measurements made again: payload and robots against delay, every mechanism side
+    /// by side
     ///
-    /// For each point: the delay from the operator's order to the server's receipt of the last robot's verified answer,
-    /// the message arrival rate, and the bytes at the server's sockets. Runs are shuffled, failures shown. The exit code
-    /// is 0 if nothing failed.
+    /// For each point: the delay from the operator's order to the server's receipt of the last
+    /// robot's verified answer, the message arrival rate, and the bytes at the server's sockets.
+    /// Runs are shuffled, failures shown. The exit code is 0 if nothing failed.
     #[command(
         after_help = "Examples:\n  taskbench paper                              the whole grid, under half an hour\n  \
                             taskbench paper --quick                      does everything work?\n  \
@@ -59,8 +62,8 @@ enum Command {
 
     /// How one server bears a fleet: all robots connect at once, then one deployment goes to all
     ///
-    /// Robots are the agent's own driver, link, fetch and verification, all in one process; they build and start nothing.
-    /// The exit code is 0 if nothing failed.
+    /// Robots are the agent's own driver, link, fetch and verification, all in one process; they
+    /// build and start nothing. The exit code is 0 if nothing failed.
     #[command(after_help = "Examples:\n  taskbench fleet --robots 10,100,1000,10000\n  \
                             taskbench fleet --robots 500 --delivery direct-push --payload 1000000")]
     Fleet(FleetFlags),
@@ -70,34 +73,42 @@ enum Command {
     Robots,
     /// Fetch blobs over HTTP, in turns with nginx where it is installed
     ///
-    /// One large blob to few and to many connections, a small one to very many, and different large ones from the disk
-    /// while the API is probed. Every connection is another robot's. Processor time is the server's own.
+    /// One large blob to few and to many connections, a small one to very many, and different large
+    /// ones from the disk while the API is probed. Every connection is another robot's. Processor
+    /// time is the server's own.
     #[command(after_help = "Example:\n  taskbench blob --runs 7 --out results")]
     Blob(BlobFlags),
 
-    /// One order for a large package, in turns with curl, openssl and tar, which fetch the same from nginx
+    /// One order for a large package, in turns with curl, openssl and tar, which fetch the same
+    /// from nginx
     ///
-    /// From the order until all robots have verified and unpacked it, against as many shells side by side that fetch, hash
-    /// and unpack one step after the other. Processor time is everybody's: server, robots, programs.
+    /// From the order until all robots have verified and unpacked it, against as many shells side
+    /// by side that fetch, hash and unpack one step after the other. Processor time is everybody's:
+    /// server, robots, programs.
     #[command(after_help = "Example:\n  taskbench pull --robots 8 --runs 7 --out results")]
     Pull(PullFlags),
 
-    /// Send a short message to each of many connected robots, in turns with mosquitto where it is installed
+    /// Send a short message to each of many connected robots, in turns with mosquitto where it is
+    /// installed
     ///
-    /// The front is measured by itself: `cargo build --release -p taskd --example front` makes the program for that. The
-    /// first message to each client is timed apart from the later ones.
+    /// The front is measured by itself: `cargo build --release -p taskd --example front` makes the
+    /// program for that. The first message to each client is timed apart from the later ones.
     #[command(after_help = "Example:\n  taskbench broker --clients 10000 --runs 7 --out results")]
     Broker(BrokerFlags),
 
     /// Report at fixed rates, and time when reports are stored, with SQLite and Postgres
-    #[command(after_help = "Example:\n  taskbench status --rate 10000 --postgres postgres://postgres@localhost/bench")]
+    #[command(
+        after_help = "Example:\n  taskbench status --rate 10000 --postgres postgres://postgres@localhost/bench"
+    )]
     Status(StatusFlags),
 
     /// Look at the page in a browser while a fleet reports, and scroll
     ///
-    /// Needs node, Chromium and what `scripts/need page` installs. First rows are timed from asking for the page, with a
-    /// session; main-thread times are the browser's own trace.
-    #[command(after_help = "Example:\n  taskbench page --robots 10000 --rate 1000 --browser \"$(scripts/need page)\"")]
+    /// Needs node, Chromium and what `scripts/need page` installs. First rows are timed from asking
+    /// for the page, with a session; main-thread times are the browser's own trace.
+    #[command(
+        after_help = "Example:\n  taskbench page --robots 10000 --rate 1000 --browser \"$(scripts/need page)\""
+    )]
     Page(PageFlags),
 
     /// Show what has changed between two results of the same scenario
@@ -140,14 +151,18 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
         Command::Report { json, html } => {
             let run = Run::read(&json).with_context(|| json.display().to_string())?;
             let html = html.unwrap_or_else(|| json.with_extension("html"));
-            std::fs::write(&html, report::page(&run)).with_context(|| html.display().to_string())?;
+            std::fs::write(&html, report::page(&run))
+                .with_context(|| html.display().to_string())?;
             Ok(ExitCode::SUCCESS)
         }
     }
 }
 
-/// The scenario's outcome. When it is interrupted it is dropped, and with it all that it has started.
-async fn until_interrupted<T>(scenario: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<T> {
+/// The scenario's outcome. When it is interrupted it is dropped, and with it all that it has
+/// started.
+async fn until_interrupted<T>(
+    scenario: impl Future<Output = anyhow::Result<T>>,
+) -> anyhow::Result<T> {
     let mut terminated = signal(SignalKind::terminate()).context("SIGTERM can't be received")?;
     tokio::select! {
         outcome = scenario => outcome,
@@ -173,7 +188,8 @@ async fn load(flags: LoadFlags) -> anyhow::Result<ExitCode> {
         cleaned = load.clean_up() => cleaned,
         _ = tokio::signal::ctrl_c() => Err(anyhow::anyhow!("interrupted again")),
     };
-    let cleaned = cleaned.with_context(|| format!("robots labelled {} may be left on the server", load.label()));
+    let cleaned = cleaned
+        .with_context(|| format!("robots labelled {} may be left on the server", load.label()));
     let mut code = if load.finish() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE };
     for error in [outcome.err(), cleaned.err()].into_iter().flatten() {
         code = complain(&error);

@@ -1,4 +1,5 @@
-//! Many robots' steps at once, and what they took: latencies and failures of one phase. It never drops a failure.
+//! Many robots' steps at once, and what they took: latencies and failures of one phase. It never
+//! drops a failure.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -20,7 +21,9 @@ pub async fn every<T>(
     let deadline = tokio::time::Instant::now() + limit;
     let steps = steps.into_iter().map(|step| async move {
         let in_time = tokio::time::timeout_at(deadline, step).await;
-        in_time.unwrap_or_else(|_| Err(anyhow::anyhow!("not done after the {limit:?} that the phase may take")))
+        in_time.unwrap_or_else(|_| {
+            Err(anyhow::anyhow!("not done after the {limit:?} that the phase may take"))
+        })
     });
     futures_util::stream::iter(steps).buffer_unordered(at_once).collect().await
 }
@@ -39,7 +42,11 @@ pub struct Phase {
 
 impl Phase {
     /// A phase that took `wall`.
-    pub fn new(name: &'static str, wall: Duration, samples: impl IntoIterator<Item = Sample>) -> Self {
+    pub fn new(
+        name: &'static str,
+        wall: Duration,
+        samples: impl IntoIterator<Item = Sample>,
+    ) -> Self {
         let mut phase = Self { name, wall, failures: BTreeMap::new(), latencies: Vec::new() };
         for sample in samples {
             match sample {
@@ -61,7 +68,8 @@ impl Phase {
         self.failures.values().sum()
     }
 
-    /// The latency in milliseconds that `percent` of the successful steps did not exceed; `None` if none succeeded.
+    /// The latency in milliseconds that `percent` of the successful steps did not exceed; `None` if
+    /// none succeeded.
     pub fn percentile_ms(&self, percent: usize) -> Option<f64> {
         let rank = (self.latencies.len() * percent).div_ceil(100).max(1);
         self.latencies.get(rank - 1).map(|latency| latency.as_micros() as f64 / 1000.0)
@@ -74,8 +82,13 @@ mod tests {
 
     #[test]
     fn percentiles_are_latencies_that_occurred() {
-        let phase = |n: u64| Phase::new("x", Duration::ZERO, (1..=n).rev().map(|ms| Ok(Duration::from_millis(ms))));
-        assert_eq!([50, 99, 100].map(|p| phase(200).percentile_ms(p)), [Some(100.0), Some(198.0), Some(200.0)]);
+        let phase = |n: u64| {
+            Phase::new("x", Duration::ZERO, (1..=n).rev().map(|ms| Ok(Duration::from_millis(ms))))
+        };
+        assert_eq!(
+            [50, 99, 100].map(|p| phase(200).percentile_ms(p)),
+            [Some(100.0), Some(198.0), Some(200.0)]
+        );
         assert_eq!([50, 99, 100].map(|p| phase(1).percentile_ms(p)), [Some(1.0); 3]);
         assert_eq!(phase(0).percentile_ms(50), None);
     }
@@ -89,8 +102,13 @@ mod tests {
                 _ => anyhow::bail!("refused"),
             }
         });
-        let phase = Phase::new("x", Duration::ZERO, every(4, Duration::from_millis(50), steps).await);
+        let phase =
+            Phase::new("x", Duration::ZERO, every(4, Duration::from_millis(50), steps).await);
         assert_eq!((phase.count(), phase.failed(), phase.failures["refused"]), (4, 3, 2));
-        assert!(phase.failures.keys().any(|text| text.contains("not done after the 50ms")), "{:?}", phase.failures);
+        assert!(
+            phase.failures.keys().any(|text| text.contains("not done after the 50ms")),
+            "{:?}",
+            phase.failures
+        );
     }
 }

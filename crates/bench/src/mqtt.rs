@@ -1,5 +1,6 @@
-//! MQTT 3.1.1 as far as thousands of measuring clients need it, at the least cost: packets are built once and sent as
-//! bytes, and of what comes in only type, packet id and payload are looked at. A real robot's client is in `robot`.
+//! MQTT 3.1.1 as far as thousands of measuring clients need it, at the least cost: packets are
+//! built once and sent as bytes, and of what comes in only type, packet id and payload are looked
+//! at. A real robot's client is in `robot`.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -54,9 +55,16 @@ pub enum Heard<'a> {
 }
 
 impl Link {
-    /// Connects as the `number`th client of a run, which decides the loopback address it comes from.
-    pub async fn connect(broker: SocketAddr, number: usize, login: &Login<'_>) -> anyhow::Result<Self> {
-        let stream = tokio::time::timeout(PATIENCE, open(broker, number)).await.context("no connection in time")??;
+    /// Connects as the `number`th client of a run, which decides the loopback address it comes
+    /// from.
+    pub async fn connect(
+        broker: SocketAddr,
+        number: usize,
+        login: &Login<'_>,
+    ) -> anyhow::Result<Self> {
+        let stream = tokio::time::timeout(PATIENCE, open(broker, number))
+            .await
+            .context("no connection in time")??;
         let (half, mut writer) = stream.into_split();
         writer.write_all(&connect_packet(login)?).await.context("CONNECT could not be sent")?;
         let mut link = Self { reader: Reader { half, bytes: Vec::new(), used: 0 }, writer };
@@ -71,7 +79,10 @@ impl Link {
         let mut body = vec![0, 1];
         put_text(&mut body, filter)?;
         body.push(1);
-        self.writer.write_all(&packet(0x82, &body)?).await.context("SUBSCRIBE could not be sent")?;
+        self.writer
+            .write_all(&packet(0x82, &body)?)
+            .await
+            .context("SUBSCRIBE could not be sent")?;
         match self.reader.next_in_time("SUBACK").await? {
             Heard::Subscribed(code) if code <= 2 => Ok(()),
             other => bail!("the broker answers SUBSCRIBE with {other:?}"),
@@ -81,7 +92,9 @@ impl Link {
 
 impl Reader {
     async fn next_in_time(&mut self, what: &'static str) -> anyhow::Result<Heard<'_>> {
-        tokio::time::timeout(PATIENCE, self.next()).await.with_context(|| format!("no {what} within {PATIENCE:?}"))?
+        tokio::time::timeout(PATIENCE, self.next())
+            .await
+            .with_context(|| format!("no {what} within {PATIENCE:?}"))?
     }
 
     /// The next packet. Cancel-safe: bytes are taken from the buffer only when the packet is whole.
@@ -198,9 +211,15 @@ fn heard(first: u8, body: &[u8]) -> anyhow::Result<Heard<'_>> {
         4 => Heard::Acknowledged(number(0)?),
         3 => {
             let topic_end = 2 + usize::from(number(0)?);
-            let (packet_id, start) =
-                if first & 0b110 == 0 { (0, topic_end) } else { (number(topic_end)?, topic_end + 2) };
-            Heard::Message { packet_id, payload: body.get(start..).context("a message that is too short")? }
+            let (packet_id, start) = if first & 0b110 == 0 {
+                (0, topic_end)
+            } else {
+                (number(topic_end)?, topic_end + 2)
+            };
+            Heard::Message {
+                packet_id,
+                payload: body.get(start..).context("a message that is too short")?,
+            }
         }
         _ => Heard::Other,
     })
@@ -224,7 +243,9 @@ mod tests {
                 assert_eq!(connect[0], 0x10);
                 assert_eq!(&connect[12..], b"\0\x01c\0\x01u\0\x01p");
                 stream.write_all(&[0x20, 2, 0, 0]).await.expect("CONNACK");
-                let sent = [message("a/b", 9, &payload).expect("built"), acknowledgement(3).to_vec()].concat();
+                let sent =
+                    [message("a/b", 9, &payload).expect("built"), acknowledgement(3).to_vec()]
+                        .concat();
                 // In two pieces, so that the first one ends within a packet.
                 stream.write_all(&sent[..100]).await.expect("sent");
                 stream.flush().await.expect("flushed");
@@ -233,7 +254,10 @@ mod tests {
         });
         let login = Login { client_id: "c", credentials: Some(("u", "p")) };
         let mut link = Link::connect(address, 0, &login).await.expect("connected");
-        assert_eq!(link.reader.next().await.expect("heard"), Heard::Message { packet_id: 9, payload: &payload });
+        assert_eq!(
+            link.reader.next().await.expect("heard"),
+            Heard::Message { packet_id: 9, payload: &payload }
+        );
         assert_eq!(link.reader.next().await.expect("heard"), Heard::Acknowledged(3));
         broker.await.expect("no panic");
         assert!(link.reader.next().await.is_err(), "the connection has ended");

@@ -1,4 +1,5 @@
-//! Packages of a wanted size whose bytes nothing can compress and nobody has seen before, as the packer would write them.
+//! Packages of a wanted size whose bytes nothing can compress and nobody has seen before, as the
+//! packer would write them.
 
 use rand::rngs::SmallRng;
 use rand::{Rng as _, SeedableRng as _};
@@ -65,10 +66,12 @@ fn content(payload: &[u8]) -> (Vec<u8>, ContentFacts) {
     header.set_mode(0o644);
     header.set_entry_type(tar::EntryType::Regular);
     let mut archive = tar::Builder::new(Vec::with_capacity(payload.len() + 4096));
-    let tar = archive.append_data(&mut header, PAYLOAD_FILE, payload).and_then(|()| archive.into_inner());
+    let tar =
+        archive.append_data(&mut header, PAYLOAD_FILE, payload).and_then(|()| archive.into_inner());
     // Writing to memory does not fail.
     let tar = tar.unwrap_or_default();
-    let facts = ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 };
+    let facts =
+        ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 };
     (zstd::bulk::compress(&tar, 1).unwrap_or_default(), facts)
 }
 

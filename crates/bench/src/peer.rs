@@ -1,5 +1,5 @@
-//! The programs that taskd is measured beside, with the settings that make them fastest. Where one is not installed, that is
-//! said and the run goes on without it.
+//! The programs that taskd is measured beside, with the settings that make them fastest. Where one
+//! is not installed, that is said and the run goes on without it.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -32,8 +32,13 @@ pub struct Peer {
 }
 
 impl Peer {
-    /// nginx, which serves the files in `root`, with OpenSSL if it gets a certificate. `None` if it is not installed.
-    pub async fn nginx(dir: &Path, root: &Path, certificate: Option<&Certificate>) -> anyhow::Result<Option<Self>> {
+    /// nginx, which serves the files in `root`, with OpenSSL if it gets a certificate. `None` if it
+    /// is not installed.
+    pub async fn nginx(
+        dir: &Path,
+        root: &Path,
+        certificate: Option<&Certificate>,
+    ) -> anyhow::Result<Option<Self>> {
         let Some(path) = find("nginx") else { return Ok(None) };
         let address = free_address().await?;
         let workers = std::thread::available_parallelism().map_or(1, usize::from);
@@ -41,8 +46,10 @@ impl Peer {
         std::fs::create_dir_all(&prefix).context("nginx's directory")?;
         let tls = match certificate {
             Some(certificate) => {
-                std::fs::write(prefix.join("nginx.pem"), &certificate.chain).context("nginx's certificate")?;
-                std::fs::write(prefix.join("nginx.key"), &certificate.key).context("nginx's key")?;
+                std::fs::write(prefix.join("nginx.pem"), &certificate.chain)
+                    .context("nginx's certificate")?;
+                std::fs::write(prefix.join("nginx.key"), &certificate.key)
+                    .context("nginx's key")?;
                 "ssl_certificate nginx.pem; ssl_certificate_key nginx.key; ssl_protocols TLSv1.3;"
             }
             None => "",
@@ -85,7 +92,12 @@ impl Peer {
         Self::start(program, &dir.join("mosquitto.log"), address, "mosquitto").await.map(Some)
     }
 
-    async fn start(program: Program, log: &Path, address: SocketAddr, name: &str) -> anyhow::Result<Self> {
+    async fn start(
+        program: Program,
+        log: &Path,
+        address: SocketAddr,
+        name: &str,
+    ) -> anyhow::Result<Self> {
         let mut process = program.start(log)?;
         let deadline = Instant::now() + START_TIMEOUT;
         let mut tick = tokio::time::interval(LOOK_INTERVAL);

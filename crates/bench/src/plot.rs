@@ -1,5 +1,6 @@
-//! Draws a plot as inline SVG: a line and a mark for each series, a thin line from the median to the 99th percentile,
-//! a cross where something failed. Colours are the page's style sheet's; what a point is stands in its tooltip.
+//! Draws a plot as inline SVG: a line and a mark for each series, a thin line from the median to
+//! the 99th percentile, a cross where something failed. Colours are the page's style sheet's; what
+//! a point is stands in its tooltip.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -33,7 +34,8 @@ struct Frame {
     y_unit: Unit,
 }
 
-/// The plot as SVG; `None` if no point belongs to it. `colours` numbers each series of the whole run.
+/// The plot as SVG; `None` if no point belongs to it. `colours` numbers each series of the whole
+/// run.
 pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Option<String> {
     let shown: Vec<&Point> = plot.points(points).collect();
     if shown.is_empty() {
@@ -44,12 +46,18 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
     let quantities = shown.iter().filter_map(|point| point.quantities.get(&plot.y));
     let frame = Frame {
         x: Axis::over(shown.iter().map(|point| point.settings[&plot.x]), plot.x_log),
-        y: Axis::over(spots().flat_map(|spot| spot.values.iter().chain(&spot.high).copied()), plot.y_log).from_zero(),
+        y: Axis::over(
+            spots().flat_map(|spot| spot.values.iter().chain(&spot.high).copied()),
+            plot.y_log,
+        )
+        .from_zero(),
         x_unit: unit_of_setting(&plot.x),
         y_unit: quantities.map(|quantity| quantity.unit).next().unwrap_or(Unit::Number),
     };
-    let mut svg =
-        format!("<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\">", escaped(&plot.title));
+    let mut svg = format!(
+        "<svg viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\">",
+        escaped(&plot.title)
+    );
     frame.draw_grid(&mut svg, plot);
     for (name, spots) in &series {
         let colour = colours.get(name).copied().unwrap_or(0);
@@ -59,7 +67,8 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
     Some(svg)
 }
 
-/// Spots by series and by the bits of their place, whose order is that of the places, which are not below zero.
+/// Spots by series and by the bits of their place, whose order is that of the places, which are not
+/// below zero.
 fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u64, Spot>> {
     let mut series: BTreeMap<&str, BTreeMap<u64, Spot>> = BTreeMap::new();
     for point in shown {
@@ -97,16 +106,26 @@ impl Frame {
         for tick in self.x.ticks() {
             let (x, text) = (self.x_of(tick), escaped(&written(tick, self.x_unit)));
             let _ = write!(svg, "<path class=\"grid\" d=\"M{x:.1} {TOP}V{bottom}\"/>");
-            let _ = write!(svg, "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>", bottom + 18.0);
+            let _ = write!(
+                svg,
+                "<text x=\"{x:.1}\" y=\"{:.1}\" text-anchor=\"middle\">{text}</text>",
+                bottom + 18.0
+            );
         }
         for tick in self.y.ticks() {
             let (y, text) = (self.y_of(tick), escaped(&written(tick, self.y_unit)));
             let _ = write!(svg, "<path class=\"grid\" d=\"M{LEFT} {y:.1}H{right}\"/>");
             let (at, below) = (LEFT - 8.0, y + 4.0);
-            let _ = write!(svg, "<text x=\"{at:.1}\" y=\"{below:.1}\" text-anchor=\"end\">{text}</text>");
+            let _ = write!(
+                svg,
+                "<text x=\"{at:.1}\" y=\"{below:.1}\" text-anchor=\"end\">{text}</text>"
+            );
         }
         let (width, height) = (right - LEFT, bottom - TOP);
-        let _ = write!(svg, "<rect class=\"frame\" x=\"{LEFT}\" y=\"{TOP}\" width=\"{width}\" height=\"{height}\"/>");
+        let _ = write!(
+            svg,
+            "<rect class=\"frame\" x=\"{LEFT}\" y=\"{TOP}\" width=\"{width}\" height=\"{height}\"/>"
+        );
         let (x, y) = (LEFT + width / 2.0, TOP + height / 2.0);
         let (x_label, y_label) = (escaped(&plot.x_label), escaped(&plot.y_label));
         let _ = write!(
@@ -118,13 +137,21 @@ impl Frame {
         let _ = write!(svg, "<text class=\"label\" {turned}>{y_label}</text>");
     }
 
-    fn draw_series(&self, svg: &mut String, plot: &Plot, name: &str, colour: usize, spots: &BTreeMap<u64, Spot>) {
+    fn draw_series(
+        &self,
+        svg: &mut String,
+        plot: &Plot,
+        name: &str,
+        colour: usize,
+        spots: &BTreeMap<u64, Spot>,
+    ) {
         let place = |bits: &u64| f64::from_bits(*bits);
         let mut line = String::new();
         for (bits, spot) in spots {
             if let Some(value) = mean(&spot.values) {
                 let letter = if line.is_empty() { 'M' } else { 'L' };
-                let _ = write!(line, "{letter}{:.1} {:.1}", self.x_of(place(bits)), self.y_of(value));
+                let _ =
+                    write!(line, "{letter}{:.1} {:.1}", self.x_of(place(bits)), self.y_of(value));
             }
         }
         let _ = write!(svg, "<g class=\"s{colour}\"><path class=\"line\" d=\"{line}\"/>");
@@ -133,11 +160,17 @@ impl Frame {
             let value = mean(&spot.values);
             let y = value.map_or(TOP + MARK * 2.0, |value| self.y_of(value));
             if let (Some(_), Some(high)) = (value, mean(&spot.high)) {
-                let _ = write!(svg, "<path class=\"high\" d=\"M{x:.1} {y:.1}V{:.1}\"/>", self.y_of(high));
+                let _ = write!(
+                    svg,
+                    "<path class=\"high\" d=\"M{x:.1} {y:.1}V{:.1}\"/>",
+                    self.y_of(high)
+                );
             }
             let at = written(place(bits), self.x_unit);
             let mut says = format!("{name}, {} {at}: ", plot.x_label);
-            says.push_str(&value.map_or("no value".to_owned(), |value| written(value, self.y_unit)));
+            says.push_str(
+                &value.map_or("no value".to_owned(), |value| written(value, self.y_unit)),
+            );
             for (text, count) in &spot.failures {
                 let _ = write!(says, "\n{count} failed: {text}");
             }
@@ -165,14 +198,26 @@ pub fn mark(colour: usize, x: f64, y: f64) -> String {
             y - m,
             s = m * 2.0
         ),
-        2 => format!("<path class=\"mark\" d=\"M{x:.1} {:.1}l{w:.1} {h:.1}h-{:.1}z\"/>", y - w, w * 2.0, h = w * 2.0),
-        _ => format!("<path class=\"mark\" d=\"M{x:.1} {:.1}l{w:.1} {w:.1}l-{w:.1} {w:.1}l-{w:.1} -{w:.1}z\"/>", y - w),
+        2 => format!(
+            "<path class=\"mark\" d=\"M{x:.1} {:.1}l{w:.1} {h:.1}h-{:.1}z\"/>",
+            y - w,
+            w * 2.0,
+            h = w * 2.0
+        ),
+        _ => format!(
+            "<path class=\"mark\" d=\"M{x:.1} {:.1}l{w:.1} {w:.1}l-{w:.1} {w:.1}l-{w:.1} -{w:.1}z\"/>",
+            y - w
+        ),
     }
 }
 
 fn cross(x: f64, y: f64) -> String {
     let (m, w) = (MARK * 1.7, MARK * 3.4);
-    format!("<path class=\"cross\" d=\"M{:.1} {:.1}l{w:.1} {w:.1}m0 -{w:.1}l-{w:.1} {w:.1}\"/>", x - m, y - m)
+    format!(
+        "<path class=\"cross\" d=\"M{:.1} {:.1}l{w:.1} {w:.1}m0 -{w:.1}l-{w:.1} {w:.1}\"/>",
+        x - m,
+        y - m
+    )
 }
 
 #[cfg(test)]
@@ -186,7 +231,10 @@ mod tests {
         let colours = [("push-pull", 0), ("direct-push", 1)].into();
         let svg = svg(&run.plots[0], &run.points, &colours).expect("points");
         assert!(svg.starts_with("<svg") && svg.ends_with("</svg>"));
-        assert_eq!((svg.matches("class=\"line\"").count(), svg.matches("class=\"cross\"").count()), (2, 1));
+        assert_eq!(
+            (svg.matches("class=\"line\"").count(), svg.matches("class=\"cross\"").count()),
+            (2, 1)
+        );
         assert_eq!(svg.matches("class=\"mark\"").count(), 3);
         assert!(svg.contains("1 failed: the client, &quot;r1&quot; &lt;lost&gt; it"), "{svg}");
         assert!(svg.contains("Delay &amp; robots") && !svg.contains("NaN"), "{svg}");
@@ -195,7 +243,8 @@ mod tests {
 
     /// Every element that is opened is closed.
     fn is_balanced(svg: &str) -> bool {
-        let opened = svg.matches('<').count() - svg.matches("</").count() - svg.matches("/>").count();
+        let opened =
+            svg.matches('<').count() - svg.matches("</").count() - svg.matches("/>").count();
         opened == svg.matches("</").count()
     }
 

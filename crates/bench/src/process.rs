@@ -1,5 +1,6 @@
-//! Starts programs and ends them: the only module that does. Each is ended by its own pid when its handle goes, and
-//! dies with this process even when that is killed. It also reads what a process has used from `/proc/<pid>`.
+//! Starts programs and ends them: the only module that does. Each is ended by its own pid when its
+//! handle goes, and dies with this process even when that is killed. It also reads what a process
+//! has used from `/proc/<pid>`.
 #![expect(clippy::disallowed_methods, reason = "this is where processes are started")]
 
 use std::ffi::{OsStr, OsString};
@@ -78,10 +79,12 @@ impl Program {
         if let Some(path) = given {
             return Ok(Self::named(path));
         }
-        let own = std::env::current_exe().map_err(|source| ProcessError::Start { program: name.to_owned(), source })?;
+        let own = std::env::current_exe()
+            .map_err(|source| ProcessError::Start { program: name.to_owned(), source })?;
         let dir = own.parent().unwrap_or(Path::new(".")).to_owned();
         // An end-to-end test's program lies one level deeper.
-        let path = [dir.join(name), dir.join("..").join(name)].into_iter().find(|path| path.is_file());
+        let path =
+            [dir.join(name), dir.join("..").join(name)].into_iter().find(|path| path.is_file());
         path.map(Self::named).ok_or(ProcessError::Missing { name, dir })
     }
 
@@ -132,21 +135,29 @@ impl Program {
         })
     }
 
-    /// Starts it with pipes to talk over: one line, one message. What it says beside them goes to `log`.
+    /// Starts it with pipes to talk over: one line, one message. What it says beside them goes to
+    /// `log`.
     pub fn converse(&self, log: &Path) -> Result<(Process, ChildStdin, ChildStdout), ProcessError> {
         let mut process = self.spawn(|command| {
             let log = File::options().create(true).append(true).open(log)?;
             command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(log).spawn()
         })?;
         let pipes = process.child.stdin.take().zip(process.child.stdout.take());
-        let missing = || ProcessError::Start { program: self.name(), source: io::ErrorKind::BrokenPipe.into() };
+        let missing = || ProcessError::Start {
+            program: self.name(),
+            source: io::ErrorKind::BrokenPipe.into(),
+        };
         let (input, output) = pipes.ok_or_else(missing)?;
         Ok((process, input, output))
     }
 
-    fn spawn(&self, start: impl FnOnce(&mut Command) -> io::Result<Child>) -> Result<Process, ProcessError> {
+    fn spawn(
+        &self,
+        start: impl FnOnce(&mut Command) -> io::Result<Child>,
+    ) -> Result<Process, ProcessError> {
         let mut command = self.command();
-        let child = start(&mut command).map_err(|source| ProcessError::Start { program: self.name(), source })?;
+        let child = start(&mut command)
+            .map_err(|source| ProcessError::Start { program: self.name(), source })?;
         Ok(Process { child, name: self.name() })
     }
 
@@ -160,10 +171,14 @@ impl Program {
         let die_with_parent = move || {
             nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
             // The parent may have ended before that was said.
-            if nix::unistd::getppid() == parent { Ok(()) } else { Err(io::ErrorKind::BrokenPipe.into()) }
+            if nix::unistd::getppid() == parent {
+                Ok(())
+            } else {
+                Err(io::ErrorKind::BrokenPipe.into())
+            }
         };
-        // SAFETY: between fork and exec only prctl and getppid are called, which are async-signal-safe; nothing is allocated
-        // (an error kind is none).
+        // SAFETY: between fork and exec only prctl and getppid are called, which are
+        // async-signal-safe; nothing is allocated (an error kind is none).
         unsafe { command.pre_exec(die_with_parent) };
         command
     }
@@ -187,7 +202,8 @@ pub fn ended_children_cpu_s() -> io::Result<f64> {
     Ok(seconds(usage.user_time()) + seconds(usage.system_time()))
 }
 
-/// A program that runs. Dropping it kills it, with all of its process group: a server's workers outlive its main process.
+/// A program that runs. Dropping it kills it, with all of its process group: a server's workers
+/// outlive its main process.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
@@ -219,8 +235,8 @@ impl Process {
         let _ = self.child.kill().await;
     }
 
-    /// Kills it and what it started in its process group, unless it was waited for: until then its pid, and with it that of
-    /// the group, is nobody else's.
+    /// Kills it and what it started in its process group, unless it was waited for: until then its
+    /// pid, and with it that of the group, is nobody else's.
     fn kill_group(&self) {
         if let Some(pid) = self.pid().and_then(|pid| i32::try_from(pid).ok()) {
             let _ = killpg(Pid::from_raw(pid), Signal::SIGKILL);
@@ -235,9 +251,13 @@ impl Process {
     /// The same of it and its children, for a server whose workers are processes.
     pub fn family_usage(&self) -> Usage {
         let Some(pid) = self.pid() else { return Usage::default() };
-        let children = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+        let children =
+            std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
         let children = children.split_whitespace().filter_map(|child| child.parse().ok());
-        std::iter::once(pid).chain(children).filter_map(Usage::of).fold(Usage::default(), Usage::plus)
+        std::iter::once(pid)
+            .chain(children)
+            .filter_map(Usage::of)
+            .fold(Usage::default(), Usage::plus)
     }
 }
 
@@ -311,7 +331,8 @@ mod tests {
     async fn a_program_runs_within_another_and_says_why_it_failed() {
         let echo = Program::named("echo").args(["hello"]).variable("WORD", "x");
         assert_eq!(echo.within(Program::named("env")).output().await.expect("runs"), "hello\n");
-        let failed = Program::named("sh").args(["-c", "echo this is why >&2; exit 3"]).output().await;
+        let failed =
+            Program::named("sh").args(["-c", "echo this is why >&2; exit 3"]).output().await;
         assert!(failed.expect_err("fails").to_string().contains("this is why"));
         let missing = Program::named("/nonexistent/program").output().await.expect_err("missing");
         assert!(missing.to_string().contains("/nonexistent/program"), "{missing}");

@@ -1,4 +1,5 @@
-//! Progress on stderr: a bar with what is being done now, or plain lines where nobody sees a bar move.
+//! Progress on stderr: a bar with what is being done now, or plain lines where nobody sees a bar
+//! move.
 
 use std::io::{IsTerminal as _, Write as _};
 
@@ -20,7 +21,8 @@ impl RunProgress {
         let steps = steps as u64;
         let bar = std::io::stderr().is_terminal().then(|| {
             let bar = ProgressBar::new(steps).with_finish(ProgressFinish::AndClear);
-            let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed}, {eta} left  {msg}");
+            let style =
+                ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed}, {eta} left  {msg}");
             if let Ok(style) = style {
                 bar.set_style(style);
             }

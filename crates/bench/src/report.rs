@@ -1,4 +1,5 @@
-//! A run as one HTML file that needs nothing else: no network, no script, light or dark as the reader's system is.
+//! A run as one HTML file that needs nothing else: no network, no script, light or dark as the
+//! reader's system is.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -17,7 +18,8 @@ pub fn page(run: &Run) -> String {
             names.push(&point.series);
         }
     }
-    let colours: BTreeMap<&str, usize> = names.iter().enumerate().map(|(number, name)| (*name, number % 8)).collect();
+    let colours: BTreeMap<&str, usize> =
+        names.iter().enumerate().map(|(number, name)| (*name, number % 8)).collect();
     let title = escaped(&format!("taskbench {}", run.scenario));
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{title}</title>\
@@ -29,8 +31,13 @@ pub fn page(run: &Run) -> String {
     }
     for plot in &run.plots {
         let Some(drawing) = svg(plot, &run.points, &colours) else { continue };
-        let shown: Vec<&str> = plot.points(&run.points).map(|point| point.series.as_str()).collect();
-        let _ = write!(page, "<figure><figcaption>{}</figcaption>{drawing}<p class=\"legend\">", escaped(&plot.title));
+        let shown: Vec<&str> =
+            plot.points(&run.points).map(|point| point.series.as_str()).collect();
+        let _ = write!(
+            page,
+            "<figure><figcaption>{}</figcaption>{drawing}<p class=\"legend\">",
+            escaped(&plot.title)
+        );
         for name in names.iter().filter(|name| shown.contains(name)) {
             let (colour, sign) = (colours[name], mark(colours[name], 7.0, 7.0));
             let _ = write!(
@@ -55,7 +62,8 @@ pub fn escaped(text: &str) -> String {
 fn facts(run: &Run) -> String {
     let machine = &run.machine;
     let memory = written(machine.memory_bytes as f64, crate::run::Unit::Bytes);
-    let versions: Vec<String> = run.versions.iter().map(|(name, version)| format!("{name} {version}")).collect();
+    let versions: Vec<String> =
+        run.versions.iter().map(|(name, version)| format!("{name} {version}")).collect();
     let rows = [
         ("began", run.began.clone()),
         ("took", format!("{:.0} s", run.wall_s)),
@@ -66,7 +74,8 @@ fn facts(run: &Run) -> String {
         ("system", format!("{}, {}", machine.system, machine.kernel)),
         ("seed", run.seed.to_string()),
     ];
-    let row = |(name, value): (&str, String)| format!("<dt>{name}</dt><dd>{}</dd>", escaped(&value));
+    let row =
+        |(name, value): (&str, String)| format!("<dt>{name}</dt><dd>{}</dd>", escaped(&value));
     format!("<dl>{}</dl>", rows.map(row).concat())
 }
 
@@ -78,11 +87,17 @@ fn failures(points: &[Point]) -> String {
             let _ = write!(text, "<li>{where_}: {count} × {}</li>", escaped(failure));
         }
     }
-    if text.is_empty() { "<p>Nothing failed.</p>".to_owned() } else { format!("<h2>Failures</h2><ul>{text}</ul>") }
+    if text.is_empty() {
+        "<p>Nothing failed.</p>".to_owned()
+    } else {
+        format!("<h2>Failures</h2><ul>{text}</ul>")
+    }
 }
 
 fn settings(point: &Point) -> String {
-    let one = |(name, value): (&String, &f64)| format!("{name} {}", written(*value, unit_of_setting(name)));
+    let one = |(name, value): (&String, &f64)| {
+        format!("{name} {}", written(*value, unit_of_setting(name)))
+    };
     point.settings.iter().map(one).collect::<Vec<_>>().join(", ")
 }
 
@@ -94,9 +109,15 @@ fn table(points: &[Point]) -> String {
         let begin = format!("<tr><td>{}<td>{}", escaped(&point.series), escaped(&settings(point)));
         for (name, quantity) in &point.quantities {
             let figures = [quantity.min, quantity.median, quantity.p95, quantity.p99, quantity.max];
-            let figures = figures.map(|value| format!("<td>{}", written(value, quantity.unit))).concat();
-            let _ =
-                write!(table, "{begin}<td>{}<td>{}{figures}<td>{}</tr>", escaped(name), quantity.count, point.failed());
+            let figures =
+                figures.map(|value| format!("<td>{}", written(value, quantity.unit))).concat();
+            let _ = write!(
+                table,
+                "{begin}<td>{}<td>{}{figures}<td>{}</tr>",
+                escaped(name),
+                quantity.count,
+                point.failed()
+            );
         }
         if point.quantities.is_empty() {
             let _ = write!(table, "{begin}<td colspan=\"7\"><td>{}</tr>", point.failed());
@@ -116,7 +137,9 @@ mod tests {
         for outside in ["<script", "http:", "https:", "url(", "@import", "<link"] {
             assert!(!page.contains(outside), "{outside}");
         }
-        for inside in ["<figure>", "prefers-color-scheme", "a &lt;note&gt;", "1 × the client", "seed", "abc"] {
+        for inside in
+            ["<figure>", "prefers-color-scheme", "a &lt;note&gt;", "1 × the client", "seed", "abc"]
+        {
             assert!(page.contains(inside), "{inside}");
         }
     }

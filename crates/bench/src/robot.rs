@@ -1,11 +1,12 @@
-//! One simulated robot: an MQTT session in a task of its own, and the steps a run asks of it. What it is ordered it
-//! verifies with the pinned key and reports on; it never fetches or runs anything.
+//! One simulated robot: an MQTT session in a task of its own, and the steps a run asks of it. What
+//! it is ordered it verifies with the pinned key and reports on; it never fetches or runs anything.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use rumqttc::{
-    AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS, SubscribeReasonCode,
+    AsyncClient, Event, EventLoop, Incoming, LastWill, MqttOptions, NetworkOptions, Outgoing, QoS,
+    SubscribeReasonCode,
 };
 use task_agent::telemetry::vitals::Source as _;
 use task_proto::api::EnrollResponse;
@@ -94,22 +95,34 @@ impl Robot {
     /// A robot that is not connected.
     pub fn new(identity: Identity) -> Self {
         let (instance, began) = (InstanceId::random(), Instant::now());
-        Self { identity: Arc::new(identity), instance, began, connection: 0, seq: 0, order: None, session: None }
+        Self {
+            identity: Arc::new(identity),
+            instance,
+            began,
+            connection: 0,
+            seq: 0,
+            order: None,
+            session: None,
+        }
     }
 
-    /// Connects and subscribes; gives the time from now to SUBACK. The status is published after it.
+    /// Connects and subscribes; gives the time from now to SUBACK. The status is published after
+    /// it.
     pub async fn connect(&mut self) -> Result<Duration, RobotError> {
         self.connection += 1;
         let begun = Instant::now();
-        let (client, mut event_loop) = AsyncClient::new(self.identity.options(self.status(false)), QUEUED_REQUESTS);
+        let (client, mut event_loop) =
+            AsyncClient::new(self.identity.options(self.status(false)), QUEUED_REQUESTS);
         let mut network = NetworkOptions::new();
         network.set_connection_timeout(PATIENCE.as_secs());
         network.set_tcp_nodelay(true);
         event_loop.set_network_options(network);
         let (heard_in, heard) = watch::channel(Heard::default());
-        let listener = listen(event_loop, client.clone(), self.identity.clone(), self.status(true), heard_in);
+        let listener =
+            listen(event_loop, client.clone(), self.identity.clone(), self.status(true), heard_in);
         let teller = tokio::spawn(tell_vitals(client.clone(), self.identity.clone()));
-        self.session = Some(Session { client, heard, listener: tokio::spawn(listener), teller, published: 0 });
+        self.session =
+            Some(Session { client, heard, listener: tokio::spawn(listener), teller, published: 0 });
         Ok(self.hear("SUBACK", |heard| heard.subscribed).await? - begun)
     }
 
@@ -130,7 +143,8 @@ impl Robot {
         Ok(at)
     }
 
-    /// Reports that what was ordered, if anything was, is in `phase`; gives the time from now to PUBACK.
+    /// Reports that what was ordered, if anything was, is in `phase`; gives the time from now to
+    /// PUBACK.
     pub async fn report(&mut self, phase: Phase) -> Result<Duration, RobotError> {
         self.seq += 1;
         let begun = Instant::now();
@@ -139,18 +153,25 @@ impl Robot {
         let session = self.session.as_mut().ok_or(RobotError::NoSession)?;
         session.published += 1;
         let published = session.published;
-        // The queue has room, as one report is under way at a time; a session that ended says so below.
+        // The queue has room, as one report is under way at a time; a session that ended says so
+        // below.
         let _ = session.client.try_publish(topic, QoS::AtLeastOnce, false, payload);
         let stored = |heard: &Heard| heard.last_report.filter(|_| heard.reports >= published);
         Ok(self.hear("PUBACK of a report", stored).await? - begun)
     }
 
-    /// Waits until `find` finds. After a failure the session is over: a late answer must not count for the next step.
-    async fn hear<T>(&mut self, what: &'static str, find: impl Fn(&Heard) -> Option<T>) -> Result<T, RobotError> {
+    /// Waits until `find` finds. After a failure the session is over: a late answer must not count
+    /// for the next step.
+    async fn hear<T>(
+        &mut self,
+        what: &'static str,
+        find: impl Fn(&Heard) -> Option<T>,
+    ) -> Result<T, RobotError> {
         let session = self.session.as_mut().ok_or(RobotError::NoSession)?;
         let news = session.heard.wait_for(|heard| heard.ended.is_some() || find(heard).is_some());
         let outcome = match tokio::time::timeout(PATIENCE, news).await {
-            Ok(Ok(heard)) => find(&heard).ok_or_else(|| RobotError::Ended(heard.ended.clone().unwrap_or_default())),
+            Ok(Ok(heard)) => find(&heard)
+                .ok_or_else(|| RobotError::Ended(heard.ended.clone().unwrap_or_default())),
             Ok(Err(_)) => Err(RobotError::NoSession),
             Err(_) => Err(RobotError::Late(what)),
         };
@@ -187,7 +208,10 @@ impl Robot {
             place: None,
             boot_id: "00000000-0000-0000-0000-000000000000".to_owned(),
             seq: self.seq,
-            observed_generation: self.order.as_ref().map_or(Generation(0), |(generation, _)| *generation),
+            observed_generation: self
+                .order
+                .as_ref()
+                .map_or(Generation(0), |(generation, _)| *generation),
             uptime_ms: u64::try_from(self.began.elapsed().as_millis()).unwrap_or(u64::MAX),
             host: HostFacts {
                 agent_version: concat!("taskbench ", env!("CARGO_PKG_VERSION")).to_owned(),
@@ -212,18 +236,26 @@ impl Identity {
         options.set_credentials(self.enrolled.robot_id.as_str(), &self.enrolled.token);
         options.set_keep_alive(KEEP_ALIVE);
         options.set_max_packet_size(MAX_DOORBELL_BYTES + 4096, MAX_DOORBELL_BYTES);
-        options.set_last_will(LastWill::new(self.topic(RobotTopic::Status), will, QoS::AtLeastOnce, false));
+        options.set_last_will(LastWill::new(
+            self.topic(RobotTopic::Status),
+            will,
+            QoS::AtLeastOnce,
+            false,
+        ));
         options
     }
 
     /// The state in a message on the `desired` topic, verified.
     fn open(&self, payload: &[u8]) -> Result<DesiredState, String> {
-        let doorbell = serde_json::from_slice(payload).map_err(|error| format!("not a desired state: {error}"))?;
+        let doorbell = serde_json::from_slice(payload)
+            .map_err(|error| format!("not a desired state: {error}"))?;
         let Doorbell::State { envelope, .. } = doorbell else {
             return Err("a desired state was too large for a message".to_owned());
         };
-        let payload = envelope.open(DESIRED_STATE_TYPE, &self.key).map_err(|error| error.to_string())?;
-        let state: DesiredState = serde_json::from_slice(&payload).map_err(|error| error.to_string())?;
+        let payload =
+            envelope.open(DESIRED_STATE_TYPE, &self.key).map_err(|error| error.to_string())?;
+        let state: DesiredState =
+            serde_json::from_slice(&payload).map_err(|error| error.to_string())?;
         let is_ours = state.robot_id == self.enrolled.robot_id;
         if is_ours { Ok(state) } else { Err("a desired state for another robot".to_owned()) }
     }
@@ -237,7 +269,8 @@ async fn listen(
     status: Vec<u8>,
     heard: watch::Sender<Heard>,
 ) {
-    // The first publish of a session is the status. Its packet id is free for reports once it is acknowledged.
+    // The first publish of a session is the status. Its packet id is free for reports once it is
+    // acknowledged.
     let (mut first_publish, mut status_acknowledged) = (None, false);
     let ended = loop {
         let event = match event_loop.poll().await {
@@ -249,7 +282,9 @@ async fn listen(
             Event::Incoming(Incoming::ConnAck(_)) => {
                 let _ = client.try_subscribe(identity.topic(RobotTopic::Desired), QoS::AtLeastOnce);
             }
-            Event::Incoming(Incoming::SubAck(ack)) if ack.return_codes.contains(&SubscribeReasonCode::Failure) => {
+            Event::Incoming(Incoming::SubAck(ack))
+                if ack.return_codes.contains(&SubscribeReasonCode::Failure) =>
+            {
                 break "the subscription was refused".to_owned();
             }
             Event::Incoming(Incoming::SubAck(_)) => {
@@ -258,8 +293,12 @@ async fn listen(
                 heard.send_modify(|heard| heard.subscribed = Some(Instant::now()));
             }
             // Vitals have no packet id.
-            Event::Outgoing(Outgoing::Publish(id)) => first_publish = first_publish.or(Some(id).filter(|id| *id != 0)),
-            Event::Incoming(Incoming::PubAck(ack)) if Some(ack.pkid) == first_publish && !status_acknowledged => {
+            Event::Outgoing(Outgoing::Publish(id)) => {
+                first_publish = first_publish.or(Some(id).filter(|id| *id != 0))
+            }
+            Event::Incoming(Incoming::PubAck(ack))
+                if Some(ack.pkid) == first_publish && !status_acknowledged =>
+            {
                 status_acknowledged = true;
             }
             Event::Incoming(Incoming::PubAck(_)) => heard.send_modify(|heard| {
@@ -267,7 +306,9 @@ async fn listen(
                 heard.last_report = Some(Instant::now());
             }),
             Event::Incoming(Incoming::Publish(message)) => match identity.open(&message.payload) {
-                Ok(state) => heard.send_modify(|heard| heard.desired = Some((state, Instant::now()))),
+                Ok(state) => {
+                    heard.send_modify(|heard| heard.desired = Some((state, Instant::now())))
+                }
                 Err(text) => break text,
             },
             _ => {}
@@ -283,10 +324,16 @@ async fn tell_vitals(client: AsyncClient, identity: Arc<Identity>) {
     let mut ticks = tokio::time::interval_at(first, VITALS_INTERVAL);
     loop {
         ticks.tick().await;
-        let telemetry = Telemetry { robot_id: identity.enrolled.robot_id.clone(), vitals: machine.look() };
+        let telemetry =
+            Telemetry { robot_id: identity.enrolled.robot_id.clone(), vitals: machine.look() };
         // Where there is no room the next ones say more.
         let payload = json_bytes(&telemetry);
-        let _ = client.try_publish(identity.topic(RobotTopic::Telemetry), QoS::AtMostOnce, false, payload);
+        let _ = client.try_publish(
+            identity.topic(RobotTopic::Telemetry),
+            QoS::AtMostOnce,
+            false,
+            payload,
+        );
     }
 }
 

@@ -1,6 +1,6 @@
-//! A process of a run's robots: `taskbench robots`, which the run starts and talks to. Each robot is the agent's own
-//! driver, plan, link, MQTT session, fetch and verification around a [`Body`] that starts nothing. It measures nothing
-//! but moments, and ends when its input does.
+//! A process of a run's robots: `taskbench robots`, which the run starts and talks to. Each robot
+//! is the agent's own driver, plan, link, MQTT session, fetch and verification around a [`Body`]
+//! that starts nothing. It measures nothing but moments, and ends when its input does.
 
 mod body;
 pub mod words;
@@ -64,7 +64,9 @@ pub async fn run() -> anyhow::Result<()> {
     let tls = client_config(crew.pin);
     let mut robots = Vec::with_capacity(crew.members.len());
     for (number, member) in (crew.first..).zip(&crew.members) {
-        let robot = assemble(&crew, another(&tls), number, member).await.with_context(|| format!("robot {number}"))?;
+        let robot = assemble(&crew, another(&tls), number, member)
+            .await
+            .with_context(|| format!("robot {number}"))?;
         robots.push((number, robot));
     }
     words.send(Word::Ready).await.map_err(|_| anyhow!("nobody listens"))?;
@@ -104,7 +106,12 @@ fn write_words(mut said: mpsc::Receiver<Word>) -> std::io::Result<()> {
 }
 
 /// Puts a robot together as `task-agent run` does, around another body.
-async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member) -> anyhow::Result<Assembled> {
+async fn assemble(
+    crew: &Crew,
+    tls: ClientConfig,
+    number: usize,
+    member: &Member,
+) -> anyhow::Result<Assembled> {
     let data = DataDir::new(&crew.data.join(number.to_string()))?;
     std::fs::create_dir_all(data.root()).with_context(|| data.root().display().to_string())?;
     let config = Config::load(data.root(), std::iter::empty::<(OsString, OsString)>())?;
@@ -114,7 +121,8 @@ async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member
     let credential = Credential::from(enrolled.token.clone());
     let shared = Shared::new(CancellationToken::new());
     let settings = FetchSettings { reserve_bytes: 0, ..FetchSettings::default() };
-    let fetcher = Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), settings);
+    let fetcher =
+        Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), settings);
     let registry = Registry::new(client.clone(), base.clone(), credential.clone());
     let fetcher = (fetcher.measured_by(shared.meter.clone()), shared.listening.clone());
     let robot = Robot::new(data, fetcher, registry, &config, &enrolled.robot_id, member.mac);
@@ -136,9 +144,12 @@ async fn assemble(crew: &Crew, tls: ClientConfig, number: usize, member: &Member
         ..HostFacts::default()
     };
     let ledger = Ledger::new(0);
-    let status = Status { online: true, start: ledger.start + 1, instance, connection: 0, place: None };
-    let driver = Driver::new(Arc::new(Body::new(robot, facts)), speaker, shared.clone(), ledger, None).await;
-    let server = server::Server::new(client, base.clone(), enrolled.robot_id.clone(), credential.clone());
+    let status =
+        Status { online: true, start: ledger.start + 1, instance, connection: 0, place: None };
+    let driver =
+        Driver::new(Arc::new(Body::new(robot, facts)), speaker, shared.clone(), ledger, None).await;
+    let server =
+        server::Server::new(client, base.clone(), enrolled.robot_id.clone(), credential.clone());
     shared.endpoint.send_replace(Some(enrolled.mqtt.clone()));
     let access = MqttAccess {
         host: crew.mqtt_host.clone(),
@@ -174,7 +185,12 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
     let (requests, asked) = mpsc::channel(QUEUED_MESSAGES);
     let (said, to_say) = mpsc::channel(QUEUED_MESSAGES);
     let (interval, source) = (VITALS_INTERVAL, Machine::new());
-    let vitals = Sender { robot_id: robot_id.clone(), interval, source: source.clone(), server: server.clone() };
+    let vitals = Sender {
+        robot_id: robot_id.clone(),
+        interval,
+        source: source.clone(),
+        server: server.clone(),
+    };
     tokio::spawn(vitals.run(shared.clone(), said.clone()));
     tokio::spawn(answer(robot_id, source, asked, said));
     tokio::spawn(witness(number, shared.clone(), words));
@@ -200,7 +216,8 @@ async fn answer(
             Ask::Vitals => Outcome::Answer(Answer::Vitals(machine.look())),
             _ => Outcome::Refusal(Refusal { code: "unsupported".to_owned(), text }),
         };
-        if let Ok(payload) = serde_json::to_vec(&Reply { robot_id: robot_id.clone(), id, outcome }) {
+        if let Ok(payload) = serde_json::to_vec(&Reply { robot_id: robot_id.clone(), id, outcome })
+        {
             let _ = said.try_send(Message { topic: RobotTopic::Reply, payload });
         }
     }
@@ -225,7 +242,8 @@ async fn witness(robot: usize, shared: Shared, words: mpsc::Sender<Word>) {
         }
         let stored = *confirmed.borrow_and_update();
         let at_ns = monotonic_ns();
-        let keeps_state = *settled.borrow_and_update() && report.is_some_and(|report| report.seq <= stored);
+        let keeps_state =
+            *settled.borrow_and_update() && report.is_some_and(|report| report.seq <= stored);
         if !reconciled && *mqtt_up.borrow_and_update() && keeps_state {
             reconciled = true;
             let _ = words.send(Word::Reconciled { robot, at_ns }).await;
@@ -254,10 +272,14 @@ async fn witness(robot: usize, shared: Shared, words: mpsc::Sender<Word>) {
 /// The orders that a report says are verified, or failed and why.
 fn news(report: &Report) -> impl Iterator<Item = (DeploymentId, Option<String>)> {
     let told = |task: &TaskReport| match task.phase {
-        Phase::Building | Phase::Staged | Phase::Starting | Phase::Running | Phase::Succeeded => Some(None),
+        Phase::Building | Phase::Staged | Phase::Starting | Phase::Running | Phase::Succeeded => {
+            Some(None)
+        }
         Phase::Failed | Phase::Unmet | Phase::RolledBack => {
             let failure = task.failure.as_ref();
-            Some(Some(failure.map_or("no reason given".to_owned(), |f| format!("{}: {}", f.code.as_str(), f.text))))
+            Some(Some(failure.map_or("no reason given".to_owned(), |f| {
+                format!("{}: {}", f.code.as_str(), f.text)
+            })))
         }
         _ => None,
     };

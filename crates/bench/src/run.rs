@@ -1,5 +1,6 @@
-//! The result of a run, whatever it measured: facts, points and the plots that show them, written as JSON, CSV and HTML.
-//! One shape for all, so that runs can be compared and drawn again. A failure is part of a point and never dropped.
+//! The result of a run, whatever it measured: facts, points and the plots that show them, written
+//! as JSON, CSV and HTML. One shape for all, so that runs can be compared and drawn again. A
+//! failure is part of a point and never dropped.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -23,7 +24,8 @@ pub struct RunFlags {
     /// Directory for the results: NAME.json, NAME.csv and NAME.html
     #[arg(long, value_name = "DIR", default_value = "taskbench-results")]
     pub out: PathBuf,
-    /// What random bytes and the order of the runs come from [default: a random number, which the results name]
+    /// What random bytes and the order of the runs come from [default: a random number, which the
+    /// results name]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
 }
@@ -207,7 +209,8 @@ impl Quantity {
         let samples: Vec<f64> = samples.into_iter().collect();
         let mut sorted = samples.clone();
         sorted.sort_unstable_by(f64::total_cmp);
-        let at = |percent: usize| sorted.get((sorted.len() * percent).div_ceil(100).max(1) - 1).copied();
+        let at =
+            |percent: usize| sorted.get((sorted.len() * percent).div_ceil(100).max(1) - 1).copied();
         let quantity = Self {
             unit,
             count: sorted.len(),
@@ -279,7 +282,8 @@ impl Run {
         self.points.iter().map(Point::failed).sum()
     }
 
-    /// Writes the three files, making the directory if need be; gives their paths. `began` is when the run began.
+    /// Writes the three files, making the directory if need be; gives their paths. `began` is when
+    /// the run began.
     pub fn write(&mut self, dir: &Path, began: Instant) -> io::Result<Vec<PathBuf>> {
         self.wall_s = (began.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
         std::fs::create_dir_all(dir)?;
@@ -298,7 +302,8 @@ impl Run {
 
     /// Reads a run back.
     pub fn read(path: &Path) -> io::Result<Self> {
-        serde_json::from_slice(&std::fs::read(path)?).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
+        serde_json::from_slice(&std::fs::read(path)?)
+            .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
     }
 
     /// A row for each quantity of each point; a point without any has one row, with its failures.
@@ -307,19 +312,38 @@ impl Run {
             self.points.iter().flat_map(|p| p.settings.keys()).collect();
         let names = settings.iter().map(|name| cell(name));
         let head = std::iter::once("series".to_owned()).chain(names);
-        let rest = ["quantity", "unit", "count", "min", "median", "p95", "p99", "max", "failed"].map(str::to_owned);
+        let rest = ["quantity", "unit", "count", "min", "median", "p95", "p99", "max", "failed"]
+            .map(str::to_owned);
         let mut text = head.chain(rest).collect::<Vec<_>>().join(",") + "\n";
         for point in &self.points {
             let mut begin = vec![cell(&point.series)];
-            begin.extend(settings.iter().map(|name| point.settings.get(*name).map_or(String::new(), f64::to_string)));
+            begin.extend(
+                settings
+                    .iter()
+                    .map(|name| point.settings.get(*name).map_or(String::new(), f64::to_string)),
+            );
             let mut row = |cells: [String; 8]| {
-                let all: Vec<String> = begin.iter().cloned().chain(cells).chain([point.failed().to_string()]).collect();
+                let all: Vec<String> = begin
+                    .iter()
+                    .cloned()
+                    .chain(cells)
+                    .chain([point.failed().to_string()])
+                    .collect();
                 text.push_str(&(all.join(",") + "\n"));
             };
             for (name, q) in &point.quantities {
                 let figures = [q.min, q.median, q.p95, q.p99, q.max].map(|value| value.to_string());
                 let [min, median, p95, p99, max] = figures;
-                row([cell(name), cell(q.unit.symbol()), q.count.to_string(), min, median, p95, p99, max]);
+                row([
+                    cell(name),
+                    cell(q.unit.symbol()),
+                    q.count.to_string(),
+                    min,
+                    median,
+                    p95,
+                    p99,
+                    max,
+                ]);
             }
             if point.quantities.is_empty() {
                 row(Default::default());
@@ -342,7 +366,8 @@ pub(crate) mod tests {
     /// A run with two series, a failure among them.
     pub fn sample() -> Run {
         let point = |series: &str, robots: f64, ms: &[f64]| {
-            let mut point = Point::new(series, [("robots", robots), ("payload_bytes", 1000.0 * robots)]);
+            let mut point =
+                Point::new(series, [("robots", robots), ("payload_bytes", 1000.0 * robots)]);
             point.measure("delay", Unit::Milliseconds, ms.iter().copied());
             point
         };
@@ -379,7 +404,9 @@ pub(crate) mod tests {
 
     #[test]
     fn figures_are_values_that_occurred() {
-        let of = |n: u32| Quantity::of(Unit::Milliseconds, (1..=n).rev().map(f64::from)).expect("figures");
+        let of = |n: u32| {
+            Quantity::of(Unit::Milliseconds, (1..=n).rev().map(f64::from)).expect("figures")
+        };
         let figures = |q: &Quantity| [q.min, q.median, q.p95, q.p99, q.max];
         assert_eq!(figures(&of(200)), [1.0, 100.0, 190.0, 198.0, 200.0]);
         assert_eq!(figures(&of(1)), [1.0; 5]);
@@ -399,7 +426,10 @@ pub(crate) mod tests {
         assert_eq!((read.failed(), &read.plots), (1, &run.plots));
         let csv = std::fs::read_to_string(&files[1]).expect("read");
         let lines: Vec<&str> = csv.lines().collect();
-        assert_eq!(lines[0], "series,payload_bytes,robots,quantity,unit,count,min,median,p95,p99,max,failed");
+        assert_eq!(
+            lines[0],
+            "series,payload_bytes,robots,quantity,unit,count,min,median,p95,p99,max,failed"
+        );
         assert_eq!(lines[1], "push-pull,1000,1,delay,ms,3,10,20,30,30,30,0");
         assert_eq!(lines[4], "direct-push,4000,4,,,,,,,,,1");
         assert_eq!(cell("a \"b\", c"), "\"a \"\"b\"\", c\"");

@@ -1,12 +1,13 @@
-//! The server's HTTP API as far as a load run needs it. Nothing is retried: a run measures what one try does.
+//! The server's HTTP API as far as a load run needs it. Nothing is retried: a run measures what one
+//! try does.
 
 use std::time::Duration;
 
 use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
 use serde::de::DeserializeOwned;
 use task_proto::api::{
-    CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, EnrollResponse, EnrollmentToken, ErrorBody,
-    IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
+    CreateDeployment, CreateEnrollmentToken, DeploymentView, EnrollRequest, EnrollResponse,
+    EnrollmentToken, ErrorBody, IDEMPOTENCY_KEY, RobotList, RobotView, ServerInfo,
 };
 use task_proto::desired::BlobRef;
 use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
@@ -46,9 +47,12 @@ pub struct Server {
 }
 
 impl Server {
-    /// The one whose certificates are by the authority with this pin, if that is known. Nothing is sent yet.
+    /// The one whose certificates are by the authority with this pin, if that is known. Nothing is
+    /// sent yet.
     pub fn new(base: Url, token: &Token, pin: Option<CaPin>) -> Result<Self, ServerError> {
-        let http = reqwest::Client::builder().timeout(ANSWER_TIMEOUT).redirect(reqwest::redirect::Policy::none());
+        let http = reqwest::Client::builder()
+            .timeout(ANSWER_TIMEOUT)
+            .redirect(reqwest::redirect::Policy::none());
         let http = http.tls_backend_preconfigured(client_config(pin));
         let http = http.build().map_err(|source| ServerError::NoAnswer("nothing", source))?;
         Ok(Self { http, base, token: token.reveal(), in_use: Mutex::default() })
@@ -60,16 +64,29 @@ impl Server {
     }
 
     /// Makes a token that robots register with.
-    pub async fn create_enrollment_token(&self, order: &CreateEnrollmentToken) -> Result<EnrollmentToken, ServerError> {
-        read("an enrolment token", self.request(Method::POST, "/api/v1/enrollment-tokens").json(order)).await
+    pub async fn create_enrollment_token(
+        &self,
+        order: &CreateEnrollmentToken,
+    ) -> Result<EnrollmentToken, ServerError> {
+        read(
+            "an enrolment token",
+            self.request(Method::POST, "/api/v1/enrollment-tokens").json(order),
+        )
+        .await
     }
 
     /// What a robot does with the enrolment token: where too many come at once it asks again.
-    pub async fn enroll(&self, token: &str, request: &EnrollRequest) -> Result<EnrollResponse, ServerError> {
+    pub async fn enroll(
+        &self,
+        token: &str,
+        request: &EnrollRequest,
+    ) -> Result<EnrollResponse, ServerError> {
         loop {
             let post = self.http.post(self.url("/api/v1/enroll")).bearer_auth(token);
             match read("an enrolment", post.json(request)).await {
-                Err(ServerError::Refused(_, StatusCode::TOO_MANY_REQUESTS, _)) => tokio::time::sleep(AGAIN).await,
+                Err(ServerError::Refused(_, StatusCode::TOO_MANY_REQUESTS, _)) => {
+                    tokio::time::sleep(AGAIN).await
+                }
                 answer => return answer,
             }
         }
@@ -88,22 +105,31 @@ impl Server {
 
     /// Removes a robot.
     pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ServerError> {
-        send("a robot's removal", self.request(Method::DELETE, &format!("/api/v1/robots/{robot}"))).await.map(drop)
+        send("a robot's removal", self.request(Method::DELETE, &format!("/api/v1/robots/{robot}")))
+            .await
+            .map(drop)
     }
 
     /// Orders a package for robots.
     pub async fn order(&self, order: &CreateDeployment) -> Result<DeploymentView, ServerError> {
-        let post = self.request(Method::POST, "/api/v1/deployments").header(IDEMPOTENCY_KEY, order.manifest.hex());
+        let post = self
+            .request(Method::POST, "/api/v1/deployments")
+            .header(IDEMPOTENCY_KEY, order.manifest.hex());
         read("the order", post.json(order)).await
     }
 
     /// Where a deployment stands, robot by robot.
     pub async fn deployment(&self, id: &DeploymentId) -> Result<DeploymentView, ServerError> {
-        read("the deployment", self.request(Method::GET, &format!("/api/v1/deployments/{id}"))).await
+        read("the deployment", self.request(Method::GET, &format!("/api/v1/deployments/{id}")))
+            .await
     }
 
     /// Pushes a package with one small file, and gives its manifest.
-    pub async fn push_package(&self, name: &TaskName, version: &Version) -> Result<Digest, ServerError> {
+    pub async fn push_package(
+        &self,
+        name: &TaskName,
+        version: &Version,
+    ) -> Result<Digest, ServerError> {
         self.push(Package::random(name.clone(), version.clone(), SMALL_BYTES, rand::random())).await
     }
 
@@ -116,19 +142,27 @@ impl Server {
         let bytes = json_bytes(&ImageManifest::package(config, content));
         let digest = Digest::of(&bytes);
         let put = self.request(Method::PUT, &format!("/v2/{name}/manifests/{version}"));
-        send("the manifest", put.header(reqwest::header::CONTENT_TYPE, MANIFEST_TYPE).body(bytes)).await?;
+        send("the manifest", put.header(reqwest::header::CONTENT_TYPE, MANIFEST_TYPE).body(bytes))
+            .await?;
         Ok(digest)
     }
 
-    /// Deletes a package version. One that robots should have is deleted by a later call, once they should not.
-    pub async fn remove_package(&self, name: &TaskName, manifest: &Digest) -> Result<(), ServerError> {
+    /// Deletes a package version. One that robots should have is deleted by a later call, once they
+    /// should not.
+    pub async fn remove_package(
+        &self,
+        name: &TaskName,
+        manifest: &Digest,
+    ) -> Result<(), ServerError> {
         let mut in_use = self.in_use.lock().await;
         in_use.push((name.clone(), *manifest));
         let mut kept = Vec::new();
         for (name, manifest) in in_use.drain(..) {
             let delete = self.request(Method::DELETE, &format!("/v2/{name}/manifests/{manifest}"));
             match send("the package's removal", delete).await {
-                Err(ServerError::Refused(_, StatusCode::CONFLICT, _)) => kept.push((name, manifest)),
+                Err(ServerError::Refused(_, StatusCode::CONFLICT, _)) => {
+                    kept.push((name, manifest))
+                }
                 removed => drop(removed?),
             }
         }
@@ -136,8 +170,14 @@ impl Server {
         Ok(())
     }
 
-    async fn push_blob(&self, name: &TaskName, blob: BlobRef, bytes: Vec<u8>) -> Result<(), ServerError> {
-        let post = self.request(Method::POST, &format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest));
+    async fn push_blob(
+        &self,
+        name: &TaskName,
+        blob: BlobRef,
+        bytes: Vec<u8>,
+    ) -> Result<(), ServerError> {
+        let post = self
+            .request(Method::POST, &format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest));
         send("a blob", post.body(bytes)).await.map(drop)
     }
 
@@ -155,17 +195,29 @@ fn json_bytes(value: &impl serde::Serialize) -> Vec<u8> {
     serde_json::to_vec(value).unwrap_or_default()
 }
 
-async fn read<T: DeserializeOwned>(what: &'static str, request: RequestBuilder) -> Result<T, ServerError> {
-    send(what, request).await?.json().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))
+async fn read<T: DeserializeOwned>(
+    what: &'static str,
+    request: RequestBuilder,
+) -> Result<T, ServerError> {
+    send(what, request)
+        .await?
+        .json()
+        .await
+        .map_err(|source| ServerError::NoAnswer(what, source.without_url()))
 }
 
 async fn send(what: &'static str, request: RequestBuilder) -> Result<Response, ServerError> {
     // Without the URL, which differs from robot to robot, the same failure has the same text.
-    let response = request.send().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))?;
+    let response =
+        request.send().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))?;
     if response.status().is_success() {
         return Ok(response);
     }
     let status = response.status();
     let body = response.json::<ErrorBody>().await;
-    Err(ServerError::Refused(what, status, body.map_or("no reason given".to_owned(), |body| body.error.message)))
+    Err(ServerError::Refused(
+        what,
+        status,
+        body.map_or("no reason given".to_owned(), |body| body.error.message),
+    ))
 }

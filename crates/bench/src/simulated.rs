@@ -1,5 +1,5 @@
-//! What simulated robots say of the machines that they do not have: figures that wander, so that whoever watches sees
-//! something. They measure nothing.
+//! What simulated robots say of the machines that they do not have: figures that wander, so that
+//! whoever watches sees something. They measure nothing.
 
 use std::time::Duration;
 
@@ -43,7 +43,8 @@ impl Default for Machine {
 
 impl Source for Machine {
     fn look(&mut self) -> Vitals {
-        let wander = |value: f64, by: f64| (value + by * (rand::random::<f64>() - 0.5)).clamp(0.01, 0.99);
+        let wander =
+            |value: f64, by: f64| (value + by * (rand::random::<f64>() - 0.5)).clamp(0.01, 0.99);
         self.cpu = wander(self.cpu, 0.2);
         self.memory = wander(self.memory, 0.02);
         self.disk = wander(self.disk, 0.001);
@@ -77,8 +78,14 @@ mod tests {
         let mut machine = Machine::new();
         for _ in 0..1000 {
             let seen = machine.look();
-            assert!(seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)), "{seen:?}");
-            assert!(seen.memory_used_bytes < seen.memory_total_bytes && seen.disk_used_bytes < seen.disk_total_bytes);
+            assert!(
+                seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)),
+                "{seen:?}"
+            );
+            assert!(
+                seen.memory_used_bytes < seen.memory_total_bytes
+                    && seen.disk_used_bytes < seen.disk_total_bytes
+            );
             assert!(seen.battery_percent.is_some_and(|percent| percent <= 100), "{seen:?}");
         }
     }

@@ -1,5 +1,5 @@
-//! A real `taskd serve` as a child, with a directory of its own, on free ports. It is ended by its pid, and its
-//! directory goes with it.
+//! A real `taskd serve` as a child, with a directory of its own, on free ports. It is ended by its
+//! pid, and its directory goes with it.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -27,10 +27,12 @@ const LOG_TAIL_BYTES: usize = 2000;
 /// Which server to measure.
 #[derive(Debug, Clone, Args)]
 pub struct TaskdFlags {
-    /// The taskd to measure [default: the one beside taskbench; build both with cargo build --release --bins]
+    /// The taskd to measure [default: the one beside taskbench; build both with cargo build
+    /// --release --bins]
     #[arg(long, value_name = "PATH")]
     pub taskd: Option<PathBuf>,
-    /// Where servers have their data; a disk, because they sync to it [default: the system's temporary directory]
+    /// Where servers have their data; a disk, because they sync to it [default: the system's
+    /// temporary directory]
     #[arg(long, value_name = "DIR")]
     pub data: Option<PathBuf>,
 }
@@ -94,14 +96,17 @@ impl Taskd {
         let mut builder = tempfile::Builder::new();
         builder.prefix("taskbench-");
         let dir = match &flags.data {
-            Some(dir) => builder.tempdir_in(dir).with_context(|| format!("--data {}", dir.display()))?,
+            Some(dir) => {
+                builder.tempdir_in(dir).with_context(|| format!("--data {}", dir.display()))?
+            }
             None => builder.tempdir().context("a temporary directory")?,
         };
         let (data, configuration) = (dir.path().join("data"), dir.path().join("taskd.toml"));
-        std::fs::write(&configuration, &order.configuration).context("the server's configuration file")?;
+        std::fs::write(&configuration, &order.configuration)
+            .context("the server's configuration file")?;
         let any = SocketAddr::new(order.listen, 0).to_string();
-        let mut program =
-            Program::beside("taskd", flags.taskd.as_deref())?.args(["serve", "--http", &any, "--mqtt", &any]);
+        let mut program = Program::beside("taskd", flags.taskd.as_deref())?
+            .args(["serve", "--http", &any, "--mqtt", &any]);
         program = program.args([Path::new("--data"), &data, Path::new("--config"), &configuration]);
         for (name, value) in &order.settings {
             program = program.variable(name, value);
@@ -109,7 +114,8 @@ impl Taskd {
         Self::launch(program, dir).await
     }
 
-    /// Ends it and starts it again on the same data, as new: nothing is in its memory. Its ports are others.
+    /// Ends it and starts it again on the same data, as new: nothing is in its memory. Its ports
+    /// are others.
     pub async fn restart(self) -> anyhow::Result<Self> {
         let Self { process, program, dir, .. } = self;
         process.end().await;
@@ -122,8 +128,10 @@ impl Taskd {
         // Those of an earlier start.
         let _ = std::fs::remove_file(&addresses);
         let mut process = program.start(&log)?;
-        let Addresses { http, mqtt, ca_pin: pin } = wait_for_addresses(&mut process, &addresses, &log).await?;
-        let token = std::fs::read_to_string(data.join("operator.token")).context("the server's operator.token")?;
+        let Addresses { http, mqtt, ca_pin: pin } =
+            wait_for_addresses(&mut process, &addresses, &log).await?;
+        let token = std::fs::read_to_string(data.join("operator.token"))
+            .context("the server's operator.token")?;
         let token: Token = token.trim().parse().context("the server's operator.token")?;
         let base: Url = url(http, pin).parse().context("the server's address")?;
         let server = Server::new(base, &token, pin)?;
@@ -203,12 +211,18 @@ fn url(http: SocketAddr, pin: Option<CaPin>) -> String {
     format!("{scheme}://{http}")
 }
 
-async fn wait_for_addresses(process: &mut Process, path: &Path, log: &Path) -> anyhow::Result<Addresses> {
+async fn wait_for_addresses(
+    process: &mut Process,
+    path: &Path,
+    log: &Path,
+) -> anyhow::Result<Addresses> {
     let deadline = Instant::now() + START_TIMEOUT;
     let mut tick = tokio::time::interval(LOOK_INTERVAL);
     loop {
         tick.tick().await;
-        if let Some(addresses) = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()) {
+        if let Some(addresses) =
+            std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice(&bytes).ok())
+        {
             return Ok(addresses);
         }
         if let Some(how) = process.ended() {

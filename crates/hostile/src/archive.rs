@@ -1,10 +1,13 @@
-//! A package's archive as a robot unpacks it, and as the server does where someone brings a directory.
+//! A package's archive as a robot unpacks it, and as the server does where someone brings a
+//! directory.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Component, Path};
 
-use task_archive::{Compression, Entries, Kind, Limits, Refusal, UnpackError, check, unpack, unpack_unannounced};
+use task_archive::{
+    Compression, Entries, Kind, Limits, Refusal, UnpackError, check, unpack, unpack_unannounced,
+};
 use task_proto::Digest;
 use task_proto::manifest::ContentFacts;
 use taskd::package::contents::list;
@@ -15,9 +18,10 @@ const BLOCK_BYTES: usize = 512;
 const CHECKSUM: std::ops::Range<usize> = 148..156;
 const MAGIC: std::ops::Range<usize> = 257..262;
 
-/// An archive, compressed or not: whatever becomes of it, nothing is changed outside of its directory, and nothing in there
-/// leads out, has a mode of its own, or is larger than announced, or than may be where nothing was announced. One that is not
-/// compressed gets the checksums that its headers need, and compressed.
+/// An archive, compressed or not: whatever becomes of it, nothing is changed outside of its
+/// directory, and nothing in there leads out, has a mode of its own, or is larger than announced,
+/// or than may be where nothing was announced. One that is not compressed gets the checksums that
+/// its headers need, and compressed.
 pub fn archive(bytes: &[u8]) {
     let plain = zstd::decode_all(bytes).ok().filter(|_| bytes.len() < 64 * 1024);
     let (content, tar) = match plain {
@@ -28,7 +32,8 @@ pub fn archive(bytes: &[u8]) {
             (zstd::encode_all(&*tar, 1).expect("compressed"), tar)
         }
     };
-    let mut facts = ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 0 };
+    let mut facts =
+        ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 0 };
     unannounced(&content, Compression::Zstd);
     // How many entries there are is found out by announcing too few.
     while let Some(found) = unpacked(&content, &facts) {
@@ -47,7 +52,8 @@ fn with_checksums(bytes: &[u8]) -> Vec<u8> {
     tar
 }
 
-/// Unpacks an archive of which nothing is known. What is unpacked was listed before, entry by entry.
+/// Unpacks an archive of which nothing is known. What is unpacked was listed before, entry by
+/// entry.
 fn unannounced(content: &[u8], compression: Compression) {
     let mut listed = 0;
     let mut entries = Entries::unannounced(content, compression, &LIMITS).expect("bytes in memory");
@@ -60,15 +66,21 @@ fn unannounced(content: &[u8], compression: Compression) {
             end => break end.is_ok(),
         }
     };
-    let unpacked = in_staging(LIMITS.bytes, |staging| unpack_unannounced(content, compression, &LIMITS, staging));
-    assert!(listed <= LIMITS.entries + 1 && (whole || unpacked.is_err()), "{listed} files, {unpacked:?}");
+    let unpacked = in_staging(LIMITS.bytes, |staging| {
+        unpack_unannounced(content, compression, &LIMITS, staging)
+    });
+    assert!(
+        listed <= LIMITS.entries + 1 && (whole || unpacked.is_err()),
+        "{listed} files, {unpacked:?}"
+    );
 }
 
-/// Unpacks as announced; the number of entries found, if more were than announced. Who only checks the archive comes to the
-/// same verdict.
+/// Unpacks as announced; the number of entries found, if more were than announced. Who only checks
+/// the archive comes to the same verdict.
 fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
     let size = content.len() as u64;
-    let unpacked = in_staging(facts.tar_size, |staging| unpack(content, size, facts, &LIMITS, staging));
+    let unpacked =
+        in_staging(facts.tar_size, |staging| unpack(content, size, facts, &LIMITS, staging));
     match check(content, size, facts, &LIMITS) {
         Ok(()) => assert_eq!(unpacked, Ok(())),
         Err(UnpackError::Refused(refusal)) => assert_eq!(unpacked, Err(refusal)),
@@ -80,7 +92,9 @@ fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
             assert!(listed.is_sorted_by(|one, next| one.path < next.path), "{listed:?}");
             None
         }
-        Err(Refusal::NotAsAnnounced { what: "entries in the archive", found, announced }) if found > announced => {
+        Err(Refusal::NotAsAnnounced { what: "entries in the archive", found, announced })
+            if found > announced =>
+        {
             Some(found)
         }
         _ => None,
@@ -88,13 +102,18 @@ fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
 }
 
 /// Unpacks and looks around; why it was refused, if it was.
-fn in_staging(most_bytes: u64, unpack: impl FnOnce(&Path) -> Result<(), UnpackError>) -> Result<(), Refusal> {
+fn in_staging(
+    most_bytes: u64,
+    unpack: impl FnOnce(&Path) -> Result<(), UnpackError>,
+) -> Result<(), Refusal> {
     let outer = tempfile::tempdir().expect("a directory");
     let (staging, neighbour) = (outer.path().join("staging"), outer.path().join("neighbour"));
     fs::write(&neighbour, "untouched").expect("written");
     let result = unpack(&staging);
-    let mut around: Vec<_> =
-        fs::read_dir(outer.path()).expect("listed").map(|entry| entry.expect("an entry").file_name()).collect();
+    let mut around: Vec<_> = fs::read_dir(outer.path())
+        .expect("listed")
+        .map(|entry| entry.expect("an entry").file_name())
+        .collect();
     around.sort();
     assert!(
         around.iter().all(|name| name == "neighbour" || name == "staging"),
@@ -110,13 +129,16 @@ fn in_staging(most_bytes: u64, unpack: impl FnOnce(&Path) -> Result<(), UnpackEr
             assert!(!refusal.to_string().contains(char::is_control), "{refusal:?}");
             Err(refusal)
         }
-        Err(UnpackError::Disk { path, source }) => panic!("{} should not have been tried: {source}", path.display()),
+        Err(UnpackError::Disk { path, source }) => {
+            panic!("{} should not have been tried: {source}", path.display())
+        }
         Err(UnpackError::Source(error)) => panic!("the source does not fail: {error}"),
         Ok(()) => Ok(()),
     }
 }
 
-/// Looks at everything below `directory`; the size of all files, those with several names counted once.
+/// Looks at everything below `directory`; the size of all files, those with several names counted
+/// once.
 fn look(directory: &Path, staging: &Path, depth: usize) -> u64 {
     assert!(depth <= 8, "{} is too deep", directory.display());
     let mut size = 0;
@@ -130,7 +152,11 @@ fn look(directory: &Path, staging: &Path, depth: usize) -> u64 {
             assert_eq!(mode, 0o755, "{}", path.display());
             size += look(&path, staging, depth + 1);
         } else {
-            assert!(metadata.is_file() && matches!(mode, 0o644 | 0o755), "{} {mode:o}", path.display());
+            assert!(
+                metadata.is_file() && matches!(mode, 0o644 | 0o755),
+                "{} {mode:o}",
+                path.display()
+            );
             size += metadata.len() / std::os::unix::fs::MetadataExt::nlink(&metadata);
         }
     }

@@ -1,6 +1,7 @@
-//! What foreign bytes must not do: one function for every parser of them. Each takes any bytes and panics if the parser
-//! panics, or if what it accepted breaks a promise: what was read is written and read back the same, an archive leaves its
-//! directory alone. The fuzzer in `fuzz/` calls them without end, the tests here with the kept corpora and changes of them.
+//! What foreign bytes must not do: one function for every parser of them. Each takes any bytes and
+//! panics if the parser panics, or if what it accepted breaks a promise: what was read is written
+//! and read back the same, an archive leaves its directory alone. The fuzzer in `fuzz/` calls them
+//! without end, the tests here with the kept corpora and changes of them.
 
 mod archive;
 mod mqtt;

@@ -12,7 +12,8 @@ use task_proto::RobotId;
 use task_proto::topic::TopicPrefix;
 use taskd::broker::codec::{DecodeError, Received, decode, encode_publish};
 use taskd::broker::{
-    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
+    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
+    RobotMessage,
 };
 use taskd::limits::conduct::{Conduct, ConductLimits};
 use tokio::runtime::Runtime;
@@ -36,8 +37,8 @@ const ROBOT: &str = "r00000000000000a1";
 const CONNECT: &[u8] =
     b"\x10\x32\x00\x04MQTT\x04\xc2\x00\x3c\x00\x11r00000000000000a1\x00\x11r00000000000000a1\x00\x00";
 
-/// Packets from a client: it does not matter in which pieces they come, and what is published has a topic that can be
-/// published to and is read again as it was.
+/// Packets from a client: it does not matter in which pieces they come, and what is published has a
+/// topic that can be published to and is read again as it was.
 pub fn mqtt_packets(bytes: &[u8]) {
     let whole = read(bytes, bytes.len());
     for piece_bytes in [1, 7] {
@@ -45,10 +46,17 @@ pub fn mqtt_packets(bytes: &[u8]) {
     }
     for packet in whole.0 {
         if let Received::Publish(publish) = packet {
-            assert!(!publish.topic.is_empty() && !publish.topic.contains(['+', '#', '\0']), "{:?}", publish.topic);
+            assert!(
+                !publish.topic.is_empty() && !publish.topic.contains(['+', '#', '\0']),
+                "{:?}",
+                publish.topic
+            );
             let mut written = BytesMut::new();
             encode_publish(&publish, &mut written);
-            assert_eq!(decode(&mut written, MAX_PACKET_BYTES), Ok(Some(Received::Publish(publish))));
+            assert_eq!(
+                decode(&mut written, MAX_PACKET_BYTES),
+                Ok(Some(Received::Publish(publish)))
+            );
             assert!(written.is_empty());
         }
     }
@@ -70,9 +78,9 @@ fn read(bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<DecodeError>
     (packets, None)
 }
 
-/// A connection, from its first byte or, if that is odd, from behind a good CONNECT: it ends when the client has said all;
-/// one that is not let in is told so in one packet or not at all; the inbox hears of this robot only, and the next client
-/// is served.
+/// A connection, from its first byte or, if that is odd, from behind a good CONNECT: it ends when
+/// the client has said all; one that is not let in is told so in one packet or not at all; the
+/// inbox hears of this robot only, and the next client is served.
 pub fn mqtt_session(bytes: &[u8]) {
     let Some((&first, said)) = bytes.split_first() else { return };
     let front = Front::running();
@@ -82,13 +90,19 @@ pub fn mqtt_session(bytes: &[u8]) {
     match heard.get(..4) {
         None => assert!(heard.is_empty(), "half an answer: {}", heard.escape_ascii()),
         Some([0x20, 2, 0, 0]) => {}
-        Some([0x20, 2, 0, 1..=5]) => assert_eq!(heard.len(), 4, "more after a refusal: {}", heard.escape_ascii()),
+        Some([0x20, 2, 0, 1..=5]) => {
+            assert_eq!(heard.len(), 4, "more after a refusal: {}", heard.escape_ascii())
+        }
         Some(_) => panic!("no CONNACK: {}", heard.escape_ascii()),
     }
     if first % 2 == 1 {
         assert_eq!(&heard[..4], [0x20, 2, 0, 0], "a good CONNECT was refused");
     }
-    assert_eq!(front.talk(&[CONNECT, b"\xe0\x00"].concat()), [0x20, 2, 0, 0], "the next client is not served");
+    assert_eq!(
+        front.talk(&[CONNECT, b"\xe0\x00"].concat()),
+        [0x20, 2, 0, 0],
+        "the next client is not served"
+    );
 }
 
 /// A broker that serves until the process ends.
@@ -106,9 +120,11 @@ impl Front {
             let limits = Limits { max_packet_bytes: MAX_PACKET_BYTES, ..Limits::default() };
             let listen = ([127, 0, 0, 1], 0).into();
             let conduct = Conduct::new(INDULGENT);
-            let config = BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits, conduct };
-            let broker =
-                runtime.block_on(Broker::start(config, Arc::new(Door), Arc::new(Letterbox))).expect("a broker");
+            let config =
+                BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits, conduct };
+            let broker = runtime
+                .block_on(Broker::start(config, Arc::new(Door), Arc::new(Letterbox)))
+                .expect("a broker");
             let address = broker.local_addr().expect("an address");
             Self { address, turn: Mutex::default(), _broker: (runtime, broker) }
         })
@@ -123,7 +139,8 @@ impl Front {
         let said = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
         match stream.read_to_end(&mut heard) {
             Ok(_) => {}
-            Err(error) if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) => {}
+            Err(error)
+                if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) => {}
             Err(error) => panic!("the connection does not end: {error} (said: {said:?})"),
         }
         heard

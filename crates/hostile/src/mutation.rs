@@ -1,8 +1,21 @@
-//! Changes inputs as a fuzzer would, but always the same way for the same seed: a test that failed once fails again.
+//! Changes inputs as a fuzzer would, but always the same way for the same seed: a test that failed
+//! once fails again.
 
 /// Numbers on which parsers stumble.
-const NUMBERS: [u64; 12] =
-    [0, 1, 0x7f, 0x80, 0xff, 0x7fff, 0xffff, 0x7fff_ffff, 0xffff_ffff, i64::MAX as u64, u64::MAX - 1, u64::MAX];
+const NUMBERS: [u64; 12] = [
+    0,
+    1,
+    0x7f,
+    0x80,
+    0xff,
+    0x7fff,
+    0xffff,
+    0x7fff_ffff,
+    0xffff_ffff,
+    i64::MAX as u64,
+    u64::MAX - 1,
+    u64::MAX,
+];
 /// Texts on which they do.
 const TEXTS: [&[u8]; 12] = [
     b"\0",
@@ -54,8 +67,10 @@ impl Mutation {
             5 => {
                 let number = NUMBERS[self.below(NUMBERS.len())];
                 let length = 1 << self.below(4);
-                let all = if self.below(2) == 0 { number.to_le_bytes() } else { number.to_be_bytes() };
-                let bytes_of_it = if self.below(2) == 0 { &all[..length] } else { &all[8 - length..] };
+                let all =
+                    if self.below(2) == 0 { number.to_le_bytes() } else { number.to_be_bytes() };
+                let bytes_of_it =
+                    if self.below(2) == 0 { &all[..length] } else { &all[8 - length..] };
                 let end = (at + length).min(bytes.len());
                 drop(bytes.splice(at..end, bytes_of_it.iter().copied()));
             }

@@ -8,12 +8,12 @@ use task_proto::selector::Selector;
 use task_proto::token::Token;
 use task_proto::topic::TopicPrefix;
 use task_proto::{
-    DeploymentId, Digest, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName, TokenId, UserName,
-    Version,
+    DeploymentId, Digest, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag,
+    TaskName, TokenId, UserName, Version,
 };
 
-/// Every kind of name: what is accepted is written as it was read, has no control character, and where it becomes a file's
-/// name it is one component that is not `.` or `..`.
+/// Every kind of name: what is accepted is written as it was read, has no control character, and
+/// where it becomes a file's name it is one component that is not `.` or `..`.
 pub fn names(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let file_names = [
@@ -37,7 +37,10 @@ pub fn names(bytes: &[u8]) {
     exact::<LabelValue>(text);
     exact::<TopicPrefix>(text);
     if exact::<RepositoryName>(text) | exact::<OutputPath>(text) {
-        assert!(text.split('/').all(|name| !matches!(name, "" | "." | "..")), "{text:?} leaves its directory");
+        assert!(
+            text.split('/').all(|name| !matches!(name, "" | "." | "..")),
+            "{text:?} leaves its directory"
+        );
     }
     if let Ok(address) = text.parse::<MacAddress>() {
         assert_eq!(address.to_string().parse(), Ok(address));
@@ -58,7 +61,9 @@ pub fn selector(bytes: &[u8]) {
     let Some(selector) = same_again::<Selector>(text) else { return };
     let again: Selector = selector.to_string().parse().expect("a selector that was written");
     let id: RobotId = "r00000000000000a1".parse().expect("valid");
-    for (name, labels) in [("spare-1", ""), ("atlas", "site=lab"), ("r2", "site=lab,base=turtlebot")] {
+    for (name, labels) in
+        [("spare-1", ""), ("atlas", "site=lab"), ("r2", "site=lab,base=turtlebot")]
+    {
         let labels: Labels = labels
             .split(',')
             .filter_map(|label| label.split_once('='))
@@ -69,8 +74,8 @@ pub fn selector(bytes: &[u8]) {
     }
 }
 
-/// A token: as text it is what it was, and its secret shows nowhere else. The bytes are tried as they are and with the
-/// checksum that they would need.
+/// A token: as text it is what it was, and its secret shows nowhere else. The bytes are tried as
+/// they are and with the checksum that they would need.
 pub fn token(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let checksummed = format!("{text}_{:08x}", crc32fast::hash(text.as_bytes()));

@@ -31,7 +31,10 @@ pub fn task_toml(bytes: &[u8]) {
     };
     if problems.is_empty() {
         let written = serde_json::to_vec(&manifest).expect("what was read can be written");
-        assert_eq!(serde_json::from_slice::<TaskManifest>(&written).expect("what was written can be read"), manifest);
+        assert_eq!(
+            serde_json::from_slice::<TaskManifest>(&written).expect("what was written can be read"),
+            manifest
+        );
         self::manifest(&written);
     }
 }
@@ -41,22 +44,30 @@ pub fn package_xml(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let Ok(xml) = taskd::package::package_xml::parse(text) else { return };
     for depends in [&xml.exec_depends, &xml.conditional_depends] {
-        assert!(depends.is_sorted_by(|a, b| a < b) && depends.iter().all(|name| xml.depends_on(name)));
+        assert!(
+            depends.is_sorted_by(|a, b| a < b) && depends.iter().all(|name| xml.depends_on(name))
+        );
     }
 }
 
-/// A task manifest that breaks no rule: it stays in its own directory, and the script that starts it has each of its words
-/// in quotes, as one word.
+/// A task manifest that breaks no rule: it stays in its own directory, and the script that starts
+/// it has each of its words in quotes, as one word.
 pub fn manifest(bytes: &[u8]) {
     let Some(manifest) = same_again::<TaskManifest>(bytes) else { return };
     let problems = manifest.problems();
-    assert!(problems.iter().all(|problem| !problem.to_string().contains(char::is_control)), "{problems:?}");
+    assert!(
+        problems.iter().all(|problem| !problem.to_string().contains(char::is_control)),
+        "{problems:?}"
+    );
     if !problems.is_empty() {
         return;
     }
     for pattern in &manifest.outputs.paths {
         let path = Path::new(pattern);
-        assert!(path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir)), "{pattern:?}");
+        assert!(
+            path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir)),
+            "{pattern:?}"
+        );
     }
     let data = DataDir::new(Path::new("/data")).expect("absolute");
     let task = data.task(&manifest.name);
@@ -76,7 +87,10 @@ fn words(line: &str) -> Vec<String> {
     loop {
         let mut word = String::new();
         loop {
-            let (text, after) = rest.strip_prefix('\'').and_then(|rest| rest.split_once('\'')).expect("a quoted text");
+            let (text, after) = rest
+                .strip_prefix('\'')
+                .and_then(|rest| rest.split_once('\''))
+                .expect("a quoted text");
             word.push_str(text);
             rest = after;
             let Some(after) = rest.strip_prefix("\\'") else { break };

@@ -5,13 +5,14 @@ use std::collections::BTreeSet;
 use task_proto::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
 use taskd::http::registry::oci::parsed::Parsed;
 
-/// An OCI manifest: its parts are known each once, its texts fit a header, and one that calls itself a package is that
-/// package when it is written again.
+/// An OCI manifest: its parts are known each once, its texts fit a header, and one that calls
+/// itself a package is that package when it is written again.
 pub fn oci_manifest(bytes: &[u8]) {
     for content_type in [None, Some(MANIFEST_TYPE)] {
         let Ok(parsed) = Parsed::new(content_type, bytes) else { continue };
         assert_eq!(parsed.parts.iter().collect::<BTreeSet<_>>().len(), parsed.parts.len());
-        let texts = [Some(&parsed.media_type), parsed.artifact_type.as_ref(), parsed.subject.as_ref()];
+        let texts =
+            [Some(&parsed.media_type), parsed.artifact_type.as_ref(), parsed.subject.as_ref()];
         assert!(texts.into_iter().flatten().all(|text| !text.contains(char::is_control)));
         let Some(package) = parsed.package else { continue };
         assert_eq!(parsed.artifact_type.as_deref(), Some(PACKAGE_TYPE));
@@ -19,7 +20,9 @@ pub fn oci_manifest(bytes: &[u8]) {
         let again = Parsed::new(content_type, &written).expect("what was written can be read");
         assert_eq!((again.package.as_ref(), &again.parts), (Some(&package), &parsed.parts));
         if let Some((config, content)) = package.package_blobs() {
-            assert!(parsed.parts.contains(&config.digest) && parsed.parts.contains(&content.digest));
+            assert!(
+                parsed.parts.contains(&config.digest) && parsed.parts.contains(&content.digest)
+            );
         }
     }
 }

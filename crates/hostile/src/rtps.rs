@@ -1,4 +1,5 @@
-//! What anybody on the network sends to a participant of the ROS graph: datagrams, and samples of discovery in them.
+//! What anybody on the network sends to a participant of the ROS graph: datagrams, and samples of
+//! discovery in them.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::{Cell, RefCell};
@@ -7,7 +8,8 @@ use rustdds::fuzzing::Receiver;
 
 /// What one input may make a thread hold in the end, whatever it says.
 const MAX_KEPT_BYTES: usize = 64 << 20;
-/// What it may take meanwhile, all allocations together: a datagram of 64 KiB can have thousands of submessages.
+/// What it may take meanwhile, all allocations together: a datagram of 64 KiB can have thousands of
+/// submessages.
 const MAX_TAKEN_BYTES: usize = 256 << 20;
 /// The most datagrams of one input.
 const MAX_DATAGRAMS: usize = 64;
@@ -19,8 +21,8 @@ thread_local! {
     static RECEIVER: RefCell<Receiver> = RefCell::new(Receiver::new());
 }
 
-/// The system's allocator, which counts for each thread what is taken. A program that runs [`rtps`] has it as its own;
-/// without it nothing is counted.
+/// The system's allocator, which counts for each thread what is taken. A program that runs [`rtps`]
+/// has it as its own; without it nothing is counted.
 pub struct Counting;
 
 // SAFETY: all is passed on to the system's allocator as it comes.
@@ -57,8 +59,9 @@ fn count(taken: usize, freed: usize) {
     let _ = LARGEST.try_with(|largest| largest.set(largest.get().max(taken)));
 }
 
-/// Datagrams, each behind two bytes that say how long it is, and the same bytes as samples of discovery: nothing panics or
-/// hangs, no single allocation is larger than the largest sample that is assembled, and little is kept.
+/// Datagrams, each behind two bytes that say how long it is, and the same bytes as samples of
+/// discovery: nothing panics or hangs, no single allocation is larger than the largest sample that
+/// is assembled, and little is kept.
 pub fn rtps(bytes: &[u8]) {
     RECEIVER.with_borrow_mut(|receiver| {
         // What is made at the first use is not the input's.

@@ -10,7 +10,8 @@ use task_proto::report::{Condition, Phase, Report, Status};
 use task_proto::request::{Reply, Request};
 use taskd::domain::deployment::Standing;
 
-/// A report, a status or a batch of log lines. An assignment goes on from a report as one that has an end.
+/// A report, a status or a batch of log lines. An assignment goes on from a report as one that has
+/// an end.
 pub fn report(bytes: &[u8]) {
     same_again::<Status>(bytes);
     same_again::<LogBatch>(bytes);
@@ -21,7 +22,8 @@ pub fn report(bytes: &[u8]) {
     }
     for task in &report.tasks {
         for phase in Phase::ALL {
-            let standing = Standing { run: task.run, phase, progress: None, failure: None, attempts: 0 };
+            let standing =
+                Standing { run: task.run, phase, progress: None, failure: None, attempts: 0 };
             let Some(next) = standing.after(task) else { continue };
             assert!(!phase.is_final(), "{phase:?} was left");
             is_clean(&next.failure.map(|failure| failure.to_string()).unwrap_or_default());
@@ -30,7 +32,10 @@ pub fn report(bytes: &[u8]) {
 }
 
 fn is_clean(text: &str) {
-    assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?} has a control character");
+    assert!(
+        !text.contains(|c: char| c.is_control() && c != '\n'),
+        "{text:?} has a control character"
+    );
 }
 
 /// A question to a robot, or its answer.
@@ -39,7 +44,8 @@ pub fn reply(bytes: &[u8]) {
     same_again::<Reply>(bytes);
 }
 
-/// A part of a package, after eight bytes that are the package's size: what is accepted lies inside of the package.
+/// A part of a package, after eight bytes that are the package's size: what is accepted lies inside
+/// of the package.
 pub fn part(bytes: &[u8]) {
     let Some((size, message)) = bytes.split_first_chunk::<8>() else { return };
     let size = u64::from_be_bytes(*size);
@@ -54,7 +60,9 @@ pub fn part(bytes: &[u8]) {
 }
 
 /// The `T` that `bytes` are, if any; written and read again it is the same.
-pub(crate) fn same_again<T: DeserializeOwned + Serialize + PartialEq + Debug>(bytes: &[u8]) -> Option<T> {
+pub(crate) fn same_again<T: DeserializeOwned + Serialize + PartialEq + Debug>(
+    bytes: &[u8],
+) -> Option<T> {
     let read: T = serde_json::from_slice(bytes).ok()?;
     let written = serde_json::to_vec(&read).expect("what was read can be written");
     let again: T = serde_json::from_slice(&written).expect("what was written can be read");

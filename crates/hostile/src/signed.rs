@@ -13,8 +13,8 @@ const KEY: [u8; 32] = [9; 32];
 /// 2100: a state that expires later is in force.
 const NOW_MS: u64 = 4_102_444_800_000;
 
-/// An envelope, or what is said on a robot's `desired` topic: only what the key has signed comes out, and only blobs that
-/// hash to their name.
+/// An envelope, or what is said on a robot's `desired` topic: only what the key has signed comes
+/// out, and only blobs that hash to their name.
 pub fn envelope(bytes: &[u8]) {
     let (mut envelopes, mut inlines) = (Vec::new(), Vec::new());
     envelopes.extend(same_again::<Envelope>(bytes));
@@ -25,7 +25,11 @@ pub fn envelope(bytes: &[u8]) {
     let key = SigningKey::from_bytes(KEY).public_key();
     for envelope in envelopes {
         if let Ok(payload) = envelope.open(DESIRED_STATE_TYPE, &key) {
-            assert!(SIGNED.contains(&&*payload), "opened without a signature: {}", payload.escape_ascii());
+            assert!(
+                SIGNED.contains(&&*payload),
+                "opened without a signature: {}",
+                payload.escape_ascii()
+            );
         }
     }
     inlines.extend(same_again::<Inline>(bytes));
@@ -37,10 +41,11 @@ pub fn envelope(bytes: &[u8]) {
     }
 }
 
-/// A desired state that the server's key signed, whatever is in it: a robot obeys its own only, never one before it, and each
-/// task once.
+/// A desired state that the server's key signed, whatever is in it: a robot obeys its own only,
+/// never one before it, and each task once.
 pub fn desired(bytes: &[u8]) {
-    let (key, robot) = (SigningKey::from_bytes(KEY), "r00000000000000a1".parse::<RobotId>().expect("valid"));
+    let (key, robot) =
+        (SigningKey::from_bytes(KEY), "r00000000000000a1".parse::<RobotId>().expect("valid"));
     let envelope = Envelope::seal(DESIRED_STATE_TYPE, bytes, &key);
     let Ok(state) = admit(&envelope, &key.public_key(), &robot, None, NOW_MS) else { return };
     assert!(state.robot_id == robot && state.expires_at_ms > NOW_MS);
@@ -49,7 +54,8 @@ pub fn desired(bytes: &[u8]) {
     names.dedup();
     assert_eq!(names.len(), state.tasks.len());
     assert_eq!(same_again::<DesiredState>(bytes).as_ref(), Some(&state));
-    let again = admit(&envelope, &key.public_key(), &robot, Some(&state), NOW_MS).expect("the same state");
+    let again =
+        admit(&envelope, &key.public_key(), &robot, Some(&state), NOW_MS).expect("the same state");
     assert_eq!(again, state);
     if let Some(generation) = state.generation.0.checked_add(1) {
         let newer = DesiredState { generation: Generation(generation), ..state.clone() };

@@ -3,7 +3,8 @@
 use bytes::BytesMut;
 use task_transport::websocket::frame::{Decoder, Opcode, Piece, Role, Violation, encode};
 
-/// Frames: it does not matter in which pieces they come, and what they carry arrives again when it is sent on.
+/// Frames: it does not matter in which pieces they come, and what they carry arrives again when it
+/// is sent on.
 pub fn websocket(bytes: &[u8]) {
     for role in [Role::Server, Role::Client] {
         let whole = read(role, bytes, bytes.len());
@@ -42,7 +43,9 @@ fn read(role: Role, bytes: &[u8], piece_bytes: usize) -> (Vec<Came>, Option<Viol
             match (decoder.decode(&mut input), all.last_mut()) {
                 (Ok(None), _) => break,
                 (Ok(Some(Piece::Data(data))), _) if data.is_empty() => {}
-                (Ok(Some(Piece::Data(data))), Some(Came::Data(before))) => before.extend_from_slice(&data),
+                (Ok(Some(Piece::Data(data))), Some(Came::Data(before))) => {
+                    before.extend_from_slice(&data)
+                }
                 (Ok(Some(Piece::Data(data))), _) => all.push(Came::Data(data.to_vec())),
                 (Ok(Some(other)), _) => all.push(Came::Other(other)),
                 (Err(violation), _) => return (all, Some(violation)),

@@ -1,5 +1,6 @@
-//! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the server's clock, sizes are
-//! bytes. Unknown fields are tolerated in answers; requests are checked by the server.
+//! Bodies of the HTTP API under `/api/v1`. Times are milliseconds since the Unix epoch by the
+//! server's clock, sizes are bytes. Unknown fields are tolerated in answers; requests are checked
+//! by the server.
 
 mod awaited;
 mod bulk;
@@ -23,26 +24,30 @@ pub use self::bulk::{BulkLabels, BulkRemove};
 pub use self::conduct::ConductTotals;
 pub use self::delivery::{DeliveryChoice, DeliveryDecision, MAX_PRIORITY, MIN_PRIORITY};
 pub use self::enrolment::{
-    AWAITS_APPROVAL, CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView, PendingRobot,
-    PendingRobotList,
+    AWAITS_APPROVAL, CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList,
+    EnrollmentTokenView, PendingRobot, PendingRobotList,
 };
 pub use self::feed::{FeedEntry, FeedKind, FeedPage, MAX_FEED_ENTRIES};
 pub use self::history::{MAX_TIMELINE, PastAssignment, TaskHistory, TimelineEntry, VitalsView};
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
-pub use self::mqtt::{BrokerCheck, BrokerChecks, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile};
+pub use self::mqtt::{
+    BrokerCheck, BrokerChecks, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile,
+};
 pub use self::orders::{RetryDeployment, RolledBack};
 pub use self::packages::{
-    ChangedFile, PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageUse, PackageVersions,
-    PackageView,
+    ChangedFile, PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageUse,
+    PackageVersions, PackageView,
 };
 pub use self::people::{
-    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, ProviderView,
-    SessionView, SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList, UserView,
+    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me,
+    ProviderView, SessionView, SetPassword, SignIn, TokenList, TokenOrigin, TokenView, UserList,
+    UserView,
 };
 pub use self::server::{HttpTraffic, MqttConnection, MqttTraffic, ServerInfo, Traffic};
 pub use self::status::{
-    BrokerStatus, DatabaseStatus, DiskStatus, LimitView, ListenerView, MAX_SITES, ReportStatus, RobotCounts,
-    RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus, Subscription, TransferStatus,
+    BrokerStatus, DatabaseStatus, DiskStatus, LimitView, ListenerView, MAX_SITES, ReportStatus,
+    RobotCounts, RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus,
+    Subscription, TransferStatus,
 };
 use crate::desired::{PackageRef, Wanted};
 use crate::envelope::PublicKey;
@@ -61,7 +66,8 @@ pub const BASE: &str = "/api/v1";
 pub const INSTANCE_HEADER: &str = "taskd-instance";
 /// The header by which an agent says where it runs, as in its reports.
 pub const PLACE_HEADER: &str = "taskd-place";
-/// Request header that makes an order safe to retry: the same key gives the same deployment. 1 to 128 visible characters.
+/// Request header that makes an order safe to retry: the same key gives the same deployment. 1 to
+/// 128 visible characters.
 pub const IDEMPOTENCY_KEY: &str = "idempotency-key";
 
 /// Every error's body.
@@ -76,7 +82,8 @@ pub struct ErrorBody {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ApiError {
-    /// `not_found`, `invalid_request`, `unauthorized`, `forbidden`, `mac_known`, `no_robots_match`, …
+    /// `not_found`, `invalid_request`, `unauthorized`, `forbidden`, `mac_known`, `no_robots_match`,
+    /// …
     pub code: String,
     /// What went wrong, naming the caller's own key.
     pub message: String,
@@ -112,12 +119,14 @@ pub struct EnrollResponse {
     pub token: String,
     /// How to reach MQTT.
     pub mqtt: MqttEndpoint,
-    /// Whether it waits to be approved: until then it is refused everything with the code [`AWAITS_APPROVAL`].
+    /// Whether it waits to be approved: until then it is refused everything with the code
+    /// [`AWAITS_APPROVAL`].
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub awaits_approval: bool,
 }
 
-/// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use ends the one before.
+/// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use
+/// ends the one before.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotToken {
@@ -125,13 +134,15 @@ pub struct RobotToken {
     pub token: String,
 }
 
-/// `GET /robots` (read), optionally `?selector=`, and `?limit=` (1 to 1,000) with `?after=`, a robot's name, for a page.
+/// `GET /robots` (read), optionally `?selector=`, and `?limit=` (1 to 1,000) with `?after=`, a
+/// robot's name, for a page.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotList {
     /// Sorted by name.
     pub robots: Vec<RobotView>,
-    /// Names and ids in the selector that none of one's robots has, sorted: an order with this selector is refused.
+    /// Names and ids in the selector that none of one's robots has, sorted: an order with this
+    /// selector is refused.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub unknown: Vec<RobotName>,
     /// On a page that is not the last: what `after` has to be for the next one.
@@ -242,7 +253,9 @@ pub struct EditRobot {
 }
 
 /// Null is something that was given.
-fn given<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<Option<T>, D::Error> {
+fn given<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
+    deserializer: D,
+) -> Result<Option<T>, D::Error> {
     T::deserialize(deserializer).map(Some)
 }
 
@@ -309,8 +322,8 @@ pub struct CreateDeployment {
     /// Seconds until what is not done expires; absent: the server's setting.
     #[serde(default)]
     pub expires_in_s: Option<u64>,
-    /// Run a service anew also on robots that run this package already. Otherwise it goes on there, and those robots have
-    /// settled at once.
+    /// Run a service anew also on robots that run this package already. Otherwise it goes on there,
+    /// and those robots have settled at once.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub restart: bool,
     /// Only say which robots it would be. Stores nothing, needs no key.
@@ -359,8 +372,8 @@ pub struct MatchedRobot {
 /// The most that one page of a list holds.
 pub const MOST_ON_A_PAGE: u32 = 1_000;
 
-/// `GET /deployments` (read): the newest first, without assignments; optionally `?limit=` (1 to 1,000) with `?before=`, a
-/// deployment's id, for a page.
+/// `GET /deployments` (read): the newest first, without assignments; optionally `?limit=` (1 to
+/// 1,000) with `?before=`, a deployment's id, for a page.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeploymentList {
@@ -381,8 +394,8 @@ pub struct DeploymentView {
     pub package: PackageRef,
     /// Service or job.
     pub kind: TaskKind,
-    /// The selector as it was given. Absent in lists and events where it is longer than 1,000 characters, and for who is
-    /// limited to some robots: it may name others.
+    /// The selector as it was given. Absent in lists and events where it is longer than 1,000
+    /// characters, and for who is limited to some robots: it may name others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selector: Option<Selector>,
     /// How the bytes travel, as it was ordered.
@@ -469,7 +482,8 @@ pub struct AssignmentView {
     pub timeline: Option<Vec<TimelineEntry>>,
 }
 
-/// `POST /tasks/{task}/{start|stop|restart|remove|rollback}` (operate), with an `Idempotency-Key` header.
+/// `POST /tasks/{task}/{start|stop|restart|remove|rollback}` (operate), with an `Idempotency-Key`
+/// header.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OrderTask {
@@ -480,8 +494,9 @@ pub struct OrderTask {
     pub dry_run: bool,
 }
 
-/// What `GET /events` (read) streams: each is the `data` of a server-sent event whose `event` is the tag's value.
-/// A view replaces what was known before. After (re)connecting, fetch the lists once.
+/// What `GET /events` (read) streams: each is the `data` of a server-sent event whose `event` is
+/// the tag's value. A view replaces what was known before. After (re)connecting, fetch the lists
+/// once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]

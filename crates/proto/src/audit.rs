@@ -1,6 +1,7 @@
-//! The audit: who did what to what, from where. Entries are numbered from 1 and chained: the digest of each covers its own
-//! text and the digest before it, so whoever changes, drops or inserts one has to change all that follow. It says what an
-//! entry is and whether a chain holds; where entries are kept is the server's.
+//! The audit: who did what to what, from where. Entries are numbered from 1 and chained: the digest
+//! of each covers its own text and the digest before it, so whoever changes, drops or inserts one
+//! has to change all that follow. It says what an entry is and whether a chain holds; where entries
+//! are kept is the server's.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -18,7 +19,8 @@ pub struct AuditEntry {
     pub number: u64,
     /// When, by the server's clock.
     pub at_ms: u64,
-    /// Who: a user's name, `operator.token` for the first token, or `enrolment` for a machine that enrols.
+    /// Who: a user's name, `operator.token` for the first token, or `enrolment` for a machine that
+    /// enrols.
     pub who: String,
     /// By which token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -76,11 +78,17 @@ impl Link {
     /// Goes one record on; an error if that is not the one that belongs here.
     pub fn follow(self, record: &AuditRecord) -> Result<Self, BrokenChain> {
         let next = self.next(record.entry.get());
-        let Some(entry) = record.read() else { return Err(BrokenChain::Unreadable { number: next.number }) };
+        let Some(entry) = record.read() else {
+            return Err(BrokenChain::Unreadable { number: next.number });
+        };
         if entry.number != next.number {
             return Err(BrokenChain::Missing { expected: next.number, found: entry.number });
         }
-        if record.digest == next.digest { Ok(next) } else { Err(BrokenChain::Changed { number: next.number }) }
+        if record.digest == next.digest {
+            Ok(next)
+        } else {
+            Err(BrokenChain::Changed { number: next.number })
+        }
     }
 }
 
@@ -96,7 +104,9 @@ pub enum BrokenChain {
         found: u64,
     },
     /// An entry is not what it was, or the ones before it are not.
-    #[error("entry {number} does not fit what is before it: it, or something before it, was changed")]
+    #[error(
+        "entry {number} does not fit what is before it: it, or something before it, was changed"
+    )]
     Changed {
         /// Which.
         number: u64,
@@ -116,7 +126,16 @@ mod tests {
     fn entry(number: u64) -> AuditEntry {
         let (who, act) = ("alice".to_owned(), "robot.edit".to_owned());
         let target = format!("r{number}");
-        AuditEntry { number, at_ms: 5, who, token: None, address: None, act, target, detail: BTreeMap::new() }
+        AuditEntry {
+            number,
+            at_ms: 5,
+            who,
+            token: None,
+            address: None,
+            act,
+            target,
+            detail: BTreeMap::new(),
+        }
     }
 
     fn chain(entries: impl IntoIterator<Item = AuditEntry>) -> Vec<AuditRecord> {
@@ -138,8 +157,10 @@ mod tests {
         let records = chain((1..=4).map(entry));
         let last = verified(&records).expect("holds");
         assert_eq!((last.number, last.digest), (4, records[3].digest));
-        let lines: Vec<String> = records.iter().map(|record| serde_json::to_string(record).expect("json")).collect();
-        let read: Vec<AuditRecord> = lines.iter().map(|line| serde_json::from_str(line).expect("a record")).collect();
+        let lines: Vec<String> =
+            records.iter().map(|record| serde_json::to_string(record).expect("json")).collect();
+        let read: Vec<AuditRecord> =
+            lines.iter().map(|line| serde_json::from_str(line).expect("a record")).collect();
         assert_eq!(verified(&read), Ok(last));
     }
 

@@ -1,5 +1,5 @@
-//! What `taskd doctor` and `task-agent doctor` have found: each check with its verdict in words, and how to mend what is
-//! wrong. Data and text; who checks reads it elsewhere.
+//! What `taskd doctor` and `task-agent doctor` have found: each check with its verdict in words,
+//! and how to mend what is wrong. Data and text; who checks reads it elsewhere.
 
 use serde::{Deserialize, Serialize};
 
@@ -72,8 +72,8 @@ impl Checkup {
         self.checks.iter().all(|check| check.verdict != Verdict::Bad)
     }
 
-    /// A line for each check, below it how to mend it, and at the end how many are not good. Control characters are left
-    /// out; `paint` may put colours around a sign.
+    /// A line for each check, below it how to mend it, and at the end how many are not good.
+    /// Control characters are left out; `paint` may put colours around a sign.
     pub fn text(&self, paint: impl Fn(Verdict) -> String) -> String {
         let one_line = |text: &str| text.replace(char::is_control, " ");
         let mut text = String::new();

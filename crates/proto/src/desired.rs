@@ -1,5 +1,5 @@
-//! The state a robot should be in: one signed document per robot and generation, and how it is announced.
-//! Whatever is absent from the document should be absent from the robot.
+//! The state a robot should be in: one signed document per robot and generation, and how it is
+//! announced. Whatever is absent from the document should be absent from the robot.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -12,7 +12,8 @@ use crate::envelope::Envelope;
 use crate::settings::{RobotSettings, each_readable};
 use crate::{DeploymentId, Digest, Generation, RobotId, TaskName, Version};
 
-/// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message; above it only the generation does.
+/// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message; above it only
+/// the generation does.
 pub const MAX_PUSHED_ENVELOPE_BYTES: usize = 64 * 1024;
 /// The largest [`Doorbell`], in bytes of JSON: an envelope and the blobs that ride beside it.
 pub const MAX_DOORBELL_BYTES: usize = 128 * 1024;
@@ -30,16 +31,21 @@ pub struct DesiredState {
     pub expires_at_ms: u64,
     /// The tasks, at most one of a name, sorted by name.
     pub tasks: Vec<DesiredTask>,
-    /// Where a robot that asks whether it may run them finds what publishers have signed. It is no part of what is
-    /// desired: it may change without the generation.
+    /// Where a robot that asks whether it may run them finds what publishers have signed. It is no
+    /// part of what is desired: it may change without the generation.
     #[serde(default, skip_serializing_if = "Evidence::is_empty")]
     pub evidence: Evidence,
     /// What the robot's administrator has set at the server; the robot's own settings win.
-    #[serde(default, skip_serializing_if = "RobotSettings::is_empty", deserialize_with = "each_readable")]
+    #[serde(
+        default,
+        skip_serializing_if = "RobotSettings::is_empty",
+        deserialize_with = "each_readable"
+    )]
     pub settings: RobotSettings,
 }
 
-/// Blobs that publishers have signed, see [`crate::publisher`]. That the server names them proves nothing.
+/// Blobs that publishers have signed, see [`crate::publisher`]. That the server names them proves
+/// nothing.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Evidence {
@@ -148,7 +154,9 @@ pub enum Wanted {
 }
 
 /// How a package's bytes travel to a robot.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Delivery {
@@ -158,7 +166,8 @@ pub enum Delivery {
     DirectPush,
     /// They ride beside the state, see [`Inline`].
     Inline,
-    /// MQTT pushes the link, the robot pulls over HTTP. Also what an agent does with a mechanism it does not know.
+    /// MQTT pushes the link, the robot pulls over HTTP. Also what an agent does with a mechanism it
+    /// does not know.
     #[default]
     #[serde(other)]
     PushPull,
@@ -207,8 +216,8 @@ pub enum Doorbell {
     },
 }
 
-/// Blobs that ride beside a signed state, in base64. They are not signed: they are only reached by the digest that the
-/// state names, which they must hash to.
+/// Blobs that ride beside a signed state, in base64. They are not signed: they are only reached by
+/// the digest that the state names, which they must hash to.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Inline(BTreeMap<Digest, Vec<u8>>);
 
@@ -232,7 +241,8 @@ impl Inline {
 
 impl Serialize for Inline {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(self.0.iter().map(|(digest, bytes)| (digest, STANDARD.encode(bytes))))
+        serializer
+            .collect_map(self.0.iter().map(|(digest, bytes)| (digest, STANDARD.encode(bytes))))
     }
 }
 
@@ -240,9 +250,9 @@ impl Serialize for Inline {
 impl<'de> Deserialize<'de> for Inline {
     fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let given: BTreeMap<String, serde_json::Value> = Deserialize::deserialize(deserializer)?;
-        let readable = given
-            .into_iter()
-            .filter_map(|(digest, text)| Some((digest.parse().ok()?, STANDARD.decode(text.as_str()?).ok()?)));
+        let readable = given.into_iter().filter_map(|(digest, text)| {
+            Some((digest.parse().ok()?, STANDARD.decode(text.as_str()?).ok()?))
+        });
         Ok(Self(readable.collect()))
     }
 }
@@ -260,7 +270,8 @@ mod tests {
         let mut inline = Inline::default();
         inline.insert(Digest::of(b"true"), b"true".to_vec());
         inline.insert(Digest::of(b"other"), b"false".to_vec());
-        let read: Inline = serde_json::from_value(serde_json::to_value(&inline).expect("json")).expect("reads");
+        let read: Inline =
+            serde_json::from_value(serde_json::to_value(&inline).expect("json")).expect("reads");
         assert_eq!(read, inline);
         assert_eq!(read.get(&blob(b"true")), Some(&b"true"[..]));
         assert_eq!(read.get(&blob(b"other")), None);

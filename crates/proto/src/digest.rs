@@ -1,5 +1,5 @@
-//! Content digests (OCI image-spec, "Digests"): `sha256:<64 hex digits>`, or `sha512:<128 hex digits>`, which the registry
-//! takes as well. What robots get has the first.
+//! Content digests (OCI image-spec, "Digests"): `sha256:<64 hex digits>`, or
+//! `sha512:<128 hex digits>`, which the registry takes as well. What robots get has the first.
 
 use std::fmt;
 use std::str::FromStr;
@@ -90,7 +90,10 @@ impl Digest {
 /// Lower-case hex.
 pub fn hex(bytes: &[u8]) -> String {
     const DIGITS: &[u8; 16] = b"0123456789abcdef";
-    bytes.iter().flat_map(|b| [DIGITS[(b >> 4) as usize] as char, DIGITS[(b & 15) as usize] as char]).collect()
+    bytes
+        .iter()
+        .flat_map(|b| [DIGITS[(b >> 4) as usize] as char, DIGITS[(b & 15) as usize] as char])
+        .collect()
 }
 
 /// The bytes of `N` × 2 lower-case hex digits; `None` for anything else.

@@ -1,6 +1,6 @@
-//! DSSE envelopes (Dead Simple Signing Envelope, protocol v1.0.2) over ed25519: how desired states, packages and lists of
-//! publishers are signed. Whoever is to believe a payload reaches it through [`Envelope::open`] or [`Envelope::signers`],
-//! which verify first.
+//! DSSE envelopes (Dead Simple Signing Envelope, protocol v1.0.2) over ed25519: how desired states,
+//! packages and lists of publishers are signed. Whoever is to believe a payload reaches it through
+//! [`Envelope::open`] or [`Envelope::signers`], which verify first.
 
 use std::fmt;
 use std::str::FromStr;
@@ -16,7 +16,8 @@ use crate::publisher::MAX_KEYS;
 /// The payload type of a signed [`crate::desired::DesiredState`].
 pub const DESIRED_STATE_TYPE: &str = "application/vnd.taskd.desired.v1+json";
 
-/// A signed payload: JSON `{"payload": base64, "payloadType": text, "signatures": [{"keyid", "sig": base64}]}`.
+/// A signed payload: JSON `{"payload": base64, "payloadType": text, "signatures": [{"keyid", "sig":
+/// base64}]}`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Envelope {
@@ -63,17 +64,28 @@ impl Envelope {
         Self {
             payload: STANDARD.encode(payload),
             payload_type: payload_type.to_owned(),
-            signatures: vec![EnvelopeSignature { keyid: key.public_key().id(), sig: STANDARD.encode(sig.to_bytes()) }],
+            signatures: vec![EnvelopeSignature {
+                keyid: key.public_key().id(),
+                sig: STANDARD.encode(sig.to_bytes()),
+            }],
         }
     }
 
     /// A payload that nobody has signed yet.
     pub fn unsigned(payload_type: &'static str, payload: &[u8]) -> Self {
-        Self { payload: STANDARD.encode(payload), payload_type: payload_type.to_owned(), signatures: Vec::new() }
+        Self {
+            payload: STANDARD.encode(payload),
+            payload_type: payload_type.to_owned(),
+            signatures: Vec::new(),
+        }
     }
 
     /// Adds a signature of the same payload by another key; one that has signed already stays once.
-    pub fn sign_also(&mut self, expected: &'static str, key: &SigningKey) -> Result<(), EnvelopeError> {
+    pub fn sign_also(
+        &mut self,
+        expected: &'static str,
+        key: &SigningKey,
+    ) -> Result<(), EnvelopeError> {
         let payload = self.unverified_payload(expected)?;
         if self.has_signed(&pre_authentication_encoding(expected, &payload), &key.public_key()) {
             return Ok(());
@@ -85,7 +97,8 @@ impl Envelope {
         Ok(())
     }
 
-    /// The payload, once a signature by `key` has been verified. Key ids are hints only and are not trusted.
+    /// The payload, once a signature by `key` has been verified. Key ids are hints only and are not
+    /// trusted.
     pub fn open(&self, expected: &'static str, key: &PublicKey) -> Result<Vec<u8>, EnvelopeError> {
         let payload = self.unverified_payload(expected)?;
         let signed = self.has_signed(&pre_authentication_encoding(expected, &payload), key);
@@ -109,10 +122,14 @@ impl Envelope {
         Ok((payload, signers))
     }
 
-    /// The payload as somebody sent it, for whoever shows it, signs it or only passes it on. It proves nothing.
+    /// The payload as somebody sent it, for whoever shows it, signs it or only passes it on. It
+    /// proves nothing.
     pub fn unverified_payload(&self, expected: &'static str) -> Result<Vec<u8>, EnvelopeError> {
         if self.payload_type != expected {
-            return Err(EnvelopeError::WrongType { found: self.payload_type.chars().take(80).collect(), expected });
+            return Err(EnvelopeError::WrongType {
+                found: self.payload_type.chars().take(80).collect(),
+                expected,
+            });
         }
         STANDARD.decode(&self.payload).map_err(|_| EnvelopeError::Encoding("payload"))
     }
@@ -122,10 +139,12 @@ impl Envelope {
         self.signatures.iter().take(MAX_SIGNATURES).map(|signature| signature.keyid.as_str())
     }
 
-    /// Whether one of the signatures is by `key`. One that names another key is not tried: a verification costs time.
+    /// Whether one of the signatures is by `key`. One that names another key is not tried: a
+    /// verification costs time.
     fn has_signed(&self, message: &[u8], key: &PublicKey) -> bool {
         let id = key.id();
-        let may_be = |signature: &&EnvelopeSignature| signature.keyid.is_empty() || signature.keyid == id;
+        let may_be =
+            |signature: &&EnvelopeSignature| signature.keyid.is_empty() || signature.keyid == id;
         self.signatures.iter().take(MAX_SIGNATURES).filter(may_be).any(|signature| {
             STANDARD
                 .decode(&signature.sig)
@@ -136,13 +155,15 @@ impl Envelope {
     }
 }
 
-/// More signatures than this are not looked at: each costs a verification. All keepers of a list of publishers may have to
-/// sign one that hands over to as many others, who sign it too.
+/// More signatures than this are not looked at: each costs a verification. All keepers of a list of
+/// publishers may have to sign one that hands over to as many others, who sign it too.
 const MAX_SIGNATURES: usize = 2 * MAX_KEYS;
 
-/// DSSE's `PAE(type, body)`: "DSSEv1", then each field's length and bytes, separated by single spaces.
+/// DSSE's `PAE(type, body)`: "DSSEv1", then each field's length and bytes, separated by single
+/// spaces.
 fn pre_authentication_encoding(payload_type: &str, payload: &[u8]) -> Vec<u8> {
-    let mut encoded = format!("DSSEv1 {} {payload_type} {} ", payload_type.len(), payload.len()).into_bytes();
+    let mut encoded =
+        format!("DSSEv1 {} {payload_type} {} ", payload_type.len(), payload.len()).into_bytes();
     encoded.extend_from_slice(payload);
     encoded
 }
@@ -243,7 +264,10 @@ mod tests {
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, b"{}", &key);
         assert_eq!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Ok(b"{}".to_vec()));
         let stranger = SigningKey::from_bytes([8; 32]).public_key();
-        assert_eq!(envelope.open(DESIRED_STATE_TYPE, &stranger), Err(EnvelopeError::NotSigned(stranger.id())));
+        assert_eq!(
+            envelope.open(DESIRED_STATE_TYPE, &stranger),
+            Err(EnvelopeError::NotSigned(stranger.id()))
+        );
     }
 
     #[test]
@@ -261,7 +285,10 @@ mod tests {
         envelope.signatures[0].keyid = eve.public_key().id();
         assert_eq!(envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1, [&keys[0]]);
         envelope.signatures[0].keyid.clear();
-        assert_eq!(envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1, [&keys[0], &keys[2]]);
+        assert_eq!(
+            envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1,
+            [&keys[0], &keys[2]]
+        );
         assert!(envelope.signers("text/plain", &keys).is_err());
     }
 
@@ -270,9 +297,15 @@ mod tests {
         let key = SigningKey::from_bytes([7; 32]);
         let mut envelope = Envelope::seal(DESIRED_STATE_TYPE, b"{\"generation\":1}", &key);
         envelope.payload = STANDARD.encode(b"{\"generation\":2}");
-        assert!(matches!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Err(EnvelopeError::NotSigned(_))));
+        assert!(matches!(
+            envelope.open(DESIRED_STATE_TYPE, &key.public_key()),
+            Err(EnvelopeError::NotSigned(_))
+        ));
         envelope.payload_type = "text/plain".to_owned();
-        assert!(matches!(envelope.open(DESIRED_STATE_TYPE, &key.public_key()), Err(EnvelopeError::WrongType { .. })));
+        assert!(matches!(
+            envelope.open(DESIRED_STATE_TYPE, &key.public_key()),
+            Err(EnvelopeError::WrongType { .. })
+        ));
     }
 
     #[test]

@@ -1,6 +1,8 @@
-//! What a parser says it expected, in the words of the files that people write. It knows no file and no key.
+//! What a parser says it expected, in the words of the files that people write. It knows no file
+//! and no key.
 
-/// A message of serde's with its types named as TOML and JSON have them: `expected a sequence` becomes `expected a list`.
+/// A message of serde's with its types named as TOML and JSON have them: `expected a sequence`
+/// becomes `expected a list`.
 ///
 /// ```
 /// use task_proto::expected::in_file_words;

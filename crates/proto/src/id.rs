@@ -1,5 +1,5 @@
-//! Names and numbers that identify things: each parsed once at the edge, then passed around as its own type.
-//! It never looks anything up.
+//! Names and numbers that identify things: each parsed once at the edge, then passed around as its
+//! own type. It never looks anything up.
 
 use std::borrow::Borrow;
 use std::collections::BTreeMap;
@@ -92,8 +92,8 @@ fn random_hex(prefix: char) -> String {
 }
 
 text_id!(
-    /// A robot's server-issued identity: `r` and 16 lower-case hex digits. It is also the robot's MQTT client id and
-    /// user name, and is never used twice.
+    /// A robot's server-issued identity: `r` and 16 lower-case hex digits. It is also the robot's
+    /// MQTT client id and user name, and is never used twice.
     RobotId like "r00000000000000a1" r"^r[0-9a-f]{16}$",
     "robot id", "the letter r and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'r')
 );
@@ -113,7 +113,8 @@ text_id!(
     "request id", "the letter q and 16 lower-case hex digits", |t| is_prefixed_hex(t, 'q')
 );
 text_id!(
-    /// A node's, topic's or service's full name on a ROS graph, `/robot/scan`; from the ROS 2 design article on names.
+    /// A node's, topic's or service's full name on a ROS graph, `/robot/scan`; from the ROS 2
+    /// design article on names.
     GraphName like "/robot/scan" r"^(/[A-Za-z_][A-Za-z0-9_]*)+$",
     "ROS name", "like /robot/scan: letters, digits and '_' in parts that begin with no digit, at most 255 bytes", |t| {
         let part_ok = |part: &str| {
@@ -124,8 +125,8 @@ text_id!(
     }
 );
 text_id!(
-    /// The name of a package and of the task it becomes on a robot. It is one component of an OCI repository name, so it
-    /// is also safe as a file name.
+    /// The name of a package and of the task it becomes on a robot. It is one component of an OCI
+    /// repository name, so it is also safe as a file name.
     TaskName like "corridor_mapping" r"^[a-z0-9]+([._-][a-z0-9]+)*$",
     "package name",
     "at most 64 lower-case letters and digits, joined by single '.', '_' or '-'", |t| {
@@ -165,8 +166,8 @@ impl RepositoryName {
 }
 
 text_id!(
-    /// A file that came back from a task, by its path below the task's directory. It can't leave the directory it is
-    /// written into.
+    /// A file that came back from a task, by its path below the task's directory. It can't leave
+    /// the directory it is written into.
     OutputPath like "maps/corridor.pgm" r"^[^/]+(/[^/]+)*$",
     "path of an output",
     "at most 1024 bytes of printable names, none of them '.' or '..', joined by single '/'", |t| {
@@ -238,11 +239,14 @@ fn is_repository_component(text: &str) -> bool {
     let bytes = text.as_bytes();
     bytes.first().is_some_and(|&b| is_word(b))
         && bytes.last().is_some_and(|&b| is_word(b))
-        && bytes.chunk_by(|&a, &b| is_word(a) == is_word(b)).all(|run| is_word(run[0]) || is_separator(run))
+        && bytes
+            .chunk_by(|&a, &b| is_word(a) == is_word(b))
+            .all(|run| is_word(run[0]) || is_separator(run))
 }
 
 fn is_label_text(text: &str) -> bool {
-    text.len() <= 63 && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'/' | b'-'))
+    text.len() <= 63
+        && text.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'/' | b'-'))
 }
 
 /// A robot's labels, sorted by key.
@@ -277,7 +281,9 @@ impl InstanceId {
 }
 
 /// The number of a robot's desired state. It only grows; zero means "none yet".
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(transparent)]
 pub struct Generation(pub u64);
@@ -295,14 +301,16 @@ impl fmt::Display for Generation {
     }
 }
 
-/// An IEEE 802 MAC-48 address, written `aa:bb:cc:dd:ee:ff`; `-` as separator and capitals are read as well.
+/// An IEEE 802 MAC-48 address, written `aa:bb:cc:dd:ee:ff`; `-` as separator and capitals are read
+/// as well.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[0-9A-Fa-f]{2}([:-][0-9A-Fa-f]{2}){5}$", example = "02:00:00:00:00:01"))]
 #[serde(try_from = "String", into = "String")]
 pub struct MacAddress([u8; 6]);
 
 impl MacAddress {
-    /// From its six octets, first on the wire first. `None` for all zeros and for group addresses, which no NIC has.
+    /// From its six octets, first on the wire first. `None` for all zeros and for group addresses,
+    /// which no NIC has.
     pub fn from_octets(octets: [u8; 6]) -> Option<Self> {
         (octets != [0; 6] && octets[0] & 1 == 0).then_some(Self(octets))
     }
@@ -316,12 +324,18 @@ impl MacAddress {
 impl FromStr for MacAddress {
     type Err = InvalidId;
     fn from_str(text: &str) -> Result<Self, InvalidId> {
-        let invalid =
-            || InvalidId::new("MAC address", text, "six two-digit hex octets like 02:00:00:00:00:01, of one NIC");
+        let invalid = || {
+            InvalidId::new(
+                "MAC address",
+                text,
+                "six two-digit hex octets like 02:00:00:00:00:01, of one NIC",
+            )
+        };
         let mut octets = [0; 6];
         let mut parts = text.split([':', '-']);
         for octet in &mut octets {
-            let part = parts.next().filter(|p| p.len() == 2 && p.bytes().all(|b| b.is_ascii_hexdigit()));
+            let part =
+                parts.next().filter(|p| p.len() == 2 && p.bytes().all(|b| b.is_ascii_hexdigit()));
             *octet = u8::from_str_radix(part.ok_or_else(invalid)?, 16).map_err(|_| invalid())?;
         }
         if parts.next().is_some() {
@@ -372,7 +386,21 @@ mod tests {
             assert!(good.parse::<RepositoryName>().is_ok(), "{good}");
         }
         let long = "a/".repeat(200);
-        for bad in ["", "/", "a/", "/a", "a//b", "a___b", "a..b", "a_-b", "-a", "a/B", "a/..", "a b", long.as_str()] {
+        for bad in [
+            "",
+            "/",
+            "a/",
+            "/a",
+            "a//b",
+            "a___b",
+            "a..b",
+            "a_-b",
+            "-a",
+            "a/B",
+            "a/..",
+            "a b",
+            long.as_str(),
+        ] {
             assert!(bad.parse::<RepositoryName>().is_err(), "{bad}");
         }
         assert!("v1.0_x-Y".parse::<Tag>().is_ok());

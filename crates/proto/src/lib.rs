@@ -1,5 +1,6 @@
-//! Wire types shared by server, agent and bench: everything that crosses the network or a disk both sides read.
-//! It never does I/O and never reads a clock; randomness and time are arguments or explicit constructors.
+//! Wire types shared by server, agent and bench: everything that crosses the network or a disk both
+//! sides read. It never does I/O and never reads a clock; randomness and time are arguments or
+//! explicit constructors.
 
 pub mod api;
 pub mod audit;
@@ -30,7 +31,7 @@ pub mod vitals;
 
 pub use digest::Digest;
 pub use id::{
-    AbsolutePath, DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag, TaskName,
-    TokenId, UserName, Version,
+    AbsolutePath, DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId,
+    RobotName, Tag, TaskName, TokenId, UserName, Version,
 };
 pub use pin::CaPin;

@@ -1,5 +1,6 @@
-//! Lines of a program's own log: whatever names and texts of others are in an event, it stays one line, and orders no terminal
-//! about. It opens nothing; it stands before what the log is written to.
+//! Lines of a program's own log: whatever names and texts of others are in an event, it stays one
+//! line, and orders no terminal about. It opens nothing; it stands before what the log is written
+//! to.
 
 use std::io::{self, Write};
 
@@ -13,7 +14,8 @@ pub struct OneLineEach<W> {
 }
 
 impl<W: Write> OneLineEach<W> {
-    /// To `to`. `has_colours`: the log's formatter puts escape sequences into events, and makes those in values harmless.
+    /// To `to`. `has_colours`: the log's formatter puts escape sequences into events, and makes
+    /// those in values harmless.
     pub fn new(to: W, has_colours: bool) -> Self {
         Self { to, has_colours }
     }
@@ -21,7 +23,8 @@ impl<W: Write> OneLineEach<W> {
 
 impl<W: Write> Write for OneLineEach<W> {
     fn write(&mut self, event: &[u8]) -> io::Result<usize> {
-        self.to.write_all(one_line(&String::from_utf8_lossy(event), self.has_colours).as_bytes())?;
+        self.to
+            .write_all(one_line(&String::from_utf8_lossy(event), self.has_colours).as_bytes())?;
         Ok(event.len())
     }
 
@@ -38,7 +41,8 @@ fn one_line(event: &str, has_colours: bool) -> String {
         _ if c.is_control() => REPLACEMENT,
         _ => c,
     };
-    let mut line: String = event.strip_suffix('\n').unwrap_or(event).chars().map(harmless).collect();
+    let mut line: String =
+        event.strip_suffix('\n').unwrap_or(event).chars().map(harmless).collect();
     line.push('\n');
     line
 }
@@ -55,10 +59,14 @@ mod tests {
             String::from_utf8(to).expect("text")
         };
         assert_eq!(written("WARN a robot: ärger\n".as_bytes(), false), "WARN a robot: ärger\n");
-        let bad = "\u{1b}[31mname=a\nERROR forged\r\u{1b}[2J\u{9b}31m\u{7}\u{8}\0\t\u{202e}\u{2028}end";
+        let bad =
+            "\u{1b}[31mname=a\nERROR forged\r\u{1b}[2J\u{9b}31m\u{7}\u{8}\0\t\u{202e}\u{2028}end";
         for (has_colours, escapes) in [(false, 0), (true, 2)] {
             let line = written(bad.as_bytes(), has_colours);
-            assert!(line.ends_with(" \u{fffd}\u{fffd}end\n") && line.contains("ERROR forged"), "{line:?}");
+            assert!(
+                line.ends_with(" \u{fffd}\u{fffd}end\n") && line.contains("ERROR forged"),
+                "{line:?}"
+            );
             assert_eq!(line.chars().filter(|c| c.is_control()).count(), escapes + 1, "{line:?}");
             assert_eq!(line.matches('\u{1b}').count(), escapes, "{line:?}");
         }

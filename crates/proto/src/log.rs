@@ -1,5 +1,5 @@
-//! Log lines on their way from a robot: what tasks print, what their nodes say on `/rosout` and `/diagnostics`, what the
-//! agent says about them. They are for people; nothing is decided by them.
+//! Log lines on their way from a robot: what tasks print, what their nodes say on `/rosout` and
+//! `/diagnostics`, what the agent says about them. They are for people; nothing is decided by them.
 
 use std::str::FromStr;
 
@@ -18,7 +18,9 @@ pub const MAX_KEPT_LINES: usize = 5000;
 pub const MAX_BATCH_BYTES: usize = 200 * 1024;
 
 /// How serious a line is: the five levels of ROS, each more serious than the one before.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[derive(
+    Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
+)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogLevel {
@@ -75,18 +77,20 @@ pub struct LogLine {
     pub text: String,
 }
 
-/// What a robot publishes on its `log` topic, and part of the answer to [`crate::request::Ask::Logs`].
+/// What a robot publishes on its `log` topic, and part of the answer to
+/// [`crate::request::Ask::Logs`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogBatch {
     /// Who speaks.
     pub robot_id: RobotId,
-    /// The robot's clock when it was sent, as in [`LogLine::at_ms`]: with it a line's age is known to whoever's clock.
+    /// The robot's clock when it was sent, as in [`LogLine::at_ms`]: with it a line's age is known
+    /// to whoever's clock.
     pub now_ms: u64,
     /// The oldest first.
     pub lines: Vec<LogLine>,
-    /// Lines that were left out since the batch before because they were too many; they are counted here and kept on the
-    /// robot.
+    /// Lines that were left out since the batch before because they were too many; they are counted
+    /// here and kept on the robot.
     #[serde(default)]
     pub suppressed: u64,
 }

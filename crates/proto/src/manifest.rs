@@ -1,5 +1,6 @@
-//! The task manifest: a package's config blob, made from `task.toml` and `package.xml` at push and obeyed by the agent.
-//! It is data and its own rules; reading the source files is the server crate's work.
+//! The task manifest: a package's config blob, made from `task.toml` and `package.xml` at push and
+//! obeyed by the agent. It is data and its own rules; reading the source files is the server
+//! crate's work.
 
 use std::collections::BTreeMap;
 
@@ -309,13 +310,16 @@ impl TaskManifest {
         problems.texts("outputs.paths", &self.outputs.paths);
         for path in &self.outputs.paths {
             if path.starts_with('/') || path.split('/').any(|part| part == "..") {
-                problems.add("outputs.paths", format!("{path:?} must stay below the task's directory"));
+                problems
+                    .add("outputs.paths", format!("{path:?} must stay below the task's directory"));
             }
         }
         problems.texts("requires.ros_distro", &self.requires.ros_distro);
         problems.texts("requires.arch", &self.requires.arch);
         problems.texts("exec_depend", &self.exec_depends);
-        if self.parameters.len() > MAX_LIST_LEN || self.parameters.values().any(|p| p.len() > MAX_LIST_LEN) {
+        if self.parameters.len() > MAX_LIST_LEN
+            || self.parameters.values().any(|p| p.len() > MAX_LIST_LEN)
+        {
             problems.add("parameters", format!("more than {MAX_LIST_LEN} entries"));
         }
         for node in self.parameters.keys() {
@@ -328,11 +332,14 @@ impl TaskManifest {
         let run = &self.run;
         match (&run.launch, &run.exec) {
             (None, None) => problems.add("run", "give either \"launch\" or \"exec\"".to_owned()),
-            (Some(_), Some(_)) => problems.add("run", "\"launch\" and \"exec\" exclude each other".to_owned()),
+            (Some(_), Some(_)) => {
+                problems.add("run", "\"launch\" and \"exec\" exclude each other".to_owned())
+            }
             (Some(launch), None) => {
                 problems.texts("run.launch", launch);
                 if launch.iter().any(|part| part.starts_with('-')) {
-                    problems.add("run.launch", "package and file must not start with '-'".to_owned());
+                    problems
+                        .add("run.launch", "package and file must not start with '-'".to_owned());
                 }
             }
             (None, Some(exec)) => {
@@ -341,8 +348,10 @@ impl TaskManifest {
                     problems.add("run.exec", "needs a command".to_owned());
                 }
                 if !run.args.is_empty() {
-                    problems
-                        .add("run.args", "goes with \"launch\"; put a command's arguments into \"exec\"".to_owned());
+                    problems.add(
+                        "run.args",
+                        "goes with \"launch\"; put a command's arguments into \"exec\"".to_owned(),
+                    );
                 }
             }
         }
@@ -375,8 +384,11 @@ impl TaskManifest {
 
     fn check_ready(&self, problems: &mut Problems) {
         let ready = &self.ready;
-        let lists =
-            [("ready.nodes", &ready.nodes), ("ready.lifecycle", &ready.lifecycle), ("ready.services", &ready.services)];
+        let lists = [
+            ("ready.nodes", &ready.nodes),
+            ("ready.lifecycle", &ready.lifecycle),
+            ("ready.services", &ready.services),
+        ];
         for (key, names) in lists {
             problems.texts(key, names);
             for name in names {
@@ -387,7 +399,10 @@ impl TaskManifest {
         for (topic, wanted) in &ready.topics {
             problems.graph_name("ready.topics", topic);
             if wanted.min_hz.is_some_and(|hz| !(hz > 0.0 && hz <= 10_000.0)) {
-                problems.add("ready.topics", format!("{topic:?} min_hz: must be above 0 and at most 10000"));
+                problems.add(
+                    "ready.topics",
+                    format!("{topic:?} min_hz: must be above 0 and at most 10000"),
+                );
             }
         }
         if self.build.tool == BuildTool::Catkin {
@@ -399,7 +414,10 @@ impl TaskManifest {
                 ("parameters", self.parameters.is_empty()),
             ];
             for (key, _) in promised.iter().filter(|(_, is_empty)| !is_empty) {
-                problems.add(key, "is about the graph of ROS 2; build.tool = \"catkin\" means ROS 1".to_owned());
+                problems.add(
+                    key,
+                    "is about the graph of ROS 2; build.tool = \"catkin\" means ROS 1".to_owned(),
+                );
             }
         }
         if !(1..=3600).contains(&ready.timeout_s) {
@@ -431,7 +449,8 @@ impl Problems {
         self.0.push(ManifestProblem { key: key.to_owned(), reason });
     }
 
-    /// Texts end up in a generated script and in argument lists: no NUL, no line breaks, no other control characters.
+    /// Texts end up in a generated script and in argument lists: no NUL, no line breaks, no other
+    /// control characters.
     fn texts<T: AsRef<str>>(&mut self, key: &str, texts: impl IntoIterator<Item = T>) {
         let mut count = 0;
         for text in texts {
@@ -487,7 +506,9 @@ mod tests {
 
     #[test]
     fn problems_name_the_users_key() {
-        let keys = |manifest: &TaskManifest| manifest.problems().into_iter().map(|p| p.key).collect::<Vec<_>>();
+        let keys = |manifest: &TaskManifest| {
+            manifest.problems().into_iter().map(|p| p.key).collect::<Vec<_>>()
+        };
         assert_eq!(keys(&manifest(Run::default())), ["run"]);
         assert_eq!(keys(&manifest(run(&[]))), ["run.exec"]);
         assert_eq!(keys(&manifest(run(&["a\nb"]))), ["run.exec"]);

@@ -98,8 +98,13 @@ impl ImageManifest {
         }
     }
 
-    /// The manifest of an artifact of type `artifact_type` that is a signed document, about `subject` or on its own.
-    pub fn signed_document(artifact_type: &str, envelope: BlobRef, subject: Option<BlobRef>) -> Self {
+    /// The manifest of an artifact of type `artifact_type` that is a signed document, about
+    /// `subject` or on its own.
+    pub fn signed_document(
+        artifact_type: &str,
+        envelope: BlobRef,
+        subject: Option<BlobRef>,
+    ) -> Self {
         Self {
             schema_version: 2,
             media_type: Some(MANIFEST_TYPE.to_owned()),

@@ -1,5 +1,5 @@
-//! What tasks bring back: the files that `[outputs]` names, as one OCI artifact per run in a repository of the robot's
-//! own. Pushed by the robot, read by operators with any OCI client.
+//! What tasks bring back: the files that `[outputs]` names, as one OCI artifact per run in a
+//! repository of the robot's own. Pushed by the robot, read by operators with any OCI client.
 
 use serde::{Deserialize, Serialize};
 
@@ -61,7 +61,9 @@ impl OutputSet {
     pub fn manifest(&self, config: BlobRef) -> ImageManifest {
         let layer = |file: &OutputFile| {
             let mut layer = Descriptor::new(FILE_TYPE, file.blob);
-            layer.annotations.insert("org.opencontainers.image.title".to_owned(), file.path.to_string());
+            layer
+                .annotations
+                .insert("org.opencontainers.image.title".to_owned(), file.path.to_string());
             layer
         };
         ImageManifest {
@@ -76,7 +78,8 @@ impl OutputSet {
     }
 }
 
-/// The repository of a robot's outputs of a task. `None` never happens for ids and names as they are made today.
+/// The repository of a robot's outputs of a task. `None` never happens for ids and names as they
+/// are made today.
 pub fn repository(robot: &RobotId, task: &TaskName) -> Option<RepositoryName> {
     format!("outputs/{robot}/{task}").parse().ok()
 }
@@ -97,7 +100,8 @@ mod tests {
         let task: TaskName = "corridor_mapping".parse().expect("valid");
         let name = repository(&robot, &task).expect("a name");
         assert_eq!(owner(&name), Some((robot, task)));
-        for foreign in ["corridor_mapping", "outputs", "outputs/x/y", "inputs/r00000000000000a1/y"] {
+        for foreign in ["corridor_mapping", "outputs", "outputs/x/y", "inputs/r00000000000000a1/y"]
+        {
             assert_eq!(owner(&foreign.parse().expect("valid")), None, "{foreign}");
         }
     }

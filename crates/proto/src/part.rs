@@ -1,5 +1,5 @@
-//! Parts of a blob that travels over MQTT: how a blob is cut, what each message holds, and which parts a robot lacks.
-//! A message is a binary header, big endian, and then the part's bytes:
+//! Parts of a blob that travels over MQTT: how a blob is cut, what each message holds, and which
+//! parts a robot lacks. A message is a binary header, big endian, and then the part's bytes:
 //!
 //! ```text
 //!  0        1         2              6              10                14
@@ -8,8 +8,8 @@
 //!  └────────┴─────────┴──────────────┴──────────────┴─────────────────┴─────────────┘
 //!   version  reserved   from 0         of the blob    of all but the last
 //! ```
-//! The header is not signed. A receiver measures it against the blob's size, which comes from the signed state, and the
-//! whole against the digest.
+//! The header is not signed. A receiver measures it against the blob's size, which comes from the
+//! signed state, and the whole against the digest.
 
 use std::ops::{Range, RangeInclusive};
 
@@ -79,7 +79,9 @@ pub enum PartError {
         part_bytes: u32,
     },
     /// The header contradicts itself or the blob's size.
-    #[error("part {index} of {count}, {part_bytes} bytes each, with {bytes} bytes does not belong to this blob")]
+    #[error(
+        "part {index} of {count}, {part_bytes} bytes each, with {bytes} bytes does not belong to this blob"
+    )]
     Foreign {
         /// As in the header.
         index: u32,
@@ -133,11 +135,14 @@ impl Cut {
 impl<'a> Part<'a> {
     /// Reads a message that came for a blob of `size` bytes, whatever its sender cut it into.
     pub fn decode(message: &'a [u8], size: u64) -> Result<Self, PartError> {
-        let (header, bytes) = message.split_first_chunk::<HEADER_BYTES>().ok_or(PartError::Short(message.len()))?;
+        let (header, bytes) =
+            message.split_first_chunk::<HEADER_BYTES>().ok_or(PartError::Short(message.len()))?;
         if header[0] != VERSION {
             return Err(PartError::Version(header[0]));
         }
-        let number = |at: usize| u32::from_be_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]]);
+        let number = |at: usize| {
+            u32::from_be_bytes([header[at], header[at + 1], header[at + 2], header[at + 3]])
+        };
         let (index, count, part_bytes) = (number(2), number(6), number(10));
         let cut = Cut::new(size, part_bytes)?;
         let range = cut.range(index);
@@ -171,7 +176,8 @@ impl PartRange {
         runs
     }
 
-    /// The parts meant, of a blob that has `count`: a robot's word is taken only as far as it makes sense.
+    /// The parts meant, of a blob that has `count`: a robot's word is taken only as far as it makes
+    /// sense.
     pub fn within(&self, count: u32) -> Option<RangeInclusive<u32>> {
         let last = count.checked_sub(1)?;
         (self.from <= self.to && self.from <= last).then(|| self.from..=self.to.min(last))
@@ -243,10 +249,14 @@ mod tests {
         let part = Part { index: 1, count: 2, part_bytes: 1024, bytes: &[7; 76] };
         let message = part.encode();
         assert_eq!(Part::decode(&message, 1100), Ok(part));
-        let foreign = |index, count, bytes| PartError::Foreign { index, count, part_bytes: 1024, bytes };
+        let foreign =
+            |index, count, bytes| PartError::Foreign { index, count, part_bytes: 1024, bytes };
         assert_eq!(Part::decode(&message, 1101), Err(foreign(1, 2, 76)));
         assert_eq!(Part::decode(&message, 3000), Err(foreign(1, 2, 76)));
-        assert_eq!(Part::decode(&Part { index: 2, bytes: &[], ..part }.encode(), 1100), Err(foreign(2, 2, 0)));
+        assert_eq!(
+            Part::decode(&Part { index: 2, bytes: &[], ..part }.encode(), 1100),
+            Err(foreign(2, 2, 0))
+        );
         assert_eq!(Part::decode(&message[..13], 1100), Err(PartError::Short(13)));
         let newer: Vec<u8> = [&[2], &message[1..]].concat();
         assert_eq!(Part::decode(&newer, 1100), Err(PartError::Version(2)));
@@ -260,7 +270,9 @@ mod tests {
         assert_eq!(Cut::new(100_000_000, MAX_PART_BYTES).map(|cut| cut.count()), Ok(1));
         let most = u64::from(MAX_PARTS) * 1024;
         assert_eq!(Cut::new(most, 1024).map(|cut| cut.count()), Ok(MAX_PARTS));
-        for (size, part_bytes) in [(most + 1, 1024), (u64::MAX, MAX_PART_BYTES), (1, 1023), (1, MAX_PART_BYTES + 1)] {
+        for (size, part_bytes) in
+            [(most + 1, 1024), (u64::MAX, MAX_PART_BYTES), (1, 1023), (1, MAX_PART_BYTES + 1)]
+        {
             assert_eq!(Cut::new(size, part_bytes), Err(PartError::Cut { size, part_bytes }));
         }
     }

@@ -1,4 +1,5 @@
-//! What people may do: roles, and the permissions each of them is made of. Who has which role is the server's to know.
+//! What people may do: roles, and the permissions each of them is made of. Who has which role is
+//! the server's to know.
 //!
 //! ```
 //! use task_proto::person::{Permission, Roles};
@@ -26,14 +27,15 @@ pub enum Permission {
     Publish,
     /// Change robots themselves: their names and labels, and whether they are there at all.
     Maintain,
-    /// What concerns everybody: people and their tokens, enrolment, the list of publishers, the broker's files, the audit.
-    /// Only ever for who is limited to no robots.
+    /// What concerns everybody: people and their tokens, enrolment, the list of publishers, the
+    /// broker's files, the audit. Only ever for who is limited to no robots.
     Administer,
 }
 
 impl Permission {
     /// All there are.
-    pub const ALL: [Self; 5] = [Self::Read, Self::Operate, Self::Publish, Self::Maintain, Self::Administer];
+    pub const ALL: [Self; 5] =
+        [Self::Read, Self::Operate, Self::Publish, Self::Maintain, Self::Administer];
 
     /// Its name.
     pub fn as_str(self) -> &'static str {
@@ -101,7 +103,9 @@ impl fmt::Display for Role {
 
 /// A text that names no role.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{given:?} is not a role: expected viewer, operator, publisher or admin, or several joined by commas")]
+#[error(
+    "{given:?} is not a role: expected viewer, operator, publisher or admin, or several joined by commas"
+)]
 pub struct InvalidRole {
     given: String,
 }
@@ -114,7 +118,8 @@ impl FromStr for Role {
     }
 }
 
-/// One role or several: who has several may do what any of them allows. On the wire a list of names.
+/// One role or several: who has several may do what any of them allows. On the wire a list of
+/// names.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = Vec<Role>, min_items = 1))]
 #[serde(try_from = "Vec<Role>", into = "Vec<Role>")]
@@ -133,7 +138,8 @@ impl Roles {
 
     /// What both allow, as the roles that are allowed by both: `None` if nothing is.
     pub fn within(&self, limit: &Self) -> Option<Self> {
-        let is_allowed = |role: &&Role| role.permissions().iter().all(|&permission| limit.allow(permission));
+        let is_allowed =
+            |role: &&Role| role.permissions().iter().all(|&permission| limit.allow(permission));
         let common: BTreeSet<Role> = self.0.iter().filter(is_allowed).copied().collect();
         (!common.is_empty()).then_some(Self(common))
     }
@@ -187,7 +193,11 @@ mod tests {
     #[test]
     fn a_role_is_a_fixed_set_of_permissions() {
         let allowed = |text: &str| -> Vec<&str> {
-            Permission::ALL.into_iter().filter(|&p| roles(text).allow(p)).map(Permission::as_str).collect()
+            Permission::ALL
+                .into_iter()
+                .filter(|&p| roles(text).allow(p))
+                .map(Permission::as_str)
+                .collect()
         };
         assert_eq!(allowed("viewer"), ["read"]);
         assert_eq!(allowed("operator"), ["read", "operate"]);
@@ -198,7 +208,9 @@ mod tests {
 
     #[test]
     fn roles_within_others_never_allow_more() {
-        let within = |one: &str, other: &str| roles(one).within(&roles(other)).map(|found| found.to_string());
+        let within = |one: &str, other: &str| {
+            roles(one).within(&roles(other)).map(|found| found.to_string())
+        };
         assert_eq!(within("viewer", "operator").as_deref(), Some("viewer"));
         assert_eq!(within("admin", "operator"), None);
         assert_eq!(within("operator,publisher", "publisher").as_deref(), Some("publisher"));

@@ -1,6 +1,7 @@
-//! Who may say that a package may be run: what publishers sign, the list of those who count, and how both are judged.
-//! After TUF and Uptane: what is signed pins digests and sizes; a list has a version and a lifetime, and is signed by the
-//! keepers of the list before it. Pure, and the same on both sides; a server judges only to turn mistakes away early.
+//! Who may say that a package may be run: what publishers sign, the list of those who count, and
+//! how both are judged. After TUF and Uptane: what is signed pins digests and sizes; a list has a
+//! version and a lifetime, and is signed by the keepers of the list before it. Pure, and the same
+//! on both sides; a server judges only to turn mistakes away early.
 
 use serde::{Deserialize, Serialize};
 
@@ -102,9 +103,9 @@ impl TryFrom<RoleFields> for Role {
     }
 }
 
-/// What a publisher signs: that just this package may be run. All its blobs are in it with digest and size, so that no
-/// part can be exchanged for another's and none has more bytes than was signed. Nothing else is in it: whoever signs the
-/// same package twice has signed the same bytes.
+/// What a publisher signs: that just this package may be run. All its blobs are in it with digest
+/// and size, so that no part can be exchanged for another's and none has more bytes than was
+/// signed. Nothing else is in it: whoever signs the same package twice has signed the same bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PackageStatement {
     /// The package.
@@ -193,7 +194,8 @@ impl PublisherList {
         Envelope::seal(LIST_TYPE, &payload, key)
     }
 
-    /// The list in `envelope`, if it may follow the one with `version` (0: none) whose keepers are `keepers`.
+    /// The list in `envelope`, if it may follow the one with `version` (0: none) whose keepers are
+    /// `keepers`.
     pub fn follow(envelope: &Envelope, keepers: &Role, version: u64) -> Result<Self, Refused> {
         let (payload, signers) = envelope.signers(LIST_TYPE, &keepers.keys)?;
         if !keepers.is_reached_by(signers.len()) {
@@ -225,7 +227,8 @@ impl PublisherList {
     }
 
     fn read(payload: &[u8]) -> Result<Self, Refused> {
-        let list: Self = serde_json::from_slice(payload).map_err(|error| Refused::Malformed(error.to_string()))?;
+        let list: Self = serde_json::from_slice(payload)
+            .map_err(|error| Refused::Malformed(error.to_string()))?;
         if list.withdrawn.len() > MAX_WITHDRAWN {
             return Err(Refused::TooManyWithdrawn(list.withdrawn.len()));
         }
@@ -265,9 +268,13 @@ pub fn vouching<'a>(
     let mut signers: Vec<&PublicKey> = Vec::new();
     let mut counted = Vec::new();
     for envelope in envelopes.iter().take(MAX_SIGNATURES) {
-        let Ok((payload, by)) = envelope.signers(STATEMENT_TYPE, &publishers.keys) else { continue };
-        let is_meant = serde_json::from_slice::<PackageStatement>(&payload).is_ok_and(|said| said.package == *package);
-        let new: Vec<&PublicKey> = by.into_iter().filter(|key| is_meant && !signers.contains(key)).collect();
+        let Ok((payload, by)) = envelope.signers(STATEMENT_TYPE, &publishers.keys) else {
+            continue;
+        };
+        let is_meant = serde_json::from_slice::<PackageStatement>(&payload)
+            .is_ok_and(|said| said.package == *package);
+        let new: Vec<&PublicKey> =
+            by.into_iter().filter(|key| is_meant && !signers.contains(key)).collect();
         if !new.is_empty() {
             signers.extend(new);
             counted.push(envelope);
@@ -276,7 +283,8 @@ pub fn vouching<'a>(
     if publishers.is_reached_by(signers.len()) {
         return Ok(counted);
     }
-    let missing = publishers.keys.iter().filter(|key| !signers.contains(key)).map(PublicKey::id).collect();
+    let missing =
+        publishers.keys.iter().filter(|key| !signers.contains(key)).map(PublicKey::id).collect();
     Err(Unsigned { signed: signers.len(), needed: publishers.threshold, missing })
 }
 
@@ -290,7 +298,8 @@ mod tests {
     }
 
     fn role(seeds: &[u8], threshold: u32) -> Role {
-        Role::new(seeds.iter().map(|seed| key(*seed).public_key()).collect(), threshold).expect("a role")
+        Role::new(seeds.iter().map(|seed| key(*seed).public_key()).collect(), threshold)
+            .expect("a role")
     }
 
     fn package(name: &str) -> PackageRef {
@@ -309,12 +318,21 @@ mod tests {
     }
 
     fn list(version: u64, publishers: Role, keepers: Role) -> PublisherList {
-        PublisherList { version, issued_at_ms: 10, expires_at_ms: 20, publishers, keepers, withdrawn: Vec::new() }
+        PublisherList {
+            version,
+            issued_at_ms: 10,
+            expires_at_ms: 20,
+            publishers,
+            keepers,
+            withdrawn: Vec::new(),
+        }
     }
 
     fn sealed(list: &PublisherList, seeds: &[u8]) -> Envelope {
         let mut envelope = list.seal(&key(seeds[0]));
-        seeds[1..].iter().for_each(|seed| envelope.sign_also(LIST_TYPE, &key(*seed)).expect("signed"));
+        seeds[1..]
+            .iter()
+            .for_each(|seed| envelope.sign_also(LIST_TYPE, &key(*seed)).expect("signed"));
         envelope
     }
 
@@ -323,7 +341,8 @@ mod tests {
         let (talker, publishers) = (package("talker"), role(&[1, 2, 3], 2));
         let [ada, bob, eve] = [1, 2, 9].map(|seed| said_by(seed, &talker));
         let signed = |envelopes: &[&Envelope]| {
-            let envelopes: Vec<Envelope> = envelopes.iter().map(|envelope| (*envelope).clone()).collect();
+            let envelopes: Vec<Envelope> =
+                envelopes.iter().map(|envelope| (*envelope).clone()).collect();
             match vouching(&publishers, &talker, &envelopes) {
                 Ok(counted) => counted.len(),
                 Err(unsigned) => panic!("{unsigned}"),
@@ -347,7 +366,8 @@ mod tests {
         let envelopes = [said_by(1, &talker)];
         assert!(vouching(&publishers, &talker, &envelopes).is_ok());
         let other = package("other");
-        // Mix and match: parts of other packages, also signed ones, in its place; and more bytes than were signed.
+        // Mix and match: parts of other packages, also signed ones, in its place; and more bytes
+        // than were signed.
         let endless = BlobRef { size: u64::MAX, ..talker.content };
         for changed in [
             PackageRef { content: other.content, ..talker.clone() },
@@ -368,7 +388,9 @@ mod tests {
         let statement = PackageStatement { package: talker.clone() };
         let payload = serde_json::to_vec(&statement).expect("json");
         for kind in [LIST_TYPE, crate::envelope::DESIRED_STATE_TYPE] {
-            assert!(vouching(&publishers, &talker, &[Envelope::seal(kind, &payload, &key(1))]).is_err());
+            assert!(
+                vouching(&publishers, &talker, &[Envelope::seal(kind, &payload, &key(1))]).is_err()
+            );
         }
     }
 
@@ -377,7 +399,9 @@ mod tests {
         let before = role(&[1, 2], 2);
         let next = list(2, role(&[5], 1), role(&[2, 3], 1));
         assert_eq!(PublisherList::follow(&sealed(&next, &[1, 2]), &before, 1), Ok(next.clone()));
-        let refused = |seeds: &[u8]| PublisherList::follow(&sealed(&next, seeds), &before, 1).expect_err("refused");
+        let refused = |seeds: &[u8]| {
+            PublisherList::follow(&sealed(&next, seeds), &before, 1).expect_err("refused")
+        };
         assert_eq!(refused(&[1, 3]), Refused::NotByKeepers { signed: 1, needed: 2 });
         assert_eq!(refused(&[5]), Refused::NotByKeepers { signed: 0, needed: 2 });
         let strangers = list(2, role(&[5], 1), role(&[3], 1));
@@ -405,8 +429,12 @@ mod tests {
         assert!(serde_json::to_vec_pretty(&envelope).expect("json").len() as u64 <= MAX_LIST_BYTES);
         let talker = package("talker");
         let mut envelope = said_by(0, &talker);
-        seeds(1).iter().for_each(|seed| envelope.sign_also(STATEMENT_TYPE, &key(*seed)).expect("signed"));
-        assert!(serde_json::to_vec_pretty(&envelope).expect("json").len() as u64 <= MAX_SIGNATURE_BYTES);
+        seeds(1)
+            .iter()
+            .for_each(|seed| envelope.sign_also(STATEMENT_TYPE, &key(*seed)).expect("signed"));
+        assert!(
+            serde_json::to_vec_pretty(&envelope).expect("json").len() as u64 <= MAX_SIGNATURE_BYTES
+        );
         assert!(vouching(&all_of(0), &talker, &[envelope]).is_ok());
     }
 
@@ -426,9 +454,15 @@ mod tests {
         let follow = |list: &PublisherList| PublisherList::follow(&sealed(list, &[1]), &keepers, 0);
         let good = list(1, role(&[5], 1), keepers.clone());
         assert!(follow(&good).is_ok_and(|list| list.is_expired(20) && !list.is_expired(19)));
-        assert_eq!(follow(&PublisherList { expires_at_ms: 10, ..good.clone() }), Err(Refused::NoLifetime));
+        assert_eq!(
+            follow(&PublisherList { expires_at_ms: 10, ..good.clone() }),
+            Err(Refused::NoLifetime)
+        );
         let withdrawn = vec![Digest::of(b"x"); MAX_WITHDRAWN + 1];
-        assert_eq!(follow(&PublisherList { withdrawn, ..good }), Err(Refused::TooManyWithdrawn(MAX_WITHDRAWN + 1)));
+        assert_eq!(
+            follow(&PublisherList { withdrawn, ..good }),
+            Err(Refused::TooManyWithdrawn(MAX_WITHDRAWN + 1))
+        );
         let keys = |count: u8| (0..count).map(|seed| key(seed).public_key()).collect::<Vec<_>>();
         assert_eq!(Role::new(keys(0), 1), Err(InvalidRole::Keys(0)));
         assert_eq!(Role::new(keys(17), 1), Err(InvalidRole::Keys(17)));

@@ -1,5 +1,5 @@
-//! What a robot says: whole snapshots of its tasks, ordered by (start, seq), and its connection status.
-//! Times are elapsed milliseconds, because a robot's clock may lie.
+//! What a robot says: whole snapshots of its tasks, ordered by (start, seq), and its connection
+//! status. Times are elapsed milliseconds, because a robot's clock may lie.
 
 mod tidy;
 
@@ -28,8 +28,9 @@ pub struct Report {
     pub start: u64,
     /// This start of the agent. Two instances alive at once are a cloned identity.
     pub instance: InstanceId,
-    /// Where this start runs: one data directory, during one boot of one machine. Of two starts in the same place the
-    /// second has begun after the first had ended. Absent: an agent that is too old to say.
+    /// Where this start runs: one data directory, during one boot of one machine. Of two starts in
+    /// the same place the second has begun after the first had ended. Absent: an agent that is too
+    /// old to say.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
     pub place: Option<Digest>,
     /// The kernel's boot id.
@@ -56,10 +57,11 @@ impl Report {
     /// The condition of a robot that was sent the generation it obeys with other content.
     pub const STATE_CONTRADICTED: &str = "state_contradicted";
 
-    /// How far the robot has come. Of two states with one generation the one that it obeys counts as the later: the other
-    /// is by a server whose database was put back to an older copy.
+    /// How far the robot has come. Of two states with one generation the one that it obeys counts
+    /// as the later: the other is by a server whose database was put back to an older copy.
     pub fn reached_generation(&self) -> Generation {
-        let is_contradicted = self.conditions.iter().any(|condition| condition.code == Self::STATE_CONTRADICTED);
+        let is_contradicted =
+            self.conditions.iter().any(|condition| condition.code == Self::STATE_CONTRADICTED);
         Generation(self.observed_generation.0.saturating_add(u64::from(is_contradicted)))
     }
 }
@@ -72,7 +74,8 @@ pub struct LinkFacts {
     /// Moving average of fetches; absent before the first that was long enough to measure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub throughput_bytes_per_s: Option<u64>,
-    /// Moving average of the time from a request to the first byte of its answer; absent before the first.
+    /// Moving average of the time from a request to the first byte of its answer; absent before the
+    /// first.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rtt_ms: Option<u32>,
     /// Sessions that were lost in the last hour.
@@ -112,8 +115,8 @@ pub struct HostFacts {
     /// What is left of its battery; absent where it has none that can be read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u8>,
-    /// The version of the list of publishers whose signatures it asks for; 0: it goes by its own settings. Absent: it
-    /// runs whatever its server orders.
+    /// The version of the list of publishers whose signatures it asks for; 0: it goes by its own
+    /// settings. Absent: it runs whatever its server orders.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub publishers: Option<u64>,
     /// What holds of all that can be set for it; absent where everything is the agent's default.
@@ -156,11 +159,13 @@ pub enum Isolation {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TaskAccounts {
-    /// Each task under its own; what was unpacked and built is read-only to it and verified before each start.
+    /// Each task under its own; what was unpacked and built is read-only to it and verified before
+    /// each start.
     PerTask,
     /// All under one, which may not change what was unpacked and built either.
     Shared,
-    /// All under the agent's: nothing keeps a task from other tasks' files and processes, or from changing its own package.
+    /// All under the agent's: nothing keeps a task from other tasks' files and processes, or from
+    /// changing its own package.
     Agent,
 }
 
@@ -199,7 +204,8 @@ pub struct TaskReport {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
     /// While the package's parts are awaited: the first runs of those it lacks, at most
-    /// [`crate::part::MAX_MISSING_RANGES`]. Empty: it listens and asks for nothing yet. Absent: it does not listen.
+    /// [`crate::part::MAX_MISSING_RANGES`]. Empty: it listens and asks for nothing yet. Absent: it
+    /// does not listen.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing_parts: Option<Vec<PartRange>>,
     /// Tries of the current phase, from 1.
@@ -404,7 +410,8 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// A failure with `code` and `text`; control characters, which a package could smuggle in, become spaces.
+    /// A failure with `code` and `text`; control characters, which a package could smuggle in,
+    /// become spaces.
     pub fn new(code: FailureCode, text: impl Into<String>) -> Self {
         Self { code, text: clean(&text.into(), MAX_FAILURE_CHARS) }
     }
@@ -416,7 +423,8 @@ impl fmt::Display for Failure {
     }
 }
 
-/// A failure's stable code. Codes of newer versions pass through unchanged; of what is none, only what could be one is kept.
+/// A failure's stable code. Codes of newer versions pass through unchanged; of what is none, only
+/// what could be one is kept.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, example = "process_exited"))]
 #[serde(from = "String")]
@@ -479,7 +487,8 @@ failure_codes! {
     OUT_OF_MEMORY = "out_of_memory";
     /// The robot has no user to run tasks as.
     NO_TASK_USER = "no_task_user";
-    /// What is on the robot's disk of a package is not what was unpacked and built: it was not started.
+    /// What is on the robot's disk of a package is not what was unpacked and built: it was not
+    /// started.
     TREE_CHANGED = "tree_changed";
     /// The robot's gate said not now.
     GATE_REFUSED = "gate_refused";
@@ -495,7 +504,8 @@ failure_codes! {
     IO_ERROR = "io_error";
     /// A person at the robot said `hold`.
     HELD = "held";
-    /// Too few of the publishers that the robot trusts have signed the package, or it was withdrawn.
+    /// Too few of the publishers that the robot trusts have signed the package, or it was
+    /// withdrawn.
     UNTRUSTED_PACKAGE = "untrusted_package";
     /// The robot's list of publishers is past its lifetime, or it has none and must have one.
     PUBLISHERS_EXPIRED = "publishers_expired";
@@ -544,12 +554,16 @@ mod tests {
             assert_eq!(serde_json::to_value(phase).expect("json"), phase.as_str());
             assert_eq!(Phase::from_text(phase.as_str()), phase);
         }
-        assert_eq!(serde_json::from_str::<Phase>("\"levitating\"").expect("tolerated"), Phase::Unknown);
+        assert_eq!(
+            serde_json::from_str::<Phase>("\"levitating\"").expect("tolerated"),
+            Phase::Unknown
+        );
     }
 
     #[test]
     fn a_code_is_a_word_whatever_comes() {
-        let read = |text: &str| serde_json::from_value::<FailureCode>(text.into()).expect("tolerated");
+        let read =
+            |text: &str| serde_json::from_value::<FailureCode>(text.into()).expect("tolerated");
         assert_eq!(read("disk_full"), FailureCode::DISK_FULL);
         assert_eq!(read("untrusted_package_2").as_str(), "untrusted_package_2");
         assert_eq!(read("\u{1b}[31mDisk\nfull <b>").as_str(), "31miskfullb");

@@ -1,5 +1,5 @@
-//! Questions to a robot and one-off actions, over MQTT: each has an id and a deadline, is asked once and never replayed.
-//! What is meant to last is part of the desired state instead.
+//! Questions to a robot and one-off actions, over MQTT: each has an id and a deadline, is asked
+//! once and never replayed. What is meant to last is part of the desired state instead.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,13 +26,14 @@ pub struct Request {
     pub ttl_ms: u64,
     /// What is asked.
     pub ask: Ask,
-    /// The [`Action`], where the question changes something: a broker that is not the server's, or who listens in, must not
-    /// be able to ask that.
+    /// The [`Action`], where the question changes something: a broker that is not the server's, or
+    /// who listens in, must not be able to ask that.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signed: Option<Envelope>,
 }
 
-/// What the server signs of a question that changes something. It is good for one robot, one start of its agent, and once.
+/// What the server signs of a question that changes something. It is good for one robot, one start
+/// of its agent, and once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Action {
     /// Whom it is for.
@@ -45,7 +46,8 @@ pub struct Action {
     pub ask: Ask,
 }
 
-/// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (read, or operate if it changes something).
+/// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (read, or operate if
+/// it changes something).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
@@ -71,7 +73,8 @@ pub enum Ask {
         /// Which parameter.
         name: String,
     },
-    /// Sets a parameter now. It lasts as long as the node: the next start sets what the package says.
+    /// Sets a parameter now. It lasts as long as the node: the next start sets what the package
+    /// says.
     SetParameter {
         /// Which node.
         node: GraphName,
@@ -194,8 +197,8 @@ pub enum Answer {
 /// Why a robot gives no answer: a stable code for programs, a sentence for people.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refusal {
-    /// `no_ros`, `no_such_node`, `no_such_parameter`, `no_such_task`, `rejected`, `timeout`, `too_large`, `busy`,
-    /// `unsupported`, …
+    /// `no_ros`, `no_such_node`, `no_such_parameter`, `no_such_task`, `rejected`, `timeout`,
+    /// `too_large`, `busy`, `unsupported`, …
     pub code: String,
     /// What and why.
     pub text: String,

@@ -1,5 +1,6 @@
-//! Words of ROS that cross the wire: graph names, lifecycle states and transitions, what a robot's graph shows.
-//! Sources: the ROS 2 design articles on names and on managed nodes, and `lifecycle_msgs`. It never talks to ROS.
+//! Words of ROS that cross the wire: graph names, lifecycle states and transitions, what a robot's
+//! graph shows. Sources: the ROS 2 design articles on names and on managed nodes, and
+//! `lifecycle_msgs`. It never talks to ROS.
 
 use serde::{Deserialize, Serialize};
 
@@ -56,7 +57,8 @@ pub enum Transition {
 
 impl Transition {
     /// Every transition.
-    pub const ALL: [Self; 5] = [Self::Configure, Self::Cleanup, Self::Activate, Self::Deactivate, Self::Shutdown];
+    pub const ALL: [Self; 5] =
+        [Self::Configure, Self::Cleanup, Self::Activate, Self::Deactivate, Self::Shutdown];
 
     /// The transition as text.
     pub fn as_str(self) -> &'static str {
@@ -126,7 +128,8 @@ pub struct TopicSummary {
     pub subscriptions: Vec<GraphName>,
 }
 
-/// A node's parameter. Its value is a truth value, a number, a text, a list of one of these, or null where it is not set.
+/// A node's parameter. Its value is a truth value, a number, a text, a list of one of these, or
+/// null where it is not set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Parameter {

@@ -1,6 +1,7 @@
-//! Which robots an order is for. `*` is every robot; commas separate terms, each of which adds robots, or takes them away if
-//! it begins with `!`, wherever it stands; within a term, `&` joins conditions; a condition is `label=value` or a robot's
-//! name or id. Where no term adds any, those of all robots are left that none takes away.
+//! Which robots an order is for. `*` is every robot; commas separate terms, each of which adds
+//! robots, or takes them away if it begins with `!`, wherever it stands; within a term, `&` joins
+//! conditions; a condition is `label=value` or a robot's name or id. Where no term adds any, those
+//! of all robots are left that none takes away.
 //!
 //! ```
 //! use task_proto::selector::Selector;
@@ -38,7 +39,8 @@ struct Terms {
     named: HashSet<RobotName>,
     /// Terms that are but a label: looked up as well.
     labelled: HashMap<LabelKey, HashSet<LabelValue>>,
-    /// The others: a robot has to meet all conditions of one. Each is tried on every robot, so they are few.
+    /// The others: a robot has to meet all conditions of one. Each is tried on every robot, so they
+    /// are few.
     described: Vec<Vec<Condition>>,
 }
 
@@ -108,14 +110,18 @@ impl Terms {
         };
         self.named.contains(name.as_str())
             || self.named.contains(id.as_str())
-            || labels.iter().any(|(key, value)| self.labelled.get(key).is_some_and(|values| values.contains(value)))
+            || labels.iter().any(|(key, value)| {
+                self.labelled.get(key).is_some_and(|values| values.contains(value))
+            })
             || self.described.iter().any(|all| all.iter().all(is_met))
     }
 
     fn add(&mut self, mut all: Vec<Condition>) {
         match (all.pop(), all.is_empty()) {
             (Some(Condition::NameOrId(text)), true) => _ = self.named.insert(text),
-            (Some(Condition::Label(key, value)), true) => _ = self.labelled.entry(key).or_default().insert(value),
+            (Some(Condition::Label(key, value)), true) => {
+                _ = self.labelled.entry(key).or_default().insert(value)
+            }
             (last, _) => self.described.push(all.into_iter().chain(last).collect()),
         }
     }
@@ -149,7 +155,11 @@ impl FromStr for Selector {
         let (mut adds, mut takes_away) = (Terms::default(), Terms::default());
         for term in text.split(',') {
             let without = term.trim_start().strip_prefix('!');
-            let all = without.unwrap_or(term).split('&').map(|part| part.trim().parse()).collect::<Result<_, _>>()?;
+            let all = without
+                .unwrap_or(term)
+                .split('&')
+                .map(|part| part.trim().parse())
+                .collect::<Result<_, _>>()?;
             if without.is_some() { takes_away.add(all) } else { adds.add(all) }
         }
         if adds.conditions() + takes_away.conditions() > MAX_CONDITIONS {
@@ -226,7 +236,9 @@ mod tests {
 
     #[test]
     fn nonsense_is_refused_by_part() {
-        for bad in ["", ",", "a,,b", "a&", "=x", "a b", "site=l ab", "**", "!", "!!a", "a&!b", "!,a"] {
+        for bad in
+            ["", ",", "a,,b", "a&", "=x", "a b", "site=l ab", "**", "!", "!!a", "a&!b", "!,a"]
+        {
             assert!(bad.parse::<Selector>().is_err(), "{bad:?}");
         }
     }
@@ -237,7 +249,8 @@ mod tests {
         let (name, labels): (RobotName, _) = ("atlas".parse().expect("valid"), Labels::new());
         let stranger = RobotId::random();
         for (without, is_meant) in [("", true), ("!", false)] {
-            let text = robots.iter().map(|id| format!("{without}{id}")).collect::<Vec<_>>().join(",");
+            let text =
+                robots.iter().map(|id| format!("{without}{id}")).collect::<Vec<_>>().join(",");
             let selector: Selector = text.parse().expect("it fits");
             assert!(robots.iter().all(|id| selector.matches(id, &name, &labels) == is_meant));
             assert_eq!(selector.matches(&stranger, &name, &labels), !is_meant);
@@ -255,7 +268,11 @@ mod tests {
         let most = ["a&b=c"; MAX_CONDITIONS / 2].join(",");
         assert!(most.parse::<Selector>().is_ok());
         for more in ["*", "!*", "!a&b"] {
-            assert_eq!(format!("{most},{more}").parse::<Selector>(), Err(InvalidSelector::TooManyConditions), "{more}");
+            assert_eq!(
+                format!("{most},{more}").parse::<Selector>(),
+                Err(InvalidSelector::TooManyConditions),
+                "{more}"
+            );
         }
     }
 
@@ -268,7 +285,10 @@ mod tests {
     #[test]
     fn names_are_those_of_all_terms() {
         let selector: Selector = "b,site=lab&a,!c,!base=husky&d,*".parse().expect("valid");
-        assert_eq!(selector.names().iter().map(RobotName::as_str).collect::<Vec<_>>(), ["a", "b", "c", "d"]);
+        assert_eq!(
+            selector.names().iter().map(RobotName::as_str).collect::<Vec<_>>(),
+            ["a", "b", "c", "d"]
+        );
         assert!("*,!site=lab".parse::<Selector>().expect("valid").names().is_empty());
     }
 }

@@ -1,5 +1,6 @@
-//! A robot's settings as the server may hold them: the same that its own property file has for how tasks meet ROS and
-//! what they may use. Where both say something, the robot's own holds, for whoever set it stands next to the robot.
+//! A robot's settings as the server may hold them: the same that its own property file has for how
+//! tasks meet ROS and what they may use. Where both say something, the robot's own holds, for
+//! whoever set it stands next to the robot.
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -13,15 +14,18 @@ pub const MAX_UNDERLAYS: usize = 16;
 /// ROS 2's last domain whose ports exist everywhere.
 pub const MAX_ROS_DOMAIN_ID: u32 = 232;
 
-/// What an administrator sets for a robot at the server. What is absent is the robot's own business.
+/// What an administrator sets for a robot at the server. What is absent is the robot's own
+/// business.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RobotSettings {
-    /// Setup files that are sourced before a task is built or run, in this order, instead of what is found in `/opt/ros`.
+    /// Setup files that are sourced before a task is built or run, in this order, instead of what
+    /// is found in `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<AbsolutePath>>,
-    /// The robot's own ROS workspace, whose `install/` or `devel/` setup file is sourced after the underlays.
+    /// The robot's own ROS workspace, whose `install/` or `devel/` setup file is sourced after the
+    /// underlays.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<AbsolutePath>,
     /// `ROS_DOMAIN_ID` of every task, 0 to 232.
@@ -33,7 +37,8 @@ pub struct RobotSettings {
     /// The least serious log lines that go to the server while nobody follows.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_level: Option<LogLevel>,
-    /// The keys of what is set and could not be read, because the server that set it is of another version.
+    /// The keys of what is set and could not be read, because the server that set it is of another
+    /// version.
     #[serde(skip)]
     pub unreadable: Vec<String>,
 }
@@ -67,7 +72,8 @@ pub struct RobotLimits {
     /// Versions that are prepared at the same time, 1 to 64.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parallel_tasks: Option<u64>,
-    /// Memory of a task whose package says nothing of it, in MiB, 1 to 16,777,216; absent: all there is.
+    /// Memory of a task whose package says nothing of it, in MiB, 1 to 16,777,216; absent: all
+    /// there is.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_memory_mb: Option<u64>,
     /// Processes and threads of such a task, and of a build, 1 to 4,194,304.
@@ -83,11 +89,12 @@ pub struct EffectiveSettings {
     /// The values that hold.
     #[serde(flatten)]
     pub values: RobotSettings,
-    /// The settings, by their keys (`underlays`, `limits.log_bytes`), whose values are the robot's own: setting them at the
-    /// server changes nothing.
+    /// The settings, by their keys (`underlays`, `limits.log_bytes`), whose values are the robot's
+    /// own: setting them at the server changes nothing.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub own: Vec<String>,
-    /// Those that the server has set and the robot does not take: its own settings do not allow it, or it can't use the value.
+    /// Those that the server has set and the robot does not take: its own settings do not allow it,
+    /// or it can't use the value.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub refused: Vec<String>,
 }
@@ -142,7 +149,8 @@ impl RobotSettings {
     /// The values that can't be used.
     pub fn faults(&self) -> Vec<InvalidSetting> {
         let underlays = self.underlays.as_ref().map_or(0, Vec::len);
-        let too_many = (underlays > MAX_UNDERLAYS).then_some(InvalidSetting::TooManyUnderlays(underlays));
+        let too_many =
+            (underlays > MAX_UNDERLAYS).then_some(InvalidSetting::TooManyUnderlays(underlays));
         let domain_id = self.ros_domain_id.map(u64::from);
         let domain_id = [("ros_domain_id", domain_id, 0, u64::from(MAX_ROS_DOMAIN_ID))];
         let bounds = domain_id.into_iter().chain(self.limits.bounds());
@@ -230,10 +238,14 @@ impl RobotLimits {
     }
 }
 
-/// Reads the settings that are of this version, and notes the keys of those that are not: they must not make a state
-/// unreadable, nor each other.
-pub(crate) fn each_readable<'de, D: Deserializer<'de>>(deserializer: D) -> Result<RobotSettings, D::Error> {
-    let Value::Object(mut values) = Value::deserialize(deserializer)? else { return Ok(RobotSettings::default()) };
+/// Reads the settings that are of this version, and notes the keys of those that are not: they must
+/// not make a state unreadable, nor each other.
+pub(crate) fn each_readable<'de, D: Deserializer<'de>>(
+    deserializer: D,
+) -> Result<RobotSettings, D::Error> {
+    let Value::Object(mut values) = Value::deserialize(deserializer)? else {
+        return Ok(RobotSettings::default());
+    };
     let mut unreadable = Vec::new();
     let mut keep = |key: String, alone: Value| {
         let is_readable = serde_json::from_value::<RobotSettings>(alone).is_ok();
@@ -243,14 +255,17 @@ pub(crate) fn each_readable<'de, D: Deserializer<'de>>(deserializer: D) -> Resul
         is_readable
     };
     if let Some(Value::Object(limits)) = values.get_mut("limits") {
-        limits.retain(|key, value| keep(format!("limits.{key}"), json!({ "limits": { key: value } })));
+        limits.retain(|key, value| {
+            keep(format!("limits.{key}"), json!({ "limits": { key: value } }))
+        });
     }
     values.retain(|key, value| keep(key.clone(), json!({ key: value })));
     let read: RobotSettings = serde_json::from_value(Value::Object(values)).unwrap_or_default();
     Ok(RobotSettings { unreadable, ..read })
 }
 
-/// Reads what is of this version, and passes over what is not: what is told must not make a report unreadable.
+/// Reads what is of this version, and passes over what is not: what is told must not make a report
+/// unreadable.
 pub(crate) fn tolerant<'de, D: Deserializer<'de>, T: DeserializeOwned + Default>(
     deserializer: D,
 ) -> Result<T, D::Error> {
@@ -264,10 +279,18 @@ mod tests {
 
     #[test]
     fn a_value_out_of_bounds_is_named_by_its_key() {
-        let check = |json: serde_json::Value| serde_json::from_value::<RobotSettings>(json).expect("parses").check();
+        let check = |json: serde_json::Value| {
+            serde_json::from_value::<RobotSettings>(json).expect("parses").check()
+        };
         let said = |json| check(json).expect_err("refused").to_string();
-        assert_eq!(check(serde_json::json!({"ros_domain_id": 232, "limits": {"parallel_tasks": 64}})), Ok(()));
-        assert_eq!(said(serde_json::json!({"ros_domain_id": 233})), "ros_domain_id: 233 is not between 0 and 232");
+        assert_eq!(
+            check(serde_json::json!({"ros_domain_id": 232, "limits": {"parallel_tasks": 64}})),
+            Ok(())
+        );
+        assert_eq!(
+            said(serde_json::json!({"ros_domain_id": 233})),
+            "ros_domain_id: 233 is not between 0 and 232"
+        );
         let none = serde_json::json!({"limits": {"parallel_tasks": 0}});
         assert_eq!(said(none), "limits.parallel_tasks: 0 is not between 1 and 64");
         let many = serde_json::json!({"underlays": vec!["/opt/ros/jazzy"; MAX_UNDERLAYS + 1]});
@@ -281,16 +304,21 @@ mod tests {
             "task_memory_mb": 0, "task_pids": 0});
         let underlays = vec!["/setup.bash"; MAX_UNDERLAYS + 1];
         let all = json!({"underlays": underlays, "workspace": "/ws", "ros_domain_id": 233, "limits": limits});
-        let (left, unusable) = serde_json::from_value::<RobotSettings>(all).expect("parses").usable();
+        let (left, unusable) =
+            serde_json::from_value::<RobotSettings>(all).expect("parses").usable();
         assert_eq!(left, serde_json::from_value(json!({"workspace": "/ws"})).expect("parses"));
         assert_eq!(unusable.len(), 12, "{unusable:?}");
     }
 
     #[test]
     fn only_clean_absolute_paths_are_read() {
-        let read = |path: &str| serde_json::from_value::<RobotSettings>(serde_json::json!({"workspace": path})).is_ok();
+        let read = |path: &str| {
+            serde_json::from_value::<RobotSettings>(serde_json::json!({"workspace": path})).is_ok()
+        };
         assert!(read("/home/robot/my ws"));
-        for bad in ["", "ws", "~/ws", "$HOME/ws", "/ws/../etc", "/ws/.", "/a\nb", "/a\u{0}", "/a\u{202e}b"] {
+        for bad in
+            ["", "ws", "~/ws", "$HOME/ws", "/ws/../etc", "/ws/.", "/a\nb", "/a\u{0}", "/a\u{202e}b"]
+        {
             assert!(!read(bad), "{bad:?}");
         }
     }

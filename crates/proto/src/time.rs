@@ -1,5 +1,5 @@
-//! Civil time, in UTC, of milliseconds since the Unix epoch, and back; and lengths of time as people say them. It never asks what
-//! time it is.
+//! Civil time, in UTC, of milliseconds since the Unix epoch, and back; and lengths of time as
+//! people say them. It never asks what time it is.
 
 use std::time::Duration;
 
@@ -15,10 +15,12 @@ pub fn timestamp(ms: u64) -> String {
     let ms = ms.min(LAST_MS);
     let (seconds, millisecond) = (ms / 1000, ms % 1000);
     let (days, second) = (seconds / 86_400, seconds % 86_400);
-    // Civil date from days, with years that begin in March so that leap days come last (Hinnant's algorithm).
+    // Civil date from days, with years that begin in March so that leap days come last (Hinnant's
+    // algorithm).
     let shifted = days + EPOCH_DAY;
     let (era, day_of_era) = (shifted / ERA_DAYS, shifted % ERA_DAYS);
-    let year_of_era = (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let year_of_era =
+        (day_of_era - day_of_era / 1460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
     let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
     let month_from_march = (5 * day_of_year + 2) / 153;
     let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
@@ -31,14 +33,22 @@ pub fn timestamp(ms: u64) -> String {
 /// What [`timestamp`] was made of; `None` for any other text.
 pub fn parse_timestamp(text: &str) -> Option<u64> {
     const SHAPE: &[u8; 24] = b"0000-00-00T00:00:00.000Z";
-    let fits = |(byte, shape): (u8, &u8)| if *shape == b'0' { byte.is_ascii_digit() } else { byte == *shape };
+    let fits = |(byte, shape): (u8, &u8)| {
+        if *shape == b'0' { byte.is_ascii_digit() } else { byte == *shape }
+    };
     if text.len() != SHAPE.len() || !text.bytes().zip(SHAPE).all(fits) {
         return None;
     }
     let number = |from: usize, to: usize| text[from..to].parse::<u64>().ok();
     let (year, month, day) = (number(0, 4)?, number(5, 7)?, number(8, 10)?);
-    let (hour, minute, second, millisecond) = (number(11, 13)?, number(14, 16)?, number(17, 19)?, number(20, 23)?);
-    if !(1..=12).contains(&month) || !(1..=31).contains(&day) || hour > 23 || minute > 59 || second > 59 {
+    let (hour, minute, second, millisecond) =
+        (number(11, 13)?, number(14, 16)?, number(17, 19)?, number(20, 23)?);
+    if !(1..=12).contains(&month)
+        || !(1..=31).contains(&day)
+        || hour > 23
+        || minute > 59
+        || second > 59
+    {
         return None;
     }
     let year = year.checked_sub(u64::from(month <= 2))?;

@@ -1,7 +1,8 @@
-//! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrolment, robot), an id, 256 random bits and a CRC-32, so that a
-//! mistyped token is refused before anything is looked up. An enrolment token also carries the server's public key and,
-//! where the server has a private certificate authority, the pin of that.
-//! Only the SHA-256 of a secret is ever stored; tokens never appear in `Debug` output.
+//! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrolment, robot), an id, 256 random bits
+//! and a CRC-32, so that a mistyped token is refused before anything is looked up. An enrolment
+//! token also carries the server's public key and, where the server has a private certificate
+//! authority, the pin of that. Only the SHA-256 of a secret is ever stored; tokens never appear in
+//! `Debug` output.
 
 use std::fmt;
 use std::str::FromStr;
@@ -52,7 +53,8 @@ impl Token {
         Self { kind, id: rand::random(), secret: rand::random(), server_key: None, ca_pin: None }
     }
 
-    /// A fresh enrolment token that pins `server_key` and, if there is one, the server's certificate authority.
+    /// A fresh enrolment token that pins `server_key` and, if there is one, the server's
+    /// certificate authority.
     pub fn random_enrolment(server_key: PublicKey, ca_pin: Option<CaPin>) -> Self {
         Self { server_key: Some(server_key), ca_pin, ..Self::random(TokenKind::Enrolment) }
     }
@@ -116,7 +118,8 @@ impl FromStr for Token {
             ["tskr", _, _] => (TokenKind::Robot, None, None),
             ["tske", _, _, key, ref pin @ ..] if pin.len() <= 1 => {
                 let key = unhex(key).and_then(PublicKey::from_bytes).ok_or(InvalidToken)?;
-                let pin = pin.first().map(|pin| pin.parse().map_err(|_| InvalidToken)).transpose()?;
+                let pin =
+                    pin.first().map(|pin| pin.parse().map_err(|_| InvalidToken)).transpose()?;
                 (TokenKind::Enrolment, Some(key), pin)
             }
             _ => return Err(InvalidToken),
@@ -161,7 +164,8 @@ mod tests {
         let read: Token = token.reveal().parse().expect("a token");
         assert_eq!((read.server_key(), read.ca_pin()), (Some(&key), Some(pin)));
         assert!(token.reveal().contains(&format!("_{pin}_")));
-        let with_checksum = |body: String| format!("{body}_{:08x}", crc32fast::hash(body.as_bytes()));
+        let with_checksum =
+            |body: String| format!("{body}_{:08x}", crc32fast::hash(body.as_bytes()));
         let body = token.body();
         assert!(with_checksum(body.clone()).parse::<Token>().is_ok());
         for wrong in [format!("{body}_{pin}"), body.replace(&pin.to_string(), "ab")] {

@@ -25,7 +25,9 @@ pub struct TopicPrefix(String);
 
 /// A prefix that MQTT or our parsing could not live with.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0:?} is not a topic prefix: 1 to 64 letters, digits, '.', '_' and '-' in levels joined by single '/'")]
+#[error(
+    "{0:?} is not a topic prefix: 1 to 64 letters, digits, '.', '_' and '-' in levels joined by single '/'"
+)]
 pub struct InvalidPrefix(String);
 
 /// What a topic is about.
@@ -58,8 +60,15 @@ pub enum RobotTopic {
 
 impl RobotTopic {
     /// Every robot topic.
-    pub const ALL: [Self; 7] =
-        [Self::Desired, Self::Report, Self::Status, Self::Telemetry, Self::Log, Self::Request, Self::Reply];
+    pub const ALL: [Self; 7] = [
+        Self::Desired,
+        Self::Report,
+        Self::Status,
+        Self::Telemetry,
+        Self::Log,
+        Self::Request,
+        Self::Reply,
+    ];
 
     /// The level's text.
     pub fn as_str(self) -> &'static str {
@@ -116,7 +125,10 @@ impl FromStr for TopicPrefix {
     type Err = InvalidPrefix;
     fn from_str(text: &str) -> Result<Self, InvalidPrefix> {
         let level_ok = |level: &str| {
-            !level.is_empty() && level.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
+            !level.is_empty()
+                && level
+                    .bytes()
+                    .all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-'))
         };
         if text.len() <= 64 && text.split('/').all(level_ok) {
             Ok(Self(text.to_owned()))

@@ -1,5 +1,6 @@
 //! How a robot's machine does: a few figures a minute on its `telemetry` topic, and the answer to
-//! [`crate::request::Ask::Vitals`]. They are for people; nothing is decided by them, and none is kept on a disk.
+//! [`crate::request::Ask::Vitals`]. They are for people; nothing is decided by them, and none is
+//! kept on a disk.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +48,8 @@ pub struct Vitals {
     pub temperature_c: Option<f32>,
 }
 
-/// What a robot publishes on its `telemetry` topic, QoS 0; without MQTT the body of its `POST /robots/{robot}/telemetry`.
+/// What a robot publishes on its `telemetry` topic, QoS 0; without MQTT the body of its
+/// `POST /robots/{robot}/telemetry`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Telemetry {

@@ -1,6 +1,7 @@
-//! The MQTT front alone, for measuring it: it lets in whoever names a robot id, stores nothing, and rings every robot that
-//! has come in once for each line on its standard input. It says its address on the first line of its output, and ends
-//! with its input. Not for a network: it listens on loopback.
+//! The MQTT front alone, for measuring it: it lets in whoever names a robot id, stores nothing, and
+//! rings every robot that has come in once for each line on its standard input. It says its address
+//! on the first line of its output, and ends with its input. Not for a network: it listens on
+//! loopback.
 
 use std::collections::BTreeSet;
 use std::io::Write as _;
@@ -13,7 +14,8 @@ use futures_util::future::BoxFuture;
 use task_proto::RobotId;
 use task_proto::topic::TopicPrefix;
 use taskd::broker::{
-    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
+    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
+    RobotMessage,
 };
 use taskd::limits::conduct::{Conduct, ConductLimits};
 
@@ -29,7 +31,8 @@ struct Open;
 impl Gatekeeper for Open {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
         let robot = login.client_id.parse().map_err(|_| Refusal::BadCredentials);
-        async move { Ok(Principal::Robot { robot: robot?, token_number: 0, is_first_use: false }) }.boxed()
+        async move { Ok(Principal::Robot { robot: robot?, token_number: 0, is_first_use: false }) }
+            .boxed()
     }
 }
 
@@ -69,7 +72,8 @@ fn main() -> anyhow::Result<()> {
     let payload = Bytes::from(vec![b'x'; PAYLOAD_BYTES]);
     for line in std::io::stdin().lines() {
         line?;
-        let robots: Vec<RobotId> = connected.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
+        let robots: Vec<RobotId> =
+            connected.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
         for robot in &robots {
             // Whoever has just left is missed by the one who counts.
             let _ = broker.ring(robot, payload.clone());

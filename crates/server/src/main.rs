@@ -20,8 +20,8 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 
-/// The C library's allocator took a quarter of the time of a short answer, where memory is taken by one thread and given back
-/// by another all the time; see docs/measurements.md.
+/// The C library's allocator took a quarter of the time of a short answer, where memory is taken by
+/// one thread and given back by another all the time; see docs/measurements.md.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
@@ -34,15 +34,23 @@ fn main() -> ExitCode {
     commands::complete(CommandLine::describe);
     let CommandLine { connection, command } =
         CommandLine::read(std::env::args_os()).unwrap_or_else(|error| error.exit());
-    // Sockets are looked at after so many tasks: those that hand out blobs take long, and would keep everybody waiting.
-    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().event_interval(TASKS_PER_LOOK).build();
+    // Sockets are looked at after so many tasks: those that hand out blobs take long, and would
+    // keep everybody waiting.
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .event_interval(TASKS_PER_LOOK)
+        .build();
     let runtime = match runtime {
         Ok(runtime) => runtime,
         Err(error) => return complain(&anyhow::Error::new(error).context("no threads to run on")),
     };
     let code = match command {
-        Command::Serve(flags) => runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error)),
-        Command::Operator(command) => runtime.block_on(commands::run(&connection, command, CommandLine::describe)),
+        Command::Serve(flags) => {
+            runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error))
+        }
+        Command::Operator(command) => {
+            runtime.block_on(commands::run(&connection, command, CommandLine::describe))
+        }
     };
     runtime.shutdown_timeout(LEFTOVER_PATIENCE);
     code
@@ -51,8 +59,8 @@ fn main() -> ExitCode {
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
     // All that a server keeps is its own: also what SQLite makes beside its database.
     umask(Mode::from_bits_truncate(0o077));
-    let filter =
-        EnvFilter::try_from_env("TASKD_LOG").unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
+    let filter = EnvFilter::try_from_env("TASKD_LOG")
+        .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
     let (limits, has_colours) = (LogLimits::default(), std::io::stderr().is_terminal());
     tracing_subscriber::fmt()
         .with_env_filter(filter)
@@ -95,7 +103,10 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
 /// SIGHUP: looks for a new certificate now. The server looks by itself every few seconds.
 fn reload(server: &Server) {
     if let Err(error) = server.reload_certificate() {
-        tracing::warn!(error = &error as &dyn std::error::Error, "the certificate stays what it was");
+        tracing::warn!(
+            error = &error as &dyn std::error::Error,
+            "the certificate stays what it was"
+        );
     }
 }
 
@@ -135,7 +146,10 @@ struct Signals {
 
 impl Signals {
     fn install() -> std::io::Result<Self> {
-        Ok(Self { terminate: signal(SignalKind::terminate())?, interrupt: signal(SignalKind::interrupt())? })
+        Ok(Self {
+            terminate: signal(SignalKind::terminate())?,
+            interrupt: signal(SignalKind::interrupt())?,
+        })
     }
 
     async fn next(&mut self) {
@@ -149,6 +163,10 @@ impl Signals {
 /// Says on stderr what went wrong, with all causes. A broken stderr is no reason to panic.
 fn complain(error: &anyhow::Error) -> ExitCode {
     let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
-    let outcome = if error.is::<ConfigError>() { commands::Outcome::Usage } else { commands::Outcome::Failed };
+    let outcome = if error.is::<ConfigError>() {
+        commands::Outcome::Usage
+    } else {
+        commands::Outcome::Failed
+    };
     outcome.into()
 }

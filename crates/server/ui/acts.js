@@ -8,7 +8,8 @@ import { number, plural } from './format.js';
 import { tell } from './notice.js';
 
 /** `3 robots`, or the one robot's name. */
-export const whom = (ids, fleet) => (ids.size === 1 ? fleet.robots.get([...ids][0])?.name ?? '1 robot' : plural(ids.size, 'robot'));
+export const whom = (ids, fleet) =>
+  ids.size === 1 ? (fleet.robots.get([...ids][0])?.name ?? '1 robot') : plural(ids.size, 'robot');
 
 /** The names of a few of them, so that nobody acts on others than they think. */
 export function names(ids, fleet) {
@@ -18,15 +19,21 @@ export function names(ids, fleet) {
 }
 
 /** Those of them that get what is ordered. */
-export const receivers = (ids, fleet) => new Set([...ids].filter((id) => !isWaiting(fleet.robots.get(id))));
+export const receivers = (ids, fleet) =>
+  new Set([...ids].filter((id) => !isWaiting(fleet.robots.get(id))));
 
 /** Says that some of those who were chosen get nothing. */
-export const leftOut = (count) => (count ? html`<p class="quiet">${number(count)} of those that were chosen ${count === 1 ? 'waits' : 'wait'} for approval and ${count === 1 ? 'gets' : 'get'} nothing until then.</p>` : nothing);
+export const leftOut = (count) =>
+  count
+    ? html`<p class="quiet">${number(count)} of those that were chosen ${count === 1 ? 'waits' : 'wait'} for approval and ${count === 1 ? 'gets' : 'get'} nothing until then.</p>`
+    : nothing;
 
 /** The tasks that these robots have, each with how many have it. */
 function tasksOf(ids, fleet) {
   const counts = new Map();
-  for (const id of ids) for (const { task } of fleet.robots.get(id)?.tasks ?? []) counts.set(task, (counts.get(task) ?? 0) + 1);
+  for (const id of ids)
+    for (const { task } of fleet.robots.get(id)?.tasks ?? [])
+      counts.set(task, (counts.get(task) ?? 0) + 1);
   return [...counts].sort();
 }
 
@@ -50,9 +57,11 @@ export function askTask(app, verb, ids, only = null) {
     isDangerous,
     action: tasks.length ? title : null,
     body: () => html`${names(chosen, app.fleet)}${leftOut(left)}
-      ${tasks.length
-        ? html`<fieldset><legend>Which task</legend>${tasks.map(([task, count], index) => html`<label class="choice"><input type="checkbox" name="task" value=${task} ?checked=${index === 0 && tasks.length === 1}> ${task} <span class="quiet">on ${plural(count, 'robot')}</span></label>`)}</fieldset>`
-        : html`<p>None of them has a task.</p>`}`,
+      ${
+        tasks.length
+          ? html`<fieldset><legend>Which task</legend>${tasks.map(([task, count], index) => html`<label class="choice"><input type="checkbox" name="task" value=${task} ?checked=${index === 0 && tasks.length === 1}> ${task} <span class="quiet">on ${plural(count, 'robot')}</span></label>`)}</fieldset>`
+          : html`<p>None of them has a task.</p>`
+      }`,
     async act({ task = [] }) {
       const wanted = [task].flat();
       if (!wanted.length) throw new Error('Choose a task.');
@@ -63,7 +72,9 @@ export function askTask(app, verb, ids, only = null) {
         answer.robots.forEach(({ id }) => robots.add(id));
         answer.without?.forEach(({ id }) => without.add(id));
       }
-      const rest = without.size ? ` On ${plural(without.size, 'robot')} no earlier package ever ran.` : '';
+      const rest = without.size
+        ? ` On ${plural(without.size, 'robot')} no earlier package ever ran.`
+        : '';
       tell(`${wanted.join(', ')}: to be ${done} on ${plural(robots.size, 'robot')}.${rest}`);
     },
   });
@@ -74,7 +85,10 @@ export function askLabels(app, ids) {
   const chosen = receivers(ids, app.fleet);
   const left = ids.size - chosen.size;
   // A field must not be called like what a form can do: `remove` would be no function any more.
-  const there = () => [...new Set([...chosen].flatMap((id) => Object.keys(app.fleet.robots.get(id)?.labels ?? {})))].sort();
+  const there = () =>
+    [
+      ...new Set([...chosen].flatMap((id) => Object.keys(app.fleet.robots.get(id)?.labels ?? {}))),
+    ].sort();
   open({
     title: `Label ${whom(chosen, app.fleet)}`,
     action: chosen.size ? 'Label' : null,
@@ -93,15 +107,22 @@ export function askLabels(app, ids) {
 
 /** `site=lab, floor=2` as an object. */
 export function parseLabels(text) {
-  const pairs = text.split(',').map((pair) => pair.trim()).filter(Boolean).map((pair) => {
-    const [label, ...value] = pair.split('=');
-    if (!value.length) throw new Error(`${pair}: a label is written as name=value`);
-    return [label.trim(), value.join('=').trim()];
-  });
+  const pairs = text
+    .split(',')
+    .map((pair) => pair.trim())
+    .filter(Boolean)
+    .map((pair) => {
+      const [label, ...value] = pair.split('=');
+      if (!value.length) throw new Error(`${pair}: a label is written as name=value`);
+      return [label.trim(), value.join('=').trim()];
+    });
   return Object.fromEntries(pairs);
 }
 
-/** Removes those that get orders at once, and one by one those that wait, whom no selector means. Whoever is gone leaves `left`. */
+/**
+ * Removes those that get orders at once, and one by one those that wait, whom no selector means.
+ * Whoever is gone leaves `left`.
+ */
 async function removeAll(left, fleet) {
   const ordered = receivers(left, fleet);
   if (ordered.size) await post('/bulk/remove', { selector: idsOf(ordered) });
@@ -124,7 +145,8 @@ export function askDelete(app, ids) {
     title: `Delete ${whom(chosen, app.fleet)}?`,
     action: 'Delete',
     isDangerous: true,
-    body: () => html`${names(chosen, app.fleet)}<p>Their tokens end. What runs there goes on running, but nothing new starts. They come back by enrolling again.</p>`,
+    body: () =>
+      html`${names(chosen, app.fleet)}<p>Their tokens end. What runs there goes on running, but nothing new starts. They come back by enrolling again.</p>`,
     async act() {
       await removeAll(left, app.fleet);
       tell(`${plural(chosen.size, 'robot')} deleted.`);
@@ -132,18 +154,28 @@ export function askDelete(app, ids) {
   });
 }
 
-/** These labels with what was changed from `before` to `after`: what somebody else has changed meanwhile stays. */
+/**
+ * These labels with what was changed from `before` to `after`: what somebody else has changed
+ * meanwhile stays.
+ */
 export function relabelled(labels, before, after) {
   const kept = Object.entries(labels).filter(([label]) => !(label in before) || label in after);
   const set = Object.entries(after).filter(([label, value]) => before[label] !== value);
   return Object.fromEntries([...kept, ...set]);
 }
 
-/** What of a robot's name and labels was changed since they were as in `robot`, and nothing else. */
+/**
+ * What of a robot's name and labels was changed since they were as in `robot`, and nothing else.
+ */
 function changesOf(app, robot, name, labels) {
   const body = {};
   if (name !== robot.name) body.name = name;
-  if (labels !== labelsOf(robot).join(', ')) body.labels = relabelled((app.fleet.robots.get(robot.id) ?? robot).labels, robot.labels, parseLabels(labels));
+  if (labels !== labelsOf(robot).join(', '))
+    body.labels = relabelled(
+      (app.fleet.robots.get(robot.id) ?? robot).labels,
+      robot.labels,
+      parseLabels(labels),
+    );
   return body;
 }
 

@@ -15,11 +15,17 @@ class Refused extends Error {
   }
 }
 
-/** How often a request is sent that the server has no time for, and what it may ask to be waited in between. */
+/**
+ * How often a request is sent that the server has no time for, and what it may ask to be waited in
+ * between.
+ */
 const TRIES = 4;
 const LONGEST_WAIT_S = 15;
 
-/** Sends a request, again where the server says soon when: it has done nothing of it. Nobody waits for a sign-in that is refused for long. */
+/**
+ * Sends a request, again where the server says soon when: it has done nothing of it. Nobody waits
+ * for a sign-in that is refused for long.
+ */
 async function send(url, options) {
   for (let tried = 1; ; tried += 1) {
     const response = await fetch(url, { ...options, signal: AbortSignal.timeout(PATIENCE_MS) });
@@ -30,16 +36,21 @@ async function send(url, options) {
   }
 }
 
-/** Asks the server; answers the parsed body. Throws `SignedOut` on 401 and `Refused` on the rest. */
+/**
+ * Asks the server; answers the parsed body. Throws `SignedOut` on 401 and `Refused` on the rest.
+ */
 async function ask(method, path, { body, query = {}, headers = {}, revive } = {}) {
-  const given = Object.entries(query).filter(([, value]) => value !== undefined && value !== null && value !== '');
+  const given = Object.entries(query).filter(
+    ([, value]) => value !== undefined && value !== null && value !== '',
+  );
   const search = given.length ? `?${new URLSearchParams(given)}` : '';
   const response = await send(BASE + path + search, {
     method,
     headers: body ? { 'content-type': 'application/json', ...headers } : headers,
     body: body && JSON.stringify(body),
   });
-  if (response.ok) return response.status === 204 ? null : JSON.parse(await response.text(), revive);
+  if (response.ok)
+    return response.status === 204 ? null : JSON.parse(await response.text(), revive);
   const said = await response.json().catch(() => null);
   if (response.status === 401) throw new SignedOut(said?.error?.message);
   throw new Refused(response.status, said?.error);
@@ -51,8 +62,8 @@ export const patch = (path, body) => ask('PATCH', path, { body });
 export const remove = (path) => ask('DELETE', path);
 
 /**
- * Sends a file's bytes, for as long as it takes; answers the parsed body. `told` gets how many have gone. By the older kind of
- * request, because `fetch` does not say that. `signal` breaks it off.
+ * Sends a file's bytes, for as long as it takes; answers the parsed body. `told` gets how many have
+ * gone. By the older kind of request, because `fetch` does not say that. `signal` breaks it off.
  */
 export function upload(path, blob, type, { told, signal }) {
   return new Promise((resolve, reject) => {
@@ -82,11 +93,17 @@ function parsed(text) {
   }
 }
 
-/** An order that may be sent again without ordering it twice: with the same key as long as the same thing is meant. */
+/**
+ * An order that may be sent again without ordering it twice: with the same key as long as the same
+ * thing is meant.
+ */
 export const order = (path, body, key) => post(path, body, { 'idempotency-key': key });
 
 /** A key for one order. The browser's own UUIDs need https. */
-export const newKey = () => Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, '0')).join('');
+export const newKey = () =>
+  Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) =>
+    byte.toString(16).padStart(2, '0'),
+  ).join('');
 
 export const session = () => get('/session');
 /** With `{ user, password }` or `{ token }`. */
@@ -109,5 +126,9 @@ export async function* robots() {
   }
 }
 
-/** Asks a robot something; answers what it answered, read with `revive` as by `JSON.parse`. Throws what it refused. */
-export const askRobot = (robot, question, revive) => ask('POST', `/robots/${robot}/ask`, { body: question, revive });
+/**
+ * Asks a robot something; answers what it answered, read with `revive` as by `JSON.parse`. Throws
+ * what it refused.
+ */
+export const askRobot = (robot, question, revive) =>
+  ask('POST', `/robots/${robot}/ask`, { body: question, revive });

@@ -1,15 +1,23 @@
-// The page: signs in, listens, finds the view of the place somebody is at, and draws it once per frame.
+// The page: signs in, listens, finds the view of the place somebody is at, and draws it once per
+// frame.
 //
-// A view is a class: `constructor(app)`, `arrive(place)` when its place's query or later parts change, `draw(now)`, which answers
-// a template, and, where it needs them, `drawn()` after the drawing, `hear(event)` for each event of the stream, `refresh()` when
-// the stream has come back and what was fetched may be old, `key(event)` for a key that nothing else takes (answers whether it
-// took it), and `leave()`. What every view may use is `app`, below.
+// A view is a class: `constructor(app)`, `arrive(place)` when its place's query or later parts
+// change, `draw(now)`, which answers a template, and, where it needs them, `drawn()` after the
+// drawing, `hear(event)` for each event of the stream, `refresh()` when the stream has come back
+// and what was fetched may be old, `key(event)` for a key that nothing else takes (answers whether
+// it took it), and `leave()`. What every view may use is `app`, below.
 
 import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import * as api from './api.js';
 import { holdFocus } from './cursor.js';
-import { close as closeDialog, dialogView, isAsking, settleDialog, takesKey as dialogTakes } from './dialog.js';
+import {
+  close as closeDialog,
+  dialogView,
+  isAsking,
+  settleDialog,
+  takesKey as dialogTakes,
+} from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
 import { ago, plural } from './format.js';
 import { change, drawWith } from './frame.js';
@@ -76,7 +84,9 @@ const page = {
   viewKey: null,
   section: SECTIONS[0],
   stream: { state: 'connecting' },
-  /** Heard while the lists are on their way: newer than the lists, or followed by something newer. */
+  /**
+   * Heard while the lists are on their way: newer than the lists, or followed by something newer.
+   */
   backlog: null,
   heardAt: null,
   /** Another way to sign in, if there is one. */
@@ -116,7 +126,10 @@ async function start({ token, problem } = ofLink()) {
   }
 }
 
-/** Leaves a link's token to who is not in: anybody can make such a link, so it signs nobody in by itself. */
+/**
+ * Leaves a link's token to who is not in: anybody can make such a link, so it signs nobody in by
+ * itself.
+ */
 function offer(token) {
   if (page.state === 'in') return;
   change(() => (page.token = token));
@@ -138,7 +151,13 @@ async function signIn(who) {
 function enter({ isNew = false } = {}) {
   live?.stop();
   change(() => {
-    Object.assign(page, { state: 'in', problem: null, token: null, isSigningIn: false, stream: { state: 'connecting' } });
+    Object.assign(page, {
+      state: 'in',
+      problem: null,
+      token: null,
+      isSigningIn: false,
+      stream: { state: 'connecting' },
+    });
     forget();
     arrive();
   });
@@ -160,7 +179,12 @@ async function lose() {
   leave();
   const { provider, ended_by_restart: isRestarted } = await api.session().catch(() => ({}));
   if (page.state !== 'signed_out' || page.isSigningIn) return;
-  change(() => Object.assign(page, { provider: provider ?? page.provider, problem: page.problem ?? (isRestarted ? RESTARTED : null) }));
+  change(() =>
+    Object.assign(page, {
+      provider: provider ?? page.provider,
+      problem: page.problem ?? (isRestarted ? RESTARTED : null),
+    }),
+  );
 }
 
 /** Nothing of one person is shown to the next. */
@@ -170,7 +194,12 @@ function forget() {
   hideNotice();
   app.uploads.stop();
   Object.assign(page, { view: null, viewKey: null, backlog: null, heardAt: null, failures: 0 });
-  Object.assign(app, { fleet: new Fleet(), selection: new Selection(), uploads: new Uploads(), me: null });
+  Object.assign(app, {
+    fleet: new Fleet(),
+    selection: new Selection(),
+    uploads: new Uploads(),
+    me: null,
+  });
 }
 
 async function signOut() {
@@ -191,7 +220,7 @@ function arrive() {
   const [name, one] = here.path;
   const section = SECTIONS.find(({ id }) => id === name) ?? SECTIONS[0];
   const View = one && section.one ? section.one : section.list;
-  const key = `${section.id} ${section.one ? one ?? '' : ''}`;
+  const key = `${section.id} ${section.one ? (one ?? '') : ''}`;
   if (page.viewKey !== key) {
     page.view?.leave?.();
     Object.assign(page, { section, viewKey: key, view: new View(app) });
@@ -258,7 +287,10 @@ async function refetch() {
 }
 
 /** Spread out, so that a server in trouble is not met by every page at once. */
-const pauseAfter = (failures) => failures ? Math.min(REFETCH_PAUSE_MS * 2 ** failures, LONGEST_PAUSE_MS) * (0.5 + Math.random() / 2) : REFETCH_PAUSE_MS;
+const pauseAfter = (failures) =>
+  failures
+    ? Math.min(REFETCH_PAUSE_MS * 2 ** failures, LONGEST_PAUSE_MS) * (0.5 + Math.random() / 2)
+    : REFETCH_PAUSE_MS;
 
 /** Waits until then, or until the stream has come back. */
 async function rest(ms) {
@@ -271,7 +303,11 @@ async function rest(ms) {
 }
 
 async function fetchLists(isMine) {
-  const [server, me, deployments] = await Promise.all([api.get('/server'), api.get('/me'), api.deployments()]);
+  const [server, me, deployments] = await Promise.all([
+    api.get('/server'),
+    api.get('/me'),
+    api.deployments(),
+  ]);
   if (!isMine()) return;
   const { fleet } = app;
   app.me = me;
@@ -300,7 +336,8 @@ async function fetchLists(isMine) {
 // Drawing
 
 drawWith((frame) => {
-  if (page.state === 'starting') return render(page.problem ? html`<p class="bad">${page.problem}</p>` : nothing, document.body);
+  if (page.state === 'starting')
+    return render(page.problem ? html`<p class="bad">${page.problem}</p>` : nothing, document.body);
   if (page.state === 'signed_out') return render(signInView(page, signIn), document.body);
   app.fleet.settle(frame);
   app.selection.keep(app.fleet.robots);
@@ -314,19 +351,32 @@ drawWith((frame) => {
 
 /** Whether something would be lost: what is typed, or what was chosen to be sent. */
 function isAtWork() {
-  const isTyping = document.activeElement?.matches('input:not([type=checkbox], [type=radio]), textarea');
+  const isTyping = document.activeElement?.matches(
+    'input:not([type=checkbox], [type=radio]), textarea',
+  );
   return isTyping || page.view.isUnsaved || !app.uploads.isEmpty;
 }
 
-/** Loads the page that another server brings; once for each, lest two of them behind one address make it load for ever. */
+/**
+ * Loads the page that another server brings; once for each, lest two of them behind one address
+ * make it load for ever.
+ */
 function renew() {
   if (sessionStorage.getItem(RENEWED) === page.serverVersion) return;
   sessionStorage.setItem(RENEWED, page.serverVersion);
   location.reload();
 }
 
-/** A view gets elements of its own: what the one before has put into them, what listens to them and what was unfolded is not its. */
-const ofView = (view, drawn) => repeat([view], (one) => one, () => drawn);
+/**
+ * A view gets elements of its own: what the one before has put into them, what listens to them and
+ * what was unfolded is not its.
+ */
+const ofView = (view, drawn) =>
+  repeat(
+    [view],
+    (one) => one,
+    () => drawn,
+  );
 
 const frameView = (now) => html`
   <header class="top">
@@ -358,16 +408,23 @@ function streamState(now) {
   const { state, retry_at, problem } = page.stream;
   if (state === 'open' && app.fleet.isLoaded) return sign(true, 'Live');
   const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
-  if (state !== 'waiting') return sign(false, html`Connecting<span aria-hidden="true">${since}</span>`);
+  if (state !== 'waiting')
+    return sign(false, html`Connecting<span aria-hidden="true">${since}</span>`);
   const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
-  return sign(false, html`<span class="bad">Not live${problem ? ` (${problem})` : ''}<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`);
+  return sign(
+    false,
+    html`<span class="bad">Not live${problem ? ` (${problem})` : ''}<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`,
+  );
 }
 
 // Keys
 
 addEventListener('keydown', (event) => {
-  if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || dialogTakes(event)) return;
-  const isTyping = event.target.matches('input:not([type=checkbox]), textarea, select, [contenteditable]');
+  if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || dialogTakes(event))
+    return;
+  const isTyping = event.target.matches(
+    'input:not([type=checkbox]), textarea, select, [contenteditable]',
+  );
   const search = document.querySelector('input[type=search]');
   if (event.key === '/' && !isTyping && search) {
     event.preventDefault();
@@ -376,7 +433,8 @@ addEventListener('keydown', (event) => {
   } else if (event.key === '?' && !isTyping) {
     event.preventDefault();
     showHelp();
-  } else if ((!isTyping || event.target === search) && page.view?.key?.(event)) event.preventDefault();
+  } else if ((!isTyping || event.target === search) && page.view?.key?.(event))
+    event.preventDefault();
 });
 
 addEventListener('scroll', () => change(), { passive: true });
@@ -384,4 +442,3 @@ addEventListener('resize', () => change());
 // Times move on, and rows find their places, also while nothing is heard.
 setInterval(() => change(), 1_000);
 start();
-

@@ -1,4 +1,5 @@
-// A line to paste into a terminal, with a button that copies it, also on plain http, where browsers offer no clipboard.
+// A line to paste into a terminal, with a button that copies it, also on plain http, where browsers
+// offer no clipboard.
 
 import { html } from './vendor/lit-html-3.3.3/lit-html.js';
 
@@ -9,10 +10,15 @@ export const command = (text) => html`
   </div>`;
 
 /** A small button that copies a text which is shown in short beside it. */
-export const copyButton = (text, what) => html`<button class="plain link copy" aria-label=${`Copy ${what}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>`;
+export const copyButton = (text, what) =>
+  html`<button class="plain link copy" aria-label=${`Copy ${what}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>`;
 
 async function copy(text, button) {
-  const isCopied = (await navigator.clipboard?.writeText(text).then(() => true, () => false)) || copyBySelection(text);
+  const isCopied =
+    (await navigator.clipboard?.writeText(text).then(
+      () => true,
+      () => false,
+    )) || copyBySelection(text);
   button.textContent = isCopied ? 'Copied' : 'Select it';
   setTimeout(() => (button.textContent = 'Copy'), 2_000);
 }

@@ -1,11 +1,15 @@
-// Going from row to row of a long list by keys: up, down, and Enter, which opens. And staying there while the rows change places.
+// Going from row to row of a long list by keys: up, down, and Enter, which opens. And staying there
+// while the rows change places.
 
 import { change } from './frame.js';
 
 const CONTROLS = 'a, button, input, summary';
 const rowOf = (key) => document.querySelector(`[data-key="${CSS.escape(key)}"]`);
 
-/** To be called before each drawing. Answers what gives the focus back after it: a row that is put elsewhere has lost it. */
+/**
+ * To be called before each drawing. Answers what gives the focus back after it: a row that is put
+ * elsewhere has lost it.
+ */
 export function holdFocus() {
   const held = document.activeElement;
   const key = held?.closest('[data-key]')?.dataset.key;
@@ -40,8 +44,15 @@ export class Cursor {
   /** Whether it took the key. `keys` are the rows', in their order. */
   key({ key, target }, keys) {
     const isSearch = target.matches('input[type=search]');
-    if (key === 'ArrowDown' || key === 'ArrowUp') return this.#move(isSearch ? 0 : key === 'ArrowDown' ? 1 : -1, keys);
-    if (key !== 'Enter' || isSearch || target.matches('button, a, summary') || !keys.includes(this.current)) return false;
+    if (key === 'ArrowDown' || key === 'ArrowUp')
+      return this.#move(isSearch ? 0 : key === 'ArrowDown' ? 1 : -1, keys);
+    if (
+      key !== 'Enter' ||
+      isSearch ||
+      target.matches('button, a, summary') ||
+      !keys.includes(this.current)
+    )
+      return false;
     this.#open(this.current);
     return true;
   }

@@ -1,4 +1,5 @@
-// One deployment: how far it has come as a whole, why some robots failed, and each robot with the phases it went through.
+// One deployment: how far it has come as a whole, why some robots failed, and each robot with the
+// phases it went through.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
@@ -24,7 +25,8 @@ const ROW = 41;
 const NARROW_ROW = 65;
 // While data streams, rows come and go at most this often.
 const ORDER_PAUSE_MS = 1_000;
-// The whole is fetched anew at most this often, and more seldom where that takes long: ten thousand robots are some megabytes.
+// The whole is fetched anew at most this often, and more seldom where that takes long: ten thousand
+// robots are some megabytes.
 const REFETCH_PAUSE_MS = 5_000;
 const REFETCH_SHARE = 10;
 // Robots that are named where it is said which are waited for.
@@ -33,11 +35,30 @@ const AWAITED_NAMES = 5;
 /** Phases that always have a place, so that nothing moves when the first robot gets there. */
 const PLACES = ['assigned', 'fetching', 'unpacking', 'building', 'starting', 'running', 'failed'];
 const JOB_PLACES = [...PLACES.slice(0, -1), 'succeeded', 'failed'];
-const LIFE = ['assigned', 'deferred', 'fetching', 'unpacking', 'building', 'staged', 'starting', 'running', 'succeeded', 'failed', 'unmet', 'expired', 'rolled_back', 'stopped', 'superseded', 'cancelled'];
+const LIFE = [
+  'assigned',
+  'deferred',
+  'fetching',
+  'unpacking',
+  'building',
+  'staged',
+  'starting',
+  'running',
+  'succeeded',
+  'failed',
+  'unmet',
+  'expired',
+  'rolled_back',
+  'stopped',
+  'superseded',
+  'cancelled',
+];
 
 export class DeploymentView {
   #rows = new Rows();
-  #cursor = new Cursor(this.#rows, (robot) => this.#look({ robot: this.#place.robot === robot ? '' : robot }));
+  #cursor = new Cursor(this.#rows, (robot) =>
+    this.#look({ robot: this.#place.robot === robot ? '' : robot }),
+  );
   #parts = new Parts();
   #deployment = null;
   #problem = null;
@@ -49,7 +70,10 @@ export class DeploymentView {
   #detailHeight = 0;
   #fetchedAt = -Infinity;
   #fetchMs = 0;
-  /** The last heard of each robot, and of the deployment, while a list is on its way: newer than the list, or followed by something newer. */
+  /**
+   * The last heard of each robot, and of the deployment, while a list is on its way: newer than the
+   * list, or followed by something newer.
+   */
   #heard = null;
   /** It has to be fetched once more. */
   #isStale = false;
@@ -63,7 +87,12 @@ export class DeploymentView {
   arrive({ path: [, id], query }) {
     const isFirst = !this.id;
     this.id = id;
-    this.#place = { phase: query.phase ?? '', reason: query.reason ?? '', q: query.q ?? '', robot: query.robot ?? '' };
+    this.#place = {
+      phase: query.phase ?? '',
+      reason: query.reason ?? '',
+      q: query.q ?? '',
+      robot: query.robot ?? '',
+    };
     this.#rows.rearrange();
     this.#shownAt = -Infinity;
     if (isFirst) this.#fetch();
@@ -98,7 +127,9 @@ export class DeploymentView {
     const begun = performance.now();
     this.#fetchedAt = begun;
     try {
-      const deployment = await get(`/deployments/${encodeURIComponent(this.id)}`, { timeline: true });
+      const deployment = await get(`/deployments/${encodeURIComponent(this.id)}`, {
+        timeline: true,
+      });
       if (this.#isGone) return;
       this.#fetchMs = performance.now() - begun;
       change(() => {
@@ -121,14 +152,23 @@ export class DeploymentView {
   /** Fetches once more, some time soon: one fetch for all that is heard meanwhile. */
   #fetchSoon() {
     if (this.#timer || this.#isGone) return;
-    const wait = Math.max(ORDER_PAUSE_MS, this.#fetchedAt + Math.max(REFETCH_PAUSE_MS, REFETCH_SHARE * this.#fetchMs) - performance.now());
+    const wait = Math.max(
+      ORDER_PAUSE_MS,
+      this.#fetchedAt +
+        Math.max(REFETCH_PAUSE_MS, REFETCH_SHARE * this.#fetchMs) -
+        performance.now(),
+    );
     this.#timer = setTimeout(() => this.#fetch(), wait);
   }
 
   /** Who ordered it is written in the audit, which administrators may read. */
   async #askWho() {
     if (!this.app.can('administer')) return;
-    const { records } = await get('/audit', { target: this.id, act: 'deployment.create', limit: 1 }).catch(() => ({ records: [] }));
+    const { records } = await get('/audit', {
+      target: this.id,
+      act: 'deployment.create',
+      limit: 1,
+    }).catch(() => ({ records: [] }));
     change(() => (this.#orderedBy = records[0]?.entry.who ?? ''));
   }
 
@@ -140,7 +180,8 @@ export class DeploymentView {
   #take(event) {
     const deployment = this.#deployment;
     if (!deployment) return;
-    if (event.type === 'robot' && this.#parts.hear(event.robot, this.id, this.app.now())) this.#fetchSoon();
+    if (event.type === 'robot' && this.#parts.hear(event.robot, this.id, this.app.now()))
+      this.#fetchSoon();
     if (event.type === 'robot_removed') {
       this.#parts.remove(event.id);
       this.#shownAt = -Infinity;
@@ -153,7 +194,8 @@ export class DeploymentView {
   // Drawing.
 
   draw(now) {
-    if (!this.#deployment) return html`<p class="path"><a href=${at(['deployments'])}>Deployments</a></p><h1>${this.id}</h1><p class=${this.#problem ? 'bad' : 'quiet'}>${this.#problem ?? 'Fetching…'}</p>`;
+    if (!this.#deployment)
+      return html`<p class="path"><a href=${at(['deployments'])}>Deployments</a></p><h1>${this.id}</h1><p class=${this.#problem ? 'bad' : 'quiet'}>${this.#problem ?? 'Fetching…'}</p>`;
     const sum = this.#parts.summary(performance.now());
     this.#choose();
     return html`
@@ -170,7 +212,14 @@ export class DeploymentView {
 
   #head(now, { retried, newer }) {
     const deployment = this.#deployment;
-    const { package: { name, version, manifest }, selector, created_at_ms: created, expires_at_ms: expires, state, outdated } = deployment;
+    const {
+      package: { name, version, manifest },
+      selector,
+      created_at_ms: created,
+      expires_at_ms: expires,
+      state,
+      outdated,
+    } = deployment;
     const isUnsettled = this.#isUnsettled;
     return html`
       <p class="path"><a href=${at(['deployments'])}>Deployments</a> <span class="quiet">/ <span class="code">${this.id}</span></span></p>
@@ -178,11 +227,15 @@ export class DeploymentView {
         <h1><a href=${at(['packages', name], { version: manifest.digest })}>${name}<span class="quiet">@${version}</span></a></h1>
         <p class="state">${deploymentState(deployment)}</p>
         ${outdated ? html`<p class="bad">▲ outdated: ${version} is another package now, this is <span class="code">${short(manifest.digest)}</span></p>` : nothing}
-        ${this.app.can('operate') ? html`<span class="acts">
+        ${
+          this.app.can('operate')
+            ? html`<span class="acts">
           ${state === 'paused' ? html`<button class="primary" @click=${() => this.#askResume()}>Resume…</button>` : nothing}
           ${retried.size ? html`<button class="quiet-button" @click=${() => this.#askRetry([...this.#parts.all.values()])}>Retry ${plural(retried.size, 'robot')}…</button>` : nothing}
           ${isUnsettled ? html`<button class="quiet-button danger-text" @click=${() => this.#askCancel()}>Cancel…</button>` : nothing}
-        </span>` : nothing}
+        </span>`
+            : nothing
+        }
       </header>
       <p class="quiet ordered">
         <span title=${selector ?? nothing}>To ${wordsOf(deployment, this.app.fleet)}</span> · ${optionsOf(deployment)}
@@ -198,7 +251,13 @@ export class DeploymentView {
   /** The deployments before and after it. */
   #relations(newer) {
     const { supersedes } = this.#deployment;
-    const links = (ids) => [...ids].slice(0, 3).map((id, index) => html`${index ? ', ' : ''}<a href=${at(['deployments', id])} title=${id}>${this.#versionOf(id)}</a>`);
+    const links = (ids) =>
+      [...ids]
+        .slice(0, 3)
+        .map(
+          (id, index) =>
+            html`${index ? ', ' : ''}<a href=${at(['deployments', id])} title=${id}>${this.#versionOf(id)}</a>`,
+        );
     return html`${supersedes.length ? html` · supersedes ${links(supersedes)}` : nothing}${newer.size ? html` · superseded by ${links(newer)}` : nothing}`;
   }
 
@@ -210,18 +269,29 @@ export class DeploymentView {
   /** The counters, which are the filter as well, and how the bytes come along. */
   #figures(now, { phases, done, total, awaited, busy, offline }) {
     const places = this.#deployment.kind === 'job' ? JOB_PLACES : PLACES;
-    const shown = [...places, ...LIFE.filter((phase) => !places.includes(phase) && phases.get(phase))];
+    const shown = [
+      ...places,
+      ...LIFE.filter((phase) => !places.includes(phase) && phases.get(phase)),
+    ];
     const all = this.#parts.all.size;
     const rate = this.#parts.throughput(now);
-    const counts = LIFE.filter((phase) => phases.get(phase)).map((phase) => ({ phase, count: phases.get(phase) }));
+    const counts = LIFE.filter((phase) => phases.get(phase)).map((phase) => ({
+      phase,
+      count: phases.get(phase),
+    }));
     return html`
       <div class="whole">${countBar(counts)}</div>
       <div class="strip phases" role="group" aria-label="Show robots that are">
-        ${[{ id: '', count: all, title: 'All' }, ...shown.map((id) => ({ id, count: phases.get(id) ?? 0, title: capital(words(id)) }))].map(({ id, count, title }) => html`
+        ${[
+          { id: '', count: all, title: 'All' },
+          ...shown.map((id) => ({ id, count: phases.get(id) ?? 0, title: capital(words(id)) })),
+        ].map(
+          ({ id, count, title }) => html`
           <button class="counter ${tone(id)}" aria-pressed=${this.#place.phase === id && !this.#place.reason} @click=${() => this.#look({ phase: this.#place.phase === id ? '' : id, reason: '' })}>
             <span class="figure">${number(count)}</span><span>${title}</span>
             <svg class="share" viewBox="0 0 100 1" preserveAspectRatio="none" aria-hidden="true"><rect class=${id ? tone(id) : 'done'} width=${id && all ? (100 * count) / all : 0} height="1"></rect></svg>
-          </button>`)}
+          </button>`,
+        )}
       </div>
       <dl class="travel">
         <div><dt>Transferred</dt><dd>${total ? bytes({ done, total }) : '–'}</dd></div>
@@ -239,7 +309,12 @@ export class DeploymentView {
     const { phase, reason, q } = this.#place;
     const text = q.toLowerCase();
     this.#shown = [...this.#parts.all.values()]
-      .filter((part) => (!phase || part.phase === phase) && (!reason || reasonOf(part) === reason) && (!text || part.name.toLowerCase().includes(text)))
+      .filter(
+        (part) =>
+          (!phase || part.phase === phase) &&
+          (!reason || reasonOf(part) === reason) &&
+          (!text || part.name.toLowerCase().includes(text)),
+      )
       .map(({ robot }) => robot);
   }
 
@@ -247,7 +322,11 @@ export class DeploymentView {
     const { all } = this.#parts;
     const keys = this.#shown;
     const height = isNarrow ? NARROW_ROW : ROW;
-    const { start, end } = this.#rows.sight(keys, (robot) => height + (robot === this.#place.robot ? this.#detailHeight : 0), `${height} ${this.#place.robot} ${this.#detailHeight}`);
+    const { start, end } = this.#rows.sight(
+      keys,
+      (robot) => height + (robot === this.#place.robot ? this.#detailHeight : 0),
+      `${height} ${this.#place.robot} ${this.#detailHeight}`,
+    );
     const isAll = keys.length === all.size;
     return html`
       <header>
@@ -256,7 +335,11 @@ export class DeploymentView {
       </header>
       <div class="table parts-table" role="grid" aria-label="Robots of this deployment" aria-rowcount=${keys.length + 1}>
         <div class="row head" role="row" aria-rowindex="1">${['Robot', 'State', 'Phase', '', 'Phases', 'Took'].map((title, index) => html`<span role="columnheader">${title || html`<span class="unseen">${index === 3 ? 'What is known' : ''}</span>`}</span>`)}</div>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(keys.slice(start, end), (robot) => robot, (robot, index) => this.#row(all.get(robot), start + index, now))}</div></div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          keys.slice(start, end),
+          (robot) => robot,
+          (robot, index) => this.#row(all.get(robot), start + index, now),
+        )}</div></div>
       </div>
       ${keys.length ? nothing : html`<p class="empty quiet">No robot is like that. <button class="plain link" @click=${() => this.#look({ phase: '', reason: '', q: '' })}>Show all</button></p>`}`;
   }
@@ -280,7 +363,9 @@ export class DeploymentView {
   }
 
   #detail({ failure, delivery, attempts, superseded_by: newer, name }, all) {
-    const { package: { name: task } } = this.#deployment;
+    const {
+      package: { name: task },
+    } = this.#deployment;
     return html`
       ${failure ? html`<p class="bad whole-text">${words(failure.code)}: ${failure.text}</p>` : nothing}
       ${list(all)}
@@ -321,9 +406,14 @@ export class DeploymentView {
     open({
       title: `Retry on ${plural(ids.size, 'robot')}`,
       action: 'Retry',
-      body: () => html`${names(ids, this.app.fleet)}<p>${name}@${version} is ordered once more in the same way, for those that ended badly${code ? html` with “${words(code)}”` : nothing} and have had no newer order since.</p>`,
+      body: () =>
+        html`${names(ids, this.app.fleet)}<p>${name}@${version} is ordered once more in the same way, for those that ended badly${code ? html` with “${words(code)}”` : nothing} and have had no newer order since.</p>`,
       act: async () => {
-        const { id } = await order(`/deployments/${this.id}/retry`, { code: code || undefined, selector }, key);
+        const { id } = await order(
+          `/deployments/${this.id}/retry`,
+          { code: code || undefined, selector },
+          key,
+        );
         go(['deployments', id]);
       },
     });
@@ -336,7 +426,8 @@ export class DeploymentView {
       action: 'Cancel the deployment',
       dismissal: 'Let it go on',
       isDangerous: true,
-      body: () => html`<p>Robots that are not done yet go back to what they had before. A service that runs already goes on.</p>`,
+      body: () =>
+        html`<p>Robots that are not done yet go back to what they had before. A service that runs already goes on.</p>`,
       act: async () => {
         await post(`/deployments/${this.id}/cancel`);
         tell(`${name}@${version} is cancelled.`);
@@ -351,7 +442,8 @@ export class DeploymentView {
       title: `Resume ${name}@${version}?`,
       action: 'Resume',
       dismissal: 'Leave it paused',
-      body: () => html`<p>More robots failed than it was told to bear. The failures so far are forgiven, and the next batch begins.</p>`,
+      body: () =>
+        html`<p>More robots failed than it was told to bear. The failures so far are forgiven, and the next batch begins.</p>`,
       act: async () => {
         await post(`/deployments/${this.id}/resume`);
         tell(`${name}@${version} goes on.`);
@@ -380,11 +472,15 @@ const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 /** What else is known of a robot's part: how far, why not, or what it waits for. */
 function note(part, { package: { name } }) {
   const { failure, degraded, progress, phase, released } = part;
-  if (failure && tone(phase) !== 'done') return html`<span class=${tone(phase) === 'bad' ? 'bad' : 'quiet'} title=${failure.text}>${words(failure.code)}<span class="quiet">: ${failure.text}</span></span>`;
+  if (failure && tone(phase) !== 'done')
+    return html`<span class=${tone(phase) === 'bad' ? 'bad' : 'quiet'} title=${failure.text}>${words(failure.code)}<span class="quiet">: ${failure.text}</span></span>`;
   const bar = progressBar({ task: name, phase, progress });
   if (bar) return bar;
-  if (degraded) return html`<span class="bad" title=${degraded.text}>▲ degraded: ${words(degraded.code)}</span>`;
-  if (['assigned', 'deferred'].includes(phase) && !part.online) return html`<span class="quiet">begins when the robot is back</span>`;
-  if (!released && phase === 'assigned') return html`<span class="quiet">waits for its batch</span>`;
+  if (degraded)
+    return html`<span class="bad" title=${degraded.text}>▲ degraded: ${words(degraded.code)}</span>`;
+  if (['assigned', 'deferred'].includes(phase) && !part.online)
+    return html`<span class="quiet">begins when the robot is back</span>`;
+  if (!released && phase === 'assigned')
+    return html`<span class="quiet">waits for its batch</span>`;
   return nothing;
 }

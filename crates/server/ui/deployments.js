@@ -18,7 +18,8 @@ const NARROW_ROW = 113;
 
 const TOLD_TERMS = 6;
 
-const failures = ({ counts }) => counts.reduce((sum, { phase, count }) => sum + (tone(phase) === 'bad' ? count : 0), 0);
+const failures = ({ counts }) =>
+  counts.reduce((sum, { phase, count }) => sum + (tone(phase) === 'bad' ? count : 0), 0);
 
 /** What a deployment can be shown under. */
 const STATES = [
@@ -27,7 +28,12 @@ const STATES = [
   { id: 'paused', title: 'Paused', sign: '‖', has: ({ state }) => state === 'paused' },
   { id: 'settled', title: 'Settled', sign: '✓', has: ({ state }) => state === 'settled' },
   { id: 'cancelled', title: 'Cancelled', sign: '✕', has: ({ state }) => state === 'cancelled' },
-  { id: 'failures', title: 'With failures', sign: '▲', has: (deployment) => failures(deployment) > 0 },
+  {
+    id: 'failures',
+    title: 'With failures',
+    sign: '▲',
+    has: (deployment) => failures(deployment) > 0,
+  },
 ];
 
 export class DeploymentsView {
@@ -58,13 +64,19 @@ export class DeploymentsView {
 
   get #shown() {
     const parts = this.#text.toLowerCase().split(/\s+/).filter(Boolean);
-    return this.app.fleet.deployments.filter((deployment) => this.#state.has(deployment) && parts.every((word) => textOf(deployment).includes(word)));
+    return this.app.fleet.deployments.filter(
+      (deployment) =>
+        this.#state.has(deployment) && parts.every((word) => textOf(deployment).includes(word)),
+    );
   }
 
   draw(now) {
     const { fleet, can } = this.app;
     const shown = this.#shown;
-    const { start, end } = this.#rows.sight(shown.map(({ id }) => id), () => (isNarrow ? NARROW_ROW : ROW));
+    const { start, end } = this.#rows.sight(
+      shown.map(({ id }) => id),
+      () => (isNarrow ? NARROW_ROW : ROW),
+    );
     return html`
       <header class="bar-of-tools">
         <h1>Deployments</h1>
@@ -81,13 +93,15 @@ export class DeploymentsView {
 
   #strip() {
     const { deployments, isLoaded, older } = this.app.fleet;
-    return html`<div class="strip" role="group" aria-label="Show deployments that are">${STATES.map((state) => {
-      const count = deployments.filter(state.has).length;
-      return html`
+    return html`<div class="strip" role="group" aria-label="Show deployments that are">${STATES.map(
+      (state) => {
+        const count = deployments.filter(state.has).length;
+        return html`
         <button class="counter ${state.id === 'failures' ? 'failed' : ''}" aria-pressed=${this.#state === state} @click=${() => this.#look(this.#text, this.#state === state ? STATES[0] : state)}>
           <span class="figure">${isLoaded || count ? number(count) : '–'}${older ? '+' : ''}</span><span>${state.sign ? html`<span aria-hidden="true">${state.sign} </span>` : nothing}${state.title}</span>
         </button>`;
-    })}</div>`;
+      },
+    )}</div>`;
   }
 
   #table(shown, start, end, now) {
@@ -95,12 +109,22 @@ export class DeploymentsView {
     return html`
       <div class="table deployments-table" role="grid" aria-label="Deployments" aria-rowcount=${shown.length + 1}>
         <div class="row head" role="row" aria-rowindex="1">${['State', 'Package', 'To', 'Progress', 'Robots', 'Ordered'].map((title) => html`<span role="columnheader">${title}</span>`)}</div>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(shown.slice(start, end), ({ id }) => id, (deployment, index) => this.#row(deployment, start + index, fleet, now))}</div></div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          shown.slice(start, end),
+          ({ id }) => id,
+          (deployment, index) => this.#row(deployment, start + index, fleet, now),
+        )}</div></div>
       </div>`;
   }
 
   #row(deployment, index, fleet, now) {
-    const { id, package: { name, version }, selector, counts, created_at_ms: created } = deployment;
+    const {
+      id,
+      package: { name, version },
+      selector,
+      counts,
+      created_at_ms: created,
+    } = deployment;
     return html`
       <div class="row" role="row" tabindex=${this.#cursor.tabindex(id, index)} aria-rowindex=${index + 2} data-key=${id} data-deployment=${id} @focusin=${() => (this.#cursor.current = id)}>
         <span class="cell state" role="gridcell">${deploymentState(deployment)}</span>
@@ -132,7 +156,10 @@ export class DeploymentsView {
       this.#look('', STATES[0]);
       return true;
     }
-    return this.#cursor.key(event, this.#shown.map(({ id }) => id));
+    return this.#cursor.key(
+      event,
+      this.#shown.map(({ id }) => id),
+    );
   }
 }
 
@@ -142,14 +169,26 @@ const noDeployments = () => html`
     ${command("taskd push ./my_pkg --to '*'")}
   </section>`;
 
-const textOf = ({ id, package: { name, version }, selector = '', state, delivery }) => `${id} ${name}@${version} ${selector} ${state} ${delivery}`.toLowerCase();
+const textOf = ({ id, package: { name, version }, selector = '', state, delivery }) =>
+  `${id} ${name}@${version} ${selector} ${state} ${delivery}`.toLowerCase();
 
-/** To whom it is, as people read it: ids that were chosen on the page become names, of many only the first are told, and of too many none is known. */
+/**
+ * To whom it is, as people read it: ids that were chosen on the page become names, of many only the
+ * first are told, and of too many none is known.
+ */
 export function wordsOf({ selector, counts }, fleet) {
   if (selector === '*') return 'all robots';
-  if (!selector) return `${number(counts.reduce((sum, { count }) => sum + count, 0))} chosen robots`;
+  if (!selector)
+    return `${number(counts.reduce((sum, { count }) => sum + count, 0))} chosen robots`;
   const terms = selector.split(',');
-  const told = terms.slice(0, TOLD_TERMS).map((term) => term.replace(/^(!?)(r[0-9a-f]{16})$/, (_, not, id) => `${not}${fleet.robots.get(id)?.name ?? id}`));
+  const told = terms
+    .slice(0, TOLD_TERMS)
+    .map((term) =>
+      term.replace(
+        /^(!?)(r[0-9a-f]{16})$/,
+        (_, not, id) => `${not}${fleet.robots.get(id)?.name ?? id}`,
+      ),
+    );
   const rest = terms.length - told.length;
   return `${told.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
 }

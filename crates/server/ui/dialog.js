@@ -1,4 +1,5 @@
-// One question at a time, in front of everything else. Whoever asks says what the form holds and what to do with it.
+// One question at a time, in front of everything else. Whoever asks says what the form holds and
+// what to do with it.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { SignedOut } from './api.js';
@@ -8,18 +9,24 @@ import { complain } from './notice.js';
 let current = null;
 /** The question that has the focus. */
 let settled = null;
-/** How often the browser has yet to say that its dialog was closed by us, which it does late: the next question may be open by then. */
+/**
+ * How often the browser has yet to say that its dialog was closed by us, which it does late: the
+ * next question may be open by then.
+ */
 let ownClosings = 0;
-/** Whether the pointer went down beside the dialog: a click that only ends there has begun within, as when text is selected. */
+/**
+ * Whether the pointer went down beside the dialog: a click that only ends there has begun within,
+ * as when text is selected.
+ */
 let isPressedBeside = false;
 
 /**
- * Opens a dialog. `question` has a `title`, `body()` (a template, drawn again each frame), the `action`'s words, whether it
- * `isDangerous`, the words to leave it by if `Cancel` would be unclear (`dismissal`), and `act(fields)`, which gets what the form holds and may throw: the dialog stays open
- * and says why, unless the error `isSaid` already.
- * Without an `action` there is only something to read. What is shown but once `isSecret`: only buttons
- * close it, one of them with the words of `dismissal`.
- * Answers the question, by which `isOpen` knows it.
+ * Opens a dialog. `question` has a `title`, `body()` (a template, drawn again each frame), the
+ * `action`'s words, whether it `isDangerous`, the words to leave it by if `Cancel` would be unclear
+ * (`dismissal`), and `act(fields)`, which gets what the form holds and may throw: the dialog stays
+ * open and says why, unless the error `isSaid` already. Without an `action` there is only something
+ * to read. What is shown but once `isSecret`: only buttons close it, one of them with the words of
+ * `dismissal`. Answers the question, by which `isOpen` knows it.
  */
 export function open(question) {
   const asked = { ...question, problem: null, isBusy: false };
@@ -50,7 +57,10 @@ function closed() {
   else close();
 }
 
-/** Whether a key is the question's. Of Escape the browser would say late that it closed the dialog, and keys in between would be nobody's. */
+/**
+ * Whether a key is the question's. Of Escape the browser would say late that it closed the dialog,
+ * and keys in between would be nobody's.
+ */
 export function takesKey(event) {
   if (!current) return false;
   if (event.key === 'Escape') {
@@ -65,7 +75,12 @@ async function submit(event) {
   const question = current;
   if (question.isBusy) return;
   const form = new FormData(event.currentTarget);
-  const fields = Object.fromEntries([...new Set(form.keys())].map((name) => [name, form.getAll(name).length > 1 ? form.getAll(name) : form.get(name)]));
+  const fields = Object.fromEntries(
+    [...new Set(form.keys())].map((name) => [
+      name,
+      form.getAll(name).length > 1 ? form.getAll(name) : form.get(name),
+    ]),
+  );
   change(() => Object.assign(question, { isBusy: true, problem: null }));
   try {
     await question.act(fields);
@@ -73,7 +88,10 @@ async function submit(event) {
   } catch (error) {
     if (error instanceof SignedOut) close();
     else if (current !== question) complain(error.message);
-    else change(() => Object.assign(question, { isBusy: false, problem: error.isSaid ? null : error.message }));
+    else
+      change(() =>
+        Object.assign(question, { isBusy: false, problem: error.isSaid ? null : error.message }),
+      );
   }
 }
 
@@ -89,7 +107,16 @@ export const dialogView = () => html`
     ${current ? content(current) : nothing}
   </dialog>`;
 
-const content = ({ title, body, action, dismissal = 'Cancel', isDangerous, isSecret, isBusy, problem }) => html`
+const content = ({
+  title,
+  body,
+  action,
+  dismissal = 'Cancel',
+  isDangerous,
+  isSecret,
+  isBusy,
+  problem,
+}) => html`
   <form @submit=${submit}>
     <header>
       <h2 id="dialog-title">${title}</h2>
@@ -106,7 +133,13 @@ export function settleDialog() {
   const element = document.getElementById('dialog');
   if (!element) return;
   if (current && !element.open) element.showModal();
-  // Not to the button that closes it, which comes first; where there is nothing to fill in, to what does no harm.
-  if (current && current !== settled) element.querySelector('form :is(input, select, textarea):not([readonly]), form :is(footer, .command) button')?.focus();
+  // Not to the button that closes it, which comes first; where there is nothing to fill in, to what
+  // does no harm.
+  if (current && current !== settled)
+    element
+      .querySelector(
+        'form :is(input, select, textarea):not([readonly]), form :is(footer, .command) button',
+      )
+      ?.focus();
   settled = current;
 }

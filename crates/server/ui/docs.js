@@ -1,5 +1,5 @@
-// The page of the API's description. What is tried out there is sent as whoever is signed in at the page, by its cookie; a
-// token can be given instead.
+// The page of the API's description. What is tried out there is sent as whoever is signed in at the
+// page, by its cookie; a token can be given instead.
 
 const dark = matchMedia('(prefers-color-scheme: dark)');
 const follow = () => document.documentElement.classList.toggle('dark-mode', dark.matches);

@@ -1,4 +1,5 @@
-// What is known of the fleet, and which robots are shown in which order. It draws nothing and asks nobody.
+// What is known of the fleet, and which robots are shown in which order. It draws nothing and asks
+// nobody.
 
 import { tone } from './format.js';
 
@@ -21,7 +22,12 @@ const KEYS = {
   address: (robot) => natural(robot.address ?? ''),
   state: (robot) => (robot.online ? 0 : 1),
   seen: (robot) => (robot.online ? -Infinity : -(robot.last_seen_ms ?? 0)),
-  task: (robot) => robot.tasks.reduce((least, task) => min(least, `${urgency(task)} ${task.task}@${natural(task.version)} ${task.phase}`), '9'),
+  task: (robot) =>
+    robot.tasks.reduce(
+      (least, task) =>
+        min(least, `${urgency(task)} ${task.task}@${natural(task.version)} ${task.phase}`),
+      '9',
+    ),
   labels: (robot) => labelsOf(robot).join(),
   cpu: (robot) => -(robot.vitals?.cpu_percent ?? -1),
   memory: (robot) => -(robot.vitals?.memory_used_bytes ?? -1),
@@ -48,9 +54,11 @@ function natural(text) {
 const urgency = ({ phase }) => ({ bad: 0, busy: 1, waiting: 2, done: 3, gone: 4 })[tone(phase)];
 
 /** Whether it has yet to be approved: until then it gets nothing of what is ordered. */
-export const isWaiting = (robot) => Boolean(robot?.conditions.some(({ code }) => code === 'awaits_approval'));
+export const isWaiting = (robot) =>
+  Boolean(robot?.conditions.some(({ code }) => code === 'awaits_approval'));
 
-export const labelsOf = ({ labels }) => Object.entries(labels).map(([label, value]) => `${label}=${value}`);
+export const labelsOf = ({ labels }) =>
+  Object.entries(labels).map(([label, value]) => `${label}=${value}`);
 
 const versionsOf = ({ tasks }) => tasks.map(({ task, version }) => `${task}@${version}`);
 
@@ -131,7 +139,8 @@ export class Fleet {
     const old = this.robots.get(id);
     const before = this.#standings.get(id);
     const after = robot && standingsOf(robot);
-    for (const name of Object.keys(this.counts)) this.counts[name] += Boolean(after?.[name]) - Boolean(before?.[name]);
+    for (const name of Object.keys(this.counts))
+      this.counts[name] += Boolean(after?.[name]) - Boolean(before?.[name]);
     if (robot) {
       this.robots.set(id, robot);
       this.#standings.set(id, after);
@@ -143,27 +152,42 @@ export class Fleet {
     // Most news leave a robot where it is, and ten thousand take a while to sort.
     const { text, standing, sort } = this.search;
     const key = KEYS[sort];
-    const isInPlace = old && robot && !text && old.name === robot.name && key(old) === key(robot) && (!standing || before[standing] === after[standing]);
+    const isInPlace =
+      old &&
+      robot &&
+      !text &&
+      old.name === robot.name &&
+      key(old) === key(robot) &&
+      (!standing || before[standing] === after[standing]);
     if (!isInPlace) this.#isUnordered = true;
   }
 
-  /** Takes in the newest deployments, as the server lists them. Older ones that were asked for stay. */
+  /**
+   * Takes in the newest deployments, as the server lists them. Older ones that were asked for stay.
+   */
   renew({ deployments, next }) {
-    const kept = next ? this.deployments.slice(this.deployments.findIndex(({ id }) => id === next) + 1 || Infinity) : [];
+    const kept = next
+      ? this.deployments.slice(this.deployments.findIndex(({ id }) => id === next) + 1 || Infinity)
+      : [];
     if (!kept.length) this.older = next;
     this.deployments = [...deployments, ...kept];
   }
 
   /** Takes in deployments that are older than all that are here. */
   extend({ deployments, next }) {
-    this.deployments = [...this.deployments, ...deployments.filter(({ id }) => !this.deployment(id))];
+    this.deployments = [
+      ...this.deployments,
+      ...deployments.filter(({ id }) => !this.deployment(id)),
+    ];
     this.older = next;
   }
 
   #replaceDeployment(deployment) {
     const at = this.deployments.findIndex(({ id }) => id === deployment.id);
     if (at >= 0) return void (this.deployments[at] = deployment);
-    const before = this.deployments.findIndex(({ created_at_ms: created }) => created <= deployment.created_at_ms);
+    const before = this.deployments.findIndex(
+      ({ created_at_ms: created }) => created <= deployment.created_at_ms,
+    );
     if (before >= 0) this.deployments.splice(before, 0, deployment);
     else if (!this.older) this.deployments.push(deployment);
   }
@@ -183,7 +207,11 @@ export class Fleet {
 
   order(now = performance.now()) {
     const { text, standing, sort, isDescending } = this.search;
-    const tests = text.toLowerCase().split(/\s+/).filter(Boolean).map((word) => this.#testOf(word));
+    const tests = text
+      .toLowerCase()
+      .split(/\s+/)
+      .filter(Boolean)
+      .map((word) => this.#testOf(word));
     const rows = [];
     for (const robot of this.robots.values()) {
       if (standing && !this.#standings.get(robot.id)[standing]) continue;
@@ -198,14 +226,17 @@ export class Fleet {
   }
 
   /**
-   * Whether a robot is found by this word. `key=value` means that label and no longer one, `name@version` that version, where there
-   * are such labels and tasks; all else may occur anywhere in what a robot is known by.
+   * Whether a robot is found by this word. `key=value` means that label and no longer one,
+   * `name@version` that version, where there are such labels and tasks; all else may occur anywhere
+   * in what a robot is known by.
    */
   #testOf(word) {
     for (const [sign, namesOf] of Object.entries(NAMED)) {
       const [name, value] = word.split(sign, 2);
-      const isName = (robot) => namesOf(robot).some((one) => one.toLowerCase().startsWith(`${name}${sign}`));
-      if (name && value && [...this.robots.values()].some(isName)) return (robot) => namesOf(robot).some((one) => one.toLowerCase() === word);
+      const isName = (robot) =>
+        namesOf(robot).some((one) => one.toLowerCase().startsWith(`${name}${sign}`));
+      if (name && value && [...this.robots.values()].some(isName))
+        return (robot) => namesOf(robot).some((one) => one.toLowerCase() === word);
     }
     return (robot) => this.#textOf(robot).includes(word);
   }
@@ -224,11 +255,32 @@ export class Fleet {
 const compare = (one, other) => (one < other ? -1 : one > other ? 1 : 0);
 
 function textOf(robot) {
-  const tasks = robot.tasks.map(({ phase, deployment, failure }) => [phase, deployment, failure?.code, failure?.text]);
+  const tasks = robot.tasks.map(({ phase, deployment, failure }) => [
+    phase,
+    deployment,
+    failure?.code,
+    failure?.text,
+  ]);
   const conditions = robot.conditions.flatMap(({ code, text }) => [code, text]);
   const state = robot.online ? 'online' : 'offline';
   const { agent_version: agent, arch, ros_distros: distros = [] } = robot.host ?? {};
-  return [robot.id, robot.name, robot.mac, robot.address, state, agent, arch, distros, labelsOf(robot), versionsOf(robot), tasks, conditions].flat(2).join('\n').toLowerCase();
+  return [
+    robot.id,
+    robot.name,
+    robot.mac,
+    robot.address,
+    state,
+    agent,
+    arch,
+    distros,
+    labelsOf(robot),
+    versionsOf(robot),
+    tasks,
+    conditions,
+  ]
+    .flat(2)
+    .join('\n')
+    .toLowerCase();
 }
 
 /** Robots that a person has chosen, and how an order names them. */
@@ -247,7 +299,9 @@ export class Selection {
 
   /** Chooses one robot or lets it go; with `isRange` all that are shown between it and the last. */
   toggle(id, shown, isRange = false) {
-    const [from, to] = [shown.indexOf(this.#anchor), shown.indexOf(id)].sort((one, other) => one - other);
+    const [from, to] = [shown.indexOf(this.#anchor), shown.indexOf(id)].sort(
+      (one, other) => one - other,
+    );
     if (isRange && from >= 0) shown.slice(from, to + 1).forEach((one) => this.ids.add(one));
     else if (!this.ids.delete(id)) this.ids.add(id);
     this.#anchor = id;
@@ -269,5 +323,8 @@ export class Selection {
   }
 }
 
-/** A selector that names each of them: by what they have in common it would also mean robots that were never shown. */
+/**
+ * A selector that names each of them: by what they have in common it would also mean robots that
+ * were never shown.
+ */
 export const idsOf = (ids) => [...ids].join(',');

@@ -1,6 +1,11 @@
 // Numbers, times and names of states as people read them.
 
-const UNITS = [['d', 86_400], ['h', 3_600], ['min', 60], ['s', 1]];
+const UNITS = [
+  ['d', 86_400],
+  ['h', 3_600],
+  ['min', 60],
+  ['s', 1],
+];
 
 /** `12 s ago`; short, because a column of it is read at a glance. */
 export function ago(then, now) {
@@ -12,7 +17,9 @@ export function ago(then, now) {
 /** A robot may say a time that is none. */
 const orUnknown = (write) => (ms) => (Math.abs(ms) <= 8.64e15 ? write(ms) : '?');
 
-/** A way to write moments in milliseconds, made once: that takes longer than drawing a whole row. */
+/**
+ * A way to write moments in milliseconds, made once: that takes longer than drawing a whole row.
+ */
 const written = (locale, options) => orUnknown(new Intl.DateTimeFormat(locale, options).format);
 
 export const moment = written(undefined, { dateStyle: 'medium', timeStyle: 'medium' });
@@ -24,7 +31,12 @@ export const clock = written(undefined, { timeStyle: 'medium' });
 export const minute = written(undefined, { hour: '2-digit', minute: '2-digit' });
 
 /** `09:05:01.250`, for what comes many times a second. */
-export const instant = written('en-GB', { hour: '2-digit', minute: '2-digit', second: '2-digit', fractionalSecondDigits: 3 });
+export const instant = written('en-GB', {
+  hour: '2-digit',
+  minute: '2-digit',
+  second: '2-digit',
+  fractionalSecondDigits: 3,
+});
 
 /** `2026-01-31T09:05:01.250Z`, for programs. */
 export const iso = orUnknown((ms) => new Date(ms).toISOString());
@@ -40,13 +52,21 @@ export const words = (code) => code.replaceAll('_', ' ');
 
 /** `12.4 MB`. */
 export function size(bytes) {
-  const [unit, length] = [['GB', 1e9], ['MB', 1e6], ['kB', 1e3]].find(([, length]) => bytes >= length) ?? ['B', 1];
+  const [unit, length] = [
+    ['GB', 1e9],
+    ['MB', 1e6],
+    ['kB', 1e3],
+  ].find(([, length]) => bytes >= length) ?? ['B', 1];
   return `${(bytes / length).toFixed(length > 1 ? 1 : 0)} ${unit}`;
 }
 
 /** `12.4 of 48.0 MB`, both in the unit of the whole, so that the text keeps its width. */
 export function bytes({ done, total }) {
-  const [unit, size] = [['GB', 1e9], ['MB', 1e6], ['kB', 1e3]].find(([, size]) => total >= size) ?? ['B', 1];
+  const [unit, size] = [
+    ['GB', 1e9],
+    ['MB', 1e6],
+    ['kB', 1e3],
+  ].find(([, size]) => total >= size) ?? ['B', 1];
   const shown = (value) => (value / size).toFixed(size > 1 ? 1 : 0);
   return `${shown(done)} of ${shown(total)} ${unit}`;
 }

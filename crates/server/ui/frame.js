@@ -1,4 +1,5 @@
-// Drawing: whatever changes the state asks for a frame, and there is one drawing per frame, however much has changed.
+// Drawing: whatever changes the state asks for a frame, and there is one drawing per frame, however
+// much has changed.
 
 let draw = () => {};
 let isDirty = false;

@@ -13,8 +13,9 @@ const KEYS = [
   [['?'], 'this help'],
 ];
 
-export const showHelp = () => open({
-  title: 'Keys',
-  body: () => html`<dl class="keys">${KEYS.map(([keys, does]) => html`<dt>${keys.map((key) => html`<kbd>${key}</kbd> `)}</dt><dd>${does}</dd>`)}</dl>
+export const showHelp = () =>
+  open({
+    title: 'Keys',
+    body: () => html`<dl class="keys">${KEYS.map(([keys, does]) => html`<dt>${keys.map((key) => html`<kbd>${key}</kbd> `)}</dt><dd>${does}</dd>`)}</dl>
     <p class="quiet">Everything here can be done at the command line and <a href="/api/docs">over the API</a> as well.</p>`,
-});
+  });

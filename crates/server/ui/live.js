@@ -1,10 +1,12 @@
-// What the server tells this tab: through the worker that all tabs share, or directly where a browser has none.
+// What the server tells this tab: through the worker that all tabs share, or directly where a
+// browser has none.
 
 import { openStream } from './stream.js';
 
 /**
- * Starts listening; `hear` gets the stream's messages. Returns `stop` (this tab) and `signOut` (all tabs). With `isNew`, a session
- * has just begun: the stream of whoever was in before ends, and the other tabs are signed out.
+ * Starts listening; `hear` gets the stream's messages. Returns `stop` (this tab) and `signOut` (all
+ * tabs). With `isNew`, a session has just begun: the stream of whoever was in before ends, and the
+ * other tabs are signed out.
  */
 export function listen(hear, { isNew }) {
   if (typeof SharedWorker === 'undefined') return direct(hear);

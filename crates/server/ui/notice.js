@@ -24,8 +24,10 @@ function show(notice, duration) {
 export const hide = () => change(() => (current = null));
 
 export const noticeView = () => html`
-  <div class="notice" role="status">${current
-    ? html`<p class=${current.isBad ? 'bad' : ''}>${current.isBad ? '▲ ' : ''}${current.text}
+  <div class="notice" role="status">${
+    current
+      ? html`<p class=${current.isBad ? 'bad' : ''}>${current.isBad ? '▲ ' : ''}${current.text}
         ${current.link ? html`<a href=${current.link[0]} @click=${hide}>${current.link[1]}</a>` : nothing}
         <button class="plain" aria-label="Close the notice" @click=${hide}>✕</button></p>`
-    : nothing}</div>`;
+      : nothing
+  }</div>`;

@@ -1,4 +1,5 @@
-// One package: its versions, and of one of them what it runs and needs, where it runs, its files, and what differs from another.
+// One package: its versions, and of one of them what it runs and needs, where it runs, its files,
+// and what differs from another.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
@@ -99,7 +100,9 @@ export class PackageView {
   }
 
   #find(text) {
-    return this.#versions?.find(({ package: { version, manifest } }) => version === text || manifest.digest === text);
+    return this.#versions?.find(
+      ({ package: { version, manifest } }) => version === text || manifest.digest === text,
+    );
   }
 
   async #fetchContent() {
@@ -114,10 +117,15 @@ export class PackageView {
     let content;
     try {
       if (from) content = { difference: differences(await get(`${path}/diff`, { from, to })) };
-      else content = { tree: new Tree((await get(`${path}/${encodeURIComponent(to)}/files`)).files) };
+      else
+        content = { tree: new Tree((await get(`${path}/${encodeURIComponent(to)}/files`)).files) };
     } catch ({ status, message }) {
       // Without a key it is asked again.
-      content = { key: null, problem: status === 404 || status === 405 ? 'This server does not tell what is in it.' : message };
+      content = {
+        key: null,
+        problem:
+          status === 404 || status === 405 ? 'This server does not tell what is in it.' : message,
+      };
     }
     if (this.#content.key === key) change(() => (this.#content = { key, ...content }));
   }
@@ -133,7 +141,9 @@ export class PackageView {
         ${version ? this.#acts(version) : nothing}
       </header>
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}
-      ${version ? html`
+      ${
+        version
+          ? html`
         <div class="package-body">
           <nav class="versions" aria-label="Versions">${this.#versions.map((one) => this.#versionLink(one, one === version, now))}</nav>
           <div class="version">
@@ -142,7 +152,9 @@ export class PackageView {
             ${this.#whereItRuns(version)}
             ${this.#files(version)}
           </div>
-        </div>` : nothing}`;
+        </div>`
+          : nothing
+      }`;
   }
 
   #acts(version) {
@@ -191,9 +203,13 @@ export class PackageView {
           <h2 id="files">${this.#other ? 'What changed' : 'Files'} <span class="count">${tree ? `${number(tree.files)}, ${size(tree.bytes)}` : ''}</span></h2>
           <span class="acts">
             ${tree ? html`<input type="search" placeholder="Search" aria-label="Search its files" aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${this.#query.q ?? ''} @input=${({ currentTarget }) => this.#look({ q: currentTarget.value })}>` : nothing}
-            ${others.length ? html`<label class="quiet">Compare with <select @change=${({ currentTarget }) => this.#look({ with: currentTarget.value })}>
+            ${
+              others.length
+                ? html`<label class="quiet">Compare with <select @change=${({ currentTarget }) => this.#look({ with: currentTarget.value })}>
               <option value="" ?selected=${!this.#other}>no other</option>
-              ${others.map((one) => html`<option value=${this.#words.get(one)} ?selected=${one === this.#other}>${this.#titleOf(one)}</option>`)}</select></label>` : nothing}
+              ${others.map((one) => html`<option value=${this.#words.get(one)} ?selected=${one === this.#other}>${this.#titleOf(one)}</option>`)}</select></label>`
+                : nothing
+            }
           </span>
         </header>
         ${problem ? html`<p class="quiet">${problem}</p>` : nothing}
@@ -205,11 +221,18 @@ export class PackageView {
   #tree(tree) {
     const text = (this.#query.q ?? '').toLowerCase();
     const rows = tree.rows(text);
-    const { start, end } = this.#rows.sight(rows.map(({ path }) => path), () => ROW);
+    const { start, end } = this.#rows.sight(
+      rows.map(({ path }) => path),
+      () => ROW,
+    );
     const hasFolds = !text && rows.some(({ kind }) => kind === 'directory');
     return html`
       <div class="table files-table" role="treegrid" aria-label="Files" aria-rowcount=${rows.length}>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(rows.slice(start, end), ({ path }) => path, (node, index) => this.#node(tree, node, start + index))}</div></div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          rows.slice(start, end),
+          ({ path }) => path,
+          (node, index) => this.#node(tree, node, start + index),
+        )}</div></div>
       </div>
       ${rows.length ? nothing : html`<p class="quiet">No file is called that.</p>`}
       ${hasFolds ? html`<p class="folds"><button class="plain link" @click=${() => this.#toggleAll(tree, true)}>Unfold all</button> <button class="plain link" @click=${() => this.#toggleAll(tree, false)}>Fold all</button></p>` : nothing}`;
@@ -220,9 +243,11 @@ export class PackageView {
     const isUnfolded = tree.isUnfolded(path);
     return html`
       <div class="row depth-${Math.min(depth, 12)}" role="row" tabindex=${this.#cursor.tabindex(path, index)} aria-level=${depth + 1} aria-expanded=${isDirectory ? isUnfolded : nothing} aria-rowindex=${index + 1} data-key=${path} @focusin=${() => (this.#cursor.current = path)}>
-        <span class="cell file code" role="gridcell" title=${path}>${isDirectory
-          ? html`<button class="plain" tabindex="-1" @click=${() => this.#toggle(path)}><span class="fold-sign" aria-hidden="true">${isUnfolded ? '▾' : '▸'}</span>${name}/</button>`
-          : html`<span class="fold-sign"></span>${name}${target ? html` <span class="quiet">→ ${target}</span>` : nothing}`}</span>
+        <span class="cell file code" role="gridcell" title=${path}>${
+          isDirectory
+            ? html`<button class="plain" tabindex="-1" @click=${() => this.#toggle(path)}><span class="fold-sign" aria-hidden="true">${isUnfolded ? '▾' : '▸'}</span>${name}/</button>`
+            : html`<span class="fold-sign"></span>${name}${target ? html` <span class="quiet">→ ${target}</span>` : nothing}`
+        }</span>
         <span class="cell mode code quiet" role="gridcell">${isDirectory ? '' : modeWords(mode)}</span>
         <span class="cell size ${isDirectory ? 'quiet' : ''}" role="gridcell">${kind === 'link' ? '' : size(length)}</span>
       </div>`;
@@ -244,13 +269,22 @@ export class PackageView {
 
   #difference(version, { rows, by }) {
     const count = (kind) => number(rows.filter((row) => row.kind === kind).length);
-    const { start, end } = this.#rows.sight(rows.map(({ path }) => path), () => ROW);
-    const manifest = this.#other ? manifestDifference(this.#other.manifest, version.manifest) : nothing;
+    const { start, end } = this.#rows.sight(
+      rows.map(({ path }) => path),
+      () => ROW,
+    );
+    const manifest = this.#other
+      ? manifestDifference(this.#other.manifest, version.manifest)
+      : nothing;
     return html`
       <p>From ${this.#other?.package.version} to ${version.package.version}: ${rows.length ? html`${count('added')} added, ${count('removed')} removed, ${count('changed')} changed, <span class="quiet">${signed(by)}</span>` : 'the files are the same'}</p>
       ${manifest === nothing ? nothing : html`<h3>In the manifest</h3>${manifest}`}
       <div class="table differences-table" role="grid" aria-label="Files that differ" aria-rowcount=${rows.length}>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(rows.slice(start, end), ({ path }) => path, (row, index) => this.#changed(row, start + index))}</div></div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          rows.slice(start, end),
+          ({ path }) => path,
+          (row, index) => this.#changed(row, start + index),
+        )}</div></div>
       </div>`;
   }
 
@@ -277,13 +311,17 @@ export class PackageView {
       this.#look({ q: '' });
       return true;
     }
-    const isFold = (key === 'ArrowRight' || key === 'ArrowLeft') && tree && event.target.matches('.row');
+    const isFold =
+      (key === 'ArrowRight' || key === 'ArrowLeft') && tree && event.target.matches('.row');
     if (isFold && tree.isUnfolded(this.#cursor.current) === (key === 'ArrowLeft')) {
       this.#toggle(this.#cursor.current);
       return true;
     }
     const rows = tree?.rows((this.#query.q ?? '').toLowerCase()) ?? difference?.rows ?? [];
-    return this.#cursor.key(event, rows.map(({ path }) => path));
+    return this.#cursor.key(
+      event,
+      rows.map(({ path }) => path),
+    );
   }
 
   // Acting.
@@ -293,14 +331,16 @@ export class PackageView {
     const ids = new Set(robots.map(({ id }) => id));
     open({
       title: `${title} is in use`,
-      body: () => html`<p>${plural(ids.size, 'robot')} should have it. Bring them another version, or remove the task from them, before it can be deleted.</p>${names(ids, this.app.fleet)}`,
+      body: () =>
+        html`<p>${plural(ids.size, 'robot')} should have it. Bring them another version, or remove the task from them, before it can be deleted.</p>${names(ids, this.app.fleet)}`,
     });
   }
 
   #askDelete(version) {
     const { manifest } = version.package;
     const title = `${this.name} ${this.#titleOf(version)}`;
-    const isOnly = this.#versions.filter((one) => one.package.version === version.package.version).length === 1;
+    const isOnly =
+      this.#versions.filter((one) => one.package.version === version.package.version).length === 1;
     const wanting = this.uses.wanting(version.package, isOnly);
     if (wanting.length) return void this.#tellWhoNeeds(title, wanting);
     const count = this.uses.of(version.package).length;
@@ -308,9 +348,12 @@ export class PackageView {
       title: `Delete ${title}?`,
       action: 'Delete',
       isDangerous: true,
-      body: () => html`<p>${count ? `It still runs on ${plural(count, 'robot')}, which should have another version. ` : ''}Its files are taken from the server, and it can't be pushed to robots any more.</p>`,
+      body: () =>
+        html`<p>${count ? `It still runs on ${plural(count, 'robot')}, which should have another version. ` : ''}Its files are taken from the server, and it can't be pushed to robots any more.</p>`,
       act: async () => {
-        await remove(`/packages/${encodeURIComponent(this.name)}/${encodeURIComponent(manifest.digest)}`);
+        await remove(
+          `/packages/${encodeURIComponent(this.name)}/${encodeURIComponent(manifest.digest)}`,
+        );
         tell(`${title} is deleted.`);
         if (this.#versions.length === 1) return go(['packages']);
         this.#query = { ...this.#query, version: undefined, with: undefined };
@@ -322,4 +365,5 @@ export class PackageView {
 }
 
 /** `+1.2 kB`. */
-const signed = (bytes) => (bytes === 0 ? '±0 B' : `${bytes > 0 ? '+' : '−'}${size(Math.abs(bytes))}`);
+const signed = (bytes) =>
+  bytes === 0 ? '±0 B' : `${bytes > 0 ? '+' : '−'}${size(Math.abs(bytes))}`;

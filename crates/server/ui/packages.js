@@ -1,4 +1,5 @@
-// The packages that can be pushed: their versions, what they are for, and on how many robots each runs. New ones are dropped here.
+// The packages that can be pushed: their versions, what they are for, and on how many robots each
+// runs. New ones are dropped here.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
@@ -22,12 +23,28 @@ const REFETCH_PAUSE_MS = 1_000;
 /** What packages can be sorted by; by the newest of their versions. */
 const KEYS = {
   name: ({ name }) => name,
-  size: ({ versions: [{ package: { content } }] }) => -content.size,
+  size: ({
+    versions: [
+      {
+        package: { content },
+      },
+    ],
+  }) => -content.size,
   pushed: ({ versions: [{ pushed_at_ms: pushed }] }) => -pushed,
   robots: ({ robots }) => -robots,
 };
 
-const COLUMNS = [['Name', 'name'], ['Version'], ['Size', 'size'], ['Digest'], ['ROS'], ['Architecture'], ['Pushed', 'pushed'], ['Runs on', 'robots'], ['']];
+const COLUMNS = [
+  ['Name', 'name'],
+  ['Version'],
+  ['Size', 'size'],
+  ['Digest'],
+  ['ROS'],
+  ['Architecture'],
+  ['Pushed', 'pushed'],
+  ['Runs on', 'robots'],
+  [''],
+];
 
 export class PackagesView {
   #rows = new Rows();
@@ -51,7 +68,12 @@ export class PackagesView {
 
   arrive({ query }) {
     this.#rows.rearrange();
-    this.#search = { q: query.q ?? '', sort: KEYS[query.sort] ? query.sort : 'name', isDescending: query.order === 'down', unfolded: new Set(query.open?.split(',')) };
+    this.#search = {
+      q: query.q ?? '',
+      sort: KEYS[query.sort] ? query.sort : 'name',
+      isDescending: query.order === 'down',
+      unfolded: new Set(query.open?.split(',')),
+    };
   }
 
   leave() {
@@ -86,7 +108,12 @@ export class PackagesView {
       this.#rows.rearrange();
       this.#search = { ...this.#search, ...search };
       const { q, sort, isDescending, unfolded } = this.#search;
-      restate({ q, sort: sort === 'name' ? '' : sort, order: isDescending ? 'down' : '', open: [...unfolded].join(',') });
+      restate({
+        q,
+        sort: sort === 'name' ? '' : sort,
+        order: isDescending ? 'down' : '',
+        open: [...unfolded].join(','),
+      });
     });
   }
 
@@ -109,7 +136,11 @@ export class PackagesView {
       if (byName.has(name)) byName.get(name).push(one);
       else byName.set(name, [one]);
     }
-    const groups = [...byName].map(([name, versions]) => ({ name, versions, robots: versions.reduce((sum, one) => sum + this.uses.of(one.package).length, 0) }));
+    const groups = [...byName].map(([name, versions]) => ({
+      name,
+      versions,
+      robots: versions.reduce((sum, one) => sum + this.uses.of(one.package).length, 0),
+    }));
     const sign = isDescending ? -1 : 1;
     return groups.sort((one, other) => {
       const [first, second] = [KEYS[sort](one), KEYS[sort](other)];
@@ -117,16 +148,28 @@ export class PackagesView {
     });
   }
 
-  /** The rows: the newest version of each package, and the older ones of those that are unfolded. */
+  /**
+   * The rows: the newest version of each package, and the older ones of those that are unfolded.
+   */
   #rowsOf(groups) {
-    return groups.flatMap(({ name, versions }) => versions.slice(0, this.#search.unfolded.has(name) ? Infinity : 1)
-      .map((one, index) => ({ key: one.package.manifest.digest, word: this.#words.get(one), one, older: index ? 0 : versions.length - 1, isOlder: index > 0 })));
+    return groups.flatMap(({ name, versions }) =>
+      versions.slice(0, this.#search.unfolded.has(name) ? Infinity : 1).map((one, index) => ({
+        key: one.package.manifest.digest,
+        word: this.#words.get(one),
+        one,
+        older: index ? 0 : versions.length - 1,
+        isOlder: index > 0,
+      })),
+    );
   }
 
   draw(now) {
     const { can } = this.app;
     const rows = this.#rowsOf(this.#shown);
-    const { start, end } = this.#rows.sight(rows.map(({ key }) => key), () => (isNarrow ? NARROW_ROW : ROW));
+    const { start, end } = this.#rows.sight(
+      rows.map(({ key }) => key),
+      () => (isNarrow ? NARROW_ROW : ROW),
+    );
     return html`
       <header class="bar-of-tools">
         <h1>Packages</h1>
@@ -146,16 +189,28 @@ export class PackagesView {
     const { sort, isDescending } = this.#search;
     return html`
       <div class="table packages-table" role="grid" aria-label="Packages" aria-rowcount=${rows.length + 1}>
-        <div class="row head" role="row" aria-rowindex="1">${COLUMNS.map(([title, key]) => html`
-          <span role="columnheader" aria-sort=${key && sort === key ? (isDescending ? 'descending' : 'ascending') : nothing}>${key
-            ? html`<button class="plain" @click=${() => this.#look({ sort: key, isDescending: sort === key && !isDescending })}>${title}<span class="arrow" aria-hidden="true">${sort === key ? (isDescending ? '↓' : '↑') : ''}</span></button>`
-            : title || html`<span class="unseen">Operation</span>`}</span>`)}</div>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(rows.slice(start, end), ({ key }) => key, (row, index) => this.#row(row, start + index, now))}</div></div>
+        <div class="row head" role="row" aria-rowindex="1">${COLUMNS.map(
+          ([title, key]) => html`
+          <span role="columnheader" aria-sort=${key && sort === key ? (isDescending ? 'descending' : 'ascending') : nothing}>${
+            key
+              ? html`<button class="plain" @click=${() => this.#look({ sort: key, isDescending: sort === key && !isDescending })}>${title}<span class="arrow" aria-hidden="true">${sort === key ? (isDescending ? '↓' : '↑') : ''}</span></button>`
+              : title || html`<span class="unseen">Operation</span>`
+          }</span>`,
+        )}</div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          rows.slice(start, end),
+          ({ key }) => key,
+          (row, index) => this.#row(row, start + index, now),
+        )}</div></div>
       </div>`;
   }
 
   #row({ key, word, one, older, isOlder }, index, now) {
-    const { package: { name, version, manifest, content }, manifest: { requires, build }, pushed_at_ms: pushed } = one;
+    const {
+      package: { name, version, manifest, content },
+      manifest: { requires, build },
+      pushed_at_ms: pushed,
+    } = one;
     const count = this.uses.of(one.package).length;
     const isUnfolded = this.#search.unfolded.has(name);
     return html`
@@ -199,15 +254,25 @@ export class PackagesView {
       this.#look({ q: '' });
       return true;
     }
-    return this.#cursor.key(event, this.#rowsOf(this.#shown).map(({ key }) => key));
+    return this.#cursor.key(
+      event,
+      this.#rowsOf(this.#shown).map(({ key }) => key),
+    );
   }
 
   // Dropping, anywhere on the page while this view is there.
 
   #listenForDrops() {
     const { signal } = this.#end;
-    const on = (type, act) => addEventListener(type, (event) => this.app.can('publish') && event.dataTransfer?.types.includes('Files') && act(event), { signal });
-    const show = (isDropping) => this.#isDropping !== isDropping && change(() => (this.#isDropping = isDropping));
+    const on = (type, act) =>
+      addEventListener(
+        type,
+        (event) =>
+          this.app.can('publish') && event.dataTransfer?.types.includes('Files') && act(event),
+        { signal },
+      );
+    const show = (isDropping) =>
+      this.#isDropping !== isDropping && change(() => (this.#isDropping = isDropping));
     on('dragover', (event) => {
       event.preventDefault();
       show(true);
@@ -237,4 +302,6 @@ function uploadButtons(uploads) {
 }
 
 const textOf = ({ package: { name, version, manifest }, manifest: { requires } }) =>
-  [`${name}@${version}`, manifest.digest, ...(requires.ros_distro ?? []), ...(requires.arch ?? [])].join(' ').toLowerCase();
+  [`${name}@${version}`, manifest.digest, ...(requires.ros_distro ?? []), ...(requires.arch ?? [])]
+    .join(' ')
+    .toLowerCase();

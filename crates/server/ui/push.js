@@ -1,4 +1,5 @@
-// The order of a package to robots: which package, which robots, how the bytes travel, how carefully.
+// The order of a package to robots: which package, which robots, how the bytes travel, how
+// carefully.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { leftOut, names, receivers, whom } from './acts.js';
@@ -32,8 +33,8 @@ const DELIVERIES = [
 ];
 
 /**
- * Asks what to push. `ids` are the robots, or `null`: then a selector is asked for. `given` may name a `package` and a
- * `manifest` that are chosen already.
+ * Asks what to push. `ids` are the robots, or `null`: then a selector is asked for. `given` may
+ * name a `package` and a `manifest` that are chosen already.
  */
 export async function askPush(app, ids = null, given = {}) {
   const chosen = ids && receivers(ids, app.fleet);
@@ -46,7 +47,12 @@ export async function askPush(app, ids = null, given = {}) {
   if (!list) return void close();
   const question = new Order(app, chosen, list.packages, given);
   const isPossible = list.packages.length && chosen?.size !== 0;
-  open({ title, action: isPossible ? 'Deploy' : null, body: () => html`${question.body()}${leftOut(left)}`, act: () => question.act() });
+  open({
+    title,
+    action: isPossible ? 'Deploy' : null,
+    body: () => html`${question.body()}${leftOut(left)}`,
+    act: () => question.act(),
+  });
 }
 
 class Order {
@@ -65,9 +71,23 @@ class Order {
   constructor(app, ids, packages, given) {
     Object.assign(this, { app, ids, packages });
     this.names = [...new Set(packages.map(({ package: { name } }) => name))];
-    // What is ordered and of whom is chosen each time: a form that is sent by mistake must order nothing.
-    this.fields = { delivery: 'adaptive', batch: '', max_failures: '', priority: '', hours: '', ...remembered(app), restart: false, selector: '', name: given.package ?? '', manifest: given.manifest };
-    this.hasMore = ['batch', 'max_failures', 'priority', 'hours'].some((field) => this.fields[field]);
+    // What is ordered and of whom is chosen each time: a form that is sent by mistake must order
+    // nothing.
+    this.fields = {
+      delivery: 'adaptive',
+      batch: '',
+      max_failures: '',
+      priority: '',
+      hours: '',
+      ...remembered(app),
+      restart: false,
+      selector: '',
+      name: given.package ?? '',
+      manifest: given.manifest,
+    };
+    this.hasMore = ['batch', 'max_failures', 'priority', 'hours'].some(
+      (field) => this.fields[field],
+    );
   }
 
   get #versions() {
@@ -75,7 +95,11 @@ class Order {
   }
 
   get #version() {
-    return this.#versions.find(({ package: { manifest } }) => manifest.digest === this.fields.manifest) ?? this.#versions[0];
+    return (
+      this.#versions.find(
+        ({ package: { manifest } }) => manifest.digest === this.fields.manifest,
+      ) ?? this.#versions[0]
+    );
   }
 
   /** How many robots it is for, where that is known. */
@@ -93,15 +117,21 @@ class Order {
   // The form.
 
   body() {
-    if (!this.packages.length) return html`<p>No package has been pushed yet. Drop one on <a href="#/packages">Packages</a>, or <code>taskd push ./my_pkg</code>.</p>`;
+    if (!this.packages.length)
+      return html`<p>No package has been pushed yet. Drop one on <a href="#/packages">Packages</a>, or <code>taskd push ./my_pkg</code>.</p>`;
     const { delivery } = this.fields;
     return html`
       ${this.ids ? names(this.ids, this.app.fleet) : this.#selector()}
       <div class="fields">
         ${this.#field('name', 'Package', this.#packageInput())}
         ${this.#field('manifest', 'Version', html`<select id="order-manifest" aria-describedby="order-manifest-problem" @change=${({ currentTarget }) => this.#set('manifest', currentTarget.value)}>${this.#versions.map((one) => html`<option value=${one.package.manifest.digest} .selected=${one === this.#version}>${one.package.version} (${size(one.package.content.size)}, ${short(one.package.manifest.digest)})</option>`)}</select>`)}
-        ${this.#field('delivery', 'Delivery', html`<select id="order-delivery" aria-describedby="delivery-words order-delivery-problem" @change=${({ currentTarget }) => this.#set('delivery', currentTarget.value)}>${DELIVERIES.map(([id, title]) => html`<option value=${id} .selected=${id === delivery}>${title}</option>`)}</select>
-          <span id="delivery-words" class="hint quiet">${DELIVERIES.find(([id]) => id === delivery)?.[2]}</span>`, 'wide')}
+        ${this.#field(
+          'delivery',
+          'Delivery',
+          html`<select id="order-delivery" aria-describedby="delivery-words order-delivery-problem" @change=${({ currentTarget }) => this.#set('delivery', currentTarget.value)}>${DELIVERIES.map(([id, title]) => html`<option value=${id} .selected=${id === delivery}>${title}</option>`)}</select>
+          <span id="delivery-words" class="hint quiet">${DELIVERIES.find(([id]) => id === delivery)?.[2]}</span>`,
+          'wide',
+        )}
       </div>
       <details class="more" ?open=${this.hasMore} @invalid=${UNFOLD}>
         <summary>Batches, priority, expiry, restart</summary>
@@ -121,8 +151,16 @@ class Order {
   #confirmation() {
     const robots = this.#robots ?? 0;
     if (robots <= ASK_ABOVE) return nothing;
-    const whom = !this.ids && this.fields.selector.trim() === '*' ? `all ${number(robots)} robots` : `${number(robots)} robots`;
-    return this.#field('many', '', html`<label class="choice"><input id="order-many" type="checkbox" required aria-describedby="order-many-problem" .checked=${this.#confirmed === robots} @change=${({ currentTarget }) => this.#confirm(currentTarget.checked ? robots : 0)}> Yes, order it on ${whom}</label>`, 'wide');
+    const whom =
+      !this.ids && this.fields.selector.trim() === '*'
+        ? `all ${number(robots)} robots`
+        : `${number(robots)} robots`;
+    return this.#field(
+      'many',
+      '',
+      html`<label class="choice"><input id="order-many" type="checkbox" required aria-describedby="order-many-problem" .checked=${this.#confirmed === robots} @change=${({ currentTarget }) => this.#confirm(currentTarget.checked ? robots : 0)}> Yes, order it on ${whom}</label>`,
+      'wide',
+    );
   }
 
   #confirm(robots) {
@@ -139,8 +177,12 @@ class Order {
   }
 
   #number(field, title, { min, max, placeholder }) {
-    return this.#field(field, title, html`<input id=${`order-${field}`} type="number" inputmode="numeric" min=${min} max=${max ?? nothing} step="1" placeholder=${placeholder} .value=${this.fields[field]}
-      aria-invalid=${field in this.#problems} aria-describedby=${`order-${field}-problem`} @input=${({ currentTarget }) => this.#set(field, currentTarget.value)}>`);
+    return this.#field(
+      field,
+      title,
+      html`<input id=${`order-${field}`} type="number" inputmode="numeric" min=${min} max=${max ?? nothing} step="1" placeholder=${placeholder} .value=${this.fields[field]}
+      aria-invalid=${field in this.#problems} aria-describedby=${`order-${field}-problem`} @input=${({ currentTarget }) => this.#set(field, currentTarget.value)}>`,
+    );
   }
 
   #packageInput() {
@@ -149,7 +191,8 @@ class Order {
       this.#set('name', currentTarget.value.trim());
       this.#set('manifest', undefined);
     };
-    if (this.names.length <= LISTED_PACKAGES) return html`<select id="order-name" required aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @change=${choose}><option value="" .selected=${!name}>Choose a package</option>${this.names.map((one) => html`<option value=${one} .selected=${one === name}>${one}</option>`)}</select>`;
+    if (this.names.length <= LISTED_PACKAGES)
+      return html`<select id="order-name" required aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @change=${choose}><option value="" .selected=${!name}>Choose a package</option>${this.names.map((one) => html`<option value=${one} .selected=${one === name}>${one}</option>`)}</select>`;
     return html`<input id="order-name" list="order-names" required autocomplete="off" autocapitalize="none" spellcheck="false" placeholder=${`one of ${number(this.names.length)}`} .value=${name}
         aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @input=${choose}>
       <datalist id="order-names">${this.names.map((one) => html`<option value=${one}></option>`)}</datalist>`;
@@ -163,19 +206,27 @@ class Order {
       this.#confirmed = 0;
       this.#count();
     };
-    return this.#field('selector', 'Robots', html`
+    return this.#field(
+      'selector',
+      'Robots',
+      html`
       <input id="order-selector" class="code" required placeholder="site=lab" .value=${this.fields.selector} autocomplete="off" autocapitalize="none" spellcheck="false" aria-invalid=${isBad} aria-describedby="match order-selector-problem" @input=${({ currentTarget }) => take(currentTarget.value)}>
       <p id="match" class=${isBad ? 'bad' : 'quiet'} role="status">${problem ?? (total === undefined ? ' ' : matched(total, some))}</p>
       <p class="suggestions" role="group" aria-label="Robots to choose">${['*', ...this.#labels].map((selector) => html`<button type="button" class="plain link" aria-pressed=${this.fields.selector === selector} @click=${() => take(selector)}>${selector === '*' ? 'all' : selector}</button>`)}</p>
-      <p class="hint quiet">Several with a comma, <code>arm,cart</code>; without one, <code>site=lab,!arm</code>.</p>`);
+      <p class="hint quiet">Several with a comma, <code>arm,cart</code>; without one, <code>site=lab,!arm</code>.</p>`,
+    );
   }
 
   /** The labels that most robots have. */
   get #labels() {
     if (!this.labels) {
       const counts = new Map();
-      for (const robot of this.app.fleet.robots.values()) for (const label of labelsOf(robot)) counts.set(label, (counts.get(label) ?? 0) + 1);
-      this.labels = [...counts].sort(([, one], [, other]) => other - one).slice(0, SHOWN_LABELS).map(([label]) => label);
+      for (const robot of this.app.fleet.robots.values())
+        for (const label of labelsOf(robot)) counts.set(label, (counts.get(label) ?? 0) + 1);
+      this.labels = [...counts]
+        .sort(([, one], [, other]) => other - one)
+        .slice(0, SHOWN_LABELS)
+        .map(([label]) => label);
     }
     return this.labels;
   }
@@ -183,13 +234,27 @@ class Order {
   /** What is about to be ordered, in a sentence. */
   #inWords() {
     const version = this.#version?.package;
-    if (!this.fields.name) return html`<span class="quiet">Choose a package${this.ids ? '' : ' and its robots'}.</span>`;
+    if (!this.fields.name)
+      return html`<span class="quiet">Choose a package${this.ids ? '' : ' and its robots'}.</span>`;
     if (!version) return html`<span class="quiet">There is no package ${this.fields.name}.</span>`;
     const robots = this.#robots;
-    const whole = robots ? ` to ${plural(robots, 'robot')}, ${size(robots * version.content.size)} in all` : '';
+    const whole = robots
+      ? ` to ${plural(robots, 'robot')}, ${size(robots * version.content.size)} in all`
+      : '';
     const { batch, max_failures: bears, priority, hours, restart } = this.fields;
-    const options = optionsInWords({ batch: Number(batch), max_failures: bears === '' ? null : Number(bears), priority: Number(priority) });
-    return [`${version.name}@${version.version}${whole}`, ...options, hours && `expires after ${plural(Number(hours), 'hour')}`, restart && 'anew where it runs already'].filter(Boolean).join('; ');
+    const options = optionsInWords({
+      batch: Number(batch),
+      max_failures: bears === '' ? null : Number(bears),
+      priority: Number(priority),
+    });
+    return [
+      `${version.name}@${version.version}${whole}`,
+      ...options,
+      hours && `expires after ${plural(Number(hours), 'hour')}`,
+      restart && 'anew where it runs already',
+    ]
+      .filter(Boolean)
+      .join('; ');
   }
 
   // What the selector means.
@@ -213,9 +278,20 @@ class Order {
     if (!name) this.#refuse('name', 'Choose a package.');
     if (!version) this.#refuse('name', `There is no package ${name}.`);
     await this.#check(selector.trim());
-    const body = { package: name, manifest: version.package.manifest.digest, delivery, selector: this.ids ? idsOf(this.ids) : selector.trim() };
+    const body = {
+      package: name,
+      manifest: version.package.manifest.digest,
+      delivery,
+      selector: this.ids ? idsOf(this.ids) : selector.trim(),
+    };
     const { batch, max_failures, priority, hours } = this.fields;
-    for (const [field, value] of Object.entries({ batch, max_failures, priority, expires_in_s: hours && Number(hours) * 3600 })) if (value !== '') body[field] = Number(value);
+    for (const [field, value] of Object.entries({
+      batch,
+      max_failures,
+      priority,
+      expires_in_s: hours && Number(hours) * 3600,
+    }))
+      if (value !== '') body[field] = Number(value);
     if (this.fields.restart) body.restart = true;
     const text = JSON.stringify(body);
     if (this.#keyed && this.#keyed !== text) this.#key = newKey();
@@ -224,7 +300,10 @@ class Order {
       const { id, assignments = [] } = await order('/deployments', body, this.#key);
       remember(this.app, this.fields);
       const running = assignments.filter(({ phase }) => phase === 'running').length;
-      if (running) tell(`${name}@${version.package.version} runs already on ${plural(running, 'robot')}, and goes on there.`);
+      if (running)
+        tell(
+          `${name}@${version.package.version} runs already on ${plural(running, 'robot')}, and goes on there.`,
+        );
       go(['deployments', id]);
     } catch (error) {
       const field = fieldOf(error);
@@ -242,7 +321,8 @@ class Order {
       change(() => (this.#match = match));
       if (match.problem) this.#refuse('selector', match.problem);
     }
-    if (this.#robots > ASK_ABOVE && this.#confirmed !== this.#robots) this.#refuse('many', `Say that ${number(this.#robots)} robots are meant.`);
+    if (this.#robots > ASK_ABOVE && this.#confirmed !== this.#robots)
+      this.#refuse('many', `Say that ${number(this.#robots)} robots are meant.`);
   }
 
   /** Says what is wrong at the field, and goes there. */
@@ -267,7 +347,11 @@ function matched(total, some) {
 async function matchOf(selector, fleet) {
   const waiting = [...fleet.robots.values()].filter(isWaiting).map(({ id }) => `!${id}`);
   try {
-    const { robots, total = robots.length, unknown = [] } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
+    const {
+      robots,
+      total = robots.length,
+      unknown = [],
+    } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
     if (unknown.length) return { problem: `No robot has the name or id ${unknown.join(', ')}.` };
     return { total, some: robots.slice(0, NAMED).map(({ name }) => name) };
   } catch (error) {
@@ -275,13 +359,30 @@ async function matchOf(selector, fleet) {
   }
 }
 
-const FIELD_OF_CODE = { no_robots_match: 'selector', unknown_robots: 'selector', out_of_scope: 'selector', package_not_found: 'manifest', package_too_large: 'delivery' };
-const FIELD_OF_KEY = { selector: 'selector', package: 'name', manifest: 'manifest', delivery: 'delivery', batch: 'batch', max_failures: 'max_failures', priority: 'priority', expires_in_s: 'hours' };
+const FIELD_OF_CODE = {
+  no_robots_match: 'selector',
+  unknown_robots: 'selector',
+  out_of_scope: 'selector',
+  package_not_found: 'manifest',
+  package_too_large: 'delivery',
+};
+const FIELD_OF_KEY = {
+  selector: 'selector',
+  package: 'name',
+  manifest: 'manifest',
+  delivery: 'delivery',
+  batch: 'batch',
+  max_failures: 'max_failures',
+  priority: 'priority',
+  expires_in_s: 'hours',
+};
 
 /** The field that a refusal is about. */
-const fieldOf = ({ code, message }) => FIELD_OF_CODE[code] ?? FIELD_OF_KEY[/^([a-z_]+)(: |\b)/.exec(message)?.[1]];
+const fieldOf = ({ code, message }) =>
+  FIELD_OF_CODE[code] ?? FIELD_OF_KEY[/^([a-z_]+)(: |\b)/.exec(message)?.[1]];
 
-// How it is to be done is kept for as long as the tab is open, each person's own; what and of whom is not.
+// How it is to be done is kept for as long as the tab is open, each person's own; what and of whom
+// is not.
 
 const placeOf = ({ me }) => `taskd.order.${me?.name}`;
 
@@ -294,16 +395,21 @@ function remembered(app) {
 }
 
 function remember(app, { delivery, batch, max_failures, priority, hours }) {
-  sessionStorage.setItem(placeOf(app), JSON.stringify({ delivery, batch, max_failures, priority, hours }));
+  sessionStorage.setItem(
+    placeOf(app),
+    JSON.stringify({ delivery, batch, max_failures, priority, hours }),
+  );
 }
 
 function optionsInWords({ batch, max_failures: bears, priority }) {
   return [
     batch && `${number(batch)} at a time`,
-    bears != null && (bears ? `pauses when more than ${number(bears)} fail` : 'pauses at the first failure'),
+    bears != null &&
+      (bears ? `pauses when more than ${number(bears)} fail` : 'pauses at the first failure'),
     priority ? `priority ${priority}` : null,
   ].filter(Boolean);
 }
 
 /** What has been ordered beside the robots, in words. */
-export const optionsOf = ({ delivery, ...options }) => [`${words(delivery)} delivery`, ...optionsInWords(options)].join(' · ');
+export const optionsOf = ({ delivery, ...options }) =>
+  [`${words(delivery)} delivery`, ...optionsInWords(options)].join(' · ');

@@ -1,8 +1,10 @@
-// The page of one robot: what it is and how it stands above, and below the part somebody has chosen, each in a module of its own.
+// The page of one robot: what it is and how it stands above, and below the part somebody has
+// chosen, each in a module of its own.
 //
-// A part is a class: `constructor(page)`, `draw(robot, now)`, and, where it needs them, `enter()` when it comes into sight,
-// `leave()` when it goes, `arrive()` when the place's query has changed, `hear(robot)` when this robot has changed, `refresh()`
-// and `drawn()`. What somebody has typed in a part stays in it while they look at another.
+// A part is a class: `constructor(page)`, `draw(robot, now)`, and, where it needs them, `enter()`
+// when it comes into sight, `leave()` when it goes, `arrive()` when the place's query has changed,
+// `hear(robot)` when this robot has changed, `refresh()` and `drawn()`. What somebody has typed in
+// a part stays in it while they look at another.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { labelsOf } from './fleet.js';
@@ -108,7 +110,9 @@ export class RobotView {
     this.#current?.part.drawn?.();
     if (this.#shownPart === this.#chosen) return;
     // On a narrow screen its link may be out of sight.
-    document.querySelector('.parts [aria-current]')?.scrollIntoView({ block: 'nearest', inline: 'nearest' });
+    document
+      .querySelector('.parts [aria-current]')
+      ?.scrollIntoView({ block: 'nearest', inline: 'nearest' });
     this.#shownPart = this.#current && this.#chosen;
   }
 
@@ -130,13 +134,17 @@ export class RobotView {
   /** A robot that gets another name keeps a page that can be shared. */
   #keepAddress({ id, name }) {
     if (this.#name === name || this.#name === id) return;
-    const { path: [section, , ...rest], query } = place();
+    const {
+      path: [section, , ...rest],
+      query,
+    } = place();
     if (section === 'robots') history.replaceState(null, '', at([section, name, ...rest], query));
     this.#name = name;
   }
 
   #noRobot() {
-    if (!this.app.fleet.isLoaded) return html`<div class="robot-page"><header class="robot-head"><h1>${this.#name}</h1></header></div>`;
+    if (!this.app.fleet.isLoaded)
+      return html`<div class="robot-page"><header class="robot-head"><h1>${this.#name}</h1></header></div>`;
     return html`
       <div class="empty">
         <h1>${this.#name}</h1>
@@ -147,7 +155,9 @@ export class RobotView {
 
   #head(robot, now) {
     const { app } = this;
-    const parts = PARTS.filter(({ needs }) => !needs || needs.some((permission) => app.can(permission)));
+    const parts = PARTS.filter(
+      ({ needs }) => !needs || needs.some((permission) => app.can(permission)),
+    );
     return html`
       <header class="robot-head">
         <h1>${robot.name}</h1>

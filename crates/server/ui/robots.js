@@ -16,31 +16,86 @@ import { Rows, isNarrow } from './rows.js';
 import { enrolCommand, newEnrolment } from './settings.js';
 import { lastSeen, phaseSign, progressBar, remarks, robotState } from './signs.js';
 
-// As in style.css: a row's height follows from its number of lines, so rows out of sight need not be drawn.
+// As in style.css: a row's height follows from its number of lines, so rows out of sight need not
+// be drawn.
 const LINE = 24;
 const PADDING = 17;
 
-/** The columns, each with its place in the grid. Those with `isOptional` are shown when asked for. */
+/**
+ * The columns, each with its place in the grid. Those with `isOptional` are shown when asked for.
+ */
 const COLUMNS = [
   { id: 'id', title: 'ID', width: '138px', look: 'code quiet', cell: ({ id }) => id },
-  { id: 'name', title: 'Name', width: 'minmax(96px, 1fr)', cell: (robot) => html`<a href=${at(['robots', robot.name])}>${robot.name}</a>` },
-  { id: 'address', title: 'IP', width: '112px', look: 'code quiet', cell: ({ address }) => address ? hostOf(address) : '–' },
+  {
+    id: 'name',
+    title: 'Name',
+    width: 'minmax(96px, 1fr)',
+    cell: (robot) => html`<a href=${at(['robots', robot.name])}>${robot.name}</a>`,
+  },
+  {
+    id: 'address',
+    title: 'IP',
+    width: '112px',
+    look: 'code quiet',
+    cell: ({ address }) => (address ? hostOf(address) : '–'),
+  },
   { id: 'state', title: 'State', width: '72px', cell: robotState },
   { id: 'seen', title: 'Last seen', width: '72px', look: 'quiet', cell: lastSeen },
-  { id: 'labels', title: 'Labels', width: 'minmax(96px, 1fr)', isOptional: true, cell: (robot) => html`<span class="code quiet" title=${labelsOf(robot).join(', ')}>${labelsOf(robot).join(', ')}</span>` },
-  { id: 'cpu', title: 'CPU', width: '56px', isOptional: true, cell: ({ vitals }) => vitals?.cpu_percent == null ? '–' : `${Math.round(vitals.cpu_percent)} %` },
-  { id: 'memory', title: 'Memory', width: '76px', isOptional: true, cell: ({ vitals }) => vitals?.memory_used_bytes == null ? '–' : size(vitals.memory_used_bytes) },
-  { id: 'disk', title: 'Free disk', width: '76px', isOptional: true, cell: ({ host }) => (host?.disk_free_bytes == null ? '–' : size(host.disk_free_bytes)) },
-  { id: 'rtt', title: 'RTT', width: '60px', isOptional: true, cell: ({ link }) => link?.rtt_ms == null ? '–' : `${link.rtt_ms} ms` },
+  {
+    id: 'labels',
+    title: 'Labels',
+    width: 'minmax(96px, 1fr)',
+    isOptional: true,
+    cell: (robot) =>
+      html`<span class="code quiet" title=${labelsOf(robot).join(', ')}>${labelsOf(robot).join(', ')}</span>`,
+  },
+  {
+    id: 'cpu',
+    title: 'CPU',
+    width: '56px',
+    isOptional: true,
+    cell: ({ vitals }) =>
+      vitals?.cpu_percent == null ? '–' : `${Math.round(vitals.cpu_percent)} %`,
+  },
+  {
+    id: 'memory',
+    title: 'Memory',
+    width: '76px',
+    isOptional: true,
+    cell: ({ vitals }) =>
+      vitals?.memory_used_bytes == null ? '–' : size(vitals.memory_used_bytes),
+  },
+  {
+    id: 'disk',
+    title: 'Free disk',
+    width: '76px',
+    isOptional: true,
+    cell: ({ host }) => (host?.disk_free_bytes == null ? '–' : size(host.disk_free_bytes)),
+  },
+  {
+    id: 'rtt',
+    title: 'RTT',
+    width: '60px',
+    isOptional: true,
+    cell: ({ link }) => (link?.rtt_ms == null ? '–' : `${link.rtt_ms} ms`),
+  },
   { id: 'task', title: 'Task', width: 'minmax(320px, 4fr)', cell: work },
 ];
 /** What can be ordered of the tasks of robots that are chosen. */
-const ORDERS = [['start', 'Start'], ['stop', 'Stop'], ['restart', 'Restart'], ['rollback', 'Roll back'], ['remove', 'Remove task']];
+const ORDERS = [
+  ['start', 'Start'],
+  ['stop', 'Stop'],
+  ['restart', 'Restart'],
+  ['rollback', 'Roll back'],
+  ['remove', 'Remove task'],
+];
 const CHOSEN_COLUMNS = 'taskd.columns';
 
 export class RobotsView {
   #rows = new Rows();
-  #cursor = new Cursor(this.#rows, (id) => go(['robots', this.app.fleet.robots.get(id)?.name ?? id]));
+  #cursor = new Cursor(this.#rows, (id) =>
+    go(['robots', this.app.fleet.robots.get(id)?.name ?? id]),
+  );
   #optional = new Set((localStorage.getItem(CHOSEN_COLUMNS) ?? '').split(',').filter(Boolean));
   #columns = this.#chosenColumns();
 
@@ -63,13 +118,22 @@ export class RobotsView {
       this.#rows.rearrange();
       this.app.fleet.look(search);
       const { text, standing, sort, isDescending } = this.app.fleet.search;
-      restate({ q: text, state: standing, sort: sort === 'name' ? '' : sort, order: isDescending ? 'down' : '' });
+      restate({
+        q: text,
+        state: standing,
+        sort: sort === 'name' ? '' : sort,
+        order: isDescending ? 'down' : '',
+      });
     });
   }
 
   draw(now) {
     const { fleet } = this.app;
-    const { start, end } = this.#rows.sight(fleet.shown, (id) => heightOf(fleet.robots.get(id)), `${fleet.reflows} ${isNarrow}`);
+    const { start, end } = this.#rows.sight(
+      fleet.shown,
+      (id) => heightOf(fleet.robots.get(id)),
+      `${fleet.reflows} ${isNarrow}`,
+    );
     return html`
       <header class="bar-of-tools">
         <h1>Robots</h1>
@@ -86,7 +150,11 @@ export class RobotsView {
 
   drawn() {
     this.#rows.place();
-    const columns = ['20px', ...this.#columns.map(({ width }) => width), this.#operations.length ? `${this.#operations.length * 52}px` : ''];
+    const columns = [
+      '20px',
+      ...this.#columns.map(({ width }) => width),
+      this.#operations.length ? `${this.#operations.length * 52}px` : '',
+    ];
     document.querySelector('.table')?.style.setProperty('--columns', columns.join(' '));
     this.#cursor.drawn();
   }
@@ -96,19 +164,26 @@ export class RobotsView {
   #strip() {
     const { fleet } = this.app;
     const all = { id: '', title: 'All', sign: '', count: fleet.robots.size };
-    const standings = [all, ...STANDINGS.map((standing) => ({ ...standing, count: fleet.counts[standing.id] }))];
-    return html`<div class="strip" role="group" aria-label="Show robots that are">${standings.map(({ id, title, sign, count }) => html`
+    const standings = [
+      all,
+      ...STANDINGS.map((standing) => ({ ...standing, count: fleet.counts[standing.id] })),
+    ];
+    return html`<div class="strip" role="group" aria-label="Show robots that are">${standings.map(
+      ({ id, title, sign, count }) => html`
       <button class="counter ${id}" aria-pressed=${fleet.search.standing === id} @click=${() => this.#look({ standing: fleet.search.standing === id ? '' : id })}>
         <span class="figure">${fleet.isLoaded || count ? number(count) : '–'}</span><span>${sign ? html`<span aria-hidden="true">${sign} </span>` : nothing}${title}</span>
-      </button>`)}</div>`;
+      </button>`,
+    )}</div>`;
   }
 
   #columnMenu() {
     return html`
       <details class="menu">
         <summary>Columns</summary>
-        <div class="menu-body">${COLUMNS.filter(({ isOptional }) => isOptional).map(({ id, title }) => html`
-          <label><input type="checkbox" .checked=${this.#optional.has(id)} @change=${() => this.#toggleColumn(id)}> ${title}</label>`)}</div>
+        <div class="menu-body">${COLUMNS.filter(({ isOptional }) => isOptional).map(
+          ({ id, title }) => html`
+          <label><input type="checkbox" .checked=${this.#optional.has(id)} @change=${() => this.#toggleColumn(id)}> ${title}</label>`,
+        )}</div>
       </details>`;
   }
 
@@ -135,33 +210,54 @@ export class RobotsView {
       <div class="table robots-table" role="grid" aria-label="Robots" aria-multiselectable="true" aria-rowcount=${fleet.shown.length + 1}>
         <div class="row head" role="row" aria-rowindex="1">
           <span role="columnheader"><input type="checkbox" aria-label="Select all that are shown" .checked=${isAll} .indeterminate=${!isAll && selection.size > 0} @change=${({ currentTarget }) => this.#toggleAll(currentTarget)}></span>
-          ${this.#columns.map(({ id, title }) => html`
+          ${this.#columns.map(
+            ({ id, title }) => html`
             <span role="columnheader" aria-sort=${sort === id ? (isDescending ? 'descending' : 'ascending') : 'none'}>
               <button class="plain" @click=${() => this.#look({ sort: id, isDescending: sort === id && !isDescending })}>${title}<span class="arrow" aria-hidden="true">${sort === id ? (isDescending ? '↓' : '↑') : ''}</span></button>
-            </span>`)}
+            </span>`,
+          )}
           ${operations.length ? html`<span role="columnheader" class="operations-head">Operation</span>` : nothing}
         </div>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(ids, (id) => id, (id, index) => this.#row(fleet.robots.get(id), start + index, operations, now))}</div></div>
+        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+          ids,
+          (id) => id,
+          (id, index) => this.#row(fleet.robots.get(id), start + index, operations, now),
+        )}</div></div>
       </div>`;
   }
 
-  /** A row, which is made anew only when something in it is: of those in sight few are at a time. */
+  /**
+   * A row, which is made anew only when something in it is: of those in sight few are at a time.
+   */
   #row(robot, index, operations, now) {
     if (!robot) return nothing;
     const { selection, fleet } = this.app;
     const isChosen = selection.has(robot.id);
     const tabindex = this.#cursor.tabindex(robot.id, index);
     const wrong = isNarrow ? troubles(robot) : [];
-    return guard([robot, index, isChosen, tabindex, isNarrow, this.#columns, operations.length, Math.floor(now / 1000)], () => html`
+    return guard(
+      [
+        robot,
+        index,
+        isChosen,
+        tabindex,
+        isNarrow,
+        this.#columns,
+        operations.length,
+        Math.floor(now / 1000),
+      ],
+      () => html`
       <div class="row" role="row" tabindex=${tabindex} aria-rowindex=${index + 2} aria-selected=${isChosen} data-key=${robot.id} data-robot=${robot.id} @focusin=${() => (this.#cursor.current = robot.id)}>
         <span class="choose" role="gridcell"><input type="checkbox" aria-label=${`Select ${robot.name}`} .checked=${isChosen} @click=${(event) => this.#toggle(robot.id, event)}></span>
         ${wrong.length ? html`<span class="cell trouble" role="gridcell">${wrong}</span>` : nothing}
         ${this.#columns.map(({ id, look, cell }) => html`<span class="cell ${id} ${look ?? ''}" role="gridcell">${cell(robot, now)}</span>`)}
         ${operations.length ? html`<span class="cell operations" role="gridcell">${operations.map(([title, act]) => html`<button class="plain" aria-label=${`${title} ${robot.name}`} @click=${() => act(robot)}>${title}</button>`)}</span>` : nothing}
-      </div>`);
+      </div>`,
+    );
   }
 
-  // A box has turned by itself when it was clicked, also where what it stands for stays: the next drawing would not find it changed.
+  // A box has turned by itself when it was clicked, also where what it stands for stays: the next
+  // drawing would not find it changed.
 
   #toggle(id, { currentTarget, shiftKey }) {
     const { selection, fleet } = this.app;
@@ -176,7 +272,10 @@ export class RobotsView {
   }
 
   get #isAll() {
-    const { fleet: { shown }, selection } = this.app;
+    const {
+      fleet: { shown },
+      selection,
+    } = this.app;
     return shown.length > 0 && shown.every((id) => selection.has(id));
   }
 
@@ -204,12 +303,20 @@ export class RobotsView {
         ${isMore ? html`<button class="plain link" @click=${() => change(() => fleet.shown.forEach((id) => ids.add(id)))}>Select all ${number(fleet.shown.length)} that match</button>` : nothing}
         <button class="plain link" @click=${() => change(() => selection.clear())}>Clear</button>
         <span class="acts">
-          ${can('operate') ? html`
+          ${
+            can('operate')
+              ? html`
             <button class="primary" @click=${() => askPush(this.app, ids)}>Push…</button>
-            ${ORDERS.map(([verb, title]) => html`<button class="quiet-button" @click=${() => askTask(this.app, verb, ids)}>${title}…</button>`)}` : nothing}
-          ${can('maintain') ? html`
+            ${ORDERS.map(([verb, title]) => html`<button class="quiet-button" @click=${() => askTask(this.app, verb, ids)}>${title}…</button>`)}`
+              : nothing
+          }
+          ${
+            can('maintain')
+              ? html`
             <button class="quiet-button" @click=${() => askLabels(this.app, ids)}>Label…</button>
-            <button class="quiet-button danger-text" @click=${() => askDelete(this.app, ids)}>Delete…</button>` : nothing}
+            <button class="quiet-button danger-text" @click=${() => askDelete(this.app, ids)}>Delete…</button>`
+              : nothing
+          }
         </span>
       </div>`;
   }
@@ -221,12 +328,15 @@ export class RobotsView {
     return html`
       <section class="empty onboarding">
         <h2>Waiting for the first robot…</h2>
-        ${can('administer') ? html`
+        ${
+          can('administer')
+            ? html`
           <p class="quiet">On each robot, run this once. The token in it is good for a day and 100 robots, unless the server is set up otherwise.</p>
           ${this.enrolment ? command(enrolCommand(this.enrolment)) : html`<p><button class="primary" @click=${() => this.#makeToken()}>Show the command</button></p>`}
           <p class="quiet">Then start the agent. The robot appears here by itself.</p>
           ${command('task-agent run')}`
-        : html`<p class="quiet">An administrator makes the token that robots enrol with: <code>taskd enroll-token create</code></p>`}
+            : html`<p class="quiet">An administrator makes the token that robots enrol with: <code>taskd enroll-token create</code></p>`
+        }
       </section>`;
   }
 
@@ -244,7 +354,11 @@ export class RobotsView {
       else change(() => selection.clear());
       return true;
     }
-    if ((key === 'x' || key === 'X') && fleet.shown.includes(current) && !target.matches('input[type=search]')) {
+    if (
+      (key === 'x' || key === 'X') &&
+      fleet.shown.includes(current) &&
+      !target.matches('input[type=search]')
+    ) {
       change(() => selection.toggle(current, fleet.shown, shiftKey));
       return true;
     }
@@ -262,13 +376,15 @@ function heightOf(robot) {
 const hostOf = (address) => address.replace(/:\d+$/, '').replace(/^\[(.*)\]$/, '$1');
 
 /**
- * The tasks, a line each. What is wrong is said within the lines, because a row that grew when its robot gets into trouble would push
- * those below it away from under the pointer.
+ * The tasks, a line each. What is wrong is said within the lines, because a row that grew when its
+ * robot gets into trouble would push those below it away from under the pointer.
  */
 function work({ conditions, tasks }) {
   const beside = isNarrow ? [] : conditions;
   if (tasks.length) return tasks.map((task, index) => taskLine(task, index ? [] : beside));
-  return beside.length ? html`<div class="line known"><span class="note">${beside.map(conditionSign)}</span></div>` : nothing;
+  return beside.length
+    ? html`<div class="line known"><span class="note">${beside.map(conditionSign)}</span></div>`
+    : nothing;
 }
 
 const taskLine = (task, conditions) => html`
@@ -304,4 +420,7 @@ function failureSign(task) {
 }
 
 /** All that is wrong, for where there is no room beside the tasks. */
-const troubles = ({ conditions, tasks }) => [...conditions.map(conditionSign), ...tasks.filter(({ failure }) => failure).map(failureSign)];
+const troubles = ({ conditions, tasks }) => [
+  ...conditions.map(conditionSign),
+  ...tasks.filter(({ failure }) => failure).map(failureSign),
+];

@@ -1,9 +1,13 @@
-// Where in the page somebody is: the address bar's `#/robots/atlas/logs?level=warn`, so that it can be shared, kept and gone back from.
+// Where in the page somebody is: the address bar's `#/robots/atlas/logs?level=warn`, so that it can
+// be shared, kept and gone back from.
 
 /** The place: `path`, its parts, and `query`, a plain object of texts. */
 export function place() {
   const [path, query] = location.hash.replace(/^#\/?/, '').split('?');
-  return { path: path.split('/').filter(Boolean).map(decoded), query: Object.fromEntries(new URLSearchParams(query)) };
+  return {
+    path: path.split('/').filter(Boolean).map(decoded),
+    query: Object.fromEntries(new URLSearchParams(query)),
+  };
 }
 
 function decoded(part) {
@@ -16,7 +20,9 @@ function decoded(part) {
 
 /** The address of a place. What is empty or absent in `query` is left out. */
 export function at(path, query = {}) {
-  const given = Object.entries(query).filter(([, value]) => value !== undefined && value !== null && value !== '');
+  const given = Object.entries(query).filter(
+    ([, value]) => value !== undefined && value !== null && value !== '',
+  );
   const text = new URLSearchParams(given).toString();
   return `#/${path.map(encodeURIComponent).join('/')}${text ? `?${text}` : ''}`;
 }

@@ -1,4 +1,5 @@
-// Long lists: only the rows in sight exist, so ten thousand cost what thirty do. The window scrolls, not the list.
+// Long lists: only the rows in sight exist, so ten thousand cost what thirty do. The window
+// scrolls, not the list.
 
 // Rows drawn beyond the edges, so that the next ones are there when the wheel turns.
 const SPARE_ROWS = 6;
@@ -7,7 +8,10 @@ const narrow = matchMedia('(max-width: 1219px)');
 export let isNarrow = narrow.matches;
 narrow.addEventListener('change', ({ matches }) => (isNarrow = matches));
 
-/** The rows of one list, which the template has as `.rows` with `.sight` in it, each row with its key as `data-key`. */
+/**
+ * The rows of one list, which the template has as `.rows` with `.sight` in it, each row with its
+ * key as `data-key`.
+ */
 export class Rows {
   #keys = [];
   #bottoms = [];
@@ -16,12 +20,18 @@ export class Rows {
   #scrolled = 0;
   #isRearranged = false;
 
-  /** A person, not the stream, has changed which rows stand where: the next drawing does not hold on to any. */
+  /**
+   * A person, not the stream, has changed which rows stand where: the next drawing does not hold on
+   * to any.
+   */
   rearrange() {
     this.#isRearranged = true;
   }
 
-  /** Which of `keys` are in sight now, as `{ start, end }`. `heightOf` gives a row's height in pixels; the same `keys` with the same `shape` have the same heights. */
+  /**
+   * Which of `keys` are in sight now, as `{ start, end }`. `heightOf` gives a row's height in
+   * pixels; the same `keys` with the same `shape` have the same heights.
+   */
   sight(keys, heightOf, shape = isNarrow) {
     if (keys !== this.#keys || shape !== this.#shape) this.#arrange(keys, heightOf, shape);
     const rows = document.querySelector('.rows');
@@ -40,12 +50,16 @@ export class Rows {
     this.#scrolled = this.#keepInPlace();
   }
 
-  /** Puts the rows where they belong; to be called after each drawing. Through the style objects: the policy of this page allows no style attributes. */
+  /**
+   * Puts the rows where they belong; to be called after each drawing. Through the style objects:
+   * the policy of this page allows no style attributes.
+   */
   place() {
     const rows = document.querySelector('.rows');
     if (!rows) return;
     rows.style.height = `${this.#bottoms.at(-1) ?? 0}px`;
-    // Not by a transform: rows that stay in sight stay where they are, and need not be painted again.
+    // Not by a transform: rows that stay in sight stay where they are, and need not be painted
+    // again.
     rows.querySelector('.sight').style.top = `${this.#offset}px`;
     if (this.#scrolled) scrollBy(0, this.#scrolled);
     this.#scrolled = 0;
@@ -58,7 +72,10 @@ export class Rows {
     if (index < 0 || !rows) return;
     const { top } = rows.getBoundingClientRect();
     const head = document.querySelector('.row.head')?.getBoundingClientRect().height ?? 0;
-    const [above, below] = [top + this.#top(index) - head, top + this.#bottoms[index] - innerHeight];
+    const [above, below] = [
+      top + this.#top(index) - head,
+      top + this.#bottoms[index] - innerHeight,
+    ];
     if (above < 0) scrollBy(0, above);
     else if (below > 0) scrollBy(0, below);
   }
@@ -78,7 +95,10 @@ export class Rows {
     return low;
   }
 
-  /** How far to scroll so that the row at the list's upper edge stays where it is, though rows above it grow or shrink. */
+  /**
+   * How far to scroll so that the row at the list's upper edge stays where it is, though rows above
+   * it grow or shrink.
+   */
   #keepInPlace() {
     const rows = document.querySelector('.rows');
     const wasRearranged = this.#isRearranged;

@@ -1,4 +1,5 @@
-// The server and the network: how it does, site by site, who is connected and listens to what, and what has happened lately.
+// The server and the network: how it does, site by site, who is connected and listens to what, and
+// what has happened lately.
 
 import { html, nothing, svg } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
@@ -58,7 +59,10 @@ export class ServerView {
       const status = await get('/server/status');
       change(() => {
         this.#problem = null;
-        this.#statuses = [...this.#statuses.slice(1 - KEPT_STATUSES), withRates(status, this.#statuses.at(-1))];
+        this.#statuses = [
+          ...this.#statuses.slice(1 - KEPT_STATUSES),
+          withRates(status, this.#statuses.at(-1)),
+        ];
       });
     } catch (error) {
       change(() => (this.#problem = error.message));
@@ -66,7 +70,9 @@ export class ServerView {
   }
 
   async #fetchSessions(after) {
-    const page = await this.app.attempt(() => get('/server/sessions', { limit: SESSIONS_A_PAGE, after }));
+    const page = await this.app.attempt(() =>
+      get('/server/sessions', { limit: SESSIONS_A_PAGE, after }),
+    );
     if (!page) return;
     change(() => {
       this.#sessions = after ? [...this.#sessions, ...page.sessions] : page.sessions;
@@ -84,7 +90,9 @@ export class ServerView {
   #take(entries) {
     const known = new Set(this.#entries.map(({ number: one }) => one));
     const fresh = entries.filter(({ number: one }) => !known.has(one));
-    this.#entries = [...fresh, ...this.#entries].sort((one, other) => other.number - one.number).slice(0, KEPT_ENTRIES);
+    this.#entries = [...fresh, ...this.#entries]
+      .sort((one, other) => other.number - one.number)
+      .slice(0, KEPT_ENTRIES);
   }
 
   draw(now) {
@@ -124,13 +132,15 @@ export class ServerView {
     return html`
       <section aria-labelledby="sessions">
         <header><h2 id="sessions">Subscriptions <span class="count">${number(this.#total)} sessions</span></h2><button class="plain link" @click=${() => this.#fetchSessions()}>Refresh</button></header>
-        ${this.#sessions.length
-          ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="sessions"><table>
+        ${
+          this.#sessions.length
+            ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="sessions"><table>
               <thead><tr><th>Robot</th><th>Topic filters</th><th class="number">Messages</th><th class="number">Bytes</th><th>Connected</th></tr></thead>
               <tbody>${repeat(this.#sessions, ({ robot }) => robot, row)}</tbody>
             </table></div>
             ${this.#more ? html`<p><button class="quiet-button" @click=${() => this.#fetchSessions(this.#more)}>Show more</button></p>` : nothing}`
-          : html`<p class="quiet">No robot is connected over MQTT.</p>`}
+            : html`<p class="quiet">No robot is connected over MQTT.</p>`
+        }
       </section>`;
   }
 
@@ -138,9 +148,15 @@ export class ServerView {
     return html`
       <section class="feed" aria-labelledby="feed">
         <header><h2 id="feed">Events</h2></header>
-        ${this.#entries.length
-          ? html`<ol>${repeat(this.#entries, ({ number: one }) => one, (entry) => feedLine(entry, now))}</ol>`
-          : html`<p class="quiet">Nothing has happened since the server started.</p>`}
+        ${
+          this.#entries.length
+            ? html`<ol>${repeat(
+                this.#entries,
+                ({ number: one }) => one,
+                (entry) => feedLine(entry, now),
+              )}</ol>`
+            : html`<p class="quiet">Nothing has happened since the server started.</p>`
+        }
       </section>`;
   }
 }
@@ -170,32 +186,91 @@ function withRates(status, before) {
 }
 
 const about = ({ version, uptime_s: uptime, listeners }) =>
-  [`taskd ${version}`, `up ${duration(uptime * 1000)}`, ...listeners.map(({ kind, address, tls }) => `${kind.toUpperCase()} ${tls ? 'over TLS ' : ''}on ${address}`)].join(' · ');
+  [
+    `taskd ${version}`,
+    `up ${duration(uptime * 1000)}`,
+    ...listeners.map(
+      ({ kind, address, tls }) => `${kind.toUpperCase()} ${tls ? 'over TLS ' : ''}on ${address}`,
+    ),
+  ].join(' · ');
 
 /** What is shown large, and the curve below it. */
 function figures({ robots, rates, transfers, reports, database, disk, broker, mqtt }) {
-  const each = (value, unit) => (value === null ? '–' : `${value < 10 ? value.toFixed(1) : number(Math.round(value))} ${unit}`);
-  const ms = (value) => (value == null ? '–' : `${value < 10 ? value.toFixed(1) : Math.round(value)} ms`);
+  const each = (value, unit) =>
+    value === null ? '–' : `${value < 10 ? value.toFixed(1) : number(Math.round(value))} ${unit}`;
+  const ms = (value) =>
+    value == null ? '–' : `${value < 10 ? value.toFixed(1) : Math.round(value)} ms`;
   const bytes = (value) => (value === null ? '–' : `${size(value)}/s`);
   const free = disk.total_bytes ? disk.free_bytes / disk.total_bytes : 1;
   return [
-    { title: 'Robots connected', value: `${number(robots.online)} of ${number(robots.known)}`, note: `${number(mqtt.robots_connected)} over MQTT`, of: (one) => one.robots.online },
-    { title: 'MQTT messages', value: each(rates.messages, '/s'), note: `${number(mqtt.messages_refused)} refused, ${number(mqtt.messages_dropped)} dropped`, of: (one) => one.rates.messages },
-    { title: 'Bandwidth', value: bytes(rates.out), note: `out; ${bytes(rates.in)} in, ${each(rates.requests, 'requests/s')}`, of: (one) => one.rates.out },
-    { title: 'Transfers', value: number(transfers.active), note: `${number(transfers.waiting)} waiting, ${size(transfers.bytes_per_s)}/s`, of: (one) => one.transfers.active },
-    { title: 'Report latency', value: ms(reports.latency_ms_p99), note: `p99; half within ${ms(reports.latency_ms_p50)}, ${each(reports.per_s, '/s')}`, of: (one) => one.reports.latency_ms_p99 },
-    { title: 'Database', value: ms(database.latency_ms), note: [database.kind, database.size_bytes != null && size(database.size_bytes)].filter(Boolean).join(', '), of: (one) => one.database.latency_ms },
-    { title: 'Free disk', value: size(disk.free_bytes), note: `of ${size(disk.total_bytes)}; packages and outputs ${size(disk.packages_bytes)}`, isBad: free < 0.05 },
-    { title: 'Broker', value: broker.healthy ? 'Healthy' : 'In trouble', note: `${broker.kind}: ${broker.detail}`, isBad: !broker.healthy },
+    {
+      title: 'Robots connected',
+      value: `${number(robots.online)} of ${number(robots.known)}`,
+      note: `${number(mqtt.robots_connected)} over MQTT`,
+      of: (one) => one.robots.online,
+    },
+    {
+      title: 'MQTT messages',
+      value: each(rates.messages, '/s'),
+      note: `${number(mqtt.messages_refused)} refused, ${number(mqtt.messages_dropped)} dropped`,
+      of: (one) => one.rates.messages,
+    },
+    {
+      title: 'Bandwidth',
+      value: bytes(rates.out),
+      note: `out; ${bytes(rates.in)} in, ${each(rates.requests, 'requests/s')}`,
+      of: (one) => one.rates.out,
+    },
+    {
+      title: 'Transfers',
+      value: number(transfers.active),
+      note: `${number(transfers.waiting)} waiting, ${size(transfers.bytes_per_s)}/s`,
+      of: (one) => one.transfers.active,
+    },
+    {
+      title: 'Report latency',
+      value: ms(reports.latency_ms_p99),
+      note: `p99; half within ${ms(reports.latency_ms_p50)}, ${each(reports.per_s, '/s')}`,
+      of: (one) => one.reports.latency_ms_p99,
+    },
+    {
+      title: 'Database',
+      value: ms(database.latency_ms),
+      note: [database.kind, database.size_bytes != null && size(database.size_bytes)]
+        .filter(Boolean)
+        .join(', '),
+      of: (one) => one.database.latency_ms,
+    },
+    {
+      title: 'Free disk',
+      value: size(disk.free_bytes),
+      note: `of ${size(disk.total_bytes)}; packages and outputs ${size(disk.packages_bytes)}`,
+      isBad: free < 0.05,
+    },
+    {
+      title: 'Broker',
+      value: broker.healthy ? 'Healthy' : 'In trouble',
+      note: `${broker.kind}: ${broker.detail}`,
+      isBad: !broker.healthy,
+    },
   ];
 }
 
-/** A small curve from nothing to the highest value. It is for the eye: the figure above it says the same. */
+/**
+ * A small curve from nothing to the highest value. It is for the eye: the figure above it says the
+ * same.
+ */
 function curve(values) {
   const most = Math.max(...values.map((value) => value ?? 0), 1e-9);
   const step = 100 / (KEPT_STATUSES - 1);
   const first = KEPT_STATUSES - values.length;
-  const points = values.map((value, index) => (value == null ? null : `${((first + index) * step).toFixed(2)},${(19 - (18 * value) / most).toFixed(2)}`)).filter(Boolean);
+  const points = values
+    .map((value, index) =>
+      value == null
+        ? null
+        : `${((first + index) * step).toFixed(2)},${(19 - (18 * value) / most).toFixed(2)}`,
+    )
+    .filter(Boolean);
   return html`<svg class="curve" viewBox="0 0 100 20" preserveAspectRatio="none" aria-hidden="true">${svg`<polyline points=${points.join(' ')}></polyline>`}</svg>`;
 }
 
@@ -204,14 +279,16 @@ const sites = ({ sites: list }) => html`
     <header><h2 id="sites">Sites</h2></header>
     <div class="scroll" tabindex="0" role="group" aria-labelledby="sites"><table>
       <thead><tr><th>Site</th><th class="number">Robots</th><th>State</th><th class="number">Throughput</th><th class="number">RTT</th></tr></thead>
-      <tbody>${list.map(({ site, robots, online, throughput_bytes_per_s: throughput, rtt_ms: rtt }) => html`
+      <tbody>${list.map(
+        ({ site, robots, online, throughput_bytes_per_s: throughput, rtt_ms: rtt }) => html`
         <tr>
           <td>${site ? html`<a href=${at(['robots'], { q: `site=${site}` })}>${site}</a>` : html`<span class="quiet">without the label site</span>`}</td>
           <td class="number">${number(robots)}</td>
           <td>${sign(online > 0, `${number(online)} online`)}</td>
           <td class="number">${throughput == null ? '–' : `${size(throughput)}/s`}</td>
           <td class="number">${rtt == null ? '–' : `${number(rtt)} ms`}</td>
-        </tr>`)}</tbody>
+        </tr>`,
+      )}</tbody>
     </table></div>
     <p class="quiet">Throughput and RTT: the median of what transfers to a site’s robots have shown.</p>
   </section>`;

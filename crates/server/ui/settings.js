@@ -1,4 +1,5 @@
-// Settings: who may come in and who may do what, and the rules by which the server decides how bytes travel.
+// Settings: who may come in and who may do what, and the rules by which the server decides how
+// bytes travel.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { parseLabels } from './acts.js';
@@ -17,7 +18,8 @@ const DAY_S = 86_400;
 export const newEnrolment = (wanted = {}) => post('/enrollment-tokens', wanted);
 
 /** The line that enrols a robot. */
-export const enrolCommand = ({ token }) => `task-agent enroll --server ${location.origin} --token ${token}`;
+export const enrolCommand = ({ token }) =>
+  `task-agent enroll --server ${location.origin} --token ${token}`;
 
 export class SettingsView {
   #enrolment = null;
@@ -42,7 +44,11 @@ export class SettingsView {
     const { app } = this;
     this.#isForAll = app.can('administer');
     const queries = { '/tokens': { all: this.#isForAll } };
-    const [tokens, rules, server] = await Promise.all(['/tokens', '/server/rules', '/server'].map((path) => app.attempt(() => get(path, queries[path]))));
+    const [tokens, rules, server] = await Promise.all(
+      ['/tokens', '/server/rules', '/server'].map((path) =>
+        app.attempt(() => get(path, queries[path])),
+      ),
+    );
     change(() => {
       this.#tokens = tokens?.tokens ?? [];
       this.#rules = rules;
@@ -50,7 +56,9 @@ export class SettingsView {
     });
     if (!this.#isForAll) return;
     this.#refreshPending();
-    const [enrolment, users] = await Promise.all(['/enrollment-tokens', '/users'].map((path) => app.attempt(() => get(path))));
+    const [enrolment, users] = await Promise.all(
+      ['/enrollment-tokens', '/users'].map((path) => app.attempt(() => get(path))),
+    );
     change(() => {
       this.#enrolment = enrolment?.tokens ?? [];
       this.#users = users?.users ?? [];
@@ -68,7 +76,10 @@ export class SettingsView {
     if (this.#isPendingStale) this.#refreshPending();
   }
 
-  /** A robot that waits and is not listed has come, and one that is listed and waits no longer has gone. */
+  /**
+   * A robot that waits and is not listed has come, and one that is listed and waits no longer has
+   * gone.
+   */
   hear({ type, robot, id }) {
     if (!this.#isForAll || (type !== 'robot' && type !== 'robot_removed')) return;
     const isListed = this.#pending.some((one) => one.id === (robot?.id ?? id));
@@ -97,12 +108,18 @@ export class SettingsView {
     return html`
       <section aria-labelledby="pending">
         <header><h2 id="pending">Robots that wait to be approved <span class="count">${number(this.#pending.length)}</span></h2></header>
-        ${table(['Name', 'MAC', 'Labels', 'From', 'Since', ''], this.#pending.map((robot) => html`
+        ${table(
+          ['Name', 'MAC', 'Labels', 'From', 'Since', ''],
+          this.#pending.map(
+            (robot) => html`
           <tr>
             <td>${robot.name}</td><td class="code">${robot.mac}</td><td class="code">${labels(robot.labels)}</td><td class="code">${robot.address ?? '–'}</td><td>${since(robot.since_ms, now)}</td>
             <td class="acts"><button class="quiet-button" @click=${() => this.#do(() => post(`/robots/${robot.id}/approve`), `${robot.name} may come in.`)}>Approve</button>
               <button class="quiet-button danger-text" @click=${() => this.#do(() => post(`/robots/${robot.id}/reject`), `${robot.name} was turned away.`)}>Turn away</button></td>
-          </tr>`), 'pending')}
+          </tr>`,
+          ),
+          'pending',
+        )}
       </section>`;
   }
 
@@ -110,14 +127,22 @@ export class SettingsView {
     return html`
       <section aria-labelledby="enrolment">
         <header><h2 id="enrolment">Enrolment tokens <span class="count">robots come in by these</span></h2><button class="primary" @click=${() => this.#askEnrolment()}>New token…</button></header>
-        ${this.#enrolment.length
-          ? table(['ID', 'For', 'Labels', 'Uses left', 'Ends', ''], this.#enrolment.map((token) => html`
+        ${
+          this.#enrolment.length
+            ? table(
+                ['ID', 'For', 'Labels', 'Uses left', 'Ends', ''],
+                this.#enrolment.map(
+                  (token) => html`
               <tr>
                 <td class="code">${token.id}</td><td>${token.robot ?? 'any robot'}${token.approval ? html`<span class="quiet">, with approval</span>` : nothing}</td><td class="code">${labels(token.labels)}</td>
                 <td>${token.uses_left ?? 'any number'}</td><td>${ends(token.expires_at_ms, now)}</td>
                 <td class="acts"><button class="quiet-button danger-text" aria-label=${`Revoke ${token.id}`} @click=${() => this.#do(() => remove(`/enrollment-tokens/${token.id}`), 'The token is revoked.')}>Revoke</button></td>
-              </tr>`), 'enrolment')
-          : html`<p class="quiet">None.</p>`}
+              </tr>`,
+                ),
+                'enrolment',
+              )
+            : html`<p class="quiet">None.</p>`
+        }
       </section>`;
   }
 
@@ -140,7 +165,11 @@ export class SettingsView {
         if (robot.trim()) wanted.robot = robot.trim();
         const made = await newEnrolment(wanted);
         this.refresh();
-        showSecret('Run this on each robot', [enrolCommand(made), 'task-agent run'], `The token is shown this once. It ends on ${moment(made.expires_at_ms)}.`);
+        showSecret(
+          'Run this on each robot',
+          [enrolCommand(made), 'task-agent run'],
+          `The token is shown this once. It ends on ${moment(made.expires_at_ms)}.`,
+        );
       },
     });
   }
@@ -150,15 +179,23 @@ export class SettingsView {
     return html`
       <section aria-labelledby="tokens">
         <header><h2 id="tokens">Access tokens <span class="count">programs sign in by these</span></h2><button class="primary" @click=${() => this.#askToken()}>New token…</button></header>
-        ${tokens.length
-          ? table(['ID', 'User', 'What for', 'May', 'Ends', ''], tokens.map((token) => html`
+        ${
+          tokens.length
+            ? table(
+                ['ID', 'User', 'What for', 'May', 'Ends', ''],
+                tokens.map(
+                  (token) => html`
               <tr>
                 <td class="code">${token.id}</td><td>${token.user}</td><td>${token.title || html`<span class="quiet">${words(token.origin)}</span>`}</td>
                 <td>${token.roles?.join(', ') ?? 'as its user'}${token.scope ? html` on <span class="code">${token.scope}</span>` : nothing}</td>
                 <td>${token.revoked_at_ms ? 'revoked' : token.expires_at_ms ? ends(token.expires_at_ms, now) : 'never'}</td>
                 <td class="acts">${token.revoked_at_ms ? nothing : html`<button class="quiet-button danger-text" aria-label=${`Revoke ${token.id}`} @click=${() => this.#askRevoke(token)}>Revoke</button>`}</td>
-              </tr>`), 'tokens')
-          : html`<p class="quiet">None.</p>`}
+              </tr>`,
+                ),
+                'tokens',
+              )
+            : html`<p class="quiet">None.</p>`
+        }
       </section>`;
   }
 
@@ -167,7 +204,8 @@ export class SettingsView {
       title: 'Revoke the token?',
       action: 'Revoke',
       isDangerous: true,
-      body: () => html`<p><span class="code">${id}</span> of ${user}${title ? `, ${title}` : ''}. Whoever uses it is out at once.</p>`,
+      body: () =>
+        html`<p><span class="code">${id}</span> of ${user}${title ? `, ${title}` : ''}. Whoever uses it is out at once.</p>`,
       act: async () => {
         await remove(`/tokens/${id}`);
         tell('The token is revoked.');
@@ -194,7 +232,11 @@ export class SettingsView {
         if (scope.trim()) wanted.scope = scope.trim();
         const made = await post('/tokens', wanted);
         this.refresh();
-        showSecret('The new token', [made.token], 'It is shown this once. At the command line: TASKD_TOKEN, or --token-file.');
+        showSecret(
+          'The new token',
+          [made.token],
+          'It is shown this once. At the command line: TASKD_TOKEN, or --token-file.',
+        );
       },
     });
   }
@@ -203,10 +245,18 @@ export class SettingsView {
     return html`
       <section aria-labelledby="people">
         <header><h2 id="people">People <span class="count">${number(this.#users.length)}</span></h2></header>
-        ${this.#users.length
-          ? table(['Name', 'Roles', 'Robots', 'Signs in'], this.#users.map(({ name, roles, scope, has_password: hasPassword, subject }) => html`
-              <tr><td>${name}</td><td>${[roles].flat().join(', ')}</td><td class="code">${scope ?? '*'}</td><td>${[hasPassword && 'by password', subject && 'by the provider'].filter(Boolean).join(', ') || 'by token'}</td></tr>`), 'people')
-          : html`<p class="quiet">Only the first token so far. Add people with</p>${command('taskd user add NAME --role operator')}`}
+        ${
+          this.#users.length
+            ? table(
+                ['Name', 'Roles', 'Robots', 'Signs in'],
+                this.#users.map(
+                  ({ name, roles, scope, has_password: hasPassword, subject }) => html`
+              <tr><td>${name}</td><td>${[roles].flat().join(', ')}</td><td class="code">${scope ?? '*'}</td><td>${[hasPassword && 'by password', subject && 'by the provider'].filter(Boolean).join(', ') || 'by token'}</td></tr>`,
+                ),
+                'people',
+              )
+            : html`<p class="quiet">Only the first token so far. Add people with</p>${command('taskd user add NAME --role operator')}`
+        }
       </section>`;
   }
 
@@ -215,12 +265,24 @@ export class SettingsView {
     return html`
       <section aria-labelledby="rules">
         <header><h2 id="rules">Adaptive delivery <span class="count">the first rule whose condition holds decides</span></h2></header>
-        ${table(['', 'Rule', 'If', 'Then', ''], rules.map(({ order, name, condition, mechanism, own }) => html`
-          <tr><td class="quiet">${order}</td><td>${name}</td><td>${condition || html`<span class="quiet">always</span>`}</td><td>${mechanism}</td><td class="quiet">${own ? 'yours' : 'built in'}</td></tr>`), 'rules')}
+        ${table(
+          ['', 'Rule', 'If', 'Then', ''],
+          rules.map(
+            ({ order, name, condition, mechanism, own }) => html`
+          <tr><td class="quiet">${order}</td><td>${name}</td><td>${condition || html`<span class="quiet">always</span>`}</td><td>${mechanism}</td><td class="quiet">${own ? 'yours' : 'built in'}</td></tr>`,
+          ),
+          'rules',
+        )}
       </section>
       <section aria-labelledby="limits">
         <header><h2 id="limits">Limits that hold <span class="count">${plural(limits.length, 'setting')}</span></h2></header>
-        ${table(['Setting', 'Value'], limits.map(({ key, value }) => html`<tr><td class="code">${key}</td><td>${value}</td></tr>`), 'limits')}
+        ${table(
+          ['Setting', 'Value'],
+          limits.map(
+            ({ key, value }) => html`<tr><td class="code">${key}</td><td>${value}</td></tr>`,
+          ),
+          'limits',
+        )}
         <p class="quiet">They are changed in the server’s configuration: <code>taskd serve --help</code>.</p>
       </section>`;
   }
@@ -241,9 +303,13 @@ export class SettingsView {
   }
 }
 
-const labels = (all) => Object.entries(all).map(([label, value]) => `${label}=${value}`).join(', ') || '–';
+const labels = (all) =>
+  Object.entries(all)
+    .map(([label, value]) => `${label}=${value}`)
+    .join(', ') || '–';
 
-const ends = (then, now) => html`<time title=${moment(then)}>${then > now ? `in ${duration(then - now)}` : 'has ended'}</time>`;
+const ends = (then, now) =>
+  html`<time title=${moment(then)}>${then > now ? `in ${duration(then - now)}` : 'has ended'}</time>`;
 
 /** A table that scrolls within itself where it is too wide. `label` is the id of its heading. */
 const table = (heads, rows, label) => html`
@@ -253,4 +319,10 @@ const table = (heads, rows, label) => html`
   </table></div>`;
 
 /** Shows lines to copy that can't be had again. */
-const showSecret = (title, lines, note) => open({ title, isSecret: true, dismissal: 'I have it', body: () => html`${lines.map(command)}<p class="quiet">${note}</p>` });
+const showSecret = (title, lines, note) =>
+  open({
+    title,
+    isSecret: true,
+    dismissal: 'I have it',
+    body: () => html`${lines.map(command)}<p class="quiet">${note}</p>`,
+  });

@@ -15,9 +15,13 @@ const PROVIDER_PROBLEMS = {
 
 export const problemOfProvider = (code) => PROVIDER_PROBLEMS[code] ?? PROVIDER_PROBLEMS.failed;
 
-export const RESTARTED = 'The server was restarted, which ended your session. Sign in again to go on where you were.';
+export const RESTARTED =
+  'The server was restarted, which ended your session. Sign in again to go on where you were.';
 
-/** Where in the page somebody was who has gone to the provider, in this tab: it sends them back to the page's beginning. */
+/**
+ * Where in the page somebody was who has gone to the provider, in this tab: it sends them back to
+ * the page's beginning.
+ */
 const LEFT_AT = 'taskd.left-at';
 
 /** Goes on there. */
@@ -27,7 +31,10 @@ export function comeBack() {
   if (place && !location.hash) history.replaceState(null, '', place);
 }
 
-/** What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the history: `before` takes its place. */
+/**
+ * What a link says, `/#token=…` or `/#problem=…`, which then leaves the address bar and the
+ * history: `before` takes its place.
+ */
 export function ofLink(before = location.pathname) {
   const said = Object.fromEntries(new URLSearchParams(location.hash.slice(1)));
   if (said.token || said.problem) history.replaceState(null, '', before);
@@ -38,7 +45,9 @@ export function ofLink(before = location.pathname) {
 function whoOf(event) {
   event.preventDefault();
   const fields = Object.fromEntries(new FormData(event.currentTarget));
-  return fields.token ? { token: fields.token.trim() } : { user: fields.user.trim(), password: fields.password };
+  return fields.token
+    ? { token: fields.token.trim() }
+    : { user: fields.user.trim(), password: fields.password };
 }
 
 /** The view. `token` is what a link brought; `signIn` gets `{ user, password }` or `{ token }`. */

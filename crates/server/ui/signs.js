@@ -11,35 +11,59 @@ export const sign = (isOn, text) => html`
 export const robotState = ({ online }) => sign(online, online ? 'Online' : 'Offline');
 
 export const lastSeen = ({ online, last_seen_ms: then }, now) =>
-  then || online ? html`<time title=${then ? moment(then) : nothing}>${online ? 'now' : ago(then, now)}</time>` : 'never';
+  then || online
+    ? html`<time title=${then ? moment(then) : nothing}>${online ? 'now' : ago(then, now)}</time>`
+    : 'never';
 
 /** A moment as `12 s ago`, with the whole of it on pointing at it. */
 export const since = (then, now) => html`<time title=${moment(then)}>${ago(then, now)}</time>`;
 
-export const phaseSign = (phase) => tone(phase) === 'bad'
-  ? html`<span class="phase bad"><span aria-hidden="true">✕ </span>${words(phase)}</span>`
-  : html`<span class="phase ${tone(phase)}">${words(phase)}</span>`;
+export const phaseSign = (phase) =>
+  tone(phase) === 'bad'
+    ? html`<span class="phase bad"><span aria-hidden="true">✕ </span>${words(phase)}</span>`
+    : html`<span class="phase ${tone(phase)}">${words(phase)}</span>`;
 
 /** How far a phase that is under way has come; null where there is nothing to measure it by. */
-export const progressBar = ({ task, phase, progress }) => progress?.total && tone(phase) === 'busy'
-  ? html`<span class="moving"><progress max=${progress.total} .value=${Math.min(progress.done, progress.total)} aria-label=${`${task} ${words(phase)}`}></progress><span class="quiet bytes">${bytes(progress)}</span></span>`
-  : null;
+export const progressBar = ({ task, phase, progress }) =>
+  progress?.total && tone(phase) === 'busy'
+    ? html`<span class="moving"><progress max=${progress.total} .value=${Math.min(progress.done, progress.total)} aria-label=${`${task} ${words(phase)}`}></progress><span class="quiet bytes">${bytes(progress)}</span></span>`
+    : null;
 
 /** What else is worth knowing of a task that has not failed. */
-export function remarks({ active, version, deployment, outdated, restarts, wanted, phase, degraded }) {
+export function remarks({
+  active,
+  version,
+  deployment,
+  outdated,
+  restarts,
+  wanted,
+  phase,
+  degraded,
+}) {
   const said = [];
   if (outdated) said.push(`▲ outdated: ${version} is another package now`);
   if (degraded) said.push(`▲ degraded: ${words(degraded.code)}`);
-  if (active && active.deployment !== deployment) said.push(active.version === version ? 'what was there before still runs' : `${active.version} still runs`);
+  if (active && active.deployment !== deployment)
+    said.push(
+      active.version === version
+        ? 'what was there before still runs'
+        : `${active.version} still runs`,
+    );
   if (restarts) said.push(`restarted ${restarts}×`);
   if (wanted === 'stopped' && phase === 'running') said.push('stop ordered');
   return said;
 }
 
-const STATES = { active: '▸ Active', paused: '‖ Paused', settled: '✓ Settled', cancelled: '✕ Cancelled' };
+const STATES = {
+  active: '▸ Active',
+  paused: '‖ Paused',
+  settled: '✓ Settled',
+  cancelled: '✕ Cancelled',
+};
 
 /** Where a deployment stands as a whole. */
-export const deploymentState = ({ state }) => html`<span class="standing ${state}">${STATES[state] ?? words(state)}</span>`;
+export const deploymentState = ({ state }) =>
+  html`<span class="standing ${state}">${STATES[state] ?? words(state)}</span>`;
 
 const ORDER = ['done', 'busy', 'waiting', 'bad', 'gone'];
 
@@ -48,7 +72,9 @@ export function countBar(counts) {
   const total = counts.reduce((sum, { count }) => sum + count, 0);
   let x = 0;
   const parts = ORDER.map((kind) => {
-    const count = counts.filter(({ phase }) => tone(phase) === kind).reduce((sum, part) => sum + part.count, 0);
+    const count = counts
+      .filter(({ phase }) => tone(phase) === kind)
+      .reduce((sum, part) => sum + part.count, 0);
     const part = svg`<rect class=${kind} x=${x} width=${total ? (100 * count) / total : 0} height="1"></rect>`;
     x += total ? (100 * count) / total : 0;
     return part;
@@ -57,4 +83,8 @@ export function countBar(counts) {
   return html`<svg class="bar" viewBox="0 0 100 1" preserveAspectRatio="none" role="img" aria-label=${said || 'none'}>${parts}</svg>`;
 }
 
-export const countWords = (counts) => counts.map(({ phase, count }) => html`<span class="phase ${tone(phase)}">${number(count)} ${words(phase)}</span> `);
+export const countWords = (counts) =>
+  counts.map(
+    ({ phase, count }) =>
+      html`<span class="phase ${tone(phase)}">${number(count)} ${words(phase)}</span> `,
+  );

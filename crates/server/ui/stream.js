@@ -1,5 +1,6 @@
-// One stream of server-sent events, kept alive: it reads, notices silence, and connects again with growing pauses.
-// It is read with fetch and not with EventSource, which hides keep-alives and the status of a refusal.
+// One stream of server-sent events, kept alive: it reads, notices silence, and connects again with
+// growing pauses. It is read with fetch and not with EventSource, which hides keep-alives and the
+// status of a refusal.
 
 const URL_OF_EVENTS = '/api/v1/events';
 // The server says something at least every 15 s.
@@ -10,9 +11,10 @@ const LONGEST_PAUSE_MS = 20_000;
 const LONGEST_LINE = 16 * 1024 * 1024;
 
 /**
- * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with `retry_at` and, where the server
- * refused, its words as `problem`) and `signed_out`, after which nothing follows. Returns a function that ends it. `url` is whose
- * events: all there are, or a robot's lines.
+ * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with
+ * `retry_at` and, where the server refused, its words as `problem`) and `signed_out`, after which
+ * nothing follows. Returns a function that ends it. `url` is whose events: all there are, or a
+ * robot's lines.
  */
 export function openStream(tell, url = URL_OF_EVENTS) {
   const end = new AbortController();
@@ -40,23 +42,31 @@ async function follow(tell, url, end) {
 }
 
 /** Waits that long, or until the end. */
-const rest = (ms, end) => new Promise((resume) => {
-  const done = () => {
-    clearTimeout(timer);
-    end.removeEventListener('abort', done);
-    resume();
-  };
-  const timer = setTimeout(done, ms);
-  end.addEventListener('abort', done);
-});
+const rest = (ms, end) =>
+  new Promise((resume) => {
+    const done = () => {
+      clearTimeout(timer);
+      end.removeEventListener('abort', done);
+      resume();
+    };
+    const timer = setTimeout(done, ms);
+    end.addEventListener('abort', done);
+  });
 
-/** Reads one connection to its end. Answers the HTTP status, if there was one, and why the server refused, if it did. */
+/**
+ * Reads one connection to its end. Answers the HTTP status, if there was one, and why the server
+ * refused, if it did.
+ */
 async function read(tell, url, opened, end) {
   const silence = new AbortController();
   let watchdog = setTimeout(() => silence.abort(), SILENCE_MS);
   try {
     const signal = AbortSignal.any([end, silence.signal]);
-    const response = await fetch(url, { headers: { accept: 'text/event-stream' }, cache: 'no-store', signal });
+    const response = await fetch(url, {
+      headers: { accept: 'text/event-stream' },
+      cache: 'no-store',
+      signal,
+    });
     if (!response.ok) return { status: response.status, problem: await refusal(response) };
     opened();
     let rest = '';
@@ -66,8 +76,11 @@ async function read(tell, url, opened, end) {
       const lines = (rest + text).split('\n');
       rest = lines.pop();
       if (rest.length > LONGEST_LINE) throw new Error('the stream is not one of events');
-      // Every event of ours is one line of JSON that names its own type; all else is comments and keep-alives.
-      const events = lines.filter((line) => line.startsWith('data:')).map((line) => JSON.parse(line.slice(5)));
+      // Every event of ours is one line of JSON that names its own type; all else is comments and
+      // keep-alives.
+      const events = lines
+        .filter((line) => line.startsWith('data:'))
+        .map((line) => JSON.parse(line.slice(5)));
       if (events.length) tell({ events });
     }
     return { status: response.status };

@@ -1,5 +1,5 @@
-// The shared worker: one stream of events for all tabs of this page, because a browser allows six connections to a server.
-// It passes on what it hears and knows nothing of robots.
+// The shared worker: one stream of events for all tabs of this page, because a browser allows six
+// connections to a server. It passes on what it hears and knows nothing of robots.
 
 import { openStream } from './stream.js';
 

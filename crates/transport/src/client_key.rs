@@ -1,5 +1,5 @@
-//! A client's own key, and the certificate by which it shows that it holds it. The certificate says nothing else: nobody
-//! vouches for it, and whoever knows the key knows whose it is.
+//! A client's own key, and the certificate by which it shows that it holds it. The certificate says
+//! nothing else: nobody vouches for it, and whoever knows the key knows whose it is.
 
 use std::fmt;
 use std::sync::Arc;
@@ -16,10 +16,12 @@ use serde::{Deserialize, Serialize};
 use task_proto::envelope::{PublicKey, SigningKey};
 
 /// What stands before the seed in an ed25519 key as PKCS #8 (RFC 8410, section 7).
-const PKCS8_PREFIX: [u8; 16] =
-    [0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20];
+const PKCS8_PREFIX: [u8; 16] = [
+    0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20,
+];
 /// What stands before the key in its SubjectPublicKeyInfo.
-const INFO_PREFIX: [u8; 12] = [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
+const INFO_PREFIX: [u8; 12] =
+    [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
 
 /// An ed25519 key. Its text is the base64 of its seed, for a file of mode 0600.
 #[derive(Serialize, Deserialize)]

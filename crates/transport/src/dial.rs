@@ -1,5 +1,6 @@
-//! Opens a connection to the server: TCP, TLS over it if the server speaks that, WebSocket over that if it is to look like
-//! HTTP. It gives up nothing and waits for ever: whoever calls it has the time.
+//! Opens a connection to the server: TCP, TLS over it if the server speaks that, WebSocket over
+//! that if it is to look like HTTP. It gives up nothing and waits for ever: whoever calls it has
+//! the time.
 
 use std::io;
 use std::net::SocketAddr;
@@ -77,12 +78,14 @@ fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
     let (first, second): (Vec<_>, Vec<_>) =
         addresses.into_iter().partition(|address| Some(address.is_ipv6()) == is_first);
     let (mut first, mut second) = (first.into_iter(), second.into_iter());
-    let pairs = std::iter::from_fn(|| Some([first.next(), second.next()]).filter(|pair| *pair != [None, None]));
+    let pairs = std::iter::from_fn(|| {
+        Some([first.next(), second.next()]).filter(|pair| *pair != [None, None])
+    });
     pairs.flatten().flatten().take(MAX_ADDRESSES).collect()
 }
 
-/// A connection to the first of these addresses that answers: one that is silent, as a family that is not routed, holds
-/// nobody up.
+/// A connection to the first of these addresses that answers: one that is silent, as a family that
+/// is not routed, holds nobody up.
 async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     let mut addresses = addresses.into_iter();
     let mut tries = JoinSet::new();
@@ -106,7 +109,8 @@ async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
 /// Opens a connection.
 pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     let (host, port) = (route.host.clone(), route.port);
-    let bare = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(&host).to_owned();
+    let bare =
+        host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(&host).to_owned();
     let addresses = match tokio::net::lookup_host((bare.as_str(), port)).await {
         Ok(addresses) => in_turns(addresses),
         Err(source) => return Err(DialError::Connect { host, port, source }),
@@ -115,7 +119,8 @@ pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
         Ok(stream) => stream,
         Err(source) => return Err(DialError::Connect { host, port, source }),
     };
-    // Small packets, each of which somebody waits for. If it can't be set, they come a little later.
+    // Small packets, each of which somebody waits for. If it can't be set, they come a little
+    // later.
     let _ = stream.set_nodelay(true);
     let stream: Box<dyn Duplex> = if let Some(tls) = &route.tls {
         let name = ServerName::try_from(bare.clone()).map_err(|_| DialError::Name(bare))?;
@@ -128,7 +133,9 @@ pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     };
     match &route.websocket {
         None => Ok(stream),
-        Some(path) => Ok(Box::new(WebSocket::connect(stream, &format!("{host}:{port}"), path).await?)),
+        Some(path) => {
+            Ok(Box::new(WebSocket::connect(stream, &format!("{host}:{port}"), path).await?))
+        }
     }
 }
 
@@ -165,7 +172,10 @@ mod tests {
         let refuses = address("127.0.0.1:1");
         let stream = connect(vec![full, refuses, open]).await.expect("connected");
         assert_eq!(stream.peer_addr().expect("its address"), open);
-        assert_eq!(connect(vec![refuses]).await.expect_err("refused").kind(), io::ErrorKind::ConnectionRefused);
+        assert_eq!(
+            connect(vec![refuses]).await.expect_err("refused").kind(),
+            io::ErrorKind::ConnectionRefused
+        );
         assert_eq!(connect(Vec::new()).await.expect_err("none").kind(), io::ErrorKind::NotFound);
     }
 }

@@ -1,5 +1,6 @@
-//! What both ends of a connection to the server share: whom a client takes for the server, how it shows who it is itself,
-//! and MQTT over WebSocket. It knows no message, keeps no file and reads no clock: the time is handed in.
+//! What both ends of a connection to the server share: whom a client takes for the server, how it
+//! shows who it is itself, and MQTT over WebSocket. It knows no message, keeps no file and reads no
+//! clock: the time is handed in.
 
 mod client_key;
 mod dial;

@@ -1,6 +1,8 @@
-//! Lends rumqttc a connection that it can't make itself. Its own TLS and WebSocket bring an old certificate verifier, know no
-//! pin and no clock that may be wrong, it waits for an address that is silent though the name has others, and it takes no
-//! stream that somebody else has opened; but it does connect to a local socket. So it gets one that has a name nobody knows and takes just this process, and what passes there is carried over.
+//! Lends rumqttc a connection that it can't make itself. Its own TLS and WebSocket bring an old
+//! certificate verifier, know no pin and no clock that may be wrong, it waits for an address that
+//! is silent though the name has others, and it takes no stream that somebody else has opened; but
+//! it does connect to a local socket. So it gets one that has a name nobody knows and takes just
+//! this process, and what passes there is carried over.
 
 use std::io;
 use std::time::Duration;
@@ -58,7 +60,8 @@ impl Line {
         &self.name
     }
 
-    /// Carries bytes both ways until either end is through, which the session sees by itself; then it rests.
+    /// Carries bytes both ways until either end is through, which the session sees by itself; then
+    /// it rests.
     pub async fn carry(self) {
         self.carry_all().await;
         std::future::pending().await
@@ -68,13 +71,16 @@ impl Line {
         let own = i32::try_from(std::process::id()).ok();
         let mut near = loop {
             match self.listener.accept().await {
-                Ok((near, _)) if near.peer_cred().is_ok_and(|peer| peer.pid() == own) => break near,
+                Ok((near, _)) if near.peer_cred().is_ok_and(|peer| peer.pid() == own) => {
+                    break near;
+                }
                 Ok(_) => {}
                 Err(_) => return,
             }
         };
         drop(self.listener);
         // rumqttc sees its own end close, whatever the reason.
-        let _ = copy_bidirectional_with_sizes(&mut near, &mut self.far, BUFFER_BYTES, BUFFER_BYTES).await;
+        let _ = copy_bidirectional_with_sizes(&mut near, &mut self.far, BUFFER_BYTES, BUFFER_BYTES)
+            .await;
     }
 }

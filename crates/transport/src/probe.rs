@@ -1,5 +1,6 @@
-//! Looks whether somebody answers as it should, for those who search for what is wrong. Greetings let nobody in: no password
-//! travels, and no failed attempt is counted. Only [`displaces`] signs in, with accounts that are there for nothing else.
+//! Looks whether somebody answers as it should, for those who search for what is wrong. Greetings
+//! let nobody in: no password travels, and no failed attempt is counted. Only [`displaces`] signs
+//! in, with accounts that are there for nothing else.
 
 use std::io;
 use std::sync::Arc;
@@ -12,7 +13,8 @@ use tokio::time::timeout;
 use crate::dial::{DialError, Duplex, Route, dial};
 use crate::trust::{Clock, Trust};
 
-/// A CONNECT of a protocol that there is not: whoever speaks MQTT refuses it by that reason, before asking who it is.
+/// A CONNECT of a protocol that there is not: whoever speaks MQTT refuses it by that reason, before
+/// asking who it is.
 const GREETING: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 0x7f, 0x02, 0, 10, 0, 0];
 /// The first byte of a CONNACK.
 const CONNACK: u8 = 0x20;
@@ -83,9 +85,13 @@ pub enum DisplaceError {
     },
 }
 
-/// Whether an MQTT 3.1.1 broker ends the session of the first account when the second one connects with the same client id.
-/// Waits for as long as the broker takes to answer.
-pub async fn displaces(route: &Route, client_id: &str, logins: [MqttLogin<'_>; 2]) -> Result<bool, DisplaceError> {
+/// Whether an MQTT 3.1.1 broker ends the session of the first account when the second one connects
+/// with the same client id. Waits for as long as the broker takes to answer.
+pub async fn displaces(
+    route: &Route,
+    client_id: &str,
+    logins: [MqttLogin<'_>; 2],
+) -> Result<bool, DisplaceError> {
     let mut first = sign_in(route, client_id, logins[0]).await?;
     let _second = sign_in(route, client_id, logins[1]).await?;
     let mut answer = [0; 2];
@@ -101,7 +107,11 @@ pub async fn displaces(route: &Route, client_id: &str, logins: [MqttLogin<'_>; 2
     Ok(timeout(CLOSING, first.read_exact(&mut answer)).await.is_ok())
 }
 
-async fn sign_in(route: &Route, client_id: &str, login: MqttLogin<'_>) -> Result<Box<dyn Duplex>, DisplaceError> {
+async fn sign_in(
+    route: &Route,
+    client_id: &str,
+    login: MqttLogin<'_>,
+) -> Result<Box<dyn Duplex>, DisplaceError> {
     let mut stream = dial(route).await?;
     let mut answer = [0; 4];
     let answered: io::Result<()> = async {
@@ -139,19 +149,21 @@ fn connect_packet(client_id: &str, login: MqttLogin<'_>) -> Vec<u8> {
     packet
 }
 
-/// When the certificate ends that is shown there, in milliseconds since the Unix epoch: what TLS complains of when its clock
-/// shows a time at which none is good. `None` where that can't be found out. Waits for as long as it takes.
+/// When the certificate ends that is shown there, in milliseconds since the Unix epoch: what TLS
+/// complains of when its clock shows a time at which none is good. `None` where that can't be found
+/// out. Waits for as long as it takes.
 pub async fn certificate_end_ms(host: &str, port: u16, trust: Trust) -> Option<u64> {
     let clock = Clock { now_ms: || FAR_FUTURE_MS, earliest_ms: 0 };
     let tls = Some(Arc::new(trust.client_config(clock)));
-    let Err(DialError::Tls { source, .. }) = dial(&Route { host: host.to_owned(), port, tls, websocket: None }).await
+    let Err(DialError::Tls { source, .. }) =
+        dial(&Route { host: host.to_owned(), port, tls, websocket: None }).await
     else {
         return None;
     };
     match source.get_ref()?.downcast_ref::<rustls::Error>()? {
-        rustls::Error::InvalidCertificate(CertificateError::ExpiredContext { not_after, .. }) => {
-            Some(not_after.as_secs() * 1000)
-        }
+        rustls::Error::InvalidCertificate(CertificateError::ExpiredContext {
+            not_after, ..
+        }) => Some(not_after.as_secs() * 1000),
         _ => None,
     }
 }

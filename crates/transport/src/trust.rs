@@ -1,5 +1,6 @@
-//! Whom a client takes for the server: the one whose private authority an enrolment token pinned, or whoever the system's
-//! root certificates vouch for under the name that was asked for. A clock that can't be right does not keep a client out.
+//! Whom a client takes for the server: the one whose private authority an enrolment token pinned,
+//! or whoever the system's root certificates vouch for under the name that was asked for. A clock
+//! that can't be right does not keep a client out.
 
 use std::fmt;
 use std::sync::Arc;
@@ -7,12 +8,15 @@ use std::time::Duration;
 
 use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
 use rustls::client::{verify_server_cert_signed_by_trust_anchor, verify_server_name};
-use rustls::crypto::{WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature};
+use rustls::crypto::{
+    WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature,
+};
 use rustls::pki_types::{CertificateDer, ServerName, UnixTime};
 use rustls::server::ParsedCertificate;
 use rustls::time_provider::TimeProvider;
 use rustls::{
-    CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore, SignatureScheme,
+    CertificateError, ClientConfig, DigitallySignedStruct, Error, OtherError, RootCertStore,
+    SignatureScheme,
 };
 use task_proto::CaPin;
 use task_proto::pin::PINNED_PROTOCOL;
@@ -23,14 +27,17 @@ const MAX_CHAIN: usize = 8;
 /// Whom a client trusts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Trust {
-    /// The authority with this pin and nobody else. It vouches for one server only, so its name does not matter.
+    /// The authority with this pin and nobody else. It vouches for one server only, so its name
+    /// does not matter.
     Pinned(CaPin),
-    /// Whom the system's root certificates vouch for, by name. `SSL_CERT_FILE` and `SSL_CERT_DIR` name others.
+    /// Whom the system's root certificates vouch for, by name. `SSL_CERT_FILE` and `SSL_CERT_DIR`
+    /// name others.
     System,
 }
 
-/// When this program was made, in milliseconds since the Unix epoch, at the earliest: a clock that shows less is wrong. A
-/// build that says its time as reproducible builds do, in `SOURCE_DATE_EPOCH`, is held to that.
+/// When this program was made, in milliseconds since the Unix epoch, at the earliest: a clock that
+/// shows less is wrong. A build that says its time as reproducible builds do, in
+/// `SOURCE_DATE_EPOCH`, is held to that.
 pub const BUILT_MS: u64 = built_ms(option_env!("SOURCE_DATE_EPOCH"));
 /// 2026-01-01: there was no such program before.
 const BEGINNING_MS: u64 = 1_767_225_600_000;
@@ -62,7 +69,8 @@ impl Trust {
         pin.map_or(Self::System, Self::Pinned)
     }
 
-    /// How a client with this trust connects by TLS. Reads the system's certificates where they count.
+    /// How a client with this trust connects by TLS. Reads the system's certificates where they
+    /// count.
     pub fn client_config(self, clock: Clock) -> ClientConfig {
         let provider = Arc::new(ring::default_provider());
         let algorithms = provider.signature_verification_algorithms;
@@ -72,7 +80,9 @@ impl Trust {
         };
         let verifier = Verifier { anchor, algorithms, earliest: at(clock.earliest_ms) };
         let builder = ClientConfig::builder_with_details(provider, Arc::new(clock));
-        let builder = builder.with_safe_default_protocol_versions().expect("the provider has suites for them");
+        let builder = builder
+            .with_safe_default_protocol_versions()
+            .expect("the provider has suites for them");
         let builder = builder.dangerous().with_custom_certificate_verifier(Arc::new(verifier));
         let mut config = builder.with_no_client_auth();
         if let Self::Pinned(_) = self {
@@ -150,7 +160,13 @@ impl Verifier {
         let server = ParsedCertificate::try_from(certificate)?;
         let by = |roots: &RootCertStore| {
             self.at_a_possible_time(now, |time| {
-                verify_server_cert_signed_by_trust_anchor(&server, roots, chain, time, self.algorithms.all)
+                verify_server_cert_signed_by_trust_anchor(
+                    &server,
+                    roots,
+                    chain,
+                    time,
+                    self.algorithms.all,
+                )
             })
         };
         match &self.anchor {
@@ -160,7 +176,8 @@ impl Verifier {
             }
             Anchor::Pin(pin) => {
                 let authority = chain.iter().find(|certificate| pin_of(certificate) == Some(*pin));
-                let authority = authority.ok_or_else(|| Error::Other(OtherError(Arc::new(WrongServer))))?;
+                let authority =
+                    authority.ok_or_else(|| Error::Other(OtherError(Arc::new(WrongServer))))?;
                 let mut roots = RootCertStore::empty();
                 roots.add(authority.clone())?;
                 by(&roots)
@@ -168,18 +185,24 @@ impl Verifier {
         }
     }
 
-    /// Checks at `now`. If that can't be right, a certificate's beginning is not held against the server: the earliest
-    /// moment counts at which all of them had begun, and what ended before that stays ended.
-    fn at_a_possible_time(&self, now: UnixTime, check: impl Fn(UnixTime) -> Result<(), Error>) -> Result<(), Error> {
+    /// Checks at `now`. If that can't be right, a certificate's beginning is not held against the
+    /// server: the earliest moment counts at which all of them had begun, and what ended before
+    /// that stays ended.
+    fn at_a_possible_time(
+        &self,
+        now: UnixTime,
+        check: impl Fn(UnixTime) -> Result<(), Error>,
+    ) -> Result<(), Error> {
         if now >= self.earliest {
             return check(now);
         }
         let mut time = self.earliest;
         for _ in 0..MAX_CHAIN {
             match check(time) {
-                Err(Error::InvalidCertificate(CertificateError::NotValidYetContext { not_before, .. }))
-                    if not_before > time =>
-                {
+                Err(Error::InvalidCertificate(CertificateError::NotValidYetContext {
+                    not_before,
+                    ..
+                })) if not_before > time => {
                     time = not_before;
                 }
                 outcome => return outcome,
@@ -198,7 +221,8 @@ impl ServerCertVerifier for Verifier {
         _ocsp_response: &[u8],
         now: UnixTime,
     ) -> Result<ServerCertVerified, Error> {
-        self.verify(end_entity, intermediates, server_name, now).map(|()| ServerCertVerified::assertion())
+        self.verify(end_entity, intermediates, server_name, now)
+            .map(|()| ServerCertVerified::assertion())
     }
 
     fn verify_tls12_signature(
@@ -227,7 +251,8 @@ impl ServerCertVerifier for Verifier {
 #[cfg(test)]
 mod tests {
     use rcgen::{
-        BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, date_time_ymd,
+        BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer,
+        KeyPair, date_time_ymd,
     };
 
     use super::*;
@@ -255,10 +280,16 @@ mod tests {
         }
 
         /// For `server.lab`, good from the first day of `from` until that of `until`.
-        fn server(&self, from: i32, until: i32, purpose: ExtendedKeyUsagePurpose) -> CertificateDer<'static> {
+        fn server(
+            &self,
+            from: i32,
+            until: i32,
+            purpose: ExtendedKeyUsagePurpose,
+        ) -> CertificateDer<'static> {
             let mut params = CertificateParams::new(vec!["server.lab".to_owned()]).expect("a name");
             params.extended_key_usages = vec![purpose];
-            (params.not_before, params.not_after) = (date_time_ymd(from, 1, 1), date_time_ymd(until, 1, 1));
+            (params.not_before, params.not_after) =
+                (date_time_ymd(from, 1, 1), date_time_ymd(until, 1, 1));
             let key = KeyPair::generate().expect("a key");
             params.signed_by(&key, &self.issuer).expect("signed").der().clone()
         }
@@ -287,7 +318,13 @@ mod tests {
         let chain = [own.certificate.clone()];
         assert_eq!(check(&pinned, &good, &chain, "10.0.0.1", BUILT_MS), Ok(()));
         let foreign = other.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
-        let refused = check(&pinned, &foreign, std::slice::from_ref(&other.certificate), "server.lab", BUILT_MS);
+        let refused = check(
+            &pinned,
+            &foreign,
+            std::slice::from_ref(&other.certificate),
+            "server.lab",
+            BUILT_MS,
+        );
         assert!(matches!(refused, Err(Error::Other(_))), "{refused:?}");
         // The pinned certificate beside another's server proves nothing.
         let both = [other.certificate.clone(), own.certificate.clone()];
@@ -306,7 +343,16 @@ mod tests {
         let server = own.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
         assert_eq!(check(&by_roots, &server, &[], "server.lab", BUILT_MS), Ok(()));
         assert!(check(&by_roots, &server, &[], "other.lab", BUILT_MS).is_err());
-        assert!(check(&verifier(Anchor::Roots(RootCertStore::empty())), &server, &[], "server.lab", BUILT_MS).is_err());
+        assert!(
+            check(
+                &verifier(Anchor::Roots(RootCertStore::empty())),
+                &server,
+                &[],
+                "server.lab",
+                BUILT_MS
+            )
+            .is_err()
+        );
     }
 
     #[test]

@@ -1,5 +1,5 @@
-//! MQTT over WebSocket (MQTT 3.1.1, section 6): a stream of bytes in binary frames, as either end. It begins as an HTTP
-//! request, so it passes what lets nothing but HTTP pass.
+//! MQTT over WebSocket (MQTT 3.1.1, section 6): a stream of bytes in binary frames, as either end.
+//! It begins as an HTTP request, so it passes what lets nothing but HTTP pass.
 
 pub mod frame;
 
@@ -28,7 +28,8 @@ const MAX_HEADERS: usize = 64;
 const FRAME_BYTES: usize = 16 * 1024;
 /// Encoded and not written yet, before nothing more is taken.
 const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
-/// Frames in a row that carry no byte of MQTT: pings, pongs, empty ones. They cost time, and nobody else counts them.
+/// Frames in a row that carry no byte of MQTT: pings, pongs, empty ones. They cost time, and nobody
+/// else counts them.
 const MAX_VAIN_FRAMES: usize = 64;
 /// What is read at once.
 const READ_BYTES: usize = 8 * 1024;
@@ -49,7 +50,9 @@ pub enum WebSocketError {
 
 /// Reads a client's request for a WebSocket and gives the headers that grant it, with status 101.
 pub fn grant(request: &HeaderMap) -> Result<HeaderMap, WebSocketError> {
-    if !has_token(request, &header::CONNECTION, "upgrade") || !has_token(request, &header::UPGRADE, "websocket") {
+    if !has_token(request, &header::CONNECTION, "upgrade")
+        || !has_token(request, &header::UPGRADE, "websocket")
+    {
         return Err(WebSocketError::Malformed("Upgrade: websocket is missing"));
     }
     if !has_token(request, &header::SEC_WEBSOCKET_VERSION, "13") {
@@ -62,7 +65,8 @@ pub fn grant(request: &HeaderMap) -> Result<HeaderMap, WebSocketError> {
     if !STANDARD.decode(key).is_ok_and(|key| key.len() == 16) {
         return Err(WebSocketError::Malformed("Sec-WebSocket-Key is not 16 bytes in base64"));
     }
-    let accept = HeaderValue::try_from(accept_of(key)).map_err(|_| WebSocketError::Malformed("Sec-WebSocket-Key"))?;
+    let accept = HeaderValue::try_from(accept_of(key))
+        .map_err(|_| WebSocketError::Malformed("Sec-WebSocket-Key"))?;
     Ok(HeaderMap::from_iter([
         (header::CONNECTION, HeaderValue::from_static("Upgrade")),
         (header::UPGRADE, HeaderValue::from_static("websocket")),
@@ -178,16 +182,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     /// Acts on the frames that are here; `unread` has what there is to read.
     fn act_on_input(&mut self) -> io::Result<()> {
         while self.unread.is_empty() && !self.is_over {
-            let piece = self.decoder.decode(&mut self.input).map_err(|violation| self.refuse(violation))?;
+            let piece =
+                self.decoder.decode(&mut self.input).map_err(|violation| self.refuse(violation))?;
             let has_data = matches!(&piece, Some(Piece::Data(bytes)) if !bytes.is_empty());
-            self.vain_frames = if has_data { 0 } else { self.vain_frames + usize::from(piece.is_some()) };
+            self.vain_frames =
+                if has_data { 0 } else { self.vain_frames + usize::from(piece.is_some()) };
             if self.vain_frames > MAX_VAIN_FRAMES {
                 return Err(self.refuse(Violation::new("another one that carries nothing")));
             }
             match piece {
                 Some(Piece::Data(bytes)) => self.unread = bytes,
                 // Who asks without reading the answers gets no more of them.
-                Some(Piece::Ping(bytes)) if !self.is_closed && self.output.len() < MAX_UNWRITTEN_BYTES => {
+                Some(Piece::Ping(bytes))
+                    if !self.is_closed && self.output.len() < MAX_UNWRITTEN_BYTES =>
+                {
                     self.queue(Opcode::Pong, &bytes);
                 }
                 Some(Piece::Ping(_) | Piece::Pong) => {}
@@ -230,12 +238,17 @@ fn judge(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocket<S> {
-    fn poll_read(self: Pin<&mut Self>, context: &mut Context<'_>, buffer: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+    fn poll_read(
+        self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         loop {
             this.act_on_input()?;
             if !this.output.is_empty() {
-                // A pong. Whatever can't be written now is written later; an error is one of the next write as well.
+                // A pong. Whatever can't be written now is written later; an error is one of the
+                // next write as well.
                 let _ = this.poll_drain(context)?;
             }
             if !this.unread.is_empty() {
@@ -258,7 +271,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocket<S> {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocket<S> {
-    fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
         let this = self.get_mut();
         if this.is_closed {
             return Poll::Ready(Err(io::ErrorKind::BrokenPipe.into()));
@@ -268,7 +285,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocket<S> {
         }
         let taken = &bytes[..bytes.len().min(FRAME_BYTES)];
         this.queue(Opcode::Binary, taken);
-        // What is taken is on its way even if nobody flushes; what does not fit now goes before the next.
+        // What is taken is on its way even if nobody flushes; what does not fit now goes before the
+        // next.
         let _ = this.poll_drain(context)?;
         Poll::Ready(Ok(taken.len()))
     }
@@ -310,7 +328,10 @@ mod tests {
             parsed.parse(&request).expect("HTTP");
             assert_eq!(parsed.path, Some("/mqtt"));
             let headers = HeaderMap::from_iter(parsed.headers.iter().map(|field| {
-                (field.name.parse::<HeaderName>().expect("a name"), HeaderValue::from_bytes(field.value).expect("one"))
+                (
+                    field.name.parse::<HeaderName>().expect("a name"),
+                    HeaderValue::from_bytes(field.value).expect("one"),
+                )
             }));
             let mut answer = "HTTP/1.1 101 Switching Protocols\r\n".to_owned();
             for (name, value) in &grant(&headers).expect("granted") {
@@ -319,7 +340,8 @@ mod tests {
             server.write_all(format!("{answer}\r\n").as_bytes()).await.expect("written");
             WebSocket::server(server)
         };
-        let (client, server) = tokio::join!(WebSocket::connect(client, "server:8080", "/mqtt"), granting);
+        let (client, server) =
+            tokio::join!(WebSocket::connect(client, "server:8080", "/mqtt"), granting);
         (client.expect("granted"), server)
     }
 
@@ -397,13 +419,24 @@ mod tests {
             let (client, mut server) = pair(1 << 16).await;
             let WebSocket { mut stream, .. } = client;
             for _ in 0..3 {
-                stream.write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES)).await.expect("written");
+                stream
+                    .write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES))
+                    .await
+                    .expect("written");
                 stream.write_all(&masked(Opcode::Binary, b"x")).await.expect("written");
                 assert_eq!(server.read_u8().await.expect("a byte"), b'x');
             }
-            stream.write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES + 1)).await.expect("written");
-            let ended = tokio::time::timeout(std::time::Duration::from_secs(10), server.read_u8()).await;
-            assert_eq!(ended.expect("in time").expect_err("no byte").kind(), io::ErrorKind::InvalidData, "{opcode:?}");
+            stream
+                .write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES + 1))
+                .await
+                .expect("written");
+            let ended =
+                tokio::time::timeout(std::time::Duration::from_secs(10), server.read_u8()).await;
+            assert_eq!(
+                ended.expect("in time").expect_err("no byte").kind(),
+                io::ErrorKind::InvalidData,
+                "{opcode:?}"
+            );
         }
     }
 
@@ -421,12 +454,14 @@ mod tests {
                 server.shutdown().await.expect("ended");
                 server
             };
-            let (error, _server) = tokio::join!(WebSocket::connect(client, "server", "/mqtt"), answering);
+            let (error, _server) =
+                tokio::join!(WebSocket::connect(client, "server", "/mqtt"), answering);
             let error = error.expect_err("none").to_string();
             assert!(error.contains(expected), "{error}");
         }
         let (client, mut server) = duplex(4096);
-        let endless = async move { while server.write_all(b"HTTP/1.1 101 OK\r\nx: y").await.is_ok() {} };
+        let endless =
+            async move { while server.write_all(b"HTTP/1.1 101 OK\r\nx: y").await.is_ok() {} };
         let (error, ()) = tokio::join!(WebSocket::connect(client, "server", "/mqtt"), endless);
         assert!(error.is_err());
     }
@@ -456,9 +491,9 @@ mod tests {
         ];
         let headers = |leave_out: &str| {
             let pairs = good.iter().filter(|(name, _)| *name != leave_out);
-            HeaderMap::from_iter(
-                pairs.map(|(name, value)| (HeaderName::from_static(name), HeaderValue::from_static(value))),
-            )
+            HeaderMap::from_iter(pairs.map(|(name, value)| {
+                (HeaderName::from_static(name), HeaderValue::from_static(value))
+            }))
         };
         let granted = grant(&headers("")).expect("granted");
         assert_eq!(granted[header::SEC_WEBSOCKET_ACCEPT], "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=");

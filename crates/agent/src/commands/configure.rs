@@ -1,5 +1,6 @@
-//! `task-agent configure`: the paper's form. It shows the MAC that was found, asks for what it can't know, and writes the
-//! property file. Flags answer questions; with `--yes` the rest keeps its value.
+//! `task-agent configure`: the paper's form. It shows the MAC that was found, asks for what it
+//! can't know, and writes the property file. Flags answer questions; with `--yes` the rest keeps
+//! its value.
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
@@ -54,7 +55,8 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     if !arguments.yes {
         ask_for_the_rest(&mut settings, &arguments)?;
     }
-    durable::create_dir_all(data.root()).with_context(|| format!("cannot make {}", data.root().display()))?;
+    durable::create_dir_all(data.root())
+        .with_context(|| format!("cannot make {}", data.root().display()))?;
     settings.write(data.root())?;
     say(format_args!("wrote {}", data.root().join(FILE_NAME).display()));
     Ok(ExitCode::SUCCESS)
@@ -88,17 +90,22 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
     }
     if arguments.labels.is_empty() {
         let pairs = settings.labels.iter().flatten().map(|(key, value)| format!("{key}={value}"));
-        settings.labels = ask("Labels (key=value,…)", &pairs.collect::<Vec<_>>().join(","), |text| {
-            let labels = text.split(',').filter(|pair| !pair.trim().is_empty());
-            labels.map(|pair| parse_label(pair.trim()).map_err(anyhow::Error::msg)).collect()
-        })?;
+        settings.labels =
+            ask("Labels (key=value,…)", &pairs.collect::<Vec<_>>().join(","), |text| {
+                let labels = text.split(',').filter(|pair| !pair.trim().is_empty());
+                labels.map(|pair| parse_label(pair.trim()).map_err(anyhow::Error::msg)).collect()
+            })?;
     }
     if arguments.underlays.is_empty() {
         let underlays = match &settings.underlays {
             Some(underlays) => underlays.clone(),
-            None => underlay::find(&[], &Places::of_this_machine()).pop().map(|best| best.setups).unwrap_or_default(),
+            None => underlay::find(&[], &Places::of_this_machine())
+                .pop()
+                .map(|best| best.setups)
+                .unwrap_or_default(),
         };
-        let shown = underlays.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
+        let shown =
+            underlays.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
         settings.underlays = ask("ROS setup file (a:b for several)", &shown, |text| {
             Ok(text.split(':').filter(|path| !path.is_empty()).map(PathBuf::from).collect())
         })?;
@@ -106,8 +113,13 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
     Ok(())
 }
 
-/// Asks until the answer can be used; an empty one takes the default, and where that is empty too, nothing.
-fn ask<T>(question: &str, default: &str, parse: impl Fn(&str) -> anyhow::Result<T>) -> anyhow::Result<Option<T>> {
+/// Asks until the answer can be used; an empty one takes the default, and where that is empty too,
+/// nothing.
+fn ask<T>(
+    question: &str,
+    default: &str,
+    parse: impl Fn(&str) -> anyhow::Result<T>,
+) -> anyhow::Result<Option<T>> {
     loop {
         let mut out = std::io::stdout().lock();
         write!(out, "{question} [{default}]: ")?;

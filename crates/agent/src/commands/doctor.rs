@@ -1,5 +1,5 @@
-//! `task-agent doctor`: looks for what commonly goes wrong on a robot and between it and its server, and says how to mend
-//! it. It changes nothing, and disturbs no agent that runs.
+//! `task-agent doctor`: looks for what commonly goes wrong on a robot and between it and its
+//! server, and says how to mend it. It changes nothing, and disturbs no agent that runs.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -65,9 +65,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     runtime.shutdown_background();
     match arguments.output {
         Output::Json => say(format_args!("{}", serde_json::to_string_pretty(&checkup)?)),
-        Output::Table => {
-            say(format_args!("{}", checkup.text(|verdict: Verdict| verdict.sign().to_string()).trim_end()))
-        }
+        Output::Table => say(format_args!(
+            "{}",
+            checkup.text(|verdict: Verdict| verdict.sign().to_string()).trim_end()
+        )),
     }
     Ok(if checkup.is_healthy() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
@@ -110,7 +111,9 @@ fn settings(checkup: &mut Checkup, data: &Path) -> Option<Config> {
         Err(error) => {
             let mend = match &error {
                 ConfigError::Io { .. } => "run it as the agent's user",
-                ConfigError::Invalid { .. } => "mend the key that it names, in agent.toml or the environment",
+                ConfigError::Invalid { .. } => {
+                    "mend the key that it names, in agent.toml or the environment"
+                }
             };
             checkup.bad("settings", chain(&error), mend);
             None
@@ -134,7 +137,8 @@ fn directory(checkup: &mut Checkup, data: &Path) -> Option<(Layout, Identity)> {
     match access(data, flags) {
         Ok(()) => checkup.good("data", format!("{} can be written", data.display())),
         Err(error) => {
-            let mend = "run it as the agent's user (root, mostly), or say where the directory is (--data)";
+            let mend =
+                "run it as the agent's user (root, mostly), or say where the directory is (--data)";
             checkup.bad("data", format!("{}: {}", data.display(), error.desc()), mend);
             return None;
         }
@@ -157,13 +161,23 @@ fn directory(checkup: &mut Checkup, data: &Path) -> Option<(Layout, Identity)> {
     checkup.good("identity", format!("{} ({})", identity.robot_id, identity.mac));
     match agent_runs(&layout) {
         true => checkup.good("agent", "runs"),
-        false => checkup.bad("agent", "does not run", "start it: systemctl start task-agent, or task-agent run"),
+        false => checkup.bad(
+            "agent",
+            "does not run",
+            "start it: systemctl start task-agent, or task-agent run",
+        ),
     }
     Some((layout, identity))
 }
 
-async fn server(checkup: &mut Checkup, identity: &Identity, base: &Url, config: Option<&Config>) -> anyhow::Result<()> {
-    let (host, port) = (base.host_str().unwrap_or_default(), base.port_or_known_default().unwrap_or_default());
+async fn server(
+    checkup: &mut Checkup,
+    identity: &Identity,
+    base: &Url,
+    config: Option<&Config>,
+) -> anyhow::Result<()> {
+    let (host, port) =
+        (base.host_str().unwrap_or_default(), base.port_or_known_default().unwrap_or_default());
     let bare = host.trim_matches(['[', ']']);
     match timeout(PATIENCE, tokio::net::lookup_host((bare, port))).await {
         Ok(Ok(_)) => checkup.good("dns", format!("{bare} is known")),
@@ -193,13 +207,22 @@ async fn server(checkup: &mut Checkup, identity: &Identity, base: &Url, config: 
         certificate(checkup, bare, port, identity).await;
     }
     let credential = Credential::from(identity.token.clone());
-    let endpoint = token(checkup, &Server::new(client, base.clone(), identity.robot_id.clone(), credential)).await;
+    let endpoint =
+        token(checkup, &Server::new(client, base.clone(), identity.robot_id.clone(), credential))
+            .await;
     match config {
         Some(config) if !config.mqtt => checkup.good("mqtt", "is turned off: the robot polls"),
         config => {
             let transport = config.map(|config| config.mqtt_transport).unwrap_or_default();
             // As the agent: where the enrolment said, until the server says something else.
-            mqtt(checkup, base, Arc::new(tls), endpoint.as_ref().unwrap_or(&identity.mqtt), transport).await;
+            mqtt(
+                checkup,
+                base,
+                Arc::new(tls),
+                endpoint.as_ref().unwrap_or(&identity.mqtt),
+                transport,
+            )
+            .await;
         }
     }
     Ok(())
@@ -220,7 +243,9 @@ async fn mqtt(
     let mqtt_tls = |is_encrypted| match (&mqtt.external, is_encrypted) {
         (_, false) => None,
         (None, true) => Some(tls.clone()),
-        (Some(broker), true) => Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates()))),
+        (Some(broker), true) => {
+            Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates())))
+        }
     };
     let by_port = |place: &MqttPlace| Route {
         host: place.host.clone().unwrap_or_else(|| base.host_str().unwrap_or_default().to_owned()),
@@ -250,25 +275,34 @@ async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> b
     let response = match client.get(url).timeout(PATIENCE).send().await {
         Ok(response) if response.status().is_success() => response,
         Ok(response) => {
-            let found = format!("what answers at {base} is not taskd (status {})", response.status().as_u16());
+            let found = format!(
+                "what answers at {base} is not taskd (status {})",
+                response.status().as_u16()
+            );
             let mend = "look whether a captive portal or a proxy is in between, and at server in agent.toml";
             checkup.bad("http", found, mend);
             return false;
         }
         Err(error) => {
-            let mend =
-                "look at the network, at server in agent.toml, and whether taskd serve runs and may be reached there";
+            let mend = "look at the network, at server in agent.toml, and whether taskd serve runs and may be reached there";
             checkup.bad("http", chain(&error.without_url()), mend);
             return false;
         }
     };
     checkup.good("http", format!("{base} answers"));
-    let date = response.headers().get(reqwest::header::DATE).and_then(|date| date.to_str().ok()).and_then(parse_date);
+    let date = response
+        .headers()
+        .get(reqwest::header::DATE)
+        .and_then(|date| date.to_str().ok())
+        .and_then(parse_date);
     let Some(server_s) = date else { return true };
     let here_s = clock::wall_ms() / 1000;
     let found = || {
         let way = if server_s > here_s { "behind" } else { "ahead of" };
-        format!("this robot's clock is {} {way} the server's", span(Duration::from_secs(server_s.abs_diff(here_s))))
+        format!(
+            "this robot's clock is {} {way} the server's",
+            span(Duration::from_secs(server_s.abs_diff(here_s)))
+        )
     };
     let mend = "let it follow NTP (timedatectl set-ntp true); without a battery-backed clock install fake-hwclock";
     match server_s.abs_diff(here_s) {
@@ -282,7 +316,8 @@ async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> b
 async fn certificate(checkup: &mut Checkup, host: &str, port: u16, identity: &Identity) {
     let trust = Trust::by(identity.ca_pin);
     let end_ms = timeout(PATIENCE, certificate_end_ms(host, port, trust)).await.ok().flatten();
-    let by = if identity.ca_pin.is_some() { "by the pinned authority" } else { "by the system's roots" };
+    let by =
+        if identity.ca_pin.is_some() { "by the pinned authority" } else { "by the system's roots" };
     match end_ms {
         Some(end_ms) if end_ms < clock::wall_ms() + SOON_MS => checkup.notice(
             "tls",
@@ -290,7 +325,10 @@ async fn certificate(checkup: &mut Checkup, host: &str, port: u16, identity: &Id
             "the server's administrator renews it",
         ),
         Some(end_ms) => {
-            checkup.good("tls", format!("vouched for {by}, until {}", task_proto::time::timestamp(end_ms)));
+            checkup.good(
+                "tls",
+                format!("vouched for {by}, until {}", task_proto::time::timestamp(end_ms)),
+            );
         }
         None => checkup.good("tls", format!("vouched for {by}")),
     }
@@ -315,9 +353,11 @@ async fn token(checkup: &mut Checkup, server: &Server) -> Option<MqttEndpoint> {
             };
             checkup.bad("token", chain(&error), mend);
         }
-        Err(_) => {
-            checkup.bad("token", "the server does not answer within 5 s", "look at the server (taskd doctor there)")
-        }
+        Err(_) => checkup.bad(
+            "token",
+            "the server does not answer within 5 s",
+            "look at the server (taskd doctor there)",
+        ),
     }
     None
 }
@@ -343,16 +383,24 @@ async fn greet(checkup: &mut Checkup, name: &str, route: &Route, has_other: bool
 }
 
 fn machine(checkup: &mut Checkup, data: &Path, config: Option<&Config>) {
-    let reserve =
-        config.and_then(|config| config.limits.disk_reserve_bytes).unwrap_or(FetchSettings::default().reserve_bytes);
+    let reserve = config
+        .and_then(|config| config.limits.disk_reserve_bytes)
+        .unwrap_or(FetchSettings::default().reserve_bytes);
     match disk::room(data) {
         Ok(room) if room.free < reserve => {
             let found = format!("{} MiB of {} MiB free", room.free >> 20, room.total >> 20);
             let mend = "make room: logs, recordings, packages of other tasks (limits.disk_reserve_bytes is kept free)";
-            if room.is_used_up() { checkup.bad("disk", found, mend) } else { checkup.notice("disk", found, mend) }
+            if room.is_used_up() {
+                checkup.bad("disk", found, mend)
+            } else {
+                checkup.notice("disk", found, mend)
+            }
         }
-        Ok(room) => checkup.good("disk", format!("{} MiB of {} MiB free", room.free >> 20, room.total >> 20)),
-        Err(error) => checkup.bad("disk", format!("{}: {error}", data.display()), "look at the file system"),
+        Ok(room) => checkup
+            .good("disk", format!("{} MiB of {} MiB free", room.free >> 20, room.total >> 20)),
+        Err(error) => {
+            checkup.bad("disk", format!("{}: {error}", data.display()), "look at the file system")
+        }
     }
     match getrlimit(Resource::RLIMIT_NOFILE) {
         Ok((files, _)) if files < WANTED_FILES => checkup.notice(
@@ -360,7 +408,9 @@ fn machine(checkup: &mut Checkup, data: &Path, config: Option<&Config>) {
             format!("an agent started from here may have {files} files open"),
             "raise the limit (LimitNOFILE= in its unit, ulimit -n here)",
         ),
-        Ok((files, _)) => checkup.good("files", format!("an agent started from here may have {files} files open")),
+        Ok((files, _)) => {
+            checkup.good("files", format!("an agent started from here may have {files} files open"))
+        }
         Err(error) => checkup.notice("files", error.desc(), "look at ulimit -n"),
     }
 }
@@ -368,7 +418,8 @@ fn machine(checkup: &mut Checkup, data: &Path, config: Option<&Config>) {
 fn ros(checkup: &mut Checkup, config: &Config) {
     let found = underlay::by_settings(&config.underlays, config.workspace.as_deref());
     let missing = found.iter().flat_map(|found| &found.setups).find(|setup| !setup.is_file());
-    let setups: Vec<String> = found.iter().flat_map(|f| &f.setups).map(|setup| setup.display().to_string()).collect();
+    let setups: Vec<String> =
+        found.iter().flat_map(|f| &f.setups).map(|setup| setup.display().to_string()).collect();
     match (missing, all_distros(&found)) {
         (Some(missing), _) => {
             let mend = "mend underlays and workspace, in agent.toml or at the server";
@@ -401,7 +452,8 @@ fn ros(checkup: &mut Checkup, config: &Config) {
     }
 }
 
-/// Where an installation has programs: beside its setup file, as in a virtual environment, or in `bin`.
+/// Where an installation has programs: beside its setup file, as in a virtual environment, or in
+/// `bin`.
 fn own_programs(installation: &Installation) -> Vec<PathBuf> {
     let dirs = installation.setups.iter().filter_map(|setup| setup.parent());
     dirs.flat_map(|dir| [dir.to_owned(), dir.join("bin")]).collect()
@@ -413,7 +465,9 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
                 (Delegate=yes in the agent's unit)";
     match cgroup::outlook() {
         Outlook::Isolates => checkup.good("cgroups", "v2, with memory and pids"),
-        Outlook::Counts => checkup.notice("cgroups", "v2, without the controllers memory and pids", mend),
+        Outlook::Counts => {
+            checkup.notice("cgroups", "v2, without the controllers memory and pids", mend)
+        }
         Outlook::Nothing => checkup.notice("cgroups", "no cgroup v2", mend),
     }
     let found = TaskUser::find(config.task_user.as_deref());
@@ -459,7 +513,8 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
 
 /// An HTTP date, like `Sun, 06 Nov 1994 08:49:37 GMT`, in seconds since the Unix epoch.
 fn parse_date(text: &str) -> Option<u64> {
-    const MONTHS: [&str; 12] = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
+    const MONTHS: [&str; 12] =
+        ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
     let mut words = text.split_once(", ")?.1.split(' ');
     let (day, name, year, clock) = (words.next()?, words.next()?, words.next()?, words.next()?);
     let month = MONTHS.iter().position(|month| *month == name)? + 1;
@@ -475,7 +530,12 @@ mod tests {
         assert_eq!(parse_date("Thu, 01 Jan 1970 00:00:00 GMT"), Some(0));
         assert_eq!(parse_date("Sun, 06 Nov 1994 08:49:37 GMT"), Some(784_111_777));
         assert_eq!(parse_date("Tue, 29 Feb 2000 00:00:00 GMT"), Some(951_782_400));
-        for bad in ["", "Sunday, 06-Nov-94 08:49:37 GMT", "Sun, 06 Nov 1994", "Sun, 99 Nov 1994 08:49:37 GMT"] {
+        for bad in [
+            "",
+            "Sunday, 06-Nov-94 08:49:37 GMT",
+            "Sun, 06 Nov 1994",
+            "Sun, 99 Nov 1994 08:49:37 GMT",
+        ] {
             assert_eq!(parse_date(bad), None, "{bad}");
         }
     }

@@ -24,8 +24,10 @@ pub fn run() -> anyhow::Result<ExitCode> {
         .build()?;
     let outcome = runtime.block_on(async {
         let (input, output) = (std::io::stdin(), std::io::stdout());
-        let input = pipe::Receiver::from_owned_fd(owned(input.as_fd())?).context("standard input")?;
-        let output = pipe::Sender::from_owned_fd(owned(output.as_fd())?).context("standard output")?;
+        let input =
+            pipe::Receiver::from_owned_fd(owned(input.as_fd())?).context("standard input")?;
+        let output =
+            pipe::Sender::from_owned_fd(owned(output.as_fd())?).context("standard output")?;
         serve::serve(input, output).await.context("the agent")
     });
     // A thread of the DDS library that hangs is no reason to stay.

@@ -1,5 +1,5 @@
-//! `task-agent hold` and `release`: a person at the robot has the last word. A flag file in the data directory, so that
-//! both work without server and without a running agent.
+//! `task-agent hold` and `release`: a person at the robot has the last word. A flag file in the
+//! data directory, so that both work without server and without a running agent.
 
 use std::process::ExitCode;
 
@@ -19,7 +19,8 @@ pub struct Arguments {
 /// From now on nothing is started or switched, also after a power cut.
 pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let path = arguments.data.data.join(HOLD_FILE);
-    durable::write(&path, b"", 0o644).with_context(|| format!("cannot write {}", path.display()))?;
+    durable::write(&path, b"", 0o644)
+        .with_context(|| format!("cannot write {}", path.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -42,10 +43,14 @@ mod tests {
         let dir = tempfile::tempdir().expect("a directory");
         let arguments = || Arguments { data: DataDir { data: dir.path().to_owned() } };
         let path = dir.path().join(HOLD_FILE);
-        // What is written so that it lasts takes the place of what was there, and is not written into it.
+        // What is written so that it lasts takes the place of what was there, and is not written
+        // into it.
         std::os::unix::fs::symlink(dir.path().join("elsewhere"), &path).expect("linked");
         hold(arguments()).expect("held");
-        assert!(path.symlink_metadata().expect("it is there").is_file() && !dir.path().join("elsewhere").exists());
+        assert!(
+            path.symlink_metadata().expect("it is there").is_file()
+                && !dir.path().join("elsewhere").exists()
+        );
         release(arguments()).expect("released");
         assert!(!path.exists());
     }

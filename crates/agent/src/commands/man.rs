@@ -15,7 +15,8 @@ pub struct Arguments {
 /// Writes a page for each subcommand.
 pub fn run(arguments: &Arguments, command_line: clap::Command) -> anyhow::Result<ExitCode> {
     let directory = &arguments.directory;
-    let written = std::fs::create_dir_all(directory).and_then(|()| clap_mangen::generate_to(command_line, directory));
+    let written = std::fs::create_dir_all(directory)
+        .and_then(|()| clap_mangen::generate_to(command_line, directory));
     written.with_context(|| format!("cannot write to {}", directory.display()))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,5 +1,5 @@
-//! `task-agent run`: puts the agent together and drives until a signal. Tasks go on running afterwards; under systemd
-//! that needs `KillMode=process`.
+//! `task-agent run`: puts the agent together and drives until a signal. Tasks go on running
+//! afterwards; under systemd that needs `KillMode=process`.
 
 use std::fs::{File, OpenOptions, Permissions, TryLockError};
 use std::io::IsTerminal as _;
@@ -62,8 +62,10 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(status.as_shell_code()));
     }
     confinement::protect_this_process();
-    // Two, also on one core: writing the ledger to a slow card must not keep the link from being served.
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
+    // Two, also on one core: writing the ledger to a slow card must not keep the link from being
+    // served.
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let outcome = runtime.block_on(drive(arguments));
     runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     outcome.map(|()| ExitCode::SUCCESS)
@@ -85,14 +87,27 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let credential = Credential::from(identity.token.clone());
     let shutdown = CancellationToken::new();
     let shared = Shared::new(shutdown.clone());
-    let fetcher =
-        Fetcher::new(client.clone(), base.clone(), credential.clone(), data.clone(), FetchSettings::default());
+    let fetcher = Fetcher::new(
+        client.clone(),
+        base.clone(),
+        credential.clone(),
+        data.clone(),
+        FetchSettings::default(),
+    );
     fetcher.limit(&config.limits);
     let fetcher = (fetcher.measured_by(shared.meter.clone()), shared.listening.clone());
     let registry = Registry::new(client.clone(), base.clone(), credential.clone());
-    let robot = Arc::new(Robot::new(data.clone(), fetcher, registry, &config, &identity.robot_id, identity.mac));
+    let robot = Arc::new(Robot::new(
+        data.clone(),
+        fetcher,
+        registry,
+        &config,
+        &identity.robot_id,
+        identity.mac,
+    ));
     let instance = InstanceId::random();
-    let orders = Orders::new(identity.robot_id.clone(), instance.clone(), identity.server_key.clone());
+    let orders =
+        Orders::new(identity.robot_id.clone(), instance.clone(), identity.server_key.clone());
     let speaker = Speaker {
         robot_id: identity.robot_id.clone(),
         server_key: identity.server_key.clone(),
@@ -102,14 +117,21 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         name: config.name.clone(),
         labels: config.labels.clone(),
     };
-    let status = Status { online: true, start: ledger.start + 1, instance: instance.clone(), connection: 0, place };
+    let status = Status {
+        online: true,
+        start: ledger.start + 1,
+        instance: instance.clone(),
+        connection: 0,
+        place,
+    };
     let driver = Driver::new(robot.clone(), speaker, shared.clone(), ledger, lost).await;
     tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
 
     let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
     let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
     let server = server.speaking_as(&instance, place);
-    let intervals = Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
+    let intervals =
+        Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
     tokio::spawn(state::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
     let rotation = Rotation {
         server: server.clone(),
@@ -134,7 +156,16 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         tokio::spawn(endpoint::follow(server, shared.clone(), config.poll_interval));
         let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
         let ways = Ways::new(&base, Arc::new(tls), config.mqtt_transport);
-        let access = MqttAccess { host, port, prefix, robot: robot_id, token: credential, status, message_bytes, ways };
+        let access = MqttAccess {
+            host,
+            port,
+            prefix,
+            robot: robot_id,
+            token: credential,
+            status,
+            message_bytes,
+            ways,
+        };
         let talk = (said, messages_out);
         converse(access, shared, heard, data, robot, orders, talk);
     } else {
@@ -172,7 +203,10 @@ fn converse(
     let forwarder = Forwarder::new(robot_id.clone(), data, robot.forward(), logs.following());
     let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
     let (batches, lines) = mpsc::channel(1);
-    tokio::spawn(Answers { robot_id, orders, logs, graph: GraphAnswers { robot }, vitals }.run(asked, messages));
+    tokio::spawn(
+        Answers { robot_id, orders, logs, graph: GraphAnswers { robot }, vitals }
+            .run(asked, messages),
+    );
     tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
     tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
 }
@@ -185,12 +219,13 @@ fn start_logging() {
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
-/// Keeps a second agent away from the data directory while this one lives. The file is this user's alone: whoever could
-/// open it could lock it, and so keep every agent from starting.
+/// Keeps a second agent away from the data directory while this one lives. The file is this user's
+/// alone: whoever could open it could lock it, and so keep every agent from starting.
 fn lock(data: &Layout) -> anyhow::Result<File> {
     let path = data.root().join("lock");
     let open = || {
-        let file = OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
+        let file =
+            OpenOptions::new().write(true).create(true).truncate(false).mode(0o600).open(&path)?;
         file.set_permissions(Permissions::from_mode(0o600)).map(|()| file)
     };
     let file = open().with_context(|| format!("cannot make {}", path.display()))?;
@@ -199,20 +234,24 @@ fn lock(data: &Layout) -> anyhow::Result<File> {
         Err(TryLockError::WouldBlock) => {
             anyhow::bail!("another task-agent already runs in {}", data.root().display())
         }
-        Err(TryLockError::Error(error)) => Err(error).with_context(|| format!("cannot lock {}", path.display())),
+        Err(TryLockError::Error(error)) => {
+            Err(error).with_context(|| format!("cannot lock {}", path.display()))
+        }
     }
 }
 
 /// The ledger, and what to say if an earlier one could not be read.
 fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
-    // The start counter must be above that of the lost ledger; seconds since 1970 are above any count of starts.
+    // The start counter must be above that of the lost ledger; seconds since 1970 are above any
+    // count of starts.
     let rebuilt = || Ledger::new(clock::wall_ms().max(clock::PROGRAM_EXISTS_SINCE_MS) / 1000);
     Ok(match Ledger::read(&data.ledger())? {
         Found::Ledger(ledger) => (*ledger, None),
         Found::Nothing if data.task_names()?.is_empty() => (Ledger::new(0), None),
-        Found::Nothing => {
-            (rebuilt(), Some("the ledger was gone: it was rebuilt from the running processes".to_owned()))
-        }
+        Found::Nothing => (
+            rebuilt(),
+            Some("the ledger was gone: it was rebuilt from the running processes".to_owned()),
+        ),
         Found::Unreadable(aside) => {
             let text = format!(
                 "the ledger could not be read and was moved to {}: it was rebuilt from the running processes",
@@ -237,7 +276,11 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
             shutdown.cancel();
         }
         (interrupt, terminate) => {
-            tracing::error!(?interrupt, ?terminate, "signals can't be received: only SIGKILL ends this agent");
+            tracing::error!(
+                ?interrupt,
+                ?terminate,
+                "signals can't be received: only SIGKILL ends this agent"
+            );
         }
     }
 }

@@ -1,5 +1,5 @@
-//! `task-agent status`: where this robot's tasks stand, read from what the agent wrote down. Works without server and
-//! without a running agent.
+//! `task-agent status`: where this robot's tasks stand, read from what the agent wrote down. Works
+//! without server and without a running agent.
 
 use std::process::ExitCode;
 
@@ -44,15 +44,23 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             say(format_args!("{status:#}"));
         }
         Output::Table => {
-            say(format_args!("robot    {} ({}) at {}", identity.robot_id, identity.mac, identity.server));
+            say(format_args!(
+                "robot    {} ({}) at {}",
+                identity.robot_id, identity.mac, identity.server
+            ));
             say(format_args!("agent    {}", if agent { "runs" } else { "does not run" }));
             if held {
-                say(format_args!("held     nothing is started or switched until task-agent release"));
+                say(format_args!(
+                    "held     nothing is started or switched until task-agent release"
+                ));
             }
             if let Some(text) = ledger.removal() {
                 say(format_args!("removed  {}", text));
             }
-            say(format_args!("{:<24} {:<14} {:<11} {:<9} FAILURE", "TASK", "VERSION", "PHASE", "PID"));
+            say(format_args!(
+                "{:<24} {:<14} {:<11} {:<9} FAILURE",
+                "TASK", "VERSION", "PHASE", "PID"
+            ));
             for record in ledger.tasks.values() {
                 say(format_args!("{}", task_row(record)));
             }

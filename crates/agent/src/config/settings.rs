@@ -1,8 +1,9 @@
-//! Which settings hold, where the robot's own file and environment and its administrator at the server both say something:
-//! the robot's own, for whoever set it stands next to it. A function of values; it reads nothing.
+//! Which settings hold, where the robot's own file and environment and its administrator at the
+//! server both say something: the robot's own, for whoever set it stands next to it. A function of
+//! values; it reads nothing.
 //!
-//! A setup file is a shell script that whoever names it gets run. So a robot that runs only what its publishers have signed
-//! takes none from its server, unless its own settings say that it may.
+//! A setup file is a shell script that whoever names it gets run. So a robot that runs only what
+//! its publishers have signed takes none from its server, unless its own settings say that it may.
 
 use std::path::{Path, PathBuf};
 
@@ -24,8 +25,9 @@ pub struct Settled {
 /// The keys of settings that name what a shell reads.
 const SHELL_KEYS: [&str; 2] = ["underlays", "workspace"];
 
-/// What holds of a robot's `own` settings and of what was `set` at the server, whose values have been checked there and are
-/// checked again, each for itself: a server's mistake must not keep the robot from its tasks, nor from the other settings.
+/// What holds of a robot's `own` settings and of what was `set` at the server, whose values have
+/// been checked there and are checked again, each for itself: a server's mistake must not keep the
+/// robot from its tasks, nor from the other settings.
 pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
     let mut config = own.clone();
     let mut mine = Vec::new();
@@ -42,7 +44,8 @@ pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
         false
     };
     if decide("underlays", !own.underlays.is_empty(), set.underlays.is_some()) {
-        config.underlays = set.underlays.iter().flatten().map(|path| PathBuf::from(path.as_str())).collect();
+        config.underlays =
+            set.underlays.iter().flatten().map(|path| PathBuf::from(path.as_str())).collect();
     }
     if decide("workspace", own.workspace.is_some(), set.workspace.is_some()) {
         config.workspace = set.workspace.as_ref().map(|path| PathBuf::from(path.as_str()));
@@ -60,8 +63,10 @@ pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
     config.task_pids = limits.task_pids.unwrap_or(config.task_pids);
     config.parallel_tasks = limits.parallel_tasks.map_or(config.parallel_tasks, count);
     let values = RobotSettings {
-        underlays: Some(config.underlays.iter().filter_map(|path| shown_path(path)).collect::<Vec<_>>())
-            .filter(|underlays| !underlays.is_empty()),
+        underlays: Some(
+            config.underlays.iter().filter_map(|path| shown_path(path)).collect::<Vec<_>>(),
+        )
+        .filter(|underlays| !underlays.is_empty()),
         workspace: config.workspace.as_deref().and_then(shown_path),
         ros_domain_id: config.ros_domain_id,
         forward_level: own.own_forward_level.or(set.forward_level),
@@ -89,7 +94,8 @@ mod tests {
     fn own(file: &str, variables: &[(&str, &str)]) -> Config {
         let dir = tempfile::tempdir().expect("a directory");
         std::fs::write(dir.path().join(crate::config::FILE_NAME), file).expect("written");
-        let variables = variables.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
+        let variables =
+            variables.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
         Config::load(dir.path(), variables).expect("loads")
     }
 
@@ -100,7 +106,10 @@ mod tests {
     #[test]
     fn what_the_robot_does_not_say_is_the_servers() {
         let own = own("", &[]);
-        assert_eq!(settle(&own, &RobotSettings::default()), Settled { config: own.clone(), effective: None });
+        assert_eq!(
+            settle(&own, &RobotSettings::default()),
+            Settled { config: own.clone(), effective: None }
+        );
         let set = set(json!({
             "underlays": ["/opt/ros/jazzy/setup.bash"], "workspace": "/home/robot/ws", "ros_domain_id": 7,
             "forward_level": "error", "limits": { "task_pids": 64, "parallel_tasks": 5 }
@@ -110,7 +119,10 @@ mod tests {
         assert_eq!(config.workspace, Some(PathBuf::from("/home/robot/ws")));
         assert_eq!((config.ros_domain_id, config.forward.level), (Some(7), LogLevel::Error));
         assert_eq!((config.task_pids, config.parallel_tasks), (64, 5));
-        assert_eq!(effective, Some(EffectiveSettings { values: set, ..EffectiveSettings::default() }));
+        assert_eq!(
+            effective,
+            Some(EffectiveSettings { values: set, ..EffectiveSettings::default() })
+        );
     }
 
     #[test]
@@ -126,31 +138,52 @@ mod tests {
         assert_eq!((config.ros_domain_id, config.forward.level), (Some(3), LogLevel::Info));
         assert_eq!((config.limits.log_bytes, config.task_pids), (Some(9000), 64));
         let effective = effective.expect("something is set");
-        assert_eq!(effective.own, ["underlays", "ros_domain_id", "forward_level", "limits.log_bytes"]);
-        assert_eq!((effective.values.limits.log_bytes, effective.values.limits.task_pids), (Some(9000), Some(64)));
+        assert_eq!(
+            effective.own,
+            ["underlays", "ros_domain_id", "forward_level", "limits.log_bytes"]
+        );
+        assert_eq!(
+            (effective.values.limits.log_bytes, effective.values.limits.task_pids),
+            (Some(9000), Some(64))
+        );
     }
 
     #[test]
     fn a_robot_that_trusts_publishers_takes_no_setup_file_from_its_server() {
         let key = task_proto::envelope::SigningKey::from_bytes([7; 32]).public_key();
         let trusting = format!("[trusted_publishers]\nkeys = [\"{key}\"]\n");
-        let set = set(json!({ "underlays": ["/tmp/evil.sh"], "workspace": "/tmp/evil", "ros_domain_id": 7 }));
+        let set = set(
+            json!({ "underlays": ["/tmp/evil.sh"], "workspace": "/tmp/evil", "ros_domain_id": 7 }),
+        );
         let Settled { config, effective } = settle(&own(&trusting, &[]), &set);
-        assert_eq!((config.underlays.len(), config.workspace, config.ros_domain_id), (0, None, Some(7)));
+        assert_eq!(
+            (config.underlays.len(), config.workspace, config.ros_domain_id),
+            (0, None, Some(7))
+        );
         assert_eq!(effective.expect("reported").refused, ["underlays", "workspace"]);
         let allows = format!("server_underlays = true\n{trusting}");
         let Settled { config, effective } = settle(&own(&allows, &[]), &set);
-        assert_eq!((config.underlays.len(), config.workspace), (1, Some(PathBuf::from("/tmp/evil"))));
+        assert_eq!(
+            (config.underlays.len(), config.workspace),
+            (1, Some(PathBuf::from("/tmp/evil")))
+        );
         assert_eq!(effective.expect("reported").refused, Vec::<String>::new());
     }
 
     #[test]
     fn what_can_not_be_is_not_taken() {
         let own = own("", &[]);
-        let set = set(json!({ "ros_domain_id": 7, "limits": { "parallel_tasks": 0, "task_pids": 64 } }));
+        let set =
+            set(json!({ "ros_domain_id": 7, "limits": { "parallel_tasks": 0, "task_pids": 64 } }));
         let set = RobotSettings { unreadable: vec!["forward_level".to_owned()], ..set };
         let Settled { config, effective } = settle(&own, &set);
-        assert_eq!((config.ros_domain_id, config.task_pids, config.parallel_tasks), (Some(7), 64, own.parallel_tasks));
-        assert_eq!(effective.expect("reported").refused, ["forward_level", "limits.parallel_tasks"]);
+        assert_eq!(
+            (config.ros_domain_id, config.task_pids, config.parallel_tasks),
+            (Some(7), 64, own.parallel_tasks)
+        );
+        assert_eq!(
+            effective.expect("reported").refused,
+            ["forward_level", "limits.parallel_tasks"]
+        );
     }
 }

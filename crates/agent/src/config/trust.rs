@@ -1,5 +1,6 @@
-//! Whom this robot trusts to publish packages: what its settings say, and after that the newest list of publishers it was
-//! shown, which is kept on the disk. It judges lists and packages; it fetches nothing, and the server has no say in it.
+//! Whom this robot trusts to publish packages: what its settings say, and after that the newest
+//! list of publishers it was shown, which is kept on the disk. It judges lists and packages; it
+//! fetches nothing, and the server has no say in it.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,7 +11,8 @@ use task_proto::Digest;
 use task_proto::desired::PackageRef;
 use task_proto::envelope::Envelope;
 use task_proto::publisher::{
-    MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, MAX_SIGNATURES, PublisherList, Refused, Role, Unsigned, vouching,
+    MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, MAX_SIGNATURES, PublisherList, Refused, Role, Unsigned,
+    vouching,
 };
 use task_proto::report::{Failure, FailureCode};
 
@@ -48,7 +50,9 @@ pub enum Distrust {
     #[error("version {0} of the list of publishers withdraws it")]
     Withdrawn(u64),
     /// Somebody may be keeping a newer list from the robot.
-    #[error("version {version} of the list of publishers, the newest this robot was shown, has expired")]
+    #[error(
+        "version {version} of the list of publishers, the newest this robot was shown, has expired"
+    )]
     Expired {
         /// Of the list.
         version: u64,
@@ -60,14 +64,20 @@ pub enum Distrust {
         path: PathBuf,
     },
     /// There must be a list and is none.
-    #[error("trusted_publishers.require_list is set, and this robot was shown no list of publishers")]
+    #[error(
+        "trusted_publishers.require_list is set, and this robot was shown no list of publishers"
+    )]
     NoList,
 }
 
 impl Distrust {
     /// It as a failure of what `package` was ordered for.
     pub fn failure(&self, package: &PackageRef) -> Failure {
-        let code = if self.may_pass() { FailureCode::PUBLISHERS_EXPIRED } else { FailureCode::UNTRUSTED_PACKAGE };
+        let code = if self.may_pass() {
+            FailureCode::PUBLISHERS_EXPIRED
+        } else {
+            FailureCode::UNTRUSTED_PACKAGE
+        };
         Failure::new(code, format!("{} {} may not run here: {self}", package.name, package.version))
     }
 
@@ -126,7 +136,12 @@ impl Trust {
         if let Err(error) = &list {
             tracing::error!(path = %path.display(), %error, "the list of publishers can't be read: nothing is run");
         }
-        Self { settings, path, is_unreadable: list.is_err(), list: RwLock::new(list.unwrap_or_default()) }
+        Self {
+            settings,
+            path,
+            is_unreadable: list.is_err(),
+            list: RwLock::new(list.unwrap_or_default()),
+        }
     }
 
     /// The version of the list that counts; 0: the settings do.
@@ -147,7 +162,9 @@ impl Trust {
         // Held over the write to the disk: lists are taken one after another.
         let mut current = self.list.write().unwrap_or_else(PoisonError::into_inner);
         let (keepers, version) =
-            current.as_ref().map_or((&self.settings.keepers, 0), |Counting { list, .. }| (&list.keepers, list.version));
+            current.as_ref().map_or((&self.settings.keepers, 0), |Counting { list, .. }| {
+                (&list.keepers, list.version)
+            });
         let list = PublisherList::follow(envelope, keepers, version)?;
         let kept = Kept { envelope: envelope.clone(), digest, settings: self.settings.clone() };
         let bytes = serde_json::to_vec(&kept).map_err(|error| NotTaken::Disk(error.into()))?;
@@ -200,8 +217,8 @@ impl Kept {
         Ok(serde_json::from_slice(bytes)?)
     }
 
-    /// The list, if it counts under `settings`. A person who changes them has the last word: then it counts only if those
-    /// who keep the lists now have signed it.
+    /// The list, if it counts under `settings`. A person who changes them has the last word: then
+    /// it counts only if those who keep the lists now have signed it.
     fn list(&self, settings: &TrustSettings) -> io::Result<Option<Counting>> {
         let list = if self.settings.keepers == settings.keepers {
             Some(PublisherList::unverified(&self.envelope).map_err(io::Error::other)?)
@@ -212,14 +229,16 @@ impl Kept {
     }
 }
 
-/// As with desired states: a clock that shows a time before this program existed is wrong and locks nobody out.
+/// As with desired states: a clock that shows a time before this program existed is wrong and locks
+/// nobody out.
 fn is_over(list: &PublisherList, wall_ms: u64) -> bool {
     wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms)
 }
 
 /// The envelopes kept about a package; none if there are none that can be read.
 pub fn read_signatures(path: &Path) -> Vec<Envelope> {
-    let bytes = untrusted_file::read(path, (MAX_SIGNATURES as u64 + 1) * MAX_SIGNATURE_BYTES).unwrap_or_default();
+    let bytes = untrusted_file::read(path, (MAX_SIGNATURES as u64 + 1) * MAX_SIGNATURE_BYTES)
+        .unwrap_or_default();
     serde_json::from_slice(&bytes).unwrap_or_default()
 }
 
@@ -291,7 +310,11 @@ mod tests {
         }
 
         fn open(dir: &tempfile::TempDir, publisher: u8, keeper: u8, requires_list: bool) -> Trust {
-            let settings = TrustSettings { publishers: role(&[publisher]), keepers: role(&[keeper]), requires_list };
+            let settings = TrustSettings {
+                publishers: role(&[publisher]),
+                keepers: role(&[keeper]),
+                requires_list,
+            };
             Trust::open(settings, dir.path().join("publishers.json"))
         }
 
@@ -307,7 +330,9 @@ mod tests {
             let talker = package("talker");
             let envelopes = signed(seed, &talker);
             let judged = self.trust.judge(&talker, &envelopes, purpose, wall_ms);
-            judged.map(|counted| counted.len()).map_err(|distrust| distrust.failure(&talker).code.as_str().to_owned())
+            judged
+                .map(|counted| counted.len())
+                .map_err(|distrust| distrust.failure(&talker).code.as_str().to_owned())
         }
 
         fn trusts(&self, seed: u8) -> bool {
@@ -322,7 +347,11 @@ mod tests {
         robot.take(&list(1, 3, 2).seal(&key(2))).expect("follows");
         for _ in 0..2 {
             assert!(!robot.trusts(1) && robot.trusts(3));
-            assert_eq!(robot.judge(1, Use::GoOn, NOW_MS), Err("untrusted_package".to_owned()), "nor started again");
+            assert_eq!(
+                robot.judge(1, Use::GoOn, NOW_MS),
+                Err("untrusted_package".to_owned()),
+                "nor started again"
+            );
             assert_eq!(robot.trust.version(), 1);
             robot.restart();
         }
@@ -345,7 +374,10 @@ mod tests {
         robot.take(&new).expect("follows");
         for _ in 0..2 {
             let refused = robot.take(&old);
-            assert!(matches!(refused, Err(NotTaken::Refused(Refused::NotNewer { offered: 1, known: 2 }))));
+            assert!(matches!(
+                refused,
+                Err(NotTaken::Refused(Refused::NotNewer { offered: 1, known: 2 }))
+            ));
             assert!(robot.take(&new).is_err() && robot.trust.counting().is_some());
             let forked = list(2, 1, 2).seal(&key(2));
             assert!(robot.take(&forked).is_err(), "another of the same version");

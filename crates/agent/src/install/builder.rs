@@ -1,6 +1,7 @@
-//! Builds a package with the build tool its manifest names: in a bash of its own, out of the way of everything else,
-//! within limits of time, memory, processes and output, and gone without a trace of processes when it ends. A build begins
-//! with empty `build` and `install` directories, so one that was interrupted is simply done again.
+//! Builds a package with the build tool its manifest names: in a bash of its own, out of the way of
+//! everything else, within limits of time, memory, processes and output, and gone without a trace
+//! of processes when it ends. A build begins with empty `build` and `install` directories, so one
+//! that was interrupted is simply done again.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File};
@@ -59,8 +60,8 @@ pub struct BuildOrder {
 pub struct BuildLimits {
     /// The time it may take.
     pub timeout: Duration,
-    /// The memory all of it may have; without a control group the data that each of its processes may have.
-    /// `None` does not limit it.
+    /// The memory all of it may have; without a control group the data that each of its processes
+    /// may have. `None` does not limit it.
     pub memory_bytes: Option<u64>,
     /// The processes and threads it may have.
     pub pids: Option<u64>,
@@ -144,8 +145,8 @@ impl BuildError {
 }
 
 impl BuildLimits {
-    /// Half an hour, and three quarters of this machine's memory, so that a build alone can't drive a robot into the
-    /// out-of-memory killer.
+    /// Half an hour, and three quarters of this machine's memory, so that a build alone can't drive
+    /// a robot into the out-of-memory killer.
     pub fn of_this_machine() -> Self {
         let memory_bytes = program::total_memory_bytes().ok().map(|total| total / 4 * 3);
         Self {
@@ -164,10 +165,12 @@ impl std::fmt::Display for Output {
     }
 }
 
-/// Builds `order`; at once done when there is nothing to build. When it returns, no process of the build is left and
-/// what was installed is on the disk.
+/// Builds `order`; at once done when there is nothing to build. When it returns, no process of the
+/// build is left and what was installed is on the disk.
 pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
-    let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else { return Ok(()) };
+    let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else {
+        return Ok(());
+    };
     let root = order.version.root();
     let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.group(root).path().to_owned());
     let guard = KillOnDrop::new(Containment::new(root, None, cgroup));
@@ -175,17 +178,21 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     guard.end(KILL_TIMEOUT).await?;
     prepare(order, &text)?;
     let Ran { status, tail, out_of_memory } = run(order, &guard, cancel).await?;
-    let output = Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
+    let output =
+        Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
     match (status, order.limits.memory_bytes.filter(|_| out_of_memory)) {
         (Some(ExitStatus::Code(0)), _) => {}
-        (Some(_), Some(limit)) => return Err(BuildError::OutOfMemory { limit_mb: limit >> 20, output }),
+        (Some(_), Some(limit)) => {
+            return Err(BuildError::OutOfMemory { limit_mb: limit >> 20, output });
+        }
         (Some(status), None) => return Err(BuildError::Failed { status, output }),
         (None, _) if cancel.is_cancelled() => return Err(BuildError::Cancelled),
         (None, _) => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
     }
     let version = order.version.clone();
-    let missing =
-        task_user::do_as(order.user.as_ref(), move || missing_package(&version)).await.map_err(failed(root))?;
+    let missing = task_user::do_as(order.user.as_ref(), move || missing_package(&version))
+        .await
+        .map_err(failed(root))?;
     if let Some(missing) = missing {
         return Err(BuildError::NotInstalled { missing, output });
     }
@@ -232,7 +239,11 @@ struct Ran {
     out_of_memory: bool,
 }
 
-async fn run(order: &BuildOrder, containment: &Containment, cancel: &CancellationToken) -> Result<Ran, BuildError> {
+async fn run(
+    order: &BuildOrder,
+    containment: &Containment,
+    cancel: &CancellationToken,
+) -> Result<Ran, BuildError> {
     let (root, script) = (order.version.root(), script_path(order));
     let mut environment = order.environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), root.display().to_string());
@@ -242,10 +253,11 @@ async fn run(order: &BuildOrder, containment: &Containment, cancel: &Cancellatio
     let limits = RunLimits { memory_bytes, cpu_weight: None, pids, filter_calls };
     let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.create(root, &limits)).transpose();
     let cgroup = cgroup.map_err(failed(root))?;
-    let confined = Confinement::new(&script, cgroup.as_ref(), &limits, order.user.as_ref()).map_err(failed(&script))?;
+    let confined = Confinement::new(&script, cgroup.as_ref(), &limits, order.user.as_ref())
+        .map_err(failed(&script))?;
     order.user.as_ref().map_or(Ok(()), |user| user.own(&writer)).map_err(failed(&script))?;
-    let mut child =
-        program::spawn_build(&script, root, &environment, NICE, confined, writer).map_err(failed(&script))?;
+    let mut child = program::spawn_build(&script, root, &environment, NICE, confined, writer)
+        .map_err(failed(&script))?;
     let log_bytes = order.limits.log_bytes;
     let copying = tokio::task::spawn_blocking(move || copy_output(reader, log, log_bytes));
     let status = tokio::select! {
@@ -258,13 +270,18 @@ async fn run(order: &BuildOrder, containment: &Containment, cancel: &Cancellatio
     containment.end(KILL_TIMEOUT).await?;
     let Ok(copied) = tokio::time::timeout(DRAIN_TIMEOUT, copying).await else {
         // One that cleared its environment got away and holds the output open.
-        return Ok(Ran { status, tail: b"a process of the build got away and still writes".to_vec(), out_of_memory });
+        return Ok(Ran {
+            status,
+            tail: b"a process of the build got away and still writes".to_vec(),
+            out_of_memory,
+        });
     };
     let tail = copied.map_err(|error| failed(&order.log)(error.into()))?;
     Ok(Ran { status, tail, out_of_memory })
 }
 
-/// Copies the first `limit` bytes of `output` into `log`, reads on to its end, and returns its last bytes.
+/// Copies the first `limit` bytes of `output` into `log`, reads on to its end, and returns its last
+/// bytes.
 fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
     let (mut room, mut tail) = (limit, VecDeque::with_capacity(TAIL_BYTES));
     let mut buffer = vec![0; 16 * 1024];
@@ -283,8 +300,9 @@ fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
     }
 }
 
-/// The package that should have been installed and was not. Build tools skip what they don't recognise and succeed. The build
-/// may have left links anywhere: only the account that it ran under looks.
+/// The package that should have been installed and was not. Build tools skip what they don't
+/// recognise and succeed. The build may have left links anywhere: only the account that it ran
+/// under looks.
 fn missing_package(version: &VersionDir) -> Option<String> {
     let installed = version.install();
     if let Some(name) = package_name(&version.src().join("package.xml")) {
@@ -293,11 +311,15 @@ fn missing_package(version: &VersionDir) -> Option<String> {
     }
     let holds_package = |entry: fs::DirEntry| entry.path().is_dir();
     let any = fs::read_dir(&installed).is_ok_and(|entries| entries.flatten().any(holds_package));
-    (!any).then(|| "anything: there is no package.xml in the package, or none the build tool accepts".to_owned())
+    (!any).then(|| {
+        "anything: there is no package.xml in the package, or none the build tool accepts"
+            .to_owned()
+    })
 }
 
-/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the element is enough. The build
-/// may have put anything in its place: what is no plain file is not read.
+/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the
+/// element is enough. The build may have put anything in its place: what is no plain file is not
+/// read.
 fn package_name(path: &Path) -> Option<String> {
     let text = String::from_utf8(untrusted_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
     // Each piece but the first begins in a comment.
@@ -309,7 +331,8 @@ fn package_name(path: &Path) -> Option<String> {
     let (_, rest) = plain.split_once("<name>")?;
     let (name, _) = rest.split_once("</name>")?;
     let name = name.trim();
-    let is_plain = !name.is_empty() && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-".contains(&byte));
+    let is_plain = !name.is_empty()
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-".contains(&byte));
     is_plain.then(|| name.to_owned())
 }
 

@@ -1,10 +1,12 @@
-//! Pulls a package from the server in one pass: stream, hash, decompress, unpack. What has arrived is kept in a `.part`
-//! file, so that a pull goes on where the last one ended, across restarts of the agent: the `.part` is replayed, the
-//! rest is asked for by Range. Bytes that were pushed, as parts or with the order itself, go the same way.
+//! Pulls a package from the server in one pass: stream, hash, decompress, unpack. What has arrived
+//! is kept in a `.part` file, so that a pull goes on where the last one ended, across restarts of
+//! the agent: the `.part` is replayed, the rest is asked for by Range. Bytes that were pushed, as
+//! parts or with the order itself, go the same way.
 //!
-//! Invariants: a tree gets its place only when all its bytes had the ordered digest and are on the disk; the bytes of a
-//! pull that failed for good are gone. When a pull is dropped or cancelled nothing is left but the `.part`.
-//! The compressed bytes are not kept once the tree is there: it is what they were for, and a robot's disk is small.
+//! Invariants: a tree gets its place only when all its bytes had the ordered digest and are on the
+//! disk; the bytes of a pull that failed for good are gone. When a pull is dropped or cancelled
+//! nothing is left but the `.part`. The compressed bytes are not kept once the tree is there: it is
+//! what they were for, and a robot's disk is small.
 
 mod download;
 mod error;
@@ -53,9 +55,11 @@ use crate::transfer::parts::Listening;
 
 /// The largest task manifest that is held in memory.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
-/// Chunks between the connection and the disk. A chunk is what hyper reads at once, at most about 400 KiB.
+/// Chunks between the connection and the disk. A chunk is what hyper reads at once, at most about
+/// 400 KiB.
 const QUEUED_CHUNKS: usize = 16;
-/// How often one pull connects anew after a cut before it is given back to the caller's slower retries.
+/// How often one pull connects anew after a cut before it is given back to the caller's slower
+/// retries.
 const MAX_RECONNECTS: u32 = 5;
 /// A connection that brought as much counts as good: the next cut is the first again.
 const PROGRESS_BYTES: u64 = 1 << 20;
@@ -80,7 +84,8 @@ pub struct FetchSettings {
     pub reserve_bytes: u64,
     /// How long the server may take for each further 16 KiB, and for its first answer.
     pub stall_timeout: Duration,
-    /// The longest wait before the first new connection after a cut; it grows with each further one.
+    /// The longest wait before the first new connection after a cut; it grows with each further
+    /// one.
     pub reconnect_wait: Duration,
     /// How long parts are waited for that the server pushes.
     pub parts: PartPatience,
@@ -161,8 +166,13 @@ impl Fetcher {
         self.offered.replace(blobs.into_iter().filter(is_itself));
     }
 
-    /// The package's task manifest, from the disk if it is there whole. Its bytes are verified either way.
-    pub async fn manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<TaskManifest, FetchError> {
+    /// The package's task manifest, from the disk if it is there whole. Its bytes are verified
+    /// either way.
+    pub async fn manifest(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<TaskManifest, FetchError> {
         if let Some(manifest) = stored_manifest(&self.data, package) {
             return Ok(manifest);
         }
@@ -176,16 +186,19 @@ impl Fetcher {
         let manifest = read_manifest(&bytes, package)?;
         let version = self.data.task(&package.name).version(&package.manifest.digest);
         let path = version.manifest();
-        let kept = durable::create_dir_all(version.root()).and_then(|()| durable::write(&path, &bytes, 0o644));
+        let kept = durable::create_dir_all(version.root())
+            .and_then(|()| durable::write(&path, &bytes, 0o644));
         kept.map_err(|source| {
-            FetchError::disk(&path, source).for_want_of_room(self.data.root(), Need::of_file(bytes.len() as u64))
+            FetchError::disk(&path, source)
+                .for_want_of_room(self.data.root(), Need::of_file(bytes.len() as u64))
         })?;
         self.offered.forget(&package.config.digest);
         Ok(manifest)
     }
 
-    /// Pulls the package's content into its version's `src`; at once done if that is there. `progress` counts its
-    /// compressed bytes, those of earlier tries included. Returns when nothing of the pull is going on any more.
+    /// Pulls the package's content into its version's `src`; at once done if that is there.
+    /// `progress` counts its compressed bytes, those of earlier tries included. Returns when
+    /// nothing of the pull is going on any more.
     pub async fn content(
         &self,
         package: &PackageRef,
@@ -197,8 +210,8 @@ impl Fetcher {
         self.content_in_turn(package, manifest, progress, cancel, turn).await
     }
 
-    /// The same for a content that the server pushes: gathers its parts from `listening` first, and pulls what does not
-    /// come. `asks` is what a report says of the parts that are lacking.
+    /// The same for a content that the server pushes: gathers its parts from `listening` first, and
+    /// pulls what does not come. `asks` is what a report says of the parts that are lacking.
     pub async fn pushed_content(
         &self,
         package: &PackageRef,
@@ -210,11 +223,17 @@ impl Fetcher {
         let turn = self.turn(package, cancel).await?;
         let content = package.content;
         let is_there = self.src(package).is_dir() || self.offered.get(&content).is_some();
-        if !is_there && self.present(package)? < content.size && !self.given_up().contains(&content.digest) {
+        if !is_there
+            && self.present(package)? < content.size
+            && !self.given_up().contains(&content.digest)
+        {
             let gathering = Gathering::open(self, package, progress, asks, turn.clone())?;
-            let need = Need::of(package, manifest, gathering.bytes(), self.settings().reserve_bytes);
+            let need =
+                Need::of(package, manifest, gathering.bytes(), self.settings().reserve_bytes);
             let gathered = match self.check_room(need) {
-                Ok(()) => gathering.run(listening.listen(content.digest, content.size), cancel).await,
+                Ok(()) => {
+                    gathering.run(listening.listen(content.digest, content.size), cancel).await
+                }
                 Err(error) => Err(error),
             };
             match gathered.map_err(|error| error.for_want_of_room(self.data.root(), need)) {
@@ -252,7 +271,8 @@ impl Fetcher {
                 self.offered.forget(&content.digest);
                 self.given_up().remove(&content.digest);
             }
-            // Nobody comes back for these bytes, or the disk is full and the ledger needs their room.
+            // Nobody comes back for these bytes, or the disk is full and the ledger needs their
+            // room.
             Err(error) if error.spoils_gathered() => self.discard(package)?,
             Err(_) => {}
         }
@@ -271,13 +291,17 @@ impl Fetcher {
 
     async fn pull_manifest(&self, package: &PackageRef) -> Result<Vec<u8>, FetchError> {
         if package.config.size > MAX_MANIFEST_BYTES {
-            let reason = format!("it has {} bytes, at most {MAX_MANIFEST_BYTES} are allowed", package.config.size);
+            let reason = format!(
+                "it has {} bytes, at most {MAX_MANIFEST_BYTES} are allowed",
+                package.config.size
+            );
             return Err(FetchError::ManifestInvalid(reason));
         }
         self.pull_whole(&RepositoryName::of_package(&package.name), package.config).await
     }
 
-    /// A blob that is held in memory, of at most `most` bytes: one that came with the order, or pulled.
+    /// A blob that is held in memory, of at most `most` bytes: one that came with the order, or
+    /// pulled.
     pub async fn small(
         &self,
         repository: &RepositoryName,
@@ -349,7 +373,8 @@ impl Fetcher {
         }
     }
 
-    /// Passes the content's bytes on, connecting anew after a cut. Ends early, and well, if nobody takes them.
+    /// Passes the content's bytes on, connecting anew after a cut. Ends early, and well, if nobody
+    /// takes them.
     async fn feed(
         &self,
         package: &PackageRef,
@@ -389,7 +414,11 @@ impl Fetcher {
     }
 
     /// Passes on what one answer has, and measures it.
-    async fn pass_on(&self, download: &mut Download, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
+    async fn pass_on(
+        &self,
+        download: &mut Download,
+        sender: &mpsc::Sender<Bytes>,
+    ) -> Result<(), FetchError> {
         let from = download.position();
         let ended = download.pass_on(sender).await;
         self.meter.transferred(download.position() - from, download.asked_at().elapsed());
@@ -399,9 +428,14 @@ impl Fetcher {
         ended
     }
 
-    async fn download_content(&self, package: &PackageRef, offset: u64) -> Result<Download, FetchError> {
+    async fn download_content(
+        &self,
+        package: &PackageRef,
+        offset: u64,
+    ) -> Result<Download, FetchError> {
         let range = offset..package.content.size;
-        self.download_range(&RepositoryName::of_package(&package.name), package.content, range).await
+        self.download_range(&RepositoryName::of_package(&package.name), package.content, range)
+            .await
     }
 
     /// Asks for a range of a blob, over a connection of its own.
@@ -416,8 +450,8 @@ impl Fetcher {
         self.start(request, repository, blob, range).await
     }
 
-    /// Sends a request. That a blob is not to be had ends an order, and is believed once it was said twice: a byte that
-    /// flips on its way to the server makes the digest another one.
+    /// Sends a request. That a blob is not to be had ends an order, and is believed once it was
+    /// said twice: a byte that flips on its way to the server makes the digest another one.
     async fn start(
         &self,
         request: impl Fn() -> Result<reqwest::RequestBuilder, FetchError>,
@@ -434,14 +468,23 @@ impl Fetcher {
         }
     }
 
-    fn request(&self, repository: &RepositoryName, blob: BlobRef) -> Result<reqwest::RequestBuilder, FetchError> {
+    fn request(
+        &self,
+        repository: &RepositoryName,
+        blob: BlobRef,
+    ) -> Result<reqwest::RequestBuilder, FetchError> {
         let mut url = self.server.clone();
         match url.path_segments_mut() {
             Ok(mut path) => {
                 path.pop_if_empty().push("v2").extend(repository.as_str().split('/'));
                 path.extend(["blobs", &blob.digest.to_string()]);
             }
-            Err(()) => return Err(FetchError::NotTheServer(format!("{} is not an HTTP address", self.server))),
+            Err(()) => {
+                return Err(FetchError::NotTheServer(format!(
+                    "{} is not an HTTP address",
+                    self.server
+                )));
+            }
         }
         Ok(self.client.get(url).bearer_auth(self.token.current()))
     }
@@ -470,7 +513,8 @@ impl Fetcher {
 
     fn discard(&self, package: &PackageRef) -> Result<(), FetchError> {
         let part = self.data.blob_part(&package.content.digest);
-        let gone = durable::remove_file(&part).and_then(|()| pushed::discard(&self.data, &package.content.digest));
+        let gone = durable::remove_file(&part)
+            .and_then(|()| pushed::discard(&self.data, &package.content.digest));
         gone.map_err(|source| FetchError::disk(&part, source))
     }
 
@@ -479,7 +523,9 @@ impl Fetcher {
         let part = self.data.blob_part(&package.content.digest);
         match fs::metadata(&part) {
             Ok(metadata) if metadata.len() <= package.content.size => Ok(metadata.len()),
-            Ok(_) => durable::remove_file(&part).map(|()| 0).map_err(|source| FetchError::disk(&part, source)),
+            Ok(_) => durable::remove_file(&part)
+                .map(|()| 0)
+                .map_err(|source| FetchError::disk(&part, source)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(0),
             Err(source) => Err(FetchError::disk(&part, source)),
         }
@@ -498,8 +544,8 @@ pub fn stored_manifest(data: &DataDir, package: &PackageRef) -> Option<TaskManif
 }
 
 fn read_manifest(bytes: &[u8], package: &PackageRef) -> Result<TaskManifest, FetchError> {
-    let manifest: TaskManifest =
-        serde_json::from_slice(bytes).map_err(|error| FetchError::ManifestInvalid(error.to_string()))?;
+    let manifest: TaskManifest = serde_json::from_slice(bytes)
+        .map_err(|error| FetchError::ManifestInvalid(error.to_string()))?;
     if manifest.name != package.name || manifest.version != package.version {
         let reason = format!(
             "it is for {} {}, ordered was {} {}",

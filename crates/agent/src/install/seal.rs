@@ -1,6 +1,7 @@
-//! What was unpacked and built of a version, as one digest for each tree. It is noted beside the version's directory, where
-//! only the agent writes, and compared before each start: what runs is what came with the signed package. A digest covers
-//! the names, kinds, contents, link targets and execute bits of all entries, not their owners and times.
+//! What was unpacked and built of a version, as one digest for each tree. It is noted beside the
+//! version's directory, where only the agent writes, and compared before each start: what runs is
+//! what came with the signed package. A digest covers the names, kinds, contents, link targets and
+//! execute bits of all entries, not their owners and times.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -52,7 +53,8 @@ impl Seal {
         Ok(Self { src: tree(&version.src())?, install })
     }
 
-    /// The seal that was noted at `path`. One that can't be understood is none that anything agrees with.
+    /// The seal that was noted at `path`. One that can't be understood is none that anything agrees
+    /// with.
     pub fn read(path: &Path) -> io::Result<Option<Result<Self, serde_json::Error>>> {
         match untrusted_file::read(path, MAX_BYTES) {
             Ok(bytes) => Ok(Some(serde_json::from_slice(&bytes))),
@@ -70,7 +72,9 @@ impl Seal {
     pub fn broken(&self, version: &VersionDir) -> io::Result<Option<Broken>> {
         let now = match Self::of(version) {
             // The package itself is gone, or has what no package has.
-            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidData) => {
+            Err(error)
+                if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidData) =>
+            {
                 return Ok(Some(Broken::Source));
             }
             now => now?,
@@ -102,10 +106,14 @@ fn tree(root: &Path) -> io::Result<Digest> {
     Ok(Digest::from_sha256(hasher.finalize().into()))
 }
 
-/// Each entry is its kind, its name and what is in it, all of known length or ended, so that no two trees give the same bytes.
+/// Each entry is its kind, its name and what is in it, all of known length or ended, so that no two
+/// trees give the same bytes.
 fn add_directory(hasher: &mut Sha256, dir: &Path, depth: usize) -> io::Result<()> {
     if depth > MAX_DEPTH {
-        return Err(io::Error::new(io::ErrorKind::InvalidData, format!("it is more than {MAX_DEPTH} levels deep")));
+        return Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            format!("it is more than {MAX_DEPTH} levels deep"),
+        ));
     }
     let names = fs::read_dir(dir)?.map(|entry| Ok(entry?.file_name()));
     let mut names = names.collect::<io::Result<Vec<OsString>>>()?;
@@ -139,7 +147,8 @@ fn add_content(hasher: &mut Sha256, mut file: File) -> io::Result<()> {
     let (mut size, mut buffer) = (0_u64, vec![0; 128 * 1024]);
     loop {
         match file.read(&mut buffer)? {
-            // The size comes last: a file that grows while it is read is no other file with a known end.
+            // The size comes last: a file that grows while it is read is no other file with a known
+            // end.
             0 => {
                 hasher.update(size.to_le_bytes());
                 return Ok(());
@@ -160,7 +169,8 @@ mod tests {
     use crate::system::layout::DataDir;
 
     fn version(root: &Path) -> VersionDir {
-        let version = DataDir::new(root).expect("a directory").task(&"talker".parse().expect("valid"));
+        let version =
+            DataDir::new(root).expect("a directory").task(&"talker".parse().expect("valid"));
         let version = version.version(&Digest::of(b"manifest"));
         fs::create_dir_all(version.src().join("bin")).expect("made");
         fs::create_dir_all(version.install().join("lib")).expect("made");
@@ -181,7 +191,9 @@ mod tests {
             (Broken::Source, |v| fs::rename(v.src().join("bin/run"), v.src().join("bin/walk"))),
             (Broken::Source, |v| fs::create_dir(v.src().join("empty"))),
             (Broken::Source, |v| fs::remove_dir_all(v.src())),
-            (Broken::Source, |v| fs::set_permissions(v.src().join("bin/run"), fs::Permissions::from_mode(0o755))),
+            (Broken::Source, |v| {
+                fs::set_permissions(v.src().join("bin/run"), fs::Permissions::from_mode(0o755))
+            }),
             (Broken::Source, |v| {
                 fs::remove_file(v.src().join("run"))?;
                 symlink("/bin/sh", v.src().join("run"))
@@ -216,7 +228,8 @@ mod tests {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
         let seal = Seal::of(&version).expect("sealed");
-        nix::unistd::mkfifo(&version.src().join("pipe"), nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
+        nix::unistd::mkfifo(&version.src().join("pipe"), nix::sys::stat::Mode::S_IRWXU)
+            .expect("a pipe");
         assert_eq!(seal.broken(&version).expect("compared"), Some(Broken::Source));
     }
 }

@@ -1,5 +1,6 @@
-//! Gets what publishers have signed: follows the lists that desired states name, and finds out whether a package may be
-//! used. What to make of the bytes is [`crate::config::trust`]'s to say; where they come from proves nothing.
+//! Gets what publishers have signed: follows the lists that desired states name, and finds out
+//! whether a package may be used. What to make of the bytes is [`crate::config::trust`]'s to say;
+//! where they come from proves nothing.
 
 use std::collections::HashSet;
 use std::io;
@@ -10,7 +11,9 @@ use std::time::Duration;
 
 use task_proto::desired::{BlobRef, DesiredState, Evidence, PackageRef};
 use task_proto::envelope::Envelope;
-use task_proto::publisher::{LIST_REPOSITORY, MAX_LIST_BYTES, MAX_LISTS, MAX_SIGNATURE_BYTES, MAX_SIGNATURES};
+use task_proto::publisher::{
+    LIST_REPOSITORY, MAX_LIST_BYTES, MAX_LISTS, MAX_SIGNATURE_BYTES, MAX_SIGNATURES,
+};
 use task_proto::{Digest, RepositoryName};
 use tokio::task::AbortHandle;
 use tokio_util::sync::CancellationToken;
@@ -82,8 +85,8 @@ impl Vouching {
         }
     }
 
-    /// Notes what a desired state names, and begins to get what is new of it: lists of publishers, and signatures of what
-    /// is installed.
+    /// Notes what a desired state names, and begins to get what is new of it: lists of publishers,
+    /// and signatures of what is installed.
     pub fn heed(self: &Arc<Self>, state: &DesiredState) {
         let mut told = self.told();
         if told.evidence == state.evidence {
@@ -155,7 +158,8 @@ impl Vouching {
                     outcome = outcome.and(self.take_signatures(package, &cancel).await.map(drop));
                 }
             }
-            // Whatever came instead: a robot that gave up would never hear that somebody is not trusted any more.
+            // Whatever came instead: a robot that gave up would never hear that somebody is not
+            // trusted any more.
             let Err(error) = outcome else { return };
             tracing::info!(error = %chain(&error), "what publishers have signed can't be had yet");
             failures += 1;
@@ -164,7 +168,8 @@ impl Vouching {
         }
     }
 
-    /// Gets the lists that were named after the one that counts, and takes them over in their order.
+    /// Gets the lists that were named after the one that counts, and takes them over in their
+    /// order.
     async fn take_lists(&self, cancel: &CancellationToken) -> Result<(), FetchError> {
         let repository: RepositoryName = LIST_REPOSITORY.parse().expect("a repository's name");
         for blob in self.fresh_lists() {
@@ -172,7 +177,11 @@ impl Vouching {
                 Ok(bytes) => bytes,
                 Err(error) => {
                     if !error.is_retryable() || matches!(error, FetchError::DigestMismatch { .. }) {
-                        let text = format!("the list of publishers {} can't be had: {}", blob.digest, chain(&error));
+                        let text = format!(
+                            "the list of publishers {} can't be had: {}",
+                            blob.digest,
+                            chain(&error)
+                        );
                         if self.told().refused.replace(text.clone()) != Some(text) {
                             self.epoch.fetch_add(1, Ordering::AcqRel);
                         }
@@ -185,14 +194,21 @@ impl Vouching {
                     Ok(()) => None,
                     // Whoever follows the lists and whoever waits for one may have got it both.
                     Err(_) if self.trust.counting() == Some(blob.digest) => None,
-                    Err(NotTaken::Disk(source)) => return Err(self.not_kept(&self.data.publishers(), source)),
+                    Err(NotTaken::Disk(source)) => {
+                        return Err(self.not_kept(&self.data.publishers(), source));
+                    }
                     Err(NotTaken::Refused(why)) => Some(why.to_string()),
                 },
                 Err(error) => Some(format!("it is no envelope: {error}")),
             };
             match &refused {
-                Some(why) => tracing::warn!(list = %blob.digest, %why, "a list of publishers was refused"),
-                None => tracing::info!(version = self.trust.version(), "goes by another list of publishers"),
+                Some(why) => {
+                    tracing::warn!(list = %blob.digest, %why, "a list of publishers was refused")
+                }
+                None => tracing::info!(
+                    version = self.trust.version(),
+                    "goes by another list of publishers"
+                ),
             }
             let mut told = self.told();
             if told.judged.len() >= MAX_JUDGED {
@@ -200,13 +216,15 @@ impl Vouching {
             }
             told.judged.insert(blob.digest);
             // What is said of the newest, which is the last, is what stays.
-            told.refused = refused.map(|why| format!("the list of publishers {} was refused: {why}", blob.digest));
+            told.refused = refused
+                .map(|why| format!("the list of publishers {} was refused: {why}", blob.digest));
             self.epoch.fetch_add(1, Ordering::AcqRel);
         }
         Ok(())
     }
 
-    /// Gets the signatures of a package that were named, and keeps those that count if they are enough; if not, says why.
+    /// Gets the signatures of a package that were named, and keeps those that count if they are
+    /// enough; if not, says why.
     async fn take_signatures(
         &self,
         package: &PackageRef,
@@ -240,12 +258,14 @@ impl Vouching {
         let told = self.told();
         let lists = &told.evidence.lists[..told.evidence.lists.len().min(MAX_LISTS)];
         let counting = self.trust.counting();
-        let known = lists.iter().rposition(|list| Some(list.digest) == counting).map_or(0, |at| at + 1);
+        let known =
+            lists.iter().rposition(|list| Some(list.digest) == counting).map_or(0, |at| at + 1);
         lists[known..].iter().filter(|list| !told.judged.contains(&list.digest)).copied().collect()
     }
 
     fn not_kept(&self, path: &Path, source: io::Error) -> FetchError {
-        FetchError::disk(path, source).for_want_of_room(self.data.root(), Need::of_file(MAX_SIGNATURE_BYTES))
+        FetchError::disk(path, source)
+            .for_want_of_room(self.data.root(), Need::of_file(MAX_SIGNATURE_BYTES))
     }
 
     fn kept(&self, package: &PackageRef) -> Vec<Envelope> {

@@ -1,7 +1,8 @@
-//! The directory that a task runs in. It is the task's own, and beside the trees that are read-only to it; links lead from
-//! here to them, so that a package finds its files where it had them: `./start.sh` for one without a build, `src/` and
-//! `install/` for one that is built. Before each start every name of the package is the package's again. What the task
-//! has written under other names stays.
+//! The directory that a task runs in. It is the task's own, and beside the trees that are read-only
+//! to it; links lead from here to them, so that a package finds its files where it had them:
+//! `./start.sh` for one without a build, `src/` and `install/` for one that is built. Before each
+//! start every name of the package is the package's again. What the task has written under other
+//! names stays.
 
 use std::fs;
 use std::io;
@@ -14,9 +15,20 @@ use crate::system::durable;
 use crate::system::layout::VersionDir;
 use crate::system::task_user::{MAX_DEPTH, TaskUser};
 
-/// What lies in a version's directory that no task wrote: the rest is what it wrote there when that was where it ran.
-const OWN_NAMES: [&str; 10] =
-    ["src", "build", "install", "log", "task.json", "run.sh", "build.sh", "built", "work", "node_logs"];
+/// What lies in a version's directory that no task wrote: the rest is what it wrote there when that
+/// was where it ran.
+const OWN_NAMES: [&str; 10] = [
+    "src",
+    "build",
+    "install",
+    "log",
+    "task.json",
+    "run.sh",
+    "build.sh",
+    "built",
+    "work",
+    "node_logs",
+];
 
 /// Makes the directory if need be, and the links in it. No process of the task may run.
 pub fn refresh(tool: BuildTool, version: &VersionDir, user: Option<&TaskUser>) -> io::Result<()> {
@@ -37,10 +49,13 @@ pub fn refresh(tool: BuildTool, version: &VersionDir, user: Option<&TaskUser>) -
     user.with_its_rights(link)?
 }
 
-/// Links everything in `from` to the same name in `to`: its files, not its directories, so that a task may write into these.
+/// Links everything in `from` to the same name in `to`: its files, not its directories, so that a
+/// task may write into these.
 fn link_below(from: &Path, to: &Path, depth: usize) -> io::Result<()> {
     if depth > MAX_DEPTH {
-        return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
+        return Err(io::Error::other(format!(
+            "a directory lies more than {MAX_DEPTH} levels deep"
+        )));
     }
     for entry in fs::read_dir(from)? {
         let entry = entry?;
@@ -66,15 +81,16 @@ fn link_to(target: &Path, place: &Path) -> io::Result<()> {
     symlink(target, place)
 }
 
-/// When a version was given to the account of all tasks, as an earlier agent did at its first start: the package was unpacked
-/// before, and what the task wrote is younger.
+/// When a version was given to the account of all tasks, as an earlier agent did at its first
+/// start: the package was unpacked before, and what the task wrote is younger.
 pub fn handed_over(version: &VersionDir) -> io::Result<(i64, i64)> {
     let about = fs::symlink_metadata(version.manifest())?;
     Ok((about.ctime(), about.ctime_nsec()))
 }
 
-/// Moves what a task has written since to where it runs now; it ran where its package lay. Nobody but the agent may have
-/// rights to the version any more, or what is looked at is not what is moved.
+/// Moves what a task has written since to where it runs now; it ran where its package lay. Nobody
+/// but the agent may have rights to the version any more, or what is looked at is not what is
+/// moved.
 pub fn move_written(tool: BuildTool, version: &VersionDir, since: (i64, i64)) -> io::Result<()> {
     let mut found = Vec::new();
     if tool == BuildTool::None {
@@ -105,10 +121,13 @@ fn find_younger(
     found: &mut Vec<(PathBuf, PathBuf)>,
 ) -> io::Result<()> {
     if depth > MAX_DEPTH {
-        return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
+        return Err(io::Error::other(format!(
+            "a directory lies more than {MAX_DEPTH} levels deep"
+        )));
     }
     for entry in fs::read_dir(from)? {
-        let (entry, about) = entry.and_then(|entry| entry.metadata().map(|about| (entry, about)))?;
+        let (entry, about) =
+            entry.and_then(|entry| entry.metadata().map(|about| (entry, about)))?;
         let place = to.join(entry.file_name());
         if about.is_dir() {
             find_younger(&entry.path(), &place, than, depth + 1, found)?;
@@ -129,7 +148,8 @@ mod tests {
     use crate::system::layout::DataDir;
 
     fn version(root: &Path) -> VersionDir {
-        let version = DataDir::new(root).expect("a directory").task(&"talker".parse().expect("valid"));
+        let version =
+            DataDir::new(root).expect("a directory").task(&"talker".parse().expect("valid"));
         let version = version.version(&Digest::of(b"manifest"));
         fs::create_dir_all(version.src().join("maps/old")).expect("made");
         fs::write(version.src().join("start.sh"), "start").expect("written");
@@ -163,7 +183,10 @@ mod tests {
         let version = version(temp.path());
         fs::create_dir_all(version.install()).expect("made");
         refresh(BuildTool::Colcon, &version, None).expect("made");
-        assert_eq!(fs::read_link(version.work().join("install")).expect("a link"), version.install());
+        assert_eq!(
+            fs::read_link(version.work().join("install")).expect("a link"),
+            version.install()
+        );
         assert_eq!(fs::read(version.work().join("src/start.sh")).expect("there"), b"start");
     }
 

@@ -1,5 +1,5 @@
-//! Where the robot's MQTT session goes: as the enrolment said, until the server says otherwise. Nothing of it is written
-//! down, for whoever starts asks again. It never connects to a broker.
+//! Where the robot's MQTT session goes: as the enrolment said, until the server says otherwise.
+//! Nothing of it is written down, for whoever starts asks again. It never connects to a broker.
 
 use std::time::Duration;
 
@@ -7,8 +7,9 @@ use crate::link::state::Shared;
 use crate::system::error_chain::chain;
 use crate::transfer::server::Server;
 
-/// Asks the server where its robots' sessions go: at the start, whenever none comes about, and every `interval` while they go
-/// to a broker that lives on when the server is told to use another. Until the agent ends.
+/// Asks the server where its robots' sessions go: at the start, whenever none comes about, and
+/// every `interval` while they go to a broker that lives on when the server is told to use another.
+/// Until the agent ends.
 pub async fn follow(server: Server, shared: Shared, interval: Duration) {
     loop {
         tokio::select! {
@@ -16,7 +17,8 @@ pub async fn follow(server: Server, shared: Shared, interval: Duration) {
             () = ask(&server, &shared) => {}
             () = shared.shutdown.cancelled() => return,
         }
-        let is_external = shared.endpoint.borrow().as_ref().is_some_and(|endpoint| endpoint.external.is_some());
+        let is_external =
+            shared.endpoint.borrow().as_ref().is_some_and(|endpoint| endpoint.external.is_some());
         let spread = 0.5 + rand::random::<f64>();
         tokio::select! {
             // Cancel-safe: a timer that is made anew each time.
@@ -42,6 +44,8 @@ async fn ask(server: &Server, shared: &Shared) {
             });
             shared.endpoint_answers.send_modify(|answers| *answers += 1);
         }
-        Err(error) => tracing::debug!(error = %chain(&error), "the server does not say where MQTT is"),
+        Err(error) => {
+            tracing::debug!(error = %chain(&error), "the server does not say where MQTT is")
+        }
     }
 }

@@ -1,10 +1,11 @@
-//! The MQTT half of the link, and the only place that names rumqttc: one session after another, each with a last will;
-//! the doorbell, questions and the parts of packages in, status, the newest report, answers and log lines out. A report
-//! is confirmed by its PUBACK, which the server sends once the report is stored; a broker that is not the server's own
-//! gets none. It never decides what to do with what it hears.
+//! The MQTT half of the link, and the only place that names rumqttc: one session after another,
+//! each with a last will; the doorbell, questions and the parts of packages in, status, the newest
+//! report, answers and log lines out. A report is confirmed by its PUBACK, which the server sends
+//! once the report is stored; a broker that is not the server's own gets none. It never decides
+//! what to do with what it hears.
 //!
-//! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that nobody takes is all
-//! that is held here; until somebody does, nothing more is read.
+//! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that
+//! nobody takes is all that is held here; until somebody does, nothing more is read.
 
 mod destination;
 mod room;
@@ -15,8 +16,8 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use rumqttc::{
-    AsyncClient, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill, MqttOptions, Outgoing, Packet,
-    Publish, QoS, StateError, Transport,
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill, MqttOptions,
+    Outgoing, Packet, Publish, QoS, StateError, Transport,
 };
 use task_proto::RobotId;
 use task_proto::api::ExternalBroker;
@@ -58,7 +59,8 @@ const QUEUED_EVENTS: usize = 2;
 const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
 /// The largest packet that is sent: the largest report.
 const MAX_SENT_BYTES: usize = MAX_REPORT_BYTES + AROUND_MESSAGE_BYTES;
-/// The largest message that is read unless the server is seen to send whole packages as one: a part of 1 MiB.
+/// The largest message that is read unless the server is seen to send whole packages as one: a part
+/// of 1 MiB.
 pub const MESSAGE_BYTES: usize = 1024 * 1024 + AROUND_MESSAGE_BYTES;
 /// The largest that MQTT has.
 const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
@@ -80,7 +82,8 @@ pub struct MqttAccess {
     pub token: Credential,
     /// What every status says; `connection` counts up from it.
     pub status: Status,
-    /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it gets larger.
+    /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it
+    /// gets larger.
     pub message_bytes: usize,
     /// How to get there.
     pub ways: Ways,
@@ -103,7 +106,12 @@ enum Ended {
 }
 
 /// Keeps a session up until the agent ends; after each end it waits with full jitter.
-pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Heard>, mut talk: Talk) {
+pub async fn run(
+    mut access: MqttAccess,
+    shared: Shared,
+    heard: mpsc::Sender<Heard>,
+    mut talk: Talk,
+) {
     let mut failures = 0u32;
     // Whether the server has been seen to send packages as messages larger than usual.
     let mut sends_large = false;
@@ -119,7 +127,8 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
         if newest != told {
             (told, place, returns) = (newest, 0, 0);
         }
-        let (there, places) = (access.destination(told.as_ref(), place), place_count(told.as_ref()));
+        let (there, places) =
+            (access.destination(told.as_ref(), place), place_count(told.as_ref()));
         let (at, external) = (access.at(&there), there.external.as_ref());
         let way = access.ways.next(&there.host, there.port, there.is_encrypted, external);
         let session = session(&at, external, way, &shared, &heard, &mut talk, room);
@@ -160,9 +169,13 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
             }
             Ended::Refused => {
                 tracing::warn!("the MQTT broker refuses this robot");
-                // Whether the robot was removed is asked over HTTP, whose answer is the server's own.
+                // Whether the robot was removed is asked over HTTP, whose answer is the server's
+                // own.
                 shared.poll.notify_one();
-                (MIN_REFUSED_BACKOFF_MS + rand::random_range(0..=MIN_REFUSED_BACKOFF_MS / 2), MAX_REFUSED_BACKOFF_MS)
+                (
+                    MIN_REFUSED_BACKOFF_MS + rand::random_range(0..=MIN_REFUSED_BACKOFF_MS / 2),
+                    MAX_REFUSED_BACKOFF_MS,
+                )
             }
             Ended::Unreachable(error) => {
                 tracing::info!(error = %chain(&error), "no MQTT session");
@@ -192,18 +205,30 @@ pub async fn run(mut access: MqttAccess, shared: Shared, heard: mpsc::Sender<Hea
 
 /// Waits until the server is at another place than `there` and that place can be reached from here;
 /// until then the session stays up. Each of the earlier `returns` doubles the wait.
-async fn server_elsewhere(access: &MqttAccess, shared: &Shared, there: &Destination, returns: &mut u32) {
+async fn server_elsewhere(
+    access: &MqttAccess,
+    shared: &Shared,
+    there: &Destination,
+    returns: &mut u32,
+) {
     let mut asked = *returns;
     loop {
         let first = named_elsewhere(shared, access, there, &mut asked).await;
-        let way = access.ways.next(&first.host, first.port, first.is_encrypted, first.external.as_ref());
+        let way =
+            access.ways.next(&first.host, first.port, first.is_encrypted, first.external.as_ref());
         match Line::open(&way, CONNECT_TIMEOUT).await {
             Ok(_) => {
-                tracing::info!(host = first.host, port = first.port, "the server is at another broker");
+                tracing::info!(
+                    host = first.host,
+                    port = first.port,
+                    "the server is at another broker"
+                );
                 *returns = returns.saturating_add(1);
                 return;
             }
-            Err(error) => tracing::info!(error = %chain(&error), "the server's broker can't be reached"),
+            Err(error) => {
+                tracing::info!(error = %chain(&error), "the server's broker can't be reached")
+            }
         }
     }
 }
@@ -294,9 +319,14 @@ async fn session(
     }
 }
 
-/// Reads and writes until the session ends. rumqttc's poll must not be dropped half way, so it runs in one future that
-/// lives as long as the session.
-async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: MessageRoom, shared: &Shared) -> Ended {
+/// Reads and writes until the session ends. rumqttc's poll must not be dropped half way, so it runs
+/// in one future that lives as long as the session.
+async fn pump(
+    event_loop: &mut EventLoop,
+    events: mpsc::Sender<Event>,
+    room: MessageRoom,
+    shared: &Shared,
+) -> Ended {
     loop {
         match event_loop.poll().await {
             Ok(event) => {
@@ -309,9 +339,9 @@ async fn pump(event_loop: &mut EventLoop, events: mpsc::Sender<Event>, room: Mes
                 | ConnectReturnCode::NotAuthorized
                 | ConnectReturnCode::BadClientId,
             )) => return Ended::Refused,
-            Err(ConnectionError::MqttState(StateError::Deserialization(rumqttc::Error::PayloadSizeLimitExceeded(
-                bytes,
-            )))) if room.was_too_narrow(bytes, shared) => return Ended::TooNarrow,
+            Err(ConnectionError::MqttState(StateError::Deserialization(
+                rumqttc::Error::PayloadSizeLimitExceeded(bytes),
+            ))) if room.was_too_narrow(bytes, shared) => return Ended::TooNarrow,
             Err(error) => return Ended::Lost(error),
         }
     }
@@ -395,7 +425,8 @@ impl Session<'_> {
         self.shared.mqtt_tried.send_replace(true);
         tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
         for topic in [RobotTopic::Desired, RobotTopic::Request] {
-            // The queue is empty at the start of a session, and a lost session is noticed by the pump.
+            // The queue is empty at the start of a session, and a lost session is noticed by the
+            // pump.
             if self.client.try_subscribe(topic_name(self.access, topic), QoS::AtLeastOnce).is_ok() {
                 self.subscriptions.asked_for_own();
             }
@@ -413,8 +444,10 @@ impl Session<'_> {
     }
 
     async fn hear(&mut self, message: Publish) {
-        let acknowledgement =
-            Acknowledgement::new(Due { packet_id: message.pkid, qos: message.qos as u8 }, self.acknowledge.clone());
+        let acknowledgement = Acknowledgement::new(
+            Due { packet_id: message.pkid, qos: message.qos as u8 },
+            self.acknowledge.clone(),
+        );
         match self.access.prefix.parse(&message.topic) {
             Some(Topic::Package(digest)) => {
                 if let Some(way) = self.shared.listening.way_to(&digest) {
@@ -427,8 +460,13 @@ impl Session<'_> {
             Some(Topic::Robot(robot, RobotTopic::Desired)) if robot == self.access.robot => {
                 self.hear_desired(&message.payload).await;
                 if self.is_external {
-                    // It is also how a server that has lost sight of its robots finds out who is there.
-                    self.publish(RobotTopic::Status, status_payload(self.access, true), Published::Status);
+                    // It is also how a server that has lost sight of its robots finds out who is
+                    // there.
+                    self.publish(
+                        RobotTopic::Status,
+                        status_payload(self.access, true),
+                        Published::Status,
+                    );
                 }
             }
             _ => {}
@@ -457,7 +495,8 @@ impl Session<'_> {
         match serde_json::from_slice::<Doorbell>(payload) {
             Ok(Doorbell::State { envelope, inline }) => {
                 // The driver ends before this task: nobody listens only when the agent ends.
-                let heard = Heard::Desired { envelope: Box::new(envelope), inline, was_asked_for: false };
+                let heard =
+                    Heard::Desired { envelope: Box::new(envelope), inline, was_asked_for: false };
                 let _ = self.heard.send(heard).await;
             }
             Ok(Doorbell::Notice { .. }) => self.shared.poll.notify_one(),
@@ -507,9 +546,12 @@ impl Session<'_> {
             return;
         }
         match serde_json::to_vec(&*report) {
-            // The server would cut the robot off for it. Over HTTP it says what is wrong, and the session stays.
+            // The server would cut the robot off for it. Over HTTP it says what is wrong, and the
+            // session stays.
             Ok(payload) if payload.len() > MAX_REPORT_BYTES => self.shared.post.notify_one(),
-            Ok(payload) => self.publish(RobotTopic::Report, payload, Published::Report { seq: report.seq }),
+            Ok(payload) => {
+                self.publish(RobotTopic::Report, payload, Published::Report { seq: report.seq })
+            }
             Err(error) => tracing::error!(%error, "a report can't be written as JSON"),
         }
     }
@@ -524,18 +566,31 @@ impl Session<'_> {
     }
 }
 
-fn options(access: &MqttAccess, external: Option<&ExternalBroker>, line: &Line, room: MessageRoom) -> MqttOptions {
-    let client_id = external.and_then(|external| external.client_id.as_deref()).unwrap_or(access.robot.as_str());
+fn options(
+    access: &MqttAccess,
+    external: Option<&ExternalBroker>,
+    line: &Line,
+    room: MessageRoom,
+) -> MqttOptions {
+    let client_id = external
+        .and_then(|external| external.client_id.as_deref())
+        .unwrap_or(access.robot.as_str());
     let mut options = MqttOptions::new(client_id, line.name(), access.port);
     options.set_transport(Transport::Unix);
-    let password = external.map_or_else(|| access.token.current(), |external| external.password.clone());
+    let password =
+        external.map_or_else(|| access.token.current(), |external| external.password.clone());
     options.set_credentials(access.robot.as_str(), password);
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
     options.set_manual_acks(true);
     options.set_max_packet_size(room.bytes, MAX_SENT_BYTES);
     let will = status_payload(access, false);
-    options.set_last_will(LastWill::new(topic_name(access, RobotTopic::Status), will, QoS::AtLeastOnce, false));
+    options.set_last_will(LastWill::new(
+        topic_name(access, RobotTopic::Status),
+        will,
+        QoS::AtLeastOnce,
+        false,
+    ));
     options
 }
 

@@ -1,6 +1,7 @@
-//! Goes over to a new token now and then, so that one that leaked is not good for ever. A new token is on the disk before
-//! it is used, for its first use ends the old one; until that is seen to have worked the old one is kept beside it. So
-//! whenever the power goes, one of the two in `identity.json` works.
+//! Goes over to a new token now and then, so that one that leaked is not good for ever. A new token
+//! is on the disk before it is used, for its first use ends the old one; until that is seen to have
+//! worked the old one is kept beside it. So whenever the power goes, one of the two in
+//! `identity.json` works.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -37,7 +38,8 @@ impl Rotation {
     /// Looks after the token until the agent ends.
     pub async fn run(mut self, shared: Shared, wall_ms: impl Fn() -> u64) {
         // A fleet that was enrolled together does not ask together.
-        let mut wait = if self.identity.next_token.is_some() { Duration::ZERO } else { spread(CHECK) };
+        let mut wait =
+            if self.identity.next_token.is_some() { Duration::ZERO } else { spread(CHECK) };
         loop {
             tokio::select! {
                 // Cancel-safe: a timer that is made anew each time.
@@ -86,8 +88,12 @@ impl Rotation {
         match self.server.with_token(next.clone()).desired(None).await {
             Ok(_) | Err(ServerError::Refused { .. }) => {
                 self.credential.replace(next.clone());
-                let identity =
-                    Identity { token: next, next_token: None, token_since_ms: wall_ms, ..self.identity.clone() };
+                let identity = Identity {
+                    token: next,
+                    next_token: None,
+                    token_since_ms: wall_ms,
+                    ..self.identity.clone()
+                };
                 if !self.keep(identity) {
                     return spread(RETRY);
                 }
@@ -97,7 +103,8 @@ impl Rotation {
             Err(ServerError::TokenRefused(_)) => {
                 tracing::info!("the server does not accept the token that lay ready");
                 // With one that was made for nothing there is no hurry to ask for another.
-                let identity = Identity { next_token: None, token_since_ms: wall_ms, ..self.identity.clone() };
+                let identity =
+                    Identity { next_token: None, token_since_ms: wall_ms, ..self.identity.clone() };
                 if self.keep(identity) { spread(CHECK) } else { spread(RETRY) }
             }
             Err(error) => {
@@ -107,9 +114,12 @@ impl Rotation {
         }
     }
 
-    /// Writes the identity, unless somebody registered the robot anew meanwhile: that must not be lost.
+    /// Writes the identity, unless somebody registered the robot anew meanwhile: that must not be
+    /// lost.
     fn keep(&mut self, identity: Identity) -> bool {
-        let is_another = |known: Identity| known.robot_id != identity.robot_id || known.token != self.identity.token;
+        let is_another = |known: Identity| {
+            known.robot_id != identity.robot_id || known.token != self.identity.token
+        };
         if Identity::read(&self.path).is_ok_and(is_another) {
             tracing::warn!("this robot was registered anew: restart the agent");
             return false;

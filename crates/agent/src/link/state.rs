@@ -1,6 +1,6 @@
-//! The link to the server: reports out, desired states in, over MQTT while it is up and over HTTP otherwise. Polling never
-//! stops, it only gets slow, so that a broker that loses messages costs time and nothing else. It verifies nothing and
-//! decides nothing: the driver does.
+//! The link to the server: reports out, desired states in, over MQTT while it is up and over HTTP
+//! otherwise. Polling never stops, it only gets slow, so that a broker that loses messages costs
+//! time and nothing else. It verifies nothing and decides nothing: the driver does.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,8 +23,8 @@ use crate::transfer::server::{Sent, Server, ServerError};
 
 /// The longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
-/// Within this time a robot whose session takes its reports also posts one, for the name and labels that only an answer
-/// brings. A fleet that starts at once spreads over it.
+/// Within this time a robot whose session takes its reports also posts one, for the name and labels
+/// that only an answer brings. A fleet that starts at once spreads over it.
 const FIRST_POST: Duration = Duration::from_secs(15);
 /// The longest wait between polls while the server refuses the token.
 pub(crate) const REFUSED_POLL: Duration = Duration::from_secs(300);
@@ -61,14 +61,16 @@ pub enum Heard {
     },
 }
 
-/// What driver and link share. The driver writes reports and whether it keeps to its state, the link the rest.
+/// What driver and link share. The driver writes reports and whether it keeps to its state, the
+/// link the rest.
 #[derive(Clone)]
 pub struct Shared {
     /// The newest report.
     pub reports: watch::Sender<Option<Arc<Report>>>,
     /// The sequence number of the newest report that is stored.
     pub confirmed: watch::Sender<u64>,
-    /// Whether the robot keeps to the state it has for some time; otherwise the server is asked for all of it again.
+    /// Whether the robot keeps to the state it has for some time; otherwise the server is asked for
+    /// all of it again.
     pub settled: watch::Sender<bool>,
     /// Where the MQTT session goes; `None`: where whoever keeps it was told at first.
     pub endpoint: watch::Sender<Option<MqttEndpoint>>,
@@ -96,14 +98,15 @@ pub struct Shared {
     pub shutdown: CancellationToken,
 }
 
-/// What goes between an MQTT session and those in the agent who answer and tell. Both ways are bounded and lossy: nothing
-/// in them outlives its moment.
+/// What goes between an MQTT session and those in the agent who answer and tell. Both ways are
+/// bounded and lossy: nothing in them outlives its moment.
 pub struct Talk {
     /// Where questions that came in go, each with when it came.
     pub requests: mpsc::Sender<(Request, Instant)>,
     /// What is to be published.
     pub messages: mpsc::Receiver<Message>,
-    /// Log lines to be published, a batch at a time: the next is taken when the one before has arrived.
+    /// Log lines to be published, a batch at a time: the next is taken when the one before has
+    /// arrived.
     pub lines: mpsc::Receiver<Vec<u8>>,
 }
 
@@ -148,9 +151,14 @@ impl Shared {
     }
 }
 
-/// The link's half over HTTP, until the agent ends. MQTT goes first, for as long as a try may take: a session brings the same
-/// with less, above all where a whole fleet starts at once.
-pub async fn over_http(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
+/// The link's half over HTTP, until the agent ends. MQTT goes first, for as long as a try may take:
+/// a session brings the same with less, above all where a whole fleet starts at once.
+pub async fn over_http(
+    server: Server,
+    shared: Shared,
+    intervals: Intervals,
+    heard: mpsc::Sender<Heard>,
+) {
     let mut tried = shared.mqtt_tried.subscribe();
     tokio::select! {
         // Cancel-safe: a watch remembers what it holds, a token can be awaited again.
@@ -169,8 +177,14 @@ pub async fn over_http(server: Server, shared: Shared, intervals: Intervals, hea
     tokio::join!(polling, post(server, shared.clone(), heard), asking);
 }
 
-/// Polls for the desired state, until the agent ends: at once, unless a session is up, which is told it without asking.
-pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: mpsc::Sender<Heard>) {
+/// Polls for the desired state, until the agent ends: at once, unless a session is up, which is
+/// told it without asking.
+pub async fn poll(
+    server: Server,
+    shared: Shared,
+    intervals: Intervals,
+    heard: mpsc::Sender<Heard>,
+) {
     let mut tag = None;
     if *shared.mqtt_up.borrow() && !next_poll(&shared, intervals, Duration::ZERO).await {
         return;
@@ -195,7 +209,9 @@ pub async fn poll(server: Server, shared: Shared, intervals: Intervals, heard: m
         if matches!(outcome, Err(ServerError::TokenRefused(_))) {
             shared.token_refused.notify_one();
         }
-        if heard.send(heard_of(outcome)).await.is_err() || !next_poll(&shared, intervals, least).await {
+        if heard.send(heard_of(outcome)).await.is_err()
+            || !next_poll(&shared, intervals, least).await
+        {
             return;
         }
     }
@@ -207,12 +223,14 @@ async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bo
     let (asked_at, spread) = (Instant::now(), spread());
     loop {
         let up = *mqtt_up.borrow_and_update();
-        let interval = (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
+        let interval =
+            (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
         tokio::select! {
-            // Cancel-safe: a timer that is made anew for the same time, so that a session that comes and goes does
-            // not put polling off for ever.
+            // Cancel-safe: a timer that is made anew for the same time, so that a session that
+            // comes and goes does not put polling off for ever.
             () = tokio::time::sleep_until(asked_at + interval) => {
-                // A report over HTTP brings the name and labels the server holds, which MQTT does not.
+                // A report over HTTP brings the name and labels the server holds, which MQTT does
+                // not.
                 shared.post.notify_one();
                 return true;
             }
@@ -228,9 +246,11 @@ async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bo
 
 fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     match outcome {
-        Ok(Some(sent)) => {
-            Heard::Desired { envelope: Box::new(sent.envelope), inline: Inline::default(), was_asked_for: true }
-        }
+        Ok(Some(sent)) => Heard::Desired {
+            envelope: Box::new(sent.envelope),
+            inline: Inline::default(),
+            was_asked_for: true,
+        },
         Ok(None) => Heard::Unchanged,
         Err(ServerError::TokenRefused(why)) => Heard::TokenRefused(why),
         Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
@@ -241,26 +261,38 @@ fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     }
 }
 
-/// Delivers reports over HTTP while no MQTT session stores them, and when it is asked to while one does, until the agent ends.
+/// Delivers reports over HTTP while no MQTT session stores them, and when it is asked to while one
+/// does, until the agent ends.
 pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
-    let (mut reports, mut mqtt_stores) = (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
+    let (mut reports, mut mqtt_stores) =
+        (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
     let mut asked = !*mqtt_stores.borrow();
     let mut failures = 0;
     loop {
         let newest = reports.borrow_and_update().clone();
         let stores = *mqtt_stores.borrow_and_update();
-        let due = newest.filter(|report| asked || (!stores && report.seq > *shared.confirmed.borrow()));
+        let due =
+            newest.filter(|report| asked || (!stores && report.seq > *shared.confirmed.borrow()));
         let mut retry = Duration::MAX;
         if let Some(report) = due {
             match server.report(&report).await {
                 Ok(reply) => {
                     (asked, failures) = (false, 0);
-                    shared.confirmed.send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
+                    shared
+                        .confirmed
+                        .send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
                     // A broker that is not the server's may have lost the doorbell.
-                    if !stores && *shared.mqtt_up.borrow() && reply.generation > report.observed_generation {
+                    if !stores
+                        && *shared.mqtt_up.borrow()
+                        && reply.generation > report.observed_generation
+                    {
                         shared.poll.notify_one();
                     }
-                    if heard.send(Heard::Confirmed { seq: report.seq, reply: Some(reply) }).await.is_err() {
+                    if heard
+                        .send(Heard::Confirmed { seq: report.seq, reply: Some(reply) })
+                        .await
+                        .is_err()
+                    {
                         return;
                     }
                     continue;
@@ -268,9 +300,13 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                 Err(error) => {
                     tracing::info!(error = %chain(&error), "no report over HTTP");
                     failures += 1;
-                    retry = Duration::from_millis(backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100));
+                    retry = Duration::from_millis(
+                        backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100),
+                    );
                     match error {
-                        ServerError::Busy { retry_after: Some(wait), .. } => retry = retry.max(wait.min(REFUSED_POLL)),
+                        ServerError::Busy { retry_after: Some(wait), .. } => {
+                            retry = retry.max(wait.min(REFUSED_POLL))
+                        }
                         ServerError::TokenRefused(why) => {
                             // What changes that is noticed by polling.
                             retry = REFUSED_POLL.mul_f64(spread());

@@ -1,5 +1,5 @@
-//! Reads stored lines back, the newest first, from any number of files at once. However much is stored, only a chunk of
-//! each file is in memory, and only so much is read for one question.
+//! Reads stored lines back, the newest first, from any number of files at once. However much is
+//! stored, only a chunk of each file is in memory, and only so much is read for one question.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -42,7 +42,8 @@ pub fn newest(files: &[LogFile], wanted: &Wanted, now_ms: u64) -> Vec<LogLine> {
     let cutoff_ms = wanted.since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms));
     let max_lines = usize::try_from(wanted.max_lines).unwrap_or(usize::MAX).min(MAX_KEPT_LINES);
     let files = files.iter().filter(|file| wanted.task.is_none() || file.task == wanted.task);
-    let mut sources: Vec<Source> = files.map(|file| Source::new(file, wanted.level, cutoff_ms)).collect();
+    let mut sources: Vec<Source> =
+        files.map(|file| Source::new(file, wanted.level, cutoff_ms)).collect();
     let mut room = MAX_SCAN_BYTES;
     sources.iter_mut().for_each(|source| source.advance(&mut room));
     let (mut twins, mut lines, mut bytes) = (Twins::default(), Vec::new(), BATCH_OVERHEAD_BYTES);
@@ -93,8 +94,9 @@ impl<'a> Source<'a> {
             }
         }
         // What has no time is at least not newer than its file.
-        let written =
-            files.first().and_then(|file| file.metadata().ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok());
+        let written = files.first().and_then(|file| {
+            file.metadata().ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()
+        });
         let at_ms = written.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(0));
         Self { file, level, cutoff_ms, lines: Backwards::new(files.into()), at_ms, head: None }
     }
@@ -106,7 +108,8 @@ impl<'a> Source<'a> {
             let record = Record::parse(&line);
             self.at_ms = record.at_ms.unwrap_or(self.at_ms);
             if self.at_ms < self.cutoff_ms {
-                // A robot that did not know the time when it started wrote lines of 1970 between those of today.
+                // A robot that did not know the time when it started wrote lines of 1970 between
+                // those of today.
                 if self.at_ms >= clock::PROGRAM_EXISTS_SINCE_MS {
                     return;
                 }
@@ -185,7 +188,8 @@ impl Backwards {
         let end = if std::mem::take(&mut self.is_newest) { whole_lines(&file, size) } else { size };
         // The line's end that the first line begins behind.
         let mut last = [0];
-        let ends_with_line = end > 0 && file.read_exact_at(&mut last, end - 1).is_ok() && last == *b"\n";
+        let ends_with_line =
+            end > 0 && file.read_exact_at(&mut last, end - 1).is_ok() && last == *b"\n";
         self.current = Some((file, if ends_with_line { end - 1 } else { end }));
         Some(())
     }
@@ -217,7 +221,11 @@ mod tests {
     const NOW_MS: u64 = clock::PROGRAM_EXISTS_SINCE_MS + 100 * DAY_MS;
 
     fn file(path: &Path, task: &str) -> LogFile {
-        LogFile { path: path.to_owned(), task: Some(task.parse().unwrap()), unmarked: LogSource::Stdout }
+        LogFile {
+            path: path.to_owned(),
+            task: Some(task.parse().unwrap()),
+            unmarked: LogSource::Stdout,
+        }
     }
 
     fn everything() -> Wanted {
@@ -241,13 +249,20 @@ mod tests {
         let temp = tempfile::tempdir().unwrap();
         let [one, two] = ["one.log", "two.log"].map(|name| temp.path().join(name));
         use LogSource::{Stderr, Stdout};
-        write(&one, &[(NOW_MS - 50, Stdout, "a"), (NOW_MS - 30, Stderr, "c"), (NOW_MS - 10, Stdout, "e")]);
+        write(
+            &one,
+            &[(NOW_MS - 50, Stdout, "a"), (NOW_MS - 30, Stderr, "c"), (NOW_MS - 10, Stdout, "e")],
+        );
         write(&two, &[(NOW_MS - 40, Stdout, "b"), (NOW_MS - 20, Stderr, "[FATAL] d")]);
-        let files = [file(&one, "one"), file(&two, "two"), file(&temp.path().join("none.log"), "one")];
+        let files =
+            [file(&one, "one"), file(&two, "two"), file(&temp.path().join("none.log"), "one")];
         assert_eq!(texts(&files, &everything()), ["a", "b", "c", "d", "e"]);
         assert_eq!(texts(&files, &Wanted { max_lines: 2, ..everything() }), ["d", "e"]);
         assert_eq!(texts(&files, &Wanted { level: LogLevel::Warn, ..everything() }), ["c", "d"]);
-        assert_eq!(texts(&files, &Wanted { task: Some("two".parse().unwrap()), ..everything() }), ["b", "d"]);
+        assert_eq!(
+            texts(&files, &Wanted { task: Some("two".parse().unwrap()), ..everything() }),
+            ["b", "d"]
+        );
         assert_eq!(texts(&files, &Wanted { since_ms: Some(30), ..everything() }), ["c", "d", "e"]);
     }
 
@@ -259,11 +274,18 @@ mod tests {
         for number in 0..2000u64 {
             let mut line = Vec::new();
             let text = number.to_string();
-            record::write(&mut line, &timestamp(NOW_MS - 2000 + number), LogSource::Stdout, false, text.as_bytes());
+            record::write(
+                &mut line,
+                &timestamp(NOW_MS - 2000 + number),
+                LogSource::Stdout,
+                false,
+                text.as_bytes(),
+            );
             log.write(&line);
         }
         let found = texts(&[file(&path, "t")], &Wanted { max_lines: u64::MAX, ..everything() });
-        let expected: Vec<String> = (2000 - found.len()..2000).map(|number| number.to_string()).collect();
+        let expected: Vec<String> =
+            (2000 - found.len()..2000).map(|number| number.to_string()).collect();
         assert_eq!(found, expected);
         assert!(found.len() > 3 * 10_000 / 33, "lines of all four files: {}", found.len());
     }
@@ -294,7 +316,10 @@ mod tests {
                 (at(10), LogSource::Stdout, "after"),
             ],
         );
-        assert_eq!(texts(&[file(&path, "t")], &Wanted { since_ms: Some(1000), ..everything() }), ["before", "after"]);
+        assert_eq!(
+            texts(&[file(&path, "t")], &Wanted { since_ms: Some(1000), ..everything() }),
+            ["before", "after"]
+        );
     }
 
     #[test]
@@ -307,7 +332,11 @@ mod tests {
         assert_eq!(shown, ["[taskd: started]", "old", "new"]);
         std::fs::write(&path, vec![0; 3 * MAX_LINE_BYTES]).unwrap();
         let lines = newest(&[file(&path, "t")], &everything(), NOW_MS);
-        assert!(lines.iter().all(|line| line.text.len() <= task_proto::log::MAX_LINE_BYTES), "{}", lines.len());
+        assert!(
+            lines.iter().all(|line| line.text.len() <= task_proto::log::MAX_LINE_BYTES),
+            "{}",
+            lines.len()
+        );
         std::fs::write(&path, "whole\nbeing writ").unwrap();
         assert_eq!(texts(&[file(&path, "t")], &everything()), ["whole"]);
     }

@@ -1,5 +1,6 @@
-//! Takes a task's two output streams into its log: each line whole, in its stream's order, with the time it was read at. It
-//! never keeps the task waiting for long: where the disk does not keep up, output is dropped and counted.
+//! Takes a task's two output streams into its log: each line whole, in its stream's order, with the
+//! time it was read at. It never keeps the task waiting for long: where the disk does not keep up,
+//! output is dropped and counted.
 
 use std::io::{self, PipeReader, Read as _};
 use std::os::fd::AsFd as _;
@@ -18,7 +19,8 @@ use crate::system::clock;
 
 /// How long the beginning of a line waits for the rest.
 const PARTIAL_TIMEOUT: Duration = Duration::from_secs(1);
-/// How long a full queue may keep the task's output waiting, before it is dropped until there is room.
+/// How long a full queue may keep the task's output waiting, before it is dropped until there is
+/// room.
 const QUEUE_PATIENCE: Duration = Duration::from_secs(1);
 /// Bytes that wait for the disk.
 const QUEUE_BYTES: usize = 1024 * 1024;
@@ -33,7 +35,10 @@ pub fn copy(spec: LogSpec, stdout: PipeReader, stderr: PipeReader) {
         let mut start = Vec::new();
         record::write_start(&mut start, clock::wall_ms());
         queue.add(&start);
-        read([Stream::new(stdout, LogSource::Stdout), Stream::new(stderr, LogSource::Stderr)], &queue);
+        read(
+            [Stream::new(stdout, LogSource::Stdout), Stream::new(stderr, LogSource::Stderr)],
+            &queue,
+        );
         queue.end();
     });
 }
@@ -61,13 +66,18 @@ fn read(mut streams: [Stream; 2], queue: &Queue) {
     }
 }
 
-/// Waits until a stream can be read or the beginning of a line has waited long enough; which can be read.
+/// Waits until a stream can be read or the beginning of a line has waited long enough; which can be
+/// read.
 fn ready(streams: &[Stream; 2]) -> Result<[bool; 2], Errno> {
     let deadline = streams.iter().filter_map(Stream::deadline).min();
-    let wait = deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()) + Duration::from_millis(1));
-    let timeout = wait.map_or(PollTimeout::NONE, |wait| wait.try_into().unwrap_or(PollTimeout::MAX));
+    let wait = deadline.map(|deadline| {
+        deadline.saturating_duration_since(Instant::now()) + Duration::from_millis(1)
+    });
+    let timeout =
+        wait.map_or(PollTimeout::NONE, |wait| wait.try_into().unwrap_or(PollTimeout::MAX));
     let open = streams.iter().filter_map(|stream| stream.pipe.as_ref());
-    let mut polled: Vec<PollFd> = open.map(|pipe| PollFd::new(pipe.as_fd(), PollFlags::POLLIN)).collect();
+    let mut polled: Vec<PollFd> =
+        open.map(|pipe| PollFd::new(pipe.as_fd(), PollFlags::POLLIN)).collect();
     poll(&mut polled, timeout)?;
     // Also an end or an error is something to read.
     let mut polled = polled.iter().map(|polled| polled.any().unwrap_or(true));
@@ -86,7 +96,13 @@ struct Stream {
 
 impl Stream {
     fn new(pipe: PipeReader, source: LogSource) -> Self {
-        Self { pipe: Some(pipe), source, partial: Vec::new(), partial_since: None, continues: false }
+        Self {
+            pipe: Some(pipe),
+            source,
+            partial: Vec::new(),
+            partial_since: None,
+            continues: false,
+        }
     }
 
     fn deadline(&self) -> Option<Instant> {
@@ -156,7 +172,9 @@ fn character_boundary(bytes: &[u8]) -> usize {
     let begins = |byte: &u8| !(0x80..0xc0).contains(byte);
     let tail = bytes.iter().rev().take(4).position(begins);
     match tail {
-        Some(back) if bytes[bytes.len() - 1 - back] >= 0xc0 && bytes.len() > back + 1 => bytes.len() - 1 - back,
+        Some(back) if bytes[bytes.len() - 1 - back] >= 0xc0 && bytes.len() > back + 1 => {
+            bytes.len() - 1 - back
+        }
         _ => bytes.len(),
     }
 }
@@ -184,7 +202,9 @@ impl Queue {
         let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         // After a gap nothing is added before the gap was noted, or it would be in the wrong place.
         let is_full = |waiting: &mut Waiting| {
-            waiting.lost_bytes == 0 && !waiting.lines.is_empty() && waiting.lines.len() + lines.len() > QUEUE_BYTES
+            waiting.lost_bytes == 0
+                && !waiting.lines.is_empty()
+                && waiting.lines.len() + lines.len() > QUEUE_BYTES
         };
         let waited = self.changed.wait_timeout_while(waiting, QUEUE_PATIENCE, is_full);
         let (mut waiting, _) = waited.unwrap_or_else(PoisonError::into_inner);
@@ -205,9 +225,13 @@ impl Queue {
     fn write_to(&self, log: &mut RotatedLog) {
         loop {
             let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-            let is_idle = |waiting: &mut Waiting| waiting.lines.is_empty() && waiting.lost_bytes == 0 && !waiting.ended;
-            let mut waiting = self.changed.wait_while(waiting, is_idle).unwrap_or_else(PoisonError::into_inner);
-            let (lines, lost_bytes) = (std::mem::take(&mut waiting.lines), std::mem::take(&mut waiting.lost_bytes));
+            let is_idle = |waiting: &mut Waiting| {
+                waiting.lines.is_empty() && waiting.lost_bytes == 0 && !waiting.ended
+            };
+            let mut waiting =
+                self.changed.wait_while(waiting, is_idle).unwrap_or_else(PoisonError::into_inner);
+            let (lines, lost_bytes) =
+                (std::mem::take(&mut waiting.lines), std::mem::take(&mut waiting.lost_bytes));
             let ended = waiting.ended;
             drop(waiting);
             self.changed.notify_all();
@@ -266,7 +290,11 @@ mod tests {
     fn long_lines_are_cut_between_characters() {
         let (mut stream, mut lines) = (stream(), Vec::new());
         let text = format!("x{}", "é".repeat(MAX_TEXT_BYTES / 2));
-        stream.take(format!("{text}\n{}\nend\n", "y".repeat(MAX_TEXT_BYTES)).as_bytes(), STAMP, &mut lines);
+        stream.take(
+            format!("{text}\n{}\nend\n", "y".repeat(MAX_TEXT_BYTES)).as_bytes(),
+            STAMP,
+            &mut lines,
+        );
         let shown = shown(&lines);
         assert_eq!(shown.len(), 4);
         assert_eq!(format!("{}{}", &shown[0][2..], &shown[1][2..]), text);
@@ -287,7 +315,8 @@ mod tests {
             queue.add(b"lost\n");
         }
         queue.end();
-        let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: u64::MAX, files: 1 });
+        let mut log =
+            RotatedLog::new(LogSpec { path: path.clone(), max_bytes: u64::MAX, files: 1 });
         queue.write_to(&mut log);
         log.write(b"kept\n");
         let text = std::fs::read_to_string(path).expect("log");
@@ -307,7 +336,9 @@ mod tests {
         let spec = LogSpec { path: path.clone(), max_bytes: u64::MAX, files: 1 };
         std::thread::scope(|scope| {
             scope.spawn(|| copy(spec, stdout, stderr));
-            scope.spawn(move || (0..20_000).try_for_each(|number| writeln!(out, "{number}")).expect("written"));
+            scope.spawn(move || {
+                (0..20_000).try_for_each(|number| writeln!(out, "{number}")).expect("written")
+            });
             scope.spawn(move || {
                 (0..20_000).try_for_each(|number| writeln!(err, "{number}")).expect("written");
                 write!(err, "no end of line").expect("written");
@@ -316,7 +347,11 @@ mod tests {
         let log = std::fs::read(path).expect("log");
         let shown = shown(&log);
         let of = |letter: &str| {
-            shown.iter().filter_map(|line| line.strip_prefix(letter)).map(str::to_owned).collect::<Vec<_>>()
+            shown
+                .iter()
+                .filter_map(|line| line.strip_prefix(letter))
+                .map(str::to_owned)
+                .collect::<Vec<_>>()
         };
         let numbers: Vec<String> = (0..20_000).map(|number| number.to_string()).collect();
         assert_eq!(shown[0], "T started");

@@ -1,6 +1,7 @@
-//! The lines that ROS nodes print, and how any bytes become a text that is safe to show. ROS 2 prints
-//! `[INFO] [1700000000.123456789] [talker]: text`; ROS 1 pads the level, may add the simulated time and colours, and
-//! names no node; `ros2 launch` puts `[talker-1] ` before it all. It keeps no state.
+//! The lines that ROS nodes print, and how any bytes become a text that is safe to show. ROS 2
+//! prints `[INFO] [1700000000.123456789] [talker]: text`; ROS 1 pads the level, may add the
+//! simulated time and colours, and names no node; `ros2 launch` puts `[talker-1] ` before it all.
+//! It keeps no state.
 
 use task_proto::id::GraphName;
 use task_proto::log::{LogLevel, MAX_LINE_BYTES};
@@ -30,10 +31,14 @@ pub fn parse(line: &str) -> Option<Said<'_>> {
     let (level, rest) = match level_of(first) {
         Some(level) => (level, rest),
         // What a launch file started comes behind its name and number.
-        None => bracket(rest.trim_start()).and_then(|(second, rest)| Some((level_of(second)?, rest)))?,
+        None => {
+            bracket(rest.trim_start()).and_then(|(second, rest)| Some((level_of(second)?, rest)))?
+        }
     };
-    let unstamped = Said { level, stamp: None, logger: None, text: rest.trim_start_matches(':').trim_start() };
-    let Some((stamp, rest)) = bracket(rest.trim_start()).filter(|(stamp, _)| is_stamp(stamp)) else {
+    let unstamped =
+        Said { level, stamp: None, logger: None, text: rest.trim_start_matches(':').trim_start() };
+    let Some((stamp, rest)) = bracket(rest.trim_start()).filter(|(stamp, _)| is_stamp(stamp))
+    else {
         return Some(unstamped);
     };
     let (logger, rest) = match bracket(rest.trim_start()) {
@@ -49,8 +54,8 @@ pub fn node_of(logger: &str) -> Option<GraphName> {
     format!("/{}", logger.replace('.', "/")).parse().ok()
 }
 
-/// `bytes` as one line of text for people: no colours, no control characters, nothing that turns the direction of
-/// writing, at most [`MAX_LINE_BYTES`].
+/// `bytes` as one line of text for people: no colours, no control characters, nothing that turns
+/// the direction of writing, at most [`MAX_LINE_BYTES`].
 pub fn printable(bytes: &[u8]) -> String {
     let text = String::from_utf8_lossy(bytes);
     let mut shown = String::with_capacity(text.len().min(MAX_LINE_BYTES));
@@ -88,8 +93,7 @@ fn skip_escape(characters: &mut std::iter::Peekable<std::str::Chars<'_>>) {
 }
 
 fn is_unsafe(character: char) -> bool {
-    let turns_direction =
-        matches!(character, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    let turns_direction = matches!(character, '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     character.is_control() || turns_direction || matches!(character, '\u{2028}' | '\u{2029}')
 }
 
@@ -121,7 +125,8 @@ fn level_of(word: &str) -> Option<LogLevel> {
     })
 }
 
-/// `1700000000.123456789`, in ROS 1 with the simulated time behind it, in its Python once with a word before it.
+/// `1700000000.123456789`, in ROS 1 with the simulated time behind it, in its Python once with a
+/// word before it.
 fn is_stamp(text: &str) -> bool {
     let text = text.strip_prefix("WallTime: ").unwrap_or(text);
     text.starts_with(|first: char| first.is_ascii_digit())
@@ -135,7 +140,12 @@ mod tests {
     fn said(line: &str) -> Option<(LogLevel, Option<String>, Option<String>, String)> {
         let line = printable(line.as_bytes());
         let said = parse(&line)?;
-        Some((said.level, said.stamp.map(str::to_owned), said.logger.map(str::to_owned), said.text.to_owned()))
+        Some((
+            said.level,
+            said.stamp.map(str::to_owned),
+            said.logger.map(str::to_owned),
+            said.text.to_owned(),
+        ))
     }
 
     fn expected(
@@ -156,13 +166,31 @@ mod tests {
                 "[INFO] [1700000000.123456789] [talker]: hello [you]: there",
                 expected(Info, "1700000000.123456789", "talker", "hello [you]: there"),
             ),
-            ("\x1b[33m[WARN] [1700000000.1] [a.b_c]: low\x1b[0m", expected(Warn, "1700000000.1", "a.b_c", "low")),
-            ("[talker-1] [ERROR] [1700000000.1] [talker]: no", expected(Error, "1700000000.1", "talker", "no")),
-            ("\x1b[0m[ INFO] [1700000000.123456]: up\x1b[0m", expected(Info, "1700000000.123456", "", "up")),
-            ("[ WARN] [1700000000.1, 12.500]: late", expected(Warn, "1700000000.1, 12.500", "", "late")),
-            ("[FATAL] [WallTime: 1700000000.1] gone", expected(Fatal, "WallTime: 1700000000.1", "", "gone")),
+            (
+                "\x1b[33m[WARN] [1700000000.1] [a.b_c]: low\x1b[0m",
+                expected(Warn, "1700000000.1", "a.b_c", "low"),
+            ),
+            (
+                "[talker-1] [ERROR] [1700000000.1] [talker]: no",
+                expected(Error, "1700000000.1", "talker", "no"),
+            ),
+            (
+                "\x1b[0m[ INFO] [1700000000.123456]: up\x1b[0m",
+                expected(Info, "1700000000.123456", "", "up"),
+            ),
+            (
+                "[ WARN] [1700000000.1, 12.500]: late",
+                expected(Warn, "1700000000.1, 12.500", "", "late"),
+            ),
+            (
+                "[FATAL] [WallTime: 1700000000.1] gone",
+                expected(Fatal, "WallTime: 1700000000.1", "", "gone"),
+            ),
             ("[DEBUG] [1700000000.1]: [x] is y", expected(Debug, "1700000000.1", "", "[x] is y")),
-            ("[ERROR] [launch]: process has died", expected(Error, "", "", "[launch]: process has died")),
+            (
+                "[ERROR] [launch]: process has died",
+                expected(Error, "", "", "[launch]: process has died"),
+            ),
             ("[WARNING] disk", expected(Warn, "", "", "disk")),
         ] {
             assert_eq!(said(line), meant, "{line}");
@@ -171,9 +199,17 @@ mod tests {
 
     #[test]
     fn other_lines_are_left_alone() {
-        for line in
-            ["", "plain", "[", "[]", "[x] [y] [INFO] z", "INFO: x", "array[INFO]", "[info] x", "[1.2] [INFORMATION] x"]
-        {
+        for line in [
+            "",
+            "plain",
+            "[",
+            "[]",
+            "[x] [y] [INFO] z",
+            "INFO: x",
+            "array[INFO]",
+            "[info] x",
+            "[1.2] [INFORMATION] x",
+        ] {
             assert_eq!(said(line), None, "{line}");
         }
     }
@@ -189,7 +225,10 @@ mod tests {
     #[test]
     fn nothing_reaches_a_terminal_but_text() {
         let shown = |bytes: &[u8]| printable(bytes);
-        assert_eq!(shown(b"\x1b[1;31mred\x1b[0m \x1b]0;title\x07x \x1b]8;;u\x1b\\link"), "red x link");
+        assert_eq!(
+            shown(b"\x1b[1;31mred\x1b[0m \x1b]0;title\x07x \x1b]8;;u\x1b\\link"),
+            "red x link"
+        );
         assert_eq!(shown(b"a\tb\r\n"), "a b");
         assert_eq!(shown(b"a\nb"), "a ⏎ b");
         assert_eq!(shown(b"\x00\x07\x7f\xff"), "\u{fffd}\u{fffd}\u{fffd}\u{fffd}");

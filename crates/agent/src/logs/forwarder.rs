@@ -1,6 +1,7 @@
-//! Publishes lines as they come: those that matter, or more while somebody follows, never more than a link bears. What
-//! is too much is counted and stays where it is kept. The files are the queue: nothing waits in memory while the server
-//! can't be reached, and a batch is only made when the link has room for it.
+//! Publishes lines as they come: those that matter, or more while somebody follows, never more than
+//! a link bears. What is too much is counted and stays where it is kept. The files are the queue:
+//! nothing waits in memory while the server can't be reached, and a batch is only made when the
+//! link has room for it.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -71,7 +72,11 @@ impl Forwarder {
                 return;
             }
             let Ok(room) = batches.reserve().await else { return };
-            let wanted = Wanted::new(*self.settings.borrow(), *self.following.borrow_and_update(), Instant::now());
+            let wanted = Wanted::new(
+                *self.settings.borrow(),
+                *self.following.borrow_and_update(),
+                Instant::now(),
+            );
             let mut gatherer = self.gatherer;
             let gathered = tokio::task::spawn_blocking(move || {
                 if !was_up {
@@ -91,7 +96,8 @@ impl Forwarder {
             tokio::select! {
                 // Cancel-safe: a timer that is made anew each time.
                 () = tokio::time::sleep(pause) => {}
-                // Cancel-safe: a watch remembers that it changed. Without a sender nobody will follow.
+                // Cancel-safe: a watch remembers that it changed. Without a sender nobody will
+                // follow.
                 Ok(()) = self.following.changed() => {}
             }
         }
@@ -192,13 +198,26 @@ impl Gatherer {
         self.counted_at = Some(now);
         batch.lines.sort_by_key(|line| line.at_ms);
         let suppressed = std::mem::take(&mut self.suppressed);
-        Some(LogBatch { robot_id: self.robot_id.clone(), now_ms: clock::wall_ms(), lines: batch.lines, suppressed })
+        Some(LogBatch {
+            robot_id: self.robot_id.clone(),
+            now_ms: clock::wall_ms(),
+            lines: batch.lines,
+            suppressed,
+        })
     }
 
-    fn read(&mut self, file: &LogFile, wanted: &Wanted, now: Instant, batch: &mut Gathered, room: &mut usize) {
+    fn read(
+        &mut self,
+        file: &LogFile,
+        wanted: &Wanted,
+        now: Instant,
+        batch: &mut Gathered,
+        room: &mut usize,
+    ) {
         let Self { tails, budgets, twins, suppressed, .. } = self;
         let burst = wanted.lines_per_s.saturating_mul(BURST_S);
-        let budget = budgets.entry(file.task.clone()).or_insert(Budget { lines: f64::from(burst), at: now });
+        let budget =
+            budgets.entry(file.task.clone()).or_insert(Budget { lines: f64::from(burst), at: now });
         budget.refill(wanted.lines_per_s, now);
         let each = |line: &[u8]| {
             let record = Record::parse(line);
@@ -218,7 +237,8 @@ impl Gatherer {
             batch.add(entry.line);
             !batch.is_full()
         };
-        if let Err(error) = tails.entry(file.path.clone()).or_default().read(&file.path, room, each) {
+        if let Err(error) = tails.entry(file.path.clone()).or_default().read(&file.path, room, each)
+        {
             tracing::debug!(path = %file.path.display(), %error, "a log can't be read");
         }
     }
@@ -282,16 +302,30 @@ mod tests {
             std::fs::create_dir_all(task.logs()).unwrap();
             let mut log = Vec::new();
             for line in lines {
-                record::write(&mut log, &timestamp(clock::wall_ms()), source, false, line.as_bytes());
+                record::write(
+                    &mut log,
+                    &timestamp(clock::wall_ms()),
+                    source,
+                    false,
+                    line.as_bytes(),
+                );
             }
             let path = if source == LogSource::Rosout { task.ros_log() } else { task.output_log() };
-            std::fs::OpenOptions::new().append(true).create(true).open(path).unwrap().write_all(&log).unwrap();
+            std::fs::OpenOptions::new()
+                .append(true)
+                .create(true)
+                .open(path)
+                .unwrap()
+                .write_all(&log)
+                .unwrap();
         }
 
-        /// What is published `later` than the last time: the texts, and the number of those left out.
+        /// What is published `later` than the last time: the texts, and the number of those left
+        /// out.
         fn gather(&mut self, later: Duration, following: Option<LogLevel>) -> (Vec<String>, u64) {
             self.now += later;
-            let following = following.map(|level| Following { level, until: self.now + Duration::from_secs(1) });
+            let following = following
+                .map(|level| Following { level, until: self.now + Duration::from_secs(1) });
             let wanted = Wanted::new(QUIET, following, self.now);
             let batch = self.gatherer.gather(&wanted, self.now);
             batch.map_or_else(Default::default, |batch| {
@@ -306,9 +340,17 @@ mod tests {
     fn what_matters_is_published_and_more_while_somebody_follows() {
         let mut bench = Bench::new();
         bench.say("one", LogSource::Stdout, ["info".to_owned()]);
-        bench.say("one", LogSource::Stderr, ["warn".to_owned(), "[DEBUG] [1.0] [n]: debug".to_owned()]);
+        bench.say(
+            "one",
+            LogSource::Stderr,
+            ["warn".to_owned(), "[DEBUG] [1.0] [n]: debug".to_owned()],
+        );
         assert_eq!(bench.gather(SECOND, None), (vec!["warn".to_owned()], 0));
-        assert_eq!(bench.gather(SECOND, Some(LogLevel::Debug)), (vec![], 0), "what was passed over is kept, not sent");
+        assert_eq!(
+            bench.gather(SECOND, Some(LogLevel::Debug)),
+            (vec![], 0),
+            "what was passed over is kept, not sent"
+        );
         bench.say("one", LogSource::Stdout, ["more".to_owned()]);
         assert_eq!(bench.gather(SECOND, Some(LogLevel::Info)), (vec!["more".to_owned()], 0));
     }
@@ -341,10 +383,18 @@ mod tests {
         let mut bench = Bench::new();
         let long = "x".repeat(3000);
         for task in ["one", "two"] {
-            bench.say(task, LogSource::Stderr, (0..60).map(|number| format!("{task} {number} {long}")));
+            bench.say(
+                task,
+                LogSource::Stderr,
+                (0..60).map(|number| format!("{task} {number} {long}")),
+            );
         }
-        let first_of_both: String = (0..2).map(|_| bench.gather(Duration::ZERO, None).0.remove(0)).collect();
-        assert!(first_of_both.contains("one 0") && first_of_both.contains("two 0"), "{first_of_both:.40}");
+        let first_of_both: String =
+            (0..2).map(|_| bench.gather(Duration::ZERO, None).0.remove(0)).collect();
+        assert!(
+            first_of_both.contains("one 0") && first_of_both.contains("two 0"),
+            "{first_of_both:.40}"
+        );
     }
 
     #[test]
@@ -359,7 +409,9 @@ mod tests {
             all.extend(bench.gather(Duration::ZERO, None).0);
         }
         assert_eq!(all.len(), 60);
-        assert!(all.iter().enumerate().all(|(number, line)| line.starts_with(&format!("{number} "))));
+        assert!(
+            all.iter().enumerate().all(|(number, line)| line.starts_with(&format!("{number} ")))
+        );
     }
 
     #[test]

@@ -1,5 +1,6 @@
-//! What a stored line says: its level, its node, its text. Nodes say most things twice, on `/rosout` and on their
-//! standard error; the second is known by the node's own time. It reads no file.
+//! What a stored line says: its level, its node, its text. Nodes say most things twice, on
+//! `/rosout` and on their standard error; the second is known by the node's own time. It reads no
+//! file.
 
 use std::path::PathBuf;
 
@@ -34,7 +35,8 @@ pub struct Entry {
     mark: Option<Mark>,
 }
 
-/// What both forms of a node's message have: who said it, and in which millisecond by the node's clock.
+/// What both forms of a node's message have: who said it, and in which millisecond by the node's
+/// clock.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Mark {
     logger: String,
@@ -46,7 +48,8 @@ struct Mark {
 pub struct Twins(Recent<(Mark, LogSource), TWIN_WINDOW>);
 
 impl Entry {
-    /// What `record` of `file` says; `None` if it says nothing. `at_ms` is for a record without a time.
+    /// What `record` of `file` says; `None` if it says nothing. `at_ms` is for a record without a
+    /// time.
     pub fn of(record: &Record, file: &LogFile, at_ms: u64) -> Option<Self> {
         let at_ms = record.at_ms.unwrap_or(at_ms);
         let source = record.source.unwrap_or(file.unmarked);
@@ -63,7 +66,10 @@ impl Entry {
             _ => &text,
         };
         let line = LogLine {
-            at_ms: stamp.and_then(millis).filter(|ms| ms.abs_diff(at_ms) < MAX_SKEW_MS).unwrap_or(at_ms),
+            at_ms: stamp
+                .and_then(millis)
+                .filter(|ms| ms.abs_diff(at_ms) < MAX_SKEW_MS)
+                .unwrap_or(at_ms),
             level,
             source,
             task: file.task.clone(),
@@ -83,7 +89,8 @@ impl Mark {
     }
 }
 
-/// The milliseconds since the Unix epoch that a node wrote as `1700000000.123456789`, the first of several.
+/// The milliseconds since the Unix epoch that a node wrote as `1700000000.123456789`, the first of
+/// several.
 fn millis(stamp: &str) -> Option<u64> {
     let (seconds, fraction) = stamp.split(',').next()?.trim().split_once('.')?;
     let fraction: u64 = format!("{fraction:0<3.3}").parse().ok()?;
@@ -110,18 +117,35 @@ mod tests {
     use task_proto::log::LogLevel;
 
     fn entry(line: &str) -> Option<Entry> {
-        let file = LogFile { path: PathBuf::new(), task: Some("talker".parse().unwrap()), unmarked: LogSource::Stdout };
+        let file = LogFile {
+            path: PathBuf::new(),
+            task: Some("talker".parse().unwrap()),
+            unmarked: LogSource::Stdout,
+        };
         Entry::of(&Record::parse(line.as_bytes()), &file, 7)
     }
 
     #[test]
     fn a_line_is_shown_without_what_is_known_of_it_otherwise() {
-        let line = entry("2026-11-21T10:00:00.123Z E [ERROR] [1.5] [robot.talker]: no \x1b[31mway").unwrap().line;
-        assert_eq!((line.level, line.source, line.text.as_str()), (LogLevel::Error, LogSource::Stderr, "no way"));
+        let line = entry("2026-11-21T10:00:00.123Z E [ERROR] [1.5] [robot.talker]: no \x1b[31mway")
+            .unwrap()
+            .line;
+        assert_eq!(
+            (line.level, line.source, line.text.as_str()),
+            (LogLevel::Error, LogSource::Stderr, "no way")
+        );
         assert_eq!(line.node.unwrap().as_str(), "/robot/talker");
         let at_ms = |line: &str| entry(line).unwrap().line.at_ms;
-        assert_eq!(at_ms("1970-01-01T00:00:07.500Z O [INFO] [7.123456789] [n]: x"), 7123, "by the node's own clock");
-        assert_eq!(at_ms("1970-01-01T01:00:00.000Z O [INFO] [7.1, 3.0]: x"), 3_600_000, "but not by a simulated one");
+        assert_eq!(
+            at_ms("1970-01-01T00:00:07.500Z O [INFO] [7.123456789] [n]: x"),
+            7123,
+            "by the node's own clock"
+        );
+        assert_eq!(
+            at_ms("1970-01-01T01:00:00.000Z O [INFO] [7.1, 3.0]: x"),
+            3_600_000,
+            "but not by a simulated one"
+        );
         let line = entry("[INFO] [1.5] [talker-1]: up").unwrap().line;
         assert_eq!((line.at_ms, line.source, line.node), (1500, LogSource::Stdout, None));
         assert_eq!(line.text, "[INFO] [1.5] [talker-1]: up");

@@ -5,9 +5,10 @@
 //! 2026-11-21T10:00:00.124Z E Traceback (most recent call last):
 //! ```
 //!
-//! The letter says where the line is from: `O` standard output, `E` standard error, `R` `/rosout`, `D` `/diagnostics`, `B`
-//! the build, `T` the agent. A small letter goes on with the line before: it was too long, or its end took its time. Lines
-//! of earlier versions have no time and no letter. It never changes a text.
+//! The letter says where the line is from: `O` standard output, `E` standard error, `R` `/rosout`,
+//! `D` `/diagnostics`, `B` the build, `T` the agent. A small letter goes on with the line before:
+//! it was too long, or its end took its time. Lines of earlier versions have no time and no letter.
+//! It never changes a text.
 
 use task_proto::log::{LogLevel, LogSource};
 use task_proto::time::{parse_timestamp, timestamp};
@@ -41,7 +42,12 @@ pub struct Record<'a> {
 impl<'a> Record<'a> {
     /// Reads a line without its end; what has no time and letter is all text.
     pub fn parse(line: &'a [u8]) -> Self {
-        Self::stamped(line).unwrap_or(Self { at_ms: None, source: None, continues: false, text: line })
+        Self::stamped(line).unwrap_or(Self {
+            at_ms: None,
+            source: None,
+            continues: false,
+            text: line,
+        })
     }
 
     fn stamped(line: &'a [u8]) -> Option<Self> {
@@ -62,12 +68,14 @@ impl<'a> Record<'a> {
         }
     }
 
-    /// How serious it is: what it says itself, else what its source stands for. `unmarked` is the source of a line that
-    /// names none.
+    /// How serious it is: what it says itself, else what its source stands for. `unmarked` is the
+    /// source of a line that names none.
     pub fn level(&self, unmarked: LogSource) -> LogLevel {
         // Most lines have no bracket near their beginning, and this is asked of each.
         let may_say = self.text.iter().take(64).any(|byte| *byte == b'[');
-        let said = may_say.then(|| console::parse(&console::printable(self.text)).map(|said| said.level)).flatten();
+        let said = may_say
+            .then(|| console::parse(&console::printable(self.text)).map(|said| said.level))
+            .flatten();
         said.unwrap_or_else(|| Self::level_of_source(self.source.unwrap_or(unmarked)))
     }
 
@@ -81,7 +89,11 @@ impl<'a> Record<'a> {
 pub fn write(log: &mut Vec<u8>, stamp: &str, source: LogSource, continues: bool, text: &[u8]) {
     let letter = letter_of(source);
     log.extend_from_slice(stamp.as_bytes());
-    log.extend_from_slice(&[b' ', if continues { letter.to_ascii_lowercase() } else { letter }, b' ']);
+    log.extend_from_slice(&[
+        b' ',
+        if continues { letter.to_ascii_lowercase() } else { letter },
+        b' ',
+    ]);
     log.extend_from_slice(text);
     log.push(b'\n');
 }

@@ -1,5 +1,6 @@
-//! A log on disk: one current file and a few older ones, never more. Writing never fails towards the task: when the disk
-//! is full the output is dropped and counted, because a task that blocks on its own log is worse.
+//! A log on disk: one current file and a few older ones, never more. Writing never fails towards
+//! the task: when the disk is full the output is dropped and counted, because a task that blocks on
+//! its own log is worse.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -62,7 +63,8 @@ impl RotatedLog {
         } else {
             bytes[..room].iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1)
         };
-        // A line that fits no file is cut; one that only does not fit the rest of this file goes to the next.
+        // A line that fits no file is cut; one that only does not fit the rest of this file goes to
+        // the next.
         let count = if count == 0 && current.size == 0 { room.min(bytes.len()) } else { count };
         if count == 0 {
             self.rotate()?;
@@ -76,10 +78,17 @@ impl RotatedLog {
     /// Says, once writing works again, how much is missing.
     fn admit_dropped(&mut self) -> io::Result<()> {
         if self.dropped_bytes > 0 {
-            let text = format!("[WARN] {} bytes of output could not be written here", self.dropped_bytes);
+            let text =
+                format!("[WARN] {} bytes of output could not be written here", self.dropped_bytes);
             // What could be written last may have been half a line.
             let mut note = vec![b'\n'];
-            record::write(&mut note, &timestamp(clock::wall_ms()), LogSource::Agent, false, text.as_bytes());
+            record::write(
+                &mut note,
+                &timestamp(clock::wall_ms()),
+                LogSource::Agent,
+                false,
+                text.as_bytes(),
+            );
             let current = self.current()?;
             current.file.write_all(&note)?;
             current.size += note.len() as u64;
@@ -92,7 +101,11 @@ impl RotatedLog {
         let current = match self.current.take() {
             Some(current) => current,
             None => {
-                let file = OpenOptions::new().append(true).create(true).mode(0o640).open(&self.spec.path)?;
+                let file = OpenOptions::new()
+                    .append(true)
+                    .create(true)
+                    .mode(0o640)
+                    .open(&self.spec.path)?;
                 let size = file.metadata()?.len();
                 Current { file, size }
             }
@@ -161,7 +174,8 @@ mod tests {
         log.write(b"kept");
         let text = read(path);
         assert!(
-            text.starts_with('\n') && text.ends_with(" T [WARN] 4 bytes of output could not be written here\nkept"),
+            text.starts_with('\n')
+                && text.ends_with(" T [WARN] 4 bytes of output could not be written here\nkept"),
             "{text}"
         );
     }

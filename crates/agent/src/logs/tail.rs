@@ -1,5 +1,5 @@
-//! Reads what is added to a log, across its rotation. It holds no file open, and remembers no line: what was not read yet
-//! waits on the disk, for as long as the log keeps it.
+//! Reads what is added to a log, across its rotation. It holds no file open, and remembers no line:
+//! what was not read yet waits on the disk, for as long as the log keeps it.
 
 use std::fs::{File, Metadata};
 use std::io;
@@ -22,7 +22,8 @@ pub struct Tail {
 struct Position {
     device: u64,
     inode: u64,
-    /// The number of a file that is gone is soon given to another; most file systems also know when a file was made.
+    /// The number of a file that is gone is soon given to another; most file systems also know when
+    /// a file was made.
     created: Option<SystemTime>,
     offset: u64,
 }
@@ -49,7 +50,12 @@ impl Tail {
     }
 
     /// Hands out the next whole lines, of at most about `room` bytes, until `each` wants no more.
-    pub fn read(&mut self, log: &Path, room: &mut usize, mut each: impl FnMut(&[u8]) -> bool) -> io::Result<()> {
+    pub fn read(
+        &mut self,
+        log: &Path,
+        room: &mut usize,
+        mut each: impl FnMut(&[u8]) -> bool,
+    ) -> io::Result<()> {
         while *room > 0 {
             let Some((path, metadata)) = self.current(log)? else { return Ok(()) };
             let mut position = match &self.at {
@@ -58,14 +64,16 @@ impl Tail {
                 _ => Position::new(&metadata, 0),
             };
             let is_newest = path == log;
-            let wants_more = read_lines(&path, metadata.len(), is_newest, &mut position, room, &mut each);
+            let wants_more =
+                read_lines(&path, metadata.len(), is_newest, &mut position, room, &mut each);
             let is_read = position.offset >= metadata.len();
             self.at = Some(position);
             if !wants_more? || is_newest {
                 return Ok(());
             }
             if is_read {
-                // Somebody has deleted the newest, while it is written: nothing more comes until it is rotated.
+                // Somebody has deleted the newest, while it is written: nothing more comes until it
+                // is rotated.
                 let Some(newer) = next_newer(log, &path)? else { return Ok(()) };
                 self.at = Some(newer);
             }
@@ -107,8 +115,8 @@ fn metadata(path: &Path) -> io::Result<Option<Metadata>> {
     }
 }
 
-/// Reads the file at `path` from `position` to its end; false when `each` wants no more. The end of a line that is still
-/// being written is left for later.
+/// Reads the file at `path` from `position` to its end; false when `each` wants no more. The end of
+/// a line that is still being written is left for later.
 fn read_lines(
     path: &Path,
     size: u64,
@@ -218,7 +226,8 @@ mod tests {
         let mut tail = Tail::default();
         assert_eq!(read(&mut tail, &log).len(), 30);
         std::fs::remove_file(&log).unwrap();
-        // What is left of it once more: nobody knows any longer how far that was read. Then no more.
+        // What is left of it once more: nobody knows any longer how far that was read. Then no
+        // more.
         read(&mut tail, &log);
         assert_eq!(read(&mut tail, &log), Vec::<String>::new());
         (0..30).for_each(|number| written.write(format!("later {number}\n").as_bytes()));

@@ -1,9 +1,11 @@
-//! The system calls that a task may not make: a seccomp filter that takes from builds and tasks what only an administrator
-//! needs, or what mostly serves to attack a kernel. A list of what is denied, not of what is allowed: ROS nodes, compilers
-//! and interpreters use almost all the rest. It is made ready before the fork; installing it makes system calls only.
+//! The system calls that a task may not make: a seccomp filter that takes from builds and tasks
+//! what only an administrator needs, or what mostly serves to attack a kernel. A list of what is
+//! denied, not of what is allowed: ROS nodes, compilers and interpreters use almost all the rest.
+//! It is made ready before the fork; installing it makes system calls only.
 //!
-//! A denied call fails with EPERM, `clone3` with ENOSYS, so that C libraries fall back to `clone`, whose flags a filter can
-//! read. All calls of another architecture are denied: they would be numbered otherwise.
+//! A denied call fails with EPERM, `clone3` with ENOSYS, so that C libraries fall back to `clone`,
+//! whose flags a filter can read. All calls of another architecture are denied: they would be
+//! numbered otherwise.
 
 use std::io;
 
@@ -22,7 +24,8 @@ pub enum Seccomp {
     Off,
 }
 
-/// The architecture of this program, as the kernel names it to a filter; `None`: there is no filter for it.
+/// The architecture of this program, as the kernel names it to a filter; `None`: there is no filter
+/// for it.
 const ARCHITECTURE: Option<u32> = if cfg!(target_arch = "x86_64") {
     Some(0xC000_003E)
 } else if cfg!(target_arch = "aarch64") {
@@ -52,7 +55,8 @@ const DENIED: [c_long; 43] = [
     libc::SYS_delete_module,
     libc::SYS_bpf,
     libc::SYS_perf_event_open,
-    // Mounts: mount, and open_tree, move_mount, fsopen, fsconfig, fsmount, fspick, mount_setattr, open_tree_attr.
+    // Mounts: mount, and open_tree, move_mount, fsopen, fsconfig, fsmount, fspick, mount_setattr,
+    // open_tree_attr.
     libc::SYS_mount,
     libc::SYS_umount2,
     libc::SYS_pivot_root,
@@ -99,7 +103,8 @@ const DENIED: [c_long; 43] = [
 ];
 
 /// `clock_settime` with 64 bits, where that is another call.
-const CLOCK_SETTIME64: c_long = if cfg!(target_pointer_width = "32") { 404 } else { libc::SYS_clock_settime };
+const CLOCK_SETTIME64: c_long =
+    if cfg!(target_pointer_width = "32") { 404 } else { libc::SYS_clock_settime };
 /// Calls that only x86 has; elsewhere one that is denied anyway stands for them.
 #[cfg(target_arch = "x86_64")]
 const IOPL: c_long = libc::SYS_iopl;
@@ -113,7 +118,8 @@ const IOPERM: c_long = libc::SYS_reboot;
 const CLONE3: c_long = 435;
 /// On x86_64 the calls of the x32 ABI have this bit.
 const X32_BIT: u32 = 0x4000_0000;
-/// Flags of `clone` and `unshare` that make namespaces. That of time namespaces is one of `unshare` only.
+/// Flags of `clone` and `unshare` that make namespaces. That of time namespaces is one of `unshare`
+/// only.
 const NEW_NAMESPACES: u32 = (libc::CLONE_NEWNS
     | libc::CLONE_NEWCGROUP
     | libc::CLONE_NEWUTS
@@ -145,11 +151,13 @@ impl CallFilter {
         ARCHITECTURE.filter(|_| kernel_filters()).map(|architecture| Self(program(architecture)))
     }
 
-    /// Installs it for the calling process and all that it starts, for good. Only system calls: it is called between fork
-    /// and exec. No program gains rights by being executed from then on, or the kernel would take no filter.
+    /// Installs it for the calling process and all that it starts, for good. Only system calls: it
+    /// is called between fork and exec. No program gains rights by being executed from then on, or
+    /// the kernel would take no filter.
     pub fn install(&self) -> io::Result<()> {
         prctl::set_no_new_privs()?;
-        // SPEC_ALLOW: older kernels slow filtered processes down otherwise, as if they ran foreign code in themselves.
+        // SPEC_ALLOW: older kernels slow filtered processes down otherwise, as if they ran foreign
+        // code in themselves.
         match self.set(libc::SECCOMP_FILTER_FLAG_SPEC_ALLOW) {
             Err(Errno::EINVAL) => Ok(self.set(0)?),
             done => Ok(done?),
@@ -157,17 +165,26 @@ impl CallFilter {
     }
 
     fn set(&self, flags: libc::c_ulong) -> Result<(), Errno> {
-        let program = libc::sock_fprog { len: self.0.len() as libc::c_ushort, filter: self.0.as_ptr().cast_mut() };
+        let program = libc::sock_fprog {
+            len: self.0.len() as libc::c_ushort,
+            filter: self.0.as_ptr().cast_mut(),
+        };
         // SAFETY: the kernel copies the program, which outlives the call and is not written to.
         let set = unsafe {
-            libc::syscall(libc::SYS_seccomp, libc::SECCOMP_SET_MODE_FILTER, flags, std::ptr::from_ref(&program))
+            libc::syscall(
+                libc::SYS_seccomp,
+                libc::SECCOMP_SET_MODE_FILTER,
+                flags,
+                std::ptr::from_ref(&program),
+            )
         };
         Errno::result(set).map(drop)
     }
 }
 
-/// Whether builds and tasks are filtered, by the setting and by whether they run under an account of their own: where
-/// they run as the agent does, what is denied there may be what they are for, and so it has to be said.
+/// Whether builds and tasks are filtered, by the setting and by whether they run under an account
+/// of their own: where they run as the agent does, what is denied there may be what they are for,
+/// and so it has to be said.
 pub fn is_wanted(setting: Option<Seccomp>, has_account: bool) -> bool {
     setting.map_or(has_account, |setting| setting == Seccomp::Default)
 }
@@ -175,13 +192,20 @@ pub fn is_wanted(setting: Option<Seccomp>, has_account: bool) -> bool {
 fn kernel_filters() -> bool {
     let action = libc::SECCOMP_RET_ERRNO;
     // SAFETY: the kernel reads one number, which outlives the call.
-    let found =
-        unsafe { libc::syscall(libc::SYS_seccomp, libc::SECCOMP_GET_ACTION_AVAIL, 0, std::ptr::from_ref(&action)) };
+    let found = unsafe {
+        libc::syscall(
+            libc::SYS_seccomp,
+            libc::SECCOMP_GET_ACTION_AVAIL,
+            0,
+            std::ptr::from_ref(&action),
+        )
+    };
     found == 0
 }
 
 fn program(architecture: u32) -> Vec<sock_filter> {
-    let mut program = vec![load(ARCHITECTURE_AT), jump(libc::BPF_JEQ, architecture, 1, 0), answer(DENY)];
+    let mut program =
+        vec![load(ARCHITECTURE_AT), jump(libc::BPF_JEQ, architecture, 1, 0), answer(DENY)];
     program.push(load(NUMBER_AT));
     if cfg!(target_arch = "x86_64") {
         program.extend([jump(libc::BPF_JGE, X32_BIT, 0, 1), answer(DENY)]);
@@ -190,7 +214,10 @@ fn program(architecture: u32) -> Vec<sock_filter> {
         program.extend([jump(libc::BPF_JEQ, call as u32, 0, 1), answer(DENY)]);
     }
     program.extend([jump(libc::BPF_JEQ, CLONE3 as u32, 0, 1), answer(UNKNOWN)]);
-    for (call, flags) in [(libc::SYS_clone, NEW_NAMESPACES), (libc::SYS_unshare, NEW_NAMESPACES | NEW_TIME_NAMESPACE)] {
+    for (call, flags) in [
+        (libc::SYS_clone, NEW_NAMESPACES),
+        (libc::SYS_unshare, NEW_NAMESPACES | NEW_TIME_NAMESPACE),
+    ] {
         program.extend([
             jump(libc::BPF_JEQ, call as u32, 0, 4),
             load(FIRST_ARGUMENT_AT),
@@ -215,7 +242,12 @@ fn load(at: u32) -> sock_filter {
 }
 
 fn jump(condition: u32, with: u32, if_so: u8, if_not: u8) -> sock_filter {
-    sock_filter { code: (libc::BPF_JMP | condition | libc::BPF_K) as u16, jt: if_so, jf: if_not, k: with }
+    sock_filter {
+        code: (libc::BPF_JMP | condition | libc::BPF_K) as u16,
+        jt: if_so,
+        jf: if_not,
+        k: with,
+    }
 }
 
 fn answer(what: u32) -> sock_filter {
@@ -232,7 +264,8 @@ mod tests {
     use crate::process::confinement::Confinement;
     use crate::process::program;
 
-    /// Each class of denied calls, made with arguments that do no harm. Says for each whether it was denied.
+    /// Each class of denied calls, made with arguments that do no harm. Says for each whether it
+    /// was denied.
     const CALLS: &str = r#"
 import ctypes, errno, mmap, os, platform, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -292,10 +325,12 @@ print("works")
         std::fs::write(&path, format!("exec python3 - <<'END'\n{script}\nEND\n")).expect("written");
         let limits = RunLimits { filter_calls, ..RunLimits::default() };
         let confinement = Confinement::new(&path, None, &limits, None).expect("confined");
-        let environment = BTreeMap::from([("PATH".to_owned(), std::env::var("PATH").expect("set"))]);
+        let environment =
+            BTreeMap::from([("PATH".to_owned(), std::env::var("PATH").expect("set"))]);
         let (said, output) = io::pipe().expect("a pipe");
         let mut child =
-            program::spawn_build(&path, Path::new("/"), &environment, 0, confinement, output).expect("started");
+            program::spawn_build(&path, Path::new("/"), &environment, 0, confinement, output)
+                .expect("started");
         let reading = tokio::task::spawn_blocking(move || io::read_to_string(said).expect("text"));
         child.wait().await.expect("collected");
         reading.await.expect("read")

@@ -1,6 +1,7 @@
-//! Control groups, version 2: one for each run and each build, so that whatever it starts stays in it, shares its limits
-//! and can be ended at one stroke. It owns the choice of the place, the limits' files and the removal; it never decides
-//! what may run. Where a machine has no writable hierarchy nothing of this is there and the caller does without.
+//! Control groups, version 2: one for each run and each build, so that whatever it starts stays in
+//! it, shares its limits and can be ended at one stroke. It owns the choice of the place, the
+//! limits' files and the removal; it never decides what may run. Where a machine has no writable
+//! hierarchy nothing of this is there and the caller does without.
 //!
 //! ```text
 //! <place>/taskd/            no processes of its own, so that its children can have limits
@@ -8,8 +9,9 @@
 //! <place>/taskd/<key>/      one run or build
 //! ```
 //!
-//! The place is the hierarchy's root, for an agent that runs as root on the machine itself: no service manager's restart
-//! of the agent touches it. Any other agent has only what was delegated to it: beside its own group, else below it.
+//! The place is the hierarchy's root, for an agent that runs as root on the machine itself: no
+//! service manager's restart of the agent touches it. Any other agent has only what was delegated
+//! to it: beside its own group, else below it.
 
 use std::fs::{self, File};
 use std::io::{self, Write as _};
@@ -32,7 +34,8 @@ const AGENT: &str = "taskd-agent";
 const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
 /// How often a directory is made that someone else's removal takes away.
 const MAKE_TRIES: usize = 10;
-/// The most groups below a run's that are looked at: a task may make some where it runs as the agent's own user.
+/// The most groups below a run's that are looked at: a task may make some where it runs as the
+/// agent's own user.
 const MAX_NESTED: usize = 1000;
 /// How long a removal waits for the last process to be gone.
 const REMOVE_TIMEOUT: Duration = Duration::from_secs(2);
@@ -66,25 +69,29 @@ pub struct Cgroups {
 pub struct Cgroup(PathBuf);
 
 impl Cgroups {
-    /// The place this process may use, if there is one. It is tried out: a group is made and removed.
+    /// The place this process may use, if there is one. It is tried out: a group is made and
+    /// removed.
     pub fn find() -> Option<Self> {
         let mount = Mount::find(&fs::read_to_string("/proc/self/mountinfo").ok()?)?;
         let own = own_path(&fs::read_to_string("/proc/self/cgroup").ok()?)?;
         let on_machine = mount.is_whole() && nix::unistd::geteuid().is_root();
-        let found: Vec<_> = mount.places(&own, on_machine).iter().filter_map(|place| Self::at(place)).collect();
+        let found: Vec<_> =
+            mount.places(&own, on_machine).iter().filter_map(|place| Self::at(place)).collect();
         // A later place is better only if it can do what an earlier one can't.
         let best = found.iter().find(|cgroups| cgroups.isolates).or(found.first());
         best.cloned()
     }
 
-    /// The place below the group at `parent`, if groups can be made there and processes brought into them.
+    /// The place below the group at `parent`, if groups can be made there and processes brought
+    /// into them.
     fn at(parent: &Path) -> Option<Self> {
         access(&parent.join("cgroup.procs"), AccessFlags::W_OK).ok()?;
         let base = parent.join(BASE);
         let probe = format!("probe-{}", std::process::id());
         let tried = || {
             let group = make(&base, &probe)?;
-            let isolates = ["memory.max", "pids.max"].iter().all(|file| group.0.join(file).exists());
+            let isolates =
+                ["memory.max", "pids.max"].iter().all(|file| group.0.join(file).exists());
             group.remove().map(|()| isolates)
         };
         let isolates = tried().ok()?;
@@ -92,8 +99,9 @@ impl Cgroups {
         Some(Self { base, isolates })
     }
 
-    /// Whether runs can be given memory and processes of their own. False where the hierarchy has no such controllers:
-    /// it can end a run for certain, but keeps none from starving its neighbours.
+    /// Whether runs can be given memory and processes of their own. False where the hierarchy has
+    /// no such controllers: it can end a run for certain, but keeps none from starving its
+    /// neighbours.
     pub fn isolates(&self) -> bool {
         self.isolates
     }
@@ -133,7 +141,8 @@ impl Cgroup {
         File::options().write(true).open(self.0.join("cgroup.procs"))
     }
 
-    /// Brings the calling process out of reach of what ends runs and agents: beside the run's group.
+    /// Brings the calling process out of reach of what ends runs and agents: beside the run's
+    /// group.
     pub fn enter_shims(&self) -> io::Result<()> {
         let base = self.0.parent().ok_or(io::ErrorKind::NotFound)?;
         make(base, SHIMS)?.entrance()?.write_all(b"0")
@@ -146,7 +155,11 @@ impl Cgroup {
             match fs::read_to_string(dir.join("cgroup.procs")) {
                 // A process that this one may not see is listed as 0.
                 Ok(text) => {
-                    pids.extend(text.lines().filter_map(|line| line.parse::<u32>().ok()).filter(|pid| *pid != 0));
+                    pids.extend(
+                        text.lines()
+                            .filter_map(|line| line.parse::<u32>().ok())
+                            .filter(|pid| *pid != 0),
+                    );
                 }
                 Err(error) if is_gone(&error) => {}
                 Err(error) => return Err(error),
@@ -155,7 +168,8 @@ impl Cgroup {
         Ok(pids)
     }
 
-    /// Kills all processes in it, also those that are being forked right now. Kernels before 5.14 can't: nothing happens.
+    /// Kills all processes in it, also those that are being forked right now. Kernels before 5.14
+    /// can't: nothing happens.
     pub fn kill(&self) -> io::Result<()> {
         match write(&self.0.join("cgroup.kill"), "1") {
             Err(error) if is_gone(&error) => Ok(()),
@@ -176,16 +190,23 @@ impl Cgroup {
     /// Whether the kernel has killed processes of it for want of memory.
     pub fn is_out_of_memory(&self) -> bool {
         let events = fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
-        events.lines().filter_map(|line| line.strip_prefix("oom_kill ")).any(|count| count.trim() != "0")
+        events
+            .lines()
+            .filter_map(|line| line.strip_prefix("oom_kill "))
+            .any(|count| count.trim() != "0")
     }
 
-    /// Removes it once its last process is gone, and what it lay in, if nothing else does. Done if it is not there.
+    /// Removes it once its last process is gone, and what it lay in, if nothing else does. Done if
+    /// it is not there.
     pub fn remove(&self) -> io::Result<()> {
         let deadline = Instant::now() + REMOVE_TIMEOUT;
         for dir in self.nested()?.iter().rev() {
             loop {
                 match fs::remove_dir(dir) {
-                    Err(error) if error.raw_os_error() == Some(libc::EBUSY) && Instant::now() < deadline => {
+                    Err(error)
+                        if error.raw_os_error() == Some(libc::EBUSY)
+                            && Instant::now() < deadline =>
+                    {
                         wait_for_event(dir)?;
                     }
                     Err(error) if !is_gone(&error) => return Err(error),
@@ -224,10 +245,14 @@ impl Cgroup {
                 Err(error) if is_gone(&error) => continue,
                 listing => listing?,
             };
-            let below = listing.flatten().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
+            let below =
+                listing.flatten().filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()));
             dirs.extend(below.map(|entry| entry.path()));
             if dirs.len() > MAX_NESTED {
-                return Err(io::Error::other(format!("more than {MAX_NESTED} groups lie below {}", self.0.display())));
+                return Err(io::Error::other(format!(
+                    "more than {MAX_NESTED} groups lie below {}",
+                    self.0.display()
+                )));
             }
         }
         Ok(dirs)
@@ -249,7 +274,8 @@ pub enum Outlook {
 pub fn outlook() -> Outlook {
     let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
     let Some(mount) = Mount::find(&table) else { return Outlook::Nothing };
-    let controllers = fs::read_to_string(mount.point.join("cgroup.controllers")).unwrap_or_default();
+    let controllers =
+        fs::read_to_string(mount.point.join("cgroup.controllers")).unwrap_or_default();
     let has = |name| controllers.split_whitespace().any(|controller| controller == name);
     if has("memory") && has("pids") { Outlook::Isolates } else { Outlook::Counts }
 }
@@ -270,7 +296,8 @@ impl Mount {
         })
     }
 
-    /// Whether it begins at the root of the machine's hierarchy, which is the one group that has no type.
+    /// Whether it begins at the root of the machine's hierarchy, which is the one group that has no
+    /// type.
     fn is_whole(&self) -> bool {
         self.root == Path::new("/") && !self.point.join("cgroup.type").exists()
     }
@@ -282,12 +309,14 @@ impl Mount {
         }
         let Ok(below) = own.strip_prefix(&self.root) else { return Vec::new() };
         let own = self.point.join(below);
-        let beside = own.parent().filter(|parent| own != self.point && parent.starts_with(&self.point));
+        let beside =
+            own.parent().filter(|parent| own != self.point && parent.starts_with(&self.point));
         beside.map(Path::to_owned).into_iter().chain([own.clone()]).collect()
     }
 }
 
-/// The group of a process, from its `/proc/<pid>/cgroup`; `None` where it lies outside of what the process sees.
+/// The group of a process, from its `/proc/<pid>/cgroup`; `None` where it lies outside of what the
+/// process sees.
 fn own_path(text: &str) -> Option<PathBuf> {
     let path = text.lines().find_map(|line| line.strip_prefix("0::"))?;
     (!path.split('/').any(|part| part == "..")).then(|| PathBuf::from(path))
@@ -298,7 +327,8 @@ fn name(dir: &Path) -> String {
     format!("run-{}", &digest.hex()[..16])
 }
 
-/// Makes a group below `base`, which someone else's removal may take away at any moment until it is there.
+/// Makes a group below `base`, which someone else's removal may take away at any moment until it is
+/// there.
 fn make(base: &Path, name: &str) -> io::Result<Cgroup> {
     let group = base.join(name);
     for _ in 0..MAKE_TRIES {
@@ -311,7 +341,10 @@ fn make(base: &Path, name: &str) -> io::Result<Cgroup> {
             made => return made.map(|()| Cgroup(group)),
         }
     }
-    Err(io::Error::other(format!("{} was removed {MAKE_TRIES} times while a group was made in it", base.display())))
+    Err(io::Error::other(format!(
+        "{} was removed {MAKE_TRIES} times while a group was made in it",
+        base.display()
+    )))
 }
 
 fn make_dir(path: &Path) -> io::Result<()> {
@@ -321,20 +354,24 @@ fn make_dir(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Lets the groups in `dir` have limits, as far as `dir` may itself. What is refused shows in what they have.
+/// Lets the groups in `dir` have limits, as far as `dir` may itself. What is refused shows in what
+/// they have.
 fn enable_controllers(dir: &Path) {
     for controller in CONTROLLERS {
         let _ = write(&dir.join("cgroup.subtree_control"), &format!("+{controller}"));
     }
 }
 
-/// Takes this process out of the group that it is to divide, if it is a container's outermost one and holds nothing else:
-/// a group with limits for those below it must have no processes. Under a service manager the group is not left: there
-/// the agent could not be started a second time.
+/// Takes this process out of the group that it is to divide, if it is a container's outermost one
+/// and holds nothing else: a group with limits for those below it must have no processes. Under a
+/// service manager the group is not left: there the agent could not be started a second time.
 fn leave(group: &Path) -> bool {
     let alone = Cgroup(group.to_owned()).pids().is_ok_and(|pids| pids == [std::process::id()]);
     let outermost = !group.parent().is_some_and(|parent| parent.join("cgroup.procs").exists());
-    let left = || make_dir(&group.join(AGENT)).and_then(|()| Cgroup(group.join(AGENT)).entrance()?.write_all(b"0"));
+    let left = || {
+        make_dir(&group.join(AGENT))
+            .and_then(|()| Cgroup(group.join(AGENT)).entrance()?.write_all(b"0"))
+    };
     alone && outermost && left().is_ok()
 }
 
@@ -372,9 +409,14 @@ mod tests {
     fn the_mount_is_found_in_every_layout() {
         let hybrid = Mount::find(HYBRID).expect("found");
         assert_eq!(hybrid.point, Path::new("/sys/fs/cgroup/unified"));
-        let unified = Mount::find("30 23 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw,nsdelegate\n").expect("found");
+        let unified =
+            Mount::find("30 23 0:26 / /sys/fs/cgroup rw - cgroup2 cgroup2 rw,nsdelegate\n")
+                .expect("found");
         assert_eq!(unified.point, Path::new("/sys/fs/cgroup"));
-        assert!(Mount::find("32 25 0:28 / /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n").is_none());
+        assert!(
+            Mount::find("32 25 0:28 / /sys/fs/cgroup/memory rw - cgroup cgroup rw,memory\n")
+                .is_none()
+        );
     }
 
     #[test]

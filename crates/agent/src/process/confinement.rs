@@ -1,7 +1,6 @@
-//! What a build or a task is put into between fork and exec: its control group, its limits, its account, its filter of
-//! system calls. [`Confinement`]
-//! is made ready before the fork, by whoever may look things up; entering it makes system calls only. It never starts
-//! anything.
+//! What a build or a task is put into between fork and exec: its control group, its limits, its
+//! account, its filter of system calls. [`Confinement`] is made ready before the fork, by whoever
+//! may look things up; entering it makes system calls only. It never starts anything.
 
 use std::ffi::CString;
 use std::fs::{self, File};
@@ -47,8 +46,9 @@ struct Account {
 }
 
 impl Confinement {
-    /// The confinement of what runs `script`. Limits that `cgroup` can't keep are kept as well as can be otherwise: the
-    /// memory for each process by itself, the processes by a limit on all of the account's.
+    /// The confinement of what runs `script`. Limits that `cgroup` can't keep are kept as well as
+    /// can be otherwise: the memory for each process by itself, the processes by a limit on all of
+    /// the account's.
     pub fn new(
         script: &Path,
         cgroup: Option<&Cgroup>,
@@ -59,9 +59,9 @@ impl Confinement {
         let keeps_pids = cgroup.is_some_and(Cgroup::limits_pids);
         let user_processes = match limits.pids.filter(|_| !keeps_pids) {
             // The kernel counts all that runs under the account, so what runs now is added.
-            Some(pids) => {
-                Some(pids.saturating_add(threads_of(user.map_or(nix::unistd::getuid().as_raw(), |user| user.uid))?))
-            }
+            Some(pids) => Some(pids.saturating_add(threads_of(
+                user.map_or(nix::unistd::getuid().as_raw(), |user| user.uid),
+            )?)),
             None => None,
         };
         let account = |user: &TaskUser| Account {
@@ -85,11 +85,14 @@ impl Confinement {
             nix::unistd::write(cgroup, b"0")?;
         }
         // It only says who goes first; where it can't be said all are equal.
-        if let Ok(file) = open(c"/proc/self/oom_score_adj", OFlag::O_WRONLY | OFlag::O_CLOEXEC, Mode::empty()) {
+        if let Ok(file) =
+            open(c"/proc/self/oom_score_adj", OFlag::O_WRONLY | OFlag::O_CLOEXEC, Mode::empty())
+        {
             let _ = nix::unistd::write(&file, TASK_OOM_SCORE.to_bytes());
         }
         if let Some(bytes) = self.data_bytes {
-            // Not the address space, of which programs with many threads or large files mapped have far more than memory.
+            // Not the address space, of which programs with many threads or large files mapped have
+            // far more than memory.
             setrlimit(Resource::RLIMIT_DATA, bytes, bytes)?;
         }
         if let Some(count) = self.user_processes {
@@ -109,10 +112,11 @@ impl Account {
         prctl::set_no_new_privs()?;
         for capability in 0..=LAST_CAPABILITY {
             // SAFETY: takes integers only.
-            match Errno::result(unsafe { libc::prctl(libc::PR_CAPBSET_DROP, capability, 0, 0, 0) }) {
+            match Errno::result(unsafe { libc::prctl(libc::PR_CAPBSET_DROP, capability, 0, 0, 0) })
+            {
                 Ok(_) => {}
-                // Beyond the last one that this kernel knows; or the agent lacks the power to give up powers, and then what
-                // is set above keeps any from being had again.
+                // Beyond the last one that this kernel knows; or the agent lacks the power to give
+                // up powers, and then what is set above keeps any from being had again.
                 Err(Errno::EINVAL | Errno::EPERM) => break,
                 Err(errno) => return Err(errno.into()),
             }
@@ -129,8 +133,8 @@ pub fn hide_this_process() {
     let _ = prctl::set_dumpable(false);
 }
 
-/// Keeps what an agent that is root knows to itself, and lets it be the last to go when memory runs out. The shims inherit
-/// the second and call this for the first.
+/// Keeps what an agent that is root knows to itself, and lets it be the last to go when memory runs
+/// out. The shims inherit the second and call this for the first.
 pub fn protect_this_process() {
     if !nix::unistd::geteuid().is_root() {
         // Tasks run as the same user: they could read the identity's file as well.
@@ -151,7 +155,8 @@ fn threads_of(uid: u32) -> io::Result<u64> {
     for process in fs::read_dir("/proc")?.flatten() {
         let owned = process.metadata().is_ok_and(|data| data.uid() == uid);
         if owned && process.file_name().as_encoded_bytes().iter().all(u8::is_ascii_digit) {
-            threads += fs::read_dir(process.path().join("task")).map_or(0, |tasks| tasks.count() as u64);
+            threads +=
+                fs::read_dir(process.path().join("task")).map_or(0, |tasks| tasks.count() as u64);
         }
     }
     Ok(threads)

@@ -1,8 +1,10 @@
-//! Everything a run has started, whatever it did to get away: all in its control group (which nothing leaves that is not
-//! root), all that carry the run directory in their environment (it survives `fork`, `setsid` and the shim's death) and
-//! all that descend from the shim, which is their subreaper (that survives a cleared environment). It signals them and
-//! proves that none is left; it never signals the shim. Out of reach, where there are no control groups, is only a process
-//! that clears its environment, locks it or makes it endless, leaves its parent and then sees its shim killed.
+//! Everything a run has started, whatever it did to get away: all in its control group (which
+//! nothing leaves that is not root), all that carry the run directory in their environment (it
+//! survives `fork`, `setsid` and the shim's death) and all that descend from the shim, which is
+//! their subreaper (that survives a cleared environment). It signals them and proves that none is
+//! left; it never signals the shim. Out of reach, where there are no control groups, is only a
+//! process that clears its environment, locks it or makes it endless, leaves its parent and then
+//! sees its shim killed.
 
 use std::collections::HashSet;
 use std::io;
@@ -16,8 +18,8 @@ use crate::process::cgroup::Cgroup;
 use crate::process::program::{ProcessEntry, ProcessIdentity, environments};
 use crate::system::clock::boot_id;
 
-/// The variable by which a run's processes are found: the path of its run directory, which no other run shares, not
-/// even one of the same deployment by a second agent on this machine.
+/// The variable by which a run's processes are found: the path of its run directory, which no other
+/// run shares, not even one of the same deployment by a second agent on this machine.
 pub const RUN_DIR_VARIABLE: &str = "TASKD_RUN_DIR";
 /// The variable that names the deployment in every process of a task.
 pub const ASSIGNMENT_VARIABLE: &str = "TASKD_ASSIGNMENT";
@@ -51,8 +53,8 @@ pub enum ContainmentError {
 pub struct KillOnDrop(Containment);
 
 impl Containment {
-    /// The processes that were started for the directory `dir`, those below `shim`, and those in the control group with
-    /// the directory `cgroup`.
+    /// The processes that were started for the directory `dir`, those below `shim`, and those in
+    /// the control group with the directory `cgroup`.
     pub fn new(dir: &Path, shim: Option<ProcessIdentity>, cgroup: Option<PathBuf>) -> Self {
         let marker = format!("{RUN_DIR_VARIABLE}={}", dir.display());
         Self { marker, shim, cgroup: cgroup.map(Cgroup::at) }
@@ -66,7 +68,8 @@ impl Containment {
     /// Sends `signal` to the members of process group `group`.
     pub fn signal_group(&self, group: u32, signal: Signal) -> io::Result<()> {
         let (table, members) = self.entries()?;
-        let in_group: HashSet<u32> = table.iter().filter(|e| e.group == group).map(|e| e.pid).collect();
+        let in_group: HashSet<u32> =
+            table.iter().filter(|e| e.group == group).map(|e| e.pid).collect();
         signal_each(members.iter().filter(|member| in_group.contains(&member.pid)), signal)
     }
 
@@ -85,16 +88,17 @@ impl Containment {
         self.cgroup.as_ref().map_or(Ok(()), Cgroup::remove)
     }
 
-    /// Kills all members: at one stroke those in the control group, then those found otherwise. They are stopped first,
-    /// until a look finds no new one, so that none forks away between the look and the kill. Returns those that were killed;
-    /// they may take a moment to be gone.
+    /// Kills all members: at one stroke those in the control group, then those found otherwise.
+    /// They are stopped first, until a look finds no new one, so that none forks away between the
+    /// look and the kill. Returns those that were killed; they may take a moment to be gone.
     pub fn kill(&self) -> io::Result<Vec<ProcessIdentity>> {
         if let Some(cgroup) = &self.cgroup {
             cgroup.kill()?;
         }
         let mut stopped = HashSet::new();
         for _ in 0..MAX_ROUNDS {
-            let new: Vec<_> = self.members()?.into_iter().filter(|member| !stopped.contains(member)).collect();
+            let new: Vec<_> =
+                self.members()?.into_iter().filter(|member| !stopped.contains(member)).collect();
             if new.is_empty() {
                 break;
             }
@@ -107,7 +111,8 @@ impl Containment {
         Ok(killed)
     }
 
-    /// Kills all members and waits until they are gone. Afterwards none is left, nor is the control group.
+    /// Kills all members and waits until they are gone. Afterwards none is left, nor is the control
+    /// group.
     pub async fn end(&self, timeout: Duration) -> Result<(), ContainmentError> {
         let ended = tokio::time::timeout(timeout, async {
             loop {
@@ -126,7 +131,12 @@ impl Containment {
             Ok(Ok(())) => Ok(self.in_background(Self::remove).await?),
             Ok(failed) => failed,
             Err(_) => {
-                let pids = self.in_background(Self::members).await?.into_iter().map(|member| member.pid).collect();
+                let pids = self
+                    .in_background(Self::members)
+                    .await?
+                    .into_iter()
+                    .map(|member| member.pid)
+                    .collect();
                 Err(ContainmentError::Survivors { pids })
             }
         }
@@ -151,15 +161,21 @@ impl Containment {
         let grouped = self.cgroup.as_ref().map_or(Ok(Vec::new()), grouped)?;
         let mut known: HashSet<u32> = grouped.iter().map(|entry| entry.pid).chain(below).collect();
         // Only of the others it takes a look into their environment to tell.
-        let others = table.iter().filter(|entry| !known.contains(&entry.pid) && !entry.is_zombie).copied().collect();
+        let others = table
+            .iter()
+            .filter(|entry| !known.contains(&entry.pid) && !entry.is_zombie)
+            .copied()
+            .collect();
         let marker = self.marker.clone();
         let marked = environments::look(others, move |entry| entry.was_started_with(&marker));
-        known.extend(marked.into_iter().filter(|(_, is_ours)| *is_ours).map(|(entry, _)| entry.pid));
+        known
+            .extend(marked.into_iter().filter(|(_, is_ours)| *is_ours).map(|(entry, _)| entry.pid));
         // Later than the table, they know better who has a pid.
         table.retain(|entry| grouped.iter().all(|later| later.pid != entry.pid));
         table.extend(grouped);
         let is_member = |entry: &&ProcessEntry| !entry.is_zombie && known.contains(&entry.pid);
-        let members = table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
+        let members =
+            table.iter().filter(is_member).map(|entry| entry.identity(&boot_id)).collect();
         Ok((table, members))
     }
 }
@@ -188,12 +204,13 @@ impl Drop for KillOnDrop {
     }
 }
 
-/// The processes in a control group, none of them mistaken for a later one with its pid: a pid counts that is in the group
-/// before and after its entry is read.
+/// The processes in a control group, none of them mistaken for a later one with its pid: a pid
+/// counts that is in the group before and after its entry is read.
 fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
     for _ in 0..MAX_ROUNDS {
         let before = cgroup.pids()?;
-        let read: Vec<_> = before.iter().filter_map(|pid| ProcessEntry::of(*pid).ok().flatten()).collect();
+        let read: Vec<_> =
+            before.iter().filter_map(|pid| ProcessEntry::of(*pid).ok().flatten()).collect();
         let after: HashSet<u32> = cgroup.pids()?.into_iter().collect();
         let sure: Vec<_> = read.into_iter().filter(|entry| after.contains(&entry.pid)).collect();
         if !sure.is_empty() || after.is_empty() {
@@ -203,13 +220,20 @@ fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
     Err(io::Error::other(format!("the processes in {} change too fast", cgroup.path().display())))
 }
 
-/// Signals all of them, also when one can't be, and then gives the last error. What this process may not signal, such as what
-/// a task runs by sudo, is no error: the others get theirs, a control group ends it all the same, and [`Containment::end`]
-/// names it where it lives on.
-pub fn signal_each<'a>(members: impl IntoIterator<Item = &'a ProcessIdentity>, signal: Signal) -> io::Result<()> {
+/// Signals all of them, also when one can't be, and then gives the last error. What this process
+/// may not signal, such as what a task runs by sudo, is no error: the others get theirs, a control
+/// group ends it all the same, and [`Containment::end`] names it where it lives on.
+pub fn signal_each<'a>(
+    members: impl IntoIterator<Item = &'a ProcessIdentity>,
+    signal: Signal,
+) -> io::Result<()> {
     let failed = members.into_iter().filter_map(|member| match member.signal(signal) {
         Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
-            tracing::warn!(pid = member.pid, signal = signal.as_str(), "a process of a task may not be signalled");
+            tracing::warn!(
+                pid = member.pid,
+                signal = signal.as_str(),
+                "a process of a task may not be signalled"
+            );
             None
         }
         signalled => signalled.err(),
@@ -245,7 +269,11 @@ mod tests {
 
     #[test]
     fn nothing_belongs_to_a_directory_nobody_was_started_for() {
-        let containment = Containment::new(Path::new("/nonexistent/run"), None, Some("/nonexistent/cgroup".into()));
+        let containment = Containment::new(
+            Path::new("/nonexistent/run"),
+            None,
+            Some("/nonexistent/cgroup".into()),
+        );
         assert_eq!(containment.members().expect("table"), []);
     }
 }

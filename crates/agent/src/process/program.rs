@@ -1,8 +1,9 @@
-//! Starts processes, signals them and knows them again. The only module that calls `fork`, `exec`, `kill` or `waitpid`
-//! and the only one that reads `/proc/<pid>`. It never decides which process should live.
+//! Starts processes, signals them and knows them again. The only module that calls `fork`, `exec`,
+//! `kill` or `waitpid` and the only one that reads `/proc/<pid>`. It never decides which process
+//! should live.
 //!
-//! A pid alone names nothing: the kernel uses it again. A [`ProcessIdentity`] is the pid with the process's start time
-//! and the boot, and signals go through a pidfd that was checked against it.
+//! A pid alone names nothing: the kernel uses it again. A [`ProcessIdentity`] is the pid with the
+//! process's start time and the boot, and signals go through a pidfd that was checked against it.
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -31,14 +32,22 @@ use crate::system::untrusted_file;
 
 pub mod environments;
 
-/// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux runs ROS on.
+/// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux
+/// runs ROS on.
 const TICKS_PER_SECOND: u64 = 100;
-/// The most that is read of an environment. Linux starts nothing with more than 6 MiB of it: a larger one was made up later.
+/// The most that is read of an environment. Linux starts nothing with more than 6 MiB of it: a
+/// larger one was made up later.
 const MAX_ENVIRONMENT_BYTES: u64 = 6 << 20;
 
 /// What process 1 passes on to the agent.
-const PASSED_ON: [Signal; 6] =
-    [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT, Signal::SIGUSR1, Signal::SIGUSR2];
+const PASSED_ON: [Signal; 6] = [
+    Signal::SIGTERM,
+    Signal::SIGINT,
+    Signal::SIGHUP,
+    Signal::SIGQUIT,
+    Signal::SIGUSR1,
+    Signal::SIGUSR2,
+];
 
 /// A process that can be told from every other, also from a later one with the same pid.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -111,12 +120,13 @@ impl ProcessIdentity {
 
     /// How long ago it was started.
     pub fn age(&self) -> io::Result<Duration> {
-        let started = Duration::from_millis(self.start_ticks.saturating_mul(1000 / TICKS_PER_SECOND));
+        let started =
+            Duration::from_millis(self.start_ticks.saturating_mul(1000 / TICKS_PER_SECOND));
         Ok(clock::uptime()?.saturating_sub(started))
     }
 
-    /// A handle on it; `None` when it is gone. The identity is checked after the handle is taken, so the handle cannot
-    /// belong to a later process.
+    /// A handle on it; `None` when it is gone. The identity is checked after the handle is taken,
+    /// so the handle cannot belong to a later process.
     pub fn open(&self) -> io::Result<Option<PidFd>> {
         let Some(handle) = PidFd::open(self.pid)? else { return Ok(None) };
         Ok(self.is_alive().then_some(handle))
@@ -151,10 +161,12 @@ impl ProcessEntry {
         Ok(entries)
     }
 
-    /// Its command name may hold spaces and parentheses, so the fields are counted from the last `)`.
+    /// Its command name may hold spaces and parentheses, so the fields are counted from the last
+    /// `)`.
     fn parse(pid: u32, line: &[u8]) -> Option<Self> {
         let end = line.iter().rposition(|byte| *byte == b')')?;
-        let fields: Vec<&str> = std::str::from_utf8(line.get(end + 1..)?).ok()?.split_ascii_whitespace().collect();
+        let fields: Vec<&str> =
+            std::str::from_utf8(line.get(end + 1..)?).ok()?.split_ascii_whitespace().collect();
         Some(Self {
             pid,
             is_zombie: matches!(*fields.first()?, "Z" | "X"),
@@ -166,28 +178,37 @@ impl ProcessEntry {
 
     /// Its identity in the boot `boot_id`.
     pub fn identity(&self, boot_id: &str) -> ProcessIdentity {
-        ProcessIdentity { pid: self.pid, start_ticks: self.start_ticks, boot_id: boot_id.to_owned() }
+        ProcessIdentity {
+            pid: self.pid,
+            start_ticks: self.start_ticks,
+            boot_id: boot_id.to_owned(),
+        }
     }
 
-    /// What it was started with as the variable `name`. `None` also where that can't be read. May take for ever, as
-    /// [`environments`] says.
+    /// What it was started with as the variable `name`. `None` also where that can't be read. May
+    /// take for ever, as [`environments`] says.
     pub fn variable(&self, name: &str) -> Option<String> {
         let environment = self.environment().ok()?;
         let mut entries = environment.split(|byte| *byte == 0);
-        let value = entries.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
+        let value =
+            entries.find_map(|entry| entry.strip_prefix(name.as_bytes())?.strip_prefix(b"="))?;
         String::from_utf8(value.to_vec()).ok()
     }
 
-    /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that can't be read. May take
-    /// for ever likewise.
+    /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that
+    /// can't be read. May take for ever likewise.
     pub fn was_started_with(&self, variable: &str) -> bool {
         let environment = self.environment().unwrap_or_default();
         environment.split(|byte| *byte == 0).any(|entry| entry == variable.as_bytes())
     }
 
-    /// Where its environment lies in its memory, and how much of that it is, is what the process itself says last.
+    /// Where its environment lies in its memory, and how much of that it is, is what the process
+    /// itself says last.
     fn environment(&self) -> io::Result<Vec<u8>> {
-        untrusted_file::read(Path::new(&format!("/proc/{}/environ", self.pid)), MAX_ENVIRONMENT_BYTES)
+        untrusted_file::read(
+            Path::new(&format!("/proc/{}/environ", self.pid)),
+            MAX_ENVIRONMENT_BYTES,
+        )
     }
 }
 
@@ -196,7 +217,8 @@ impl PidFd {
         // SAFETY: pidfd_open takes two integers and touches no memory of ours.
         let fd = unsafe { libc::syscall(libc::SYS_pidfd_open, pid as libc::pid_t, 0) };
         match Errno::result(fd) {
-            // SAFETY: the kernel just returned this descriptor to us, nobody else owns it. Descriptors fit an int.
+            // SAFETY: the kernel just returned this descriptor to us, nobody else owns it.
+            // Descriptors fit an int.
             Ok(fd) => Ok(Some(Self(unsafe { OwnedFd::from_raw_fd(fd as RawFd) }))),
             // EINVAL is what kernels say for a pid that is a thread and leads no process.
             Err(Errno::ESRCH | Errno::EINVAL) => Ok(None),
@@ -207,8 +229,11 @@ impl PidFd {
     /// Sends `signal`; a process that has ended meanwhile is no error.
     pub fn signal(&self, signal: Signal) -> io::Result<()> {
         let (fd, no_info) = (self.0.as_raw_fd(), std::ptr::null::<libc::siginfo_t>());
-        // SAFETY: a null siginfo is allowed and means the same as kill(2); the descriptor is open while `self` lives.
-        let result = unsafe { libc::syscall(libc::SYS_pidfd_send_signal, fd, signal as libc::c_int, no_info, 0) };
+        // SAFETY: a null siginfo is allowed and means the same as kill(2); the descriptor is open
+        // while `self` lives.
+        let result = unsafe {
+            libc::syscall(libc::SYS_pidfd_send_signal, fd, signal as libc::c_int, no_info, 0)
+        };
         match Errno::result(result) {
             Ok(_) | Err(Errno::ESRCH) => Ok(()),
             Err(errno) => Err(errno.into()),
@@ -217,7 +242,8 @@ impl PidFd {
 
     /// Resolves when the process has ended. Cancel-safe.
     pub async fn ended(self) -> io::Result<()> {
-        // SAFETY: the owned descriptor stays open, and is the same one, until the registration is dropped with it.
+        // SAFETY: the owned descriptor stays open, and is the same one, until the registration is
+        // dropped with it.
         let registered = unsafe { AsyncFd::register_with_interest(self.0, Interest::READABLE)? };
         registered.readable().await.map(|_| ())
     }
@@ -226,15 +252,18 @@ impl PidFd {
 /// The memory this machine has.
 pub fn total_memory_bytes() -> io::Result<u64> {
     let text = std::fs::read_to_string("/proc/meminfo")?;
-    let kibibytes = text.strip_prefix("MemTotal:").and_then(|rest| rest.split_ascii_whitespace().next()?.parse().ok());
+    let kibibytes = text
+        .strip_prefix("MemTotal:")
+        .and_then(|rest| rest.split_ascii_whitespace().next()?.parse().ok());
     kibibytes
         .map(|count: u64| count * 1024)
         .ok_or_else(|| io::Error::other("/proc/meminfo does not begin with a total"))
 }
 
-/// Starts `program shim --dir DIR` detached: in its own session and not as a child of the caller, so that neither the
-/// caller's death nor a signal to its process group reaches it. `lock` becomes its standard input and so stays locked
-/// until the shim lets go of it. What it answers can be read from the returned pipe.
+/// Starts `program shim --dir DIR` detached: in its own session and not as a child of the caller,
+/// so that neither the caller's death nor a signal to its process group reaches it. `lock` becomes
+/// its standard input and so stays locked until the shim lets go of it. What it answers can be read
+/// from the returned pipe.
 pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeReader> {
     let (reader, writer) = io::pipe()?;
     let mut command = command(program, &BTreeMap::new());
@@ -242,7 +271,8 @@ pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeRead
     command.stdin(lock).stdout(writer).stderr(Stdio::null());
     let detach = || {
         nix::unistd::setsid()?;
-        // SAFETY: between fork and exec there is one thread; the parent's branch does nothing but end.
+        // SAFETY: between fork and exec there is one thread; the parent's branch does nothing but
+        // end.
         match unsafe { nix::unistd::fork()? } {
             nix::unistd::ForkResult::Child => reset_for_exec(),
             // SAFETY: _exit is async-signal-safe and runs nothing of this process's clean-up.
@@ -256,8 +286,9 @@ pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeRead
     Ok(reader)
 }
 
-/// Starts a task's script under bash, confined, in its own process group, with exactly `environment`. When the calling thread
-/// dies, and with it the reader of the task's output, the task gets the signal that stops a ROS node in good order.
+/// Starts a task's script under bash, confined, in its own process group, with exactly
+/// `environment`. When the calling thread dies, and with it the reader of the task's output, the
+/// task gets the signal that stops a ROS node in good order.
 pub fn spawn_task(
     script: &Path,
     directory: &Path,
@@ -274,7 +305,8 @@ pub fn spawn_task(
     let prepare = move || {
         reset_for_exec()?;
         confinement.enter()?;
-        // Entered with the task's rights: it may have put a link to what only root may enter in its place.
+        // Entered with the task's rights: it may have put a link to what only root may enter in its
+        // place.
         nix::unistd::chdir(directory.as_c_str())?;
         // A change of user takes the wish back, so it comes after.
         prctl::set_pdeathsig(Signal::SIGINT)?;
@@ -286,7 +318,8 @@ pub fn spawn_task(
     Ok(command.spawn()?.id())
 }
 
-/// Starts a build script under bash, confined, in its own session, `nice`, out of the way of everything that matters more.
+/// Starts a build script under bash, confined, in its own session, `nice`, out of the way of
+/// everything that matters more.
 pub fn spawn_build(
     script: &Path,
     directory: &Path,
@@ -300,8 +333,8 @@ pub fn spawn_build(
     command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
     let prepare = move || {
         enter_session()?;
-        // Being nice is a courtesy: where it is refused the build still runs.
-        // SAFETY: both calls take integers only. The second is ioprio_set(this process, best effort, last).
+        // Being nice is a courtesy: where it is refused the build still runs. SAFETY: both calls
+        // take integers only. The second is ioprio_set(this process, best effort, last).
         let _ = unsafe {
             libc::setpriority(libc::PRIO_PROCESS, 0, nice)
                 | libc::syscall(libc::SYS_ioprio_set, 1, 0, (2 << 13) | 7) as libc::c_int
@@ -329,8 +362,9 @@ pub fn spawn_gate(
     tokio::process::Command::from(command).spawn()
 }
 
-/// Starts `program graph`, confined, in its own session, `nice`, with at most `data_bytes` of memory whatever control group
-/// it is in. It is spoken with over its standard input and output, and ends with the former.
+/// Starts `program graph`, confined, in its own session, `nice`, with at most `data_bytes` of
+/// memory whatever control group it is in. It is spoken with over its standard input and output,
+/// and ends with the former.
 pub fn spawn_graph(
     program: &Path,
     environment: &BTreeMap<String, String>,
@@ -357,8 +391,8 @@ pub fn spawn_graph(
     command.kill_on_drop(true).spawn()
 }
 
-/// Makes the caller the shim of what it starts: orphans below it become its children, signals meant for others do not
-/// end it, and the end of a child can be waited for with [`next_child`].
+/// Makes the caller the shim of what it starts: orphans below it become its children, signals meant
+/// for others do not end it, and the end of a child can be waited for with [`next_child`].
 pub fn become_shim() -> io::Result<()> {
     // Already a session leader when it was started by `spawn_shim`.
     let _ = nix::unistd::setsid();
@@ -373,10 +407,11 @@ pub fn become_shim() -> io::Result<()> {
     Ok(nix::sys::signal::sigprocmask(SigmaskHow::SIG_BLOCK, Some(&blocked), None)?)
 }
 
-/// Where the calling process is process 1, as in a container, orphans of its namespace become its children, and nobody else
-/// collects them. It then goes on as a child of its own (`None`), and what was called is left with that: it collects
-/// whatever ends, passes signals on to the child, and returns with it how that ended. So no wait of the agent's for what it
-/// has started can be taken from it. Call it before any other thread exists.
+/// Where the calling process is process 1, as in a container, orphans of its namespace become its
+/// children, and nobody else collects them. It then goes on as a child of its own (`None`), and
+/// what was called is left with that: it collects whatever ends, passes signals on to the child,
+/// and returns with it how that ended. So no wait of the agent's for what it has started can be
+/// taken from it. Call it before any other thread exists.
 pub fn collect_orphans_as_init() -> io::Result<Option<ExitStatus>> {
     if std::process::id() != 1 {
         return Ok(None);
@@ -393,7 +428,9 @@ pub fn collect_orphans_as_init() -> io::Result<Option<ExitStatus>> {
             before.thread_set_mask()?;
             Ok(None)
         }
-        nix::unistd::ForkResult::Parent { child } => collect_until_end_of(child, &signals).map(Some),
+        nix::unistd::ForkResult::Parent { child } => {
+            collect_until_end_of(child, &signals).map(Some)
+        }
     }
 }
 
@@ -401,7 +438,9 @@ fn collect_until_end_of(child: Pid, signals: &SigSet) -> io::Result<ExitStatus> 
     loop {
         match waitpid(Pid::from_raw(-1), Some(WaitPidFlag::WNOHANG)) {
             Ok(WaitStatus::Exited(pid, code)) if pid == child => return Ok(ExitStatus::Code(code)),
-            Ok(WaitStatus::Signaled(pid, signal, _)) if pid == child => return Ok(ExitStatus::Signal(signal as i32)),
+            Ok(WaitStatus::Signaled(pid, signal, _)) if pid == child => {
+                return Ok(ExitStatus::Signal(signal as i32));
+            }
             Ok(WaitStatus::StillAlive) => {
                 // SAFETY: all zeros is a siginfo.
                 let mut told: libc::siginfo_t = unsafe { std::mem::zeroed() };
@@ -433,11 +472,15 @@ pub fn close_standard_streams() -> io::Result<()> {
 pub fn next_child(timeout: Option<Duration>) -> io::Result<ChildEvent> {
     loop {
         match waitpid(Pid::from_raw(-1), Some(WaitPidFlag::WNOHANG)) {
-            Ok(WaitStatus::Exited(pid, code)) => return Ok(ChildEvent::Ended(number(pid), ExitStatus::Code(code))),
+            Ok(WaitStatus::Exited(pid, code)) => {
+                return Ok(ChildEvent::Ended(number(pid), ExitStatus::Code(code)));
+            }
             Ok(WaitStatus::Signaled(pid, signal, _)) => {
                 return Ok(ChildEvent::Ended(number(pid), ExitStatus::Signal(signal as i32)));
             }
-            Ok(WaitStatus::StillAlive) if !wait_for_sigchld(timeout)? => return Ok(ChildEvent::TimedOut),
+            Ok(WaitStatus::StillAlive) if !wait_for_sigchld(timeout)? => {
+                return Ok(ChildEvent::TimedOut);
+            }
             Ok(_) | Err(Errno::EINTR) => {}
             Err(Errno::ECHILD) => return Ok(ChildEvent::NoChildren),
             Err(errno) => return Err(errno.into()),
@@ -470,15 +513,16 @@ fn command(program: &Path, environment: &BTreeMap<String, String>) -> std::proce
     command
 }
 
-/// Makes a child the leader of a session and process group of its own. An agent that was started by hand has a terminal,
-/// and whoever shares it could type there in the name of root.
+/// Makes a child the leader of a session and process group of its own. An agent that was started by
+/// hand has a terminal, and whoever shares it could type there in the name of root.
 fn enter_session() -> io::Result<()> {
     nix::unistd::setsid()?;
     reset_for_exec()
 }
 
-/// Gives a child what a login shell would give it: default signal dispositions, nothing blocked, no stray descriptors.
-/// SIGINT in particular is inherited as ignored from a shell's `&`, and then a ROS node could not be stopped with it.
+/// Gives a child what a login shell would give it: default signal dispositions, nothing blocked, no
+/// stray descriptors. SIGINT in particular is inherited as ignored from a shell's `&`, and then a
+/// ROS node could not be stopped with it.
 fn reset_for_exec() -> io::Result<()> {
     for signal in Signal::iterator() {
         if !matches!(signal, Signal::SIGKILL | Signal::SIGSTOP) {
@@ -487,8 +531,11 @@ fn reset_for_exec() -> io::Result<()> {
         }
     }
     nix::sys::signal::sigprocmask(SigmaskHow::SIG_SETMASK, Some(&SigSet::empty()), None)?;
-    // SAFETY: takes integers only. The descriptors stay open for `Command`'s own error pipe and close at exec.
-    let _ = unsafe { libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC) };
+    // SAFETY: takes integers only. The descriptors stay open for `Command`'s own error pipe and
+    // close at exec.
+    let _ = unsafe {
+        libc::syscall(libc::SYS_close_range, 3, libc::c_uint::MAX, libc::CLOSE_RANGE_CLOEXEC)
+    };
     Ok(())
 }
 
@@ -562,7 +609,11 @@ mod tests {
     #[test]
     fn the_process_table_holds_this_process_with_its_environment() {
         let own = std::process::id();
-        let entry = ProcessEntry::all().expect("table").into_iter().find(|entry| entry.pid == own).expect("listed");
+        let entry = ProcessEntry::all()
+            .expect("table")
+            .into_iter()
+            .find(|entry| entry.pid == own)
+            .expect("listed");
         let path = std::env::var("PATH").expect("set");
         assert!(entry.was_started_with(&format!("PATH={path}")));
         assert!(!entry.was_started_with("PATH="));
@@ -574,10 +625,12 @@ mod tests {
         let temp = tempfile::tempdir().expect("a directory");
         let script = temp.path().join("script");
         // Process group and session.
-        std::fs::write(&script, "read -r line < /proc/$$/stat; set -- $line; echo $$ $5 $6").expect("written");
+        std::fs::write(&script, "read -r line < /proc/$$/stat; set -- $line; echo $$ $5 $6")
+            .expect("written");
         let environment = BTreeMap::new();
         let (mut built, output) = io::pipe().expect("a pipe");
-        let confinement = Confinement::new(&script, None, &Default::default(), None).expect("confined");
+        let confinement =
+            Confinement::new(&script, None, &Default::default(), None).expect("confined");
         let build = spawn_build(&script, temp.path(), &environment, 0, confinement, output);
         let (mut said, output) = io::pipe().expect("a pipe");
         let words = ["/bin/bash".to_owned(), script.display().to_string()];
@@ -625,7 +678,13 @@ mod tests {
                 // SAFETY: the claim and the answer are copies that outlive the calls.
                 nix::unistd::ForkResult::Child => unsafe {
                     let size = size_of::<Claim>();
-                    let refused = libc::prctl(libc::PR_SET_MM, libc::PR_SET_MM_MAP, &raw const claim, size, 0);
+                    let refused = libc::prctl(
+                        libc::PR_SET_MM,
+                        libc::PR_SET_MM_MAP,
+                        &raw const claim,
+                        size,
+                        0,
+                    );
                     let answer = [u8::from(refused == 0)];
                     libc::write(says.as_raw_fd(), answer.as_ptr().cast(), 1);
                     loop {
@@ -640,7 +699,9 @@ mod tests {
             nix::sys::signal::kill(child, Signal::SIGKILL).expect("killed");
             waitpid(child, None).expect("collected");
             if answer == [0] {
-                return eprintln!("unavailable: this kernel lets no process say where its environment lies");
+                return eprintln!(
+                    "unavailable: this kernel lets no process say where its environment lies"
+                );
             }
             assert_eq!(found, (is_read, is_read), "{bytes} bytes");
         }

@@ -1,7 +1,7 @@
-//! The run directory: where one start of a task is written down, by the supervisor before it and by the shim during it.
-//! One directory is one start; it is never used again. It holds `spec.json` (what to run), `begun` (it may run from now on),
-//! `pid.json` (who runs it), `exit.json` (how it ended) and `lock` (held while the start is in progress). It never starts or
-//! signals a process.
+//! The run directory: where one start of a task is written down, by the supervisor before it and by
+//! the shim during it. One directory is one start; it is never used again. It holds `spec.json`
+//! (what to run), `begun` (it may run from now on), `pid.json` (who runs it), `exit.json` (how it
+//! ended) and `lock` (held while the start is in progress). It never starts or signals a process.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -27,13 +27,15 @@ pub struct RunDir(PathBuf);
 /// What a shim runs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunSpec {
-    /// The deployment this run belongs to; every process of the task carries it as `TASKD_ASSIGNMENT`.
+    /// The deployment this run belongs to; every process of the task carries it as
+    /// `TASKD_ASSIGNMENT`.
     pub assignment: DeploymentId,
     /// The generated script, run by bash.
     pub script: PathBuf,
     /// The directory it runs in.
     pub directory: PathBuf,
-    /// The whole environment; nothing is inherited. The supervisor adds `TASKD_ASSIGNMENT` and `TASKD_RUN_DIR`.
+    /// The whole environment; nothing is inherited. The supervisor adds `TASKD_ASSIGNMENT` and
+    /// `TASKD_RUN_DIR`.
     pub environment: BTreeMap<String, String>,
     /// Who gets the SIGINT of a stop.
     #[serde(default)]
@@ -63,8 +65,8 @@ pub struct Started {
     pub task: ProcessIdentity,
 }
 
-/// The end of a run. When this is on disk, none of the run's processes is left that the shim could see and end, and what the run
-/// wrote for bringing back is on the disk as well.
+/// The end of a run. When this is on disk, none of the run's processes is left that the shim could
+/// see and end, and what the run wrote for bringing back is on the disk as well.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
     /// How the first process ended.
@@ -107,8 +109,8 @@ impl RunDirError {
 }
 
 impl RunDir {
-    /// The run directory at `path`, created if absent. The path becomes absolute and free of links, because it is also
-    /// the key by which the run's processes are found.
+    /// The run directory at `path`, created if absent. The path becomes absolute and free of links,
+    /// because it is also the key by which the run's processes are found.
     pub fn create(path: &Path) -> Result<Self, RunDirError> {
         let failed = |source| RunDirError::Io { path: path.to_owned(), source };
         durable::create_dir_all(path).map_err(failed)?;
@@ -145,7 +147,8 @@ impl RunDir {
         self.write("spec.json", spec)
     }
 
-    /// Writes down that it is about to be run: until it is known by whom, nobody can tell whether it was.
+    /// Writes down that it is about to be run: until it is known by whom, nobody can tell whether
+    /// it was.
     pub fn write_begun(&self) -> Result<(), RunDirError> {
         let path = self.0.join("begun");
         durable::write(&path, b"", 0o600).map_err(|source| RunDirError::Io { path, source })
@@ -172,10 +175,10 @@ impl RunDir {
         self.write("exit.json", ended)
     }
 
-    /// Takes the start lock; `None` while a start is in progress. Nobody waits for it in here: a start may hang, and takes
-    /// who waits with it. The lock goes with the file, also into a child that inherits it, so there is no moment at which a
-    /// start is under way and the lock is free. Where nothing can be written any more, what runs can still be looked at and
-    /// stopped.
+    /// Takes the start lock; `None` while a start is in progress. Nobody waits for it in here: a
+    /// start may hang, and takes who waits with it. The lock goes with the file, also into a child
+    /// that inherits it, so there is no moment at which a start is under way and the lock is free.
+    /// Where nothing can be written any more, what runs can still be looked at and stopped.
     pub fn try_lock(&self) -> Result<Option<File>, RunDirError> {
         self.locked(File::try_lock)
     }
@@ -185,7 +188,10 @@ impl RunDir {
         self.locked(File::try_lock_shared)
     }
 
-    fn locked(&self, lock: impl Fn(&File) -> Result<(), TryLockError>) -> Result<Option<File>, RunDirError> {
+    fn locked(
+        &self,
+        lock: impl Fn(&File) -> Result<(), TryLockError>,
+    ) -> Result<Option<File>, RunDirError> {
         let path = self.0.join("lock");
         let failed = |source| RunDirError::Io { path: path.clone(), source };
         let mut anew = OpenOptions::new();
@@ -205,9 +211,9 @@ impl RunDir {
     fn read<T: DeserializeOwned>(&self, name: &str) -> Result<Option<T>, RunDirError> {
         let path = self.0.join(name);
         match std::fs::read(&path) {
-            Ok(bytes) => {
-                serde_json::from_slice(&bytes).map(Some).map_err(|source| RunDirError::Malformed { path, source })
-            }
+            Ok(bytes) => serde_json::from_slice(&bytes)
+                .map(Some)
+                .map_err(|source| RunDirError::Malformed { path, source }),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(source) => Err(RunDirError::Io { path, source }),
         }
@@ -215,8 +221,8 @@ impl RunDir {
 
     fn write<T: Serialize>(&self, name: &str, value: &T) -> Result<(), RunDirError> {
         let path = self.0.join(name);
-        let bytes =
-            serde_json::to_vec(value).map_err(|source| RunDirError::Malformed { path: path.clone(), source })?;
+        let bytes = serde_json::to_vec(value)
+            .map_err(|source| RunDirError::Malformed { path: path.clone(), source })?;
         durable::write(&path, &bytes, 0o600).map_err(|source| RunDirError::Io { path, source })
     }
 }
@@ -232,14 +238,19 @@ mod tests {
     fn a_run_on_a_disk_that_became_read_only_can_be_locked() {
         let temp = tempfile::tempdir().expect("temp dir");
         with_own_mounts(|| {
-            let mounted = |flags| mount(Some("tmpfs"), temp.path(), Some("tmpfs"), flags, None::<&str>);
+            let mounted =
+                |flags| mount(Some("tmpfs"), temp.path(), Some("tmpfs"), flags, None::<&str>);
             mounted(MsFlags::empty()).expect("mounted");
             let dir = RunDir::create(&temp.path().join("run")).expect("create");
             drop(dir.try_lock().expect("locked").expect("nobody has it"));
             mounted(MsFlags::MS_REMOUNT | MsFlags::MS_RDONLY).expect("mounted anew");
-            let held = RunDir::create(dir.path()).expect("it is there").try_lock_shared().expect("locked");
+            let held =
+                RunDir::create(dir.path()).expect("it is there").try_lock_shared().expect("locked");
             assert!(dir.try_lock().expect("looked at").is_none());
-            assert!(dir.try_lock_shared().expect("locked").is_some(), "readers do not wait for each other");
+            assert!(
+                dir.try_lock_shared().expect("locked").is_some(),
+                "readers do not wait for each other"
+            );
             drop(held);
         });
     }
@@ -249,7 +260,8 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let dir = RunDir::create(&temp.path().join("run")).expect("create");
         assert_eq!(dir.ended().expect("read"), None);
-        let ended = Ended { status: ExitStatus::Signal(9), at_uptime_ms: 77, out_of_memory_bytes: None };
+        let ended =
+            Ended { status: ExitStatus::Signal(9), at_uptime_ms: 77, out_of_memory_bytes: None };
         dir.write_ended(&ended).expect("write");
         assert_eq!(dir.ended().expect("read"), Some(ended));
         let text = std::fs::read_to_string(dir.path().join("exit.json")).expect("read");

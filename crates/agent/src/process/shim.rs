@@ -1,6 +1,7 @@
-//! The process between agent and task: `task-agent shim --dir RUNDIR`. It starts the task, owns its output, collects
-//! every orphan below it and writes down how it all ended. It lives exactly as long as its task, needs nothing of the
-//! agent after the start and never decides anything: no restart, no stop.
+//! The process between agent and task: `task-agent shim --dir RUNDIR`. It starts the task, owns its
+//! output, collects every orphan below it and writes down how it all ended. It lives exactly as
+//! long as its task, needs nothing of the agent after the start and never decides anything: no
+//! restart, no stop.
 //!
 //! It has no async runtime: two threads copy the output, the main thread waits for children.
 
@@ -26,7 +27,8 @@ use crate::system::durable;
 const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
 /// How long it may take after SIGKILL; what is still there then hangs in the kernel.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
-/// How often the end is tried to be written to a full disk, and how long it rests in between: an hour in all.
+/// How often the end is tried to be written to a full disk, and how long it rests in between: an
+/// hour in all.
 const MAX_WRITES: u32 = 720;
 const ROOM_PAUSE: Duration = Duration::from_secs(5);
 /// How long the rest of the output may take once nobody is left to write any.
@@ -96,8 +98,9 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     let at_uptime_ms = u64::try_from(clock::uptime()?.as_millis()).unwrap_or(u64::MAX);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
     if task.has_outputs {
-        // The agent brings the files back once it reads that the run ended, also after a power cut. The run directory lies
-        // on the same file system, and no task can put anything else in its place.
+        // The agent brings the files back once it reads that the run ended, also after a power cut.
+        // The run directory lies on the same file system, and no task can put anything else in its
+        // place.
         let _ = durable::sync_file_system(dir.path());
     }
     let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
@@ -108,7 +111,10 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
 }
 
 /// The task may have filled the disk itself, and how it ended must not be lost for that.
-fn once_there_is_room(pause: Duration, mut write: impl FnMut() -> Result<(), RunDirError>) -> Result<(), RunDirError> {
+fn once_there_is_room(
+    pause: Duration,
+    mut write: impl FnMut() -> Result<(), RunDirError>,
+) -> Result<(), RunDirError> {
     for _ in 1..MAX_WRITES {
         match write() {
             Err(error) if error.is_full() => std::thread::park_timeout(pause),
@@ -131,7 +137,8 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
         Err(source) => {
             // Where it stays, the run counts as one that was lost: that of a job is not made again.
             let _ = dir.forget_begun();
-            let (script, directory) = (spec.script.display().to_string(), spec.directory.display().to_string());
+            let (script, directory) =
+                (spec.script.display().to_string(), spec.directory.display().to_string());
             return Err(ShimError::Start { script, directory, source });
         }
     };
@@ -161,16 +168,25 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
 fn start(spec: &RunSpec, output: PipeWriter, errors: PipeWriter) -> io::Result<u32> {
     let cgroup = spec.cgroup.clone().map(Cgroup::at);
     if let Some(cgroup) = &cgroup {
-        // Where it can't be, the shim stays with the agent and ends with all of its group, should that be ended.
+        // Where it can't be, the shim stays with the agent and ends with all of its group, should
+        // that be ended.
         let _ = cgroup.enter_shims();
     }
-    let confinement = Confinement::new(&spec.script, cgroup.as_ref(), &spec.limits, spec.user.as_ref())?;
+    let confinement =
+        Confinement::new(&spec.script, cgroup.as_ref(), &spec.limits, spec.user.as_ref())?;
     if let Some(user) = &spec.user {
         // A task may open its output by name, as `/dev/stdout`.
         user.own(&output)?;
         user.own(&errors)?;
     }
-    program::spawn_task(&spec.script, &spec.directory, &spec.environment, confinement, output, errors)
+    program::spawn_task(
+        &spec.script,
+        &spec.directory,
+        &spec.environment,
+        confinement,
+        output,
+        errors,
+    )
 }
 
 fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {
@@ -190,7 +206,9 @@ fn wait_for_task(task: u32) -> io::Result<ExitStatus> {
     loop {
         match program::next_child(None)? {
             ChildEvent::Ended(pid, status) if pid == task => return Ok(status),
-            ChildEvent::NoChildren => return Err(io::Error::other("the task was collected by someone else")),
+            ChildEvent::NoChildren => {
+                return Err(io::Error::other("the task was collected by someone else"));
+            }
             ChildEvent::Ended(..) | ChildEvent::TimedOut => {}
         }
     }
@@ -221,7 +239,9 @@ fn collect_until_empty(containment: &Containment, timeout: Duration) -> io::Resu
         let rest = deadline.saturating_duration_since(Instant::now());
         match program::next_child(Some(rest))? {
             ChildEvent::Ended(..) => {}
-            ChildEvent::NoChildren | ChildEvent::TimedOut => return Ok(containment.members()?.is_empty()),
+            ChildEvent::NoChildren | ChildEvent::TimedOut => {
+                return Ok(containment.members()?.is_empty());
+            }
         }
     }
 }
@@ -243,15 +263,24 @@ mod tests {
 
     #[test]
     fn how_a_task_ended_is_written_once_the_disk_has_room_again() {
-        let refused = |kind: io::ErrorKind| RunDirError::Io { path: "exit.json".into(), source: kind.into() };
-        let mut answers =
-            vec![Ok(()), Err(refused(io::ErrorKind::StorageFull)), Err(refused(io::ErrorKind::QuotaExceeded))];
-        once_there_is_room(Duration::ZERO, || answers.pop().expect("asked three times")).expect("written");
+        let refused =
+            |kind: io::ErrorKind| RunDirError::Io { path: "exit.json".into(), source: kind.into() };
+        let mut answers = vec![
+            Ok(()),
+            Err(refused(io::ErrorKind::StorageFull)),
+            Err(refused(io::ErrorKind::QuotaExceeded)),
+        ];
+        once_there_is_room(Duration::ZERO, || answers.pop().expect("asked three times"))
+            .expect("written");
         assert!(answers.is_empty());
         let mut count = 0;
         let never = once_there_is_room(Duration::ZERO, || {
             count += 1;
-            Err(refused(if count == 2 { io::ErrorKind::PermissionDenied } else { io::ErrorKind::StorageFull }))
+            Err(refused(if count == 2 {
+                io::ErrorKind::PermissionDenied
+            } else {
+                io::ErrorKind::StorageFull
+            }))
         });
         assert!(never.is_err() && count == 2, "what room does not mend is told at once");
     }

@@ -1,5 +1,5 @@
-//! Starts runs, finds them again and ends them. The run directory is all it knows: a new agent sees what the last one
-//! saw. It never restarts anything by itself and never decides what should run.
+//! Starts runs, finds them again and ends them. The run directory is all it knows: a new agent sees
+//! what the last one saw. It never restarts anything by itself and never decides what should run.
 //!
 //! ```text
 //!   NeverStarted ── start ──▶ Running ── task ends ──▶ Exited
@@ -18,7 +18,9 @@ use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
 use crate::process::cgroup::Cgroups;
-use crate::process::containment::{ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE, signal_each};
+use crate::process::containment::{
+    ASSIGNMENT_VARIABLE, Containment, ContainmentError, RUN_DIR_VARIABLE, signal_each,
+};
 use crate::process::program;
 use crate::process::program::{ExitStatus, ProcessIdentity};
 use crate::process::run_dir::{RunDir, RunDirError, RunSpec, Started};
@@ -60,8 +62,8 @@ pub enum Observed {
         /// The limit.
         limit_bytes: u64,
     },
-    /// It was started, but how it ended is not known: its shim was killed, or the machine went down. None of its
-    /// processes is left.
+    /// It was started, but how it ended is not known: its shim was killed, or the machine went
+    /// down. None of its processes is left.
     Gone,
 }
 
@@ -112,19 +114,22 @@ impl SupervisorError {
 }
 
 impl Supervisor {
-    /// A supervisor whose shims are `program shim`, and whose runs get their control groups from `cgroups`.
+    /// A supervisor whose shims are `program shim`, and whose runs get their control groups from
+    /// `cgroups`.
     pub fn new(program: impl Into<PathBuf>, cgroups: Option<Cgroups>) -> Self {
         Self { program: program.into(), cgroups }
     }
 
-    /// A supervisor whose shims are this very program, also after its file was replaced by a newer version.
+    /// A supervisor whose shims are this very program, also after its file was replaced by a newer
+    /// version.
     pub fn of_this_program(cgroups: Option<Cgroups>) -> Self {
         Self::new("/proc/self/exe", cgroups)
     }
 
-    /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it is. The run survives
-    /// the caller from the moment the shim exists: dropping this future takes it back only before that. After
-    /// [`SupervisorError::NoAnswer`] it may be one or the other, and [`Self::observe`] tells which.
+    /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it
+    /// is. The run survives the caller from the moment the shim exists: dropping this future takes
+    /// it back only before that. After [`SupervisorError::NoAnswer`] it may be one or the other,
+    /// and [`Self::observe`] tells which.
     pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
         let started = tokio::time::timeout(START_TIMEOUT, self.start_shim(path, spec));
         started.await.unwrap_or(Err(SupervisorError::NoAnswer))
@@ -145,16 +150,21 @@ impl Supervisor {
             }
             spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
             spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
-            spec.cgroup = cgroups.as_ref().map(|cgroups| cgroups.group(dir.path()).path().to_owned());
+            spec.cgroup =
+                cgroups.as_ref().map(|cgroups| cgroups.group(dir.path()).path().to_owned());
             dir.write_spec(&spec)?;
             if let Some(cgroups) = cgroups {
-                cgroups.create(dir.path(), &spec.limits).map_err(failed("make the task's control group"))?;
+                cgroups
+                    .create(dir.path(), &spec.limits)
+                    .map_err(failed("make the task's control group"))?;
             }
             // Whoever gave up and looks meanwhile finds the spec, and waits for the lock.
             if given_up.is_cancelled() {
                 return Err(SupervisorError::NoAnswer);
             }
-            program::spawn_shim(&program, dir.path(), lock).map(Begun::Asked).map_err(failed("start the shim"))
+            program::spawn_shim(&program, dir.path(), lock)
+                .map(Begun::Asked)
+                .map_err(failed("start the shim"))
         });
         let answer = match begun.await? {
             Begun::Runs(started) => return Ok(started),
@@ -171,14 +181,19 @@ impl Supervisor {
         }
     }
 
-    /// What has become of the run at `path`. Waits for a start in progress. When the shim was killed, what it left
-    /// behind is ended here: nobody reads its output any more or could tell how it ends.
+    /// What has become of the run at `path`. Waits for a start in progress. When the shim was
+    /// killed, what it left behind is ended here: nobody reads its output any more or could tell
+    /// how it ends.
     pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
         self.observe_within(path, START_TIMEOUT).await
     }
 
     /// The same, but waits for a start in progress no longer than that.
-    pub async fn observe_within(&self, path: &Path, patience: Duration) -> Result<Observed, SupervisorError> {
+    pub async fn observe_within(
+        &self,
+        path: &Path,
+        patience: Duration,
+    ) -> Result<Observed, SupervisorError> {
         if !path.join("spec.json").exists() {
             return Ok(Observed::NeverStarted);
         }
@@ -191,7 +206,8 @@ impl Supervisor {
         // The order matters: a shim that is gone has written `exit.json` before, if it could.
         let shim_lives = started.shim.is_alive();
         if let Some(ended) = dir.ended()? {
-            let killed = ended.out_of_memory_bytes.map(|limit_bytes| Observed::OutOfMemory { limit_bytes });
+            let killed =
+                ended.out_of_memory_bytes.map(|limit_bytes| Observed::OutOfMemory { limit_bytes });
             return Ok(killed.unwrap_or(Observed::Exited(ended.status)));
         }
         if shim_lives {
@@ -202,7 +218,8 @@ impl Supervisor {
         Ok(Observed::Gone)
     }
 
-    /// Resolves when the run at `path` does not run any more, at once if it doesn't now. Nothing is polled. Cancel-safe.
+    /// Resolves when the run at `path` does not run any more, at once if it doesn't now. Nothing is
+    /// polled. Cancel-safe.
     pub async fn wait(&self, path: &Path) -> Result<Observed, SupervisorError> {
         loop {
             let observed = self.observe(path).await?;
@@ -225,10 +242,11 @@ impl Supervisor {
         Ok(members.iter().map(|member| member.pid).collect())
     }
 
-    /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone where its launcher wants
-    /// that; `grace`; SIGTERM to all of it; `grace`; SIGKILL.
-    /// Afterwards none of its processes is left, wherever they had hidden. Dropping the future leaves a run that may
-    /// still be ending; calling again begins with SIGINT again, and on a run that has ended only makes sure.
+    /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone
+    /// where its launcher wants that; `grace`; SIGTERM to all of it; `grace`; SIGKILL. Afterwards
+    /// none of its processes is left, wherever they had hidden. Dropping the future leaves a run
+    /// that may still be ending; calling again begins with SIGINT again, and on a run that has
+    /// ended only makes sure.
     pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
         let mut observed = match self.observe(path).await {
             Err(SupervisorError::Starting) => {
@@ -241,7 +259,11 @@ impl Supervisor {
             return Ok(observed);
         }
         let (dir, started, cgroup) = read(path).await?;
-        let containment = Containment::new(dir.path(), started.as_ref().map(|started| started.shim.clone()), cgroup);
+        let containment = Containment::new(
+            dir.path(),
+            started.as_ref().map(|started| started.shim.clone()),
+            cgroup,
+        );
         if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
             observed = self.end_run(&dir, &containment, &started.task, grace).await?;
         }
@@ -249,8 +271,9 @@ impl Supervisor {
         Ok(observed)
     }
 
-    /// Kills what is in the control group of a run whose start does not end: it hangs before the task's own program, as on
-    /// a file system that does not answer. Its shim then takes it for a task that has ended, and lets go of the lock.
+    /// Kills what is in the control group of a run whose start does not end: it hangs before the
+    /// task's own program, as on a file system that does not answer. Its shim then takes it for a
+    /// task that has ended, and lets go of the lock.
     async fn end_start(&self, path: &Path) -> Result<(), SupervisorError> {
         let Some(cgroups) = self.cgroups.clone() else { return Err(SupervisorError::Starting) };
         let path = path.to_owned();
@@ -281,17 +304,22 @@ impl Supervisor {
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
             return ended;
         }
-        containment.in_background(|all| all.signal_all(Signal::SIGTERM)).await.map_err(&signalled)?;
+        containment
+            .in_background(|all| all.signal_all(Signal::SIGTERM))
+            .await
+            .map_err(&signalled)?;
         if let Ok(ended) = tokio::time::timeout(grace, self.wait(path)).await {
             return ended;
         }
         containment.end(KILL_TIMEOUT).await?;
-        // The shim needs a moment to write the end down; should it hang, the run is over all the same.
+        // The shim needs a moment to write the end down; should it hang, the run is over all the
+        // same.
         tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(Observed::Gone))
     }
 }
 
-/// The run directory, who runs it and in which control group, once no start is in progress; an error where one never ends.
+/// The run directory, who runs it and in which control group, once no start is in progress; an
+/// error where one never ends.
 async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
     read_within(path, START_TIMEOUT).await
 }
@@ -308,8 +336,8 @@ async fn read_within(
     Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
 }
 
-/// What `attempt` gives for the run directory once it has its lock. It is made again and again, since a thread that waited
-/// for the lock of a start that hangs would be gone for good.
+/// What `attempt` gives for the run directory once it has its lock. It is made again and again,
+/// since a thread that waited for the lock of a start that hangs would be gone for good.
 async fn once_locked<T: Send + 'static>(
     path: &Path,
     patience: Duration,

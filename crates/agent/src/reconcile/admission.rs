@@ -1,5 +1,5 @@
-//! Which desired states this robot obeys: signed by the pinned key, for this robot, not older than what it has, still in
-//! force. Pure; a refusal says why, and the state before it stays.
+//! Which desired states this robot obeys: signed by the pinned key, for this robot, not older than
+//! what it has, still in force. Pure; a refusal says why, and the state before it stays.
 
 use std::collections::BTreeSet;
 
@@ -40,11 +40,14 @@ pub enum Refused {
     #[error("it expired at {0} ms since 1970")]
     Expired(u64),
     /// It names a task twice, or too many.
-    #[error("it names task {0} twice, or a package of another name for it, or more than {MAX_TASKS} tasks")]
+    #[error(
+        "it names task {0} twice, or a package of another name for it, or more than {MAX_TASKS} tasks"
+    )]
     Tasks(TaskName),
 }
 
-/// The desired state in `envelope`, if this robot may obey it. `accepted` is the state it obeys now.
+/// The desired state in `envelope`, if this robot may obey it. `accepted` is the state it obeys
+/// now.
 pub fn admit(
     envelope: &Envelope,
     key: &PublicKey,
@@ -73,7 +76,11 @@ pub fn admit(
 }
 
 /// The desired state in `envelope`, signature, robot and shape verified, its age not.
-pub fn open(envelope: &Envelope, key: &PublicKey, robot: &RobotId) -> Result<DesiredState, Refused> {
+pub fn open(
+    envelope: &Envelope,
+    key: &PublicKey,
+    robot: &RobotId,
+) -> Result<DesiredState, Refused> {
     let payload = envelope.open(DESIRED_STATE_TYPE, key).map_err(Refused::Signature)?;
     let state: DesiredState = serde_json::from_slice(&payload).map_err(Refused::Malformed)?;
     if state.robot_id != *robot {
@@ -88,8 +95,8 @@ pub fn open(envelope: &Envelope, key: &PublicKey, robot: &RobotId) -> Result<Des
     Ok(state)
 }
 
-/// Whether the state's time is over. A clock that shows a time before this program existed is wrong, as on a robot
-/// without a battery clock, and must not lock it out.
+/// Whether the state's time is over. A clock that shows a time before this program existed is
+/// wrong, as on a robot without a battery clock, and must not lock it out.
 pub fn is_expired(state: &DesiredState, wall_ms: u64) -> bool {
     wall_ms >= PROGRAM_EXISTS_SINCE_MS && wall_ms >= state.expires_at_ms
 }
@@ -143,11 +150,18 @@ mod tests {
             admit(&seal(state, key_used), &key.public_key(), &robot, Some(&accepted), NOW_MS)
         };
         assert_eq!(ask(&state(&robot, 6), &key).expect("newer").generation, Generation(6));
-        assert!(matches!(ask(&state(&robot, 6), &SigningKey::random()), Err(Refused::Signature(_))));
+        assert!(matches!(
+            ask(&state(&robot, 6), &SigningKey::random()),
+            Err(Refused::Signature(_))
+        ));
         assert!(matches!(ask(&state(&RobotId::random(), 6), &key), Err(Refused::OtherRobot(_))));
         assert!(matches!(ask(&state(&robot, 4), &key), Err(Refused::Stale { .. })));
         assert!(matches!(ask(&state(&robot, 5), &key), Err(Refused::Contradicts(_))));
-        let resigned = DesiredState { issued_at_ms: NOW_MS + 9, expires_at_ms: NOW_MS + 99, ..accepted.clone() };
+        let resigned = DesiredState {
+            issued_at_ms: NOW_MS + 9,
+            expires_at_ms: NOW_MS + 99,
+            ..accepted.clone()
+        };
         assert_eq!(ask(&resigned, &key).expect("signed anew"), resigned);
         let expired = DesiredState { expires_at_ms: NOW_MS, ..state(&robot, 6) };
         assert!(matches!(ask(&expired, &key), Err(Refused::Expired(_))));

@@ -1,12 +1,15 @@
-//! Answers to the server's questions: each is answered by itself, within the time it has, and a few at a time. It looks and
-//! passes on; what lasts comes with the desired state and goes through the driver.
+//! Answers to the server's questions: each is answered by itself, within the time it has, and a few
+//! at a time. It looks and passes on; what lasts comes with the desired state and goes through the
+//! driver.
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::RobotId;
 use task_proto::log::LogBatch;
-use task_proto::request::{Answer, Ask, MAX_REPLY_BYTES, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
+use task_proto::request::{
+    Answer, Ask, MAX_REPLY_BYTES, MAX_TTL_MS, Outcome, Refusal, Reply, Request,
+};
 use task_proto::topic::RobotTopic;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -20,7 +23,8 @@ use crate::reconcile::orders::{Orders, refusal};
 use crate::system::clock;
 use crate::telemetry::vitals;
 
-/// Questions answered at the same time; a lifecycle transition may take seconds and should not hold up a list.
+/// Questions answered at the same time; a lifecycle transition may take seconds and should not hold
+/// up a list.
 const AT_A_TIME: usize = 8;
 
 /// Who answers.
@@ -39,7 +43,11 @@ pub struct Answers {
 
 impl Answers {
     /// Answers until nobody can ask any more.
-    pub async fn run(self, mut requests: mpsc::Receiver<(Request, Instant)>, messages: mpsc::Sender<Message>) {
+    pub async fn run(
+        self,
+        mut requests: mpsc::Receiver<(Request, Instant)>,
+        messages: mpsc::Sender<Message>,
+    ) {
         let answers = Arc::new(self);
         let mut under_way = JoinSet::new();
         loop {
@@ -76,7 +84,8 @@ impl Answers {
         };
         let payload = match written(answer) {
             Ok(payload) if payload.len() > MAX_REPLY_BYTES => {
-                let text = format!("the answer has {} bytes, more than a message may have", payload.len());
+                let text =
+                    format!("the answer has {} bytes, more than a message may have", payload.len());
                 written(Err(refusal("too_large", text)))
             }
             written => written,
@@ -102,10 +111,15 @@ impl Answers {
             Ask::Topics => self.graph.topics().await,
             Ask::Parameters { node } => self.graph.parameters(&node).await,
             Ask::Parameter { node, name } => self.graph.parameter(&node, &name).await,
-            Ask::SetParameter { node, parameter } => self.graph.set_parameter(&node, &parameter).await,
+            Ask::SetParameter { node, parameter } => {
+                self.graph.set_parameter(&node, &parameter).await
+            }
             Ask::Lifecycle { node, transition } => self.graph.lifecycle(&node, transition).await,
             Ask::Vitals => Ok(Answer::Vitals(self.vitals.now().await)),
-            Ask::Unknown => Err(refusal("unsupported", "this agent does not know the question; it may be too old")),
+            Ask::Unknown => Err(refusal(
+                "unsupported",
+                "this agent does not know the question; it may be too old",
+            )),
         }
     }
 

@@ -1,9 +1,9 @@
-//! The driver: the one task that owns the ledger. It asks the plan for each task's next step, writes the ledger, lets the
-//! step run, and reports what changed. It decides nothing about tasks and does nothing to the robot itself: that is the
-//! plan's and the effects' work.
+//! The driver: the one task that owns the ledger. It asks the plan for each task's next step,
+//! writes the ledger, lets the step run, and reports what changed. It decides nothing about tasks
+//! and does nothing to the robot itself: that is the plan's and the effects' work.
 //!
-//! Steps run as tasks of their own and send back only that they ended, so nothing here is ever waited for long; a step
-//! that is no longer wanted is told so and, if it does not end, dropped.
+//! Steps run as tasks of their own and send back only that they ended, so nothing here is ever
+//! waited for long; a step that is no longer wanted is told so and, if it does not end, dropped.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -45,8 +45,13 @@ const MAX_TURNS: u32 = 64;
 const MAX_SIGHTS: usize = 16;
 
 /// What is known of a disk that nobody has looked at.
-static NOTHING_PREPARED: Prepared =
-    Prepared { manifest: None, content: false, built: false, versions: Vec::new(), vouched: Vouched::No };
+static NOTHING_PREPARED: Prepared = Prepared {
+    manifest: None,
+    content: false,
+    built: false,
+    versions: Vec::new(),
+    vouched: Vouched::No,
+};
 
 /// Who the driver speaks for.
 #[derive(Debug, Clone)]
@@ -74,7 +79,8 @@ struct View {
     prepared: Option<Prepared>,
     /// What became of the active run's process; `None` likewise.
     process: Option<ProcessState>,
-    /// When to look at it again, should nothing have been told of it: a look may take long, and all tasks wait for it.
+    /// When to look at it again, should nothing have been told of it: a look may take long, and all
+    /// tasks wait for it.
     look_again: Option<Instant>,
     /// Who looks at that process.
     watched: Option<Watched>,
@@ -131,7 +137,8 @@ pub struct Driver<E> {
     ledger: Ledger,
     /// The ledger has changes that are not on the disk.
     dirty: bool,
-    /// Of the accepted state that is on the disk: what was accepted and is forgotten by a power cut must be sent again.
+    /// Of the accepted state that is on the disk: what was accepted and is forgotten by a power cut
+    /// must be sent again.
     observed: Generation,
     desired: Option<DesiredState>,
     views: BTreeMap<TaskName, View>,
@@ -148,7 +155,8 @@ pub struct Driver<E> {
     conditions: BTreeMap<&'static str, String>,
     /// What the server withholds, in its words.
     withheld: Option<Condition>,
-    /// The contents whose gathered bytes were kept when they were last gone through; `None`: they are to be.
+    /// The contents whose gathered bytes were kept when they were last gone through; `None`: they
+    /// are to be.
     kept_parts: Option<Vec<Digest>>,
     /// Notified when parts that are lacking are to be asked for.
     asks: Arc<Notify>,
@@ -159,8 +167,8 @@ pub struct Driver<E> {
 }
 
 impl<E: Effects> Driver<E> {
-    /// The driver that goes on from `ledger`, which the caller has not counted this start in. `lost` says that and where
-    /// an earlier ledger was moved.
+    /// The driver that goes on from `ledger`, which the caller has not counted this start in.
+    /// `lost` says that and where an earlier ledger was moved.
     pub async fn new(
         effects: Arc<E>,
         speaker: Speaker,
@@ -182,7 +190,8 @@ impl<E: Effects> Driver<E> {
         if let Some(accepted) = &ledger.accepted {
             match admission::open(&accepted.envelope, &speaker.server_key, &speaker.robot_id) {
                 Ok(state) => desired = Some(state),
-                // The robot was registered anew: the tasks go on as they are until the new server has spoken.
+                // The robot was registered anew: the tasks go on as they are until the new server
+                // has spoken.
                 Err(error) => {
                     tracing::warn!(error = %chain(&error), "the state in the ledger is not this server's");
                     ledger.accepted = None;
@@ -246,7 +255,8 @@ impl<E: Effects> Driver<E> {
         self.save();
     }
 
-    /// Plans every task until all rest, begins what is to be done, reports. Gives the time of the next turn.
+    /// Plans every task until all rest, begins what is to be done, reports. Gives the time of the
+    /// next turn.
     async fn turn(&mut self) -> Instant {
         // Looked at before each turn: after `hold` nothing may be started any more.
         self.held = self.effects.is_held();
@@ -280,10 +290,12 @@ impl<E: Effects> Driver<E> {
         wake
     }
 
-    /// Whether the step ends something and nothing is to come in its place. It is done also where nothing can be written:
-    /// it may be what makes room, and an agent that has forgotten it does it again.
+    /// Whether the step ends something and nothing is to come in its place. It is done also where
+    /// nothing can be written: it may be what makes room, and an agent that has forgotten it does
+    /// it again.
     fn only_takes_away(&self, task: &TaskName, step: &Step) -> bool {
-        let is_wanted = self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
+        let is_wanted =
+            self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
         matches!(step, Step::Stop(_) | Step::Remove) && !is_wanted
     }
 
@@ -291,12 +303,14 @@ impl<E: Effects> Driver<E> {
     fn task_names(&self) -> Vec<TaskName> {
         let desired = self.desired.iter().flat_map(|state| &state.tasks);
         let desired = desired.map(|task| (task.task.clone(), task.priority));
-        let known = self.ledger.tasks.iter().map(|(task, record)| (task.clone(), record.order.priority));
+        let known =
+            self.ledger.tasks.iter().map(|(task, record)| (task.clone(), record.order.priority));
         let is_desired = |task: &TaskName| desired.clone().any(|(other, _)| other == *task);
         plan::in_turn(known.filter(|(task, _)| !is_desired(task)).chain(desired.clone()).collect())
     }
 
-    /// What is desired of a task. Before any desired state is known, what its record was ordered to be.
+    /// What is desired of a task. Before any desired state is known, what its record was ordered to
+    /// be.
     fn desired_task(&self, task: &TaskName) -> Option<DesiredTask> {
         match &self.desired {
             Some(state) => state.tasks.iter().find(|desired| desired.task == *task).cloned(),
@@ -306,11 +320,16 @@ impl<E: Effects> Driver<E> {
 
     /// Whether new work may be begun.
     fn may_begin(&self, now: Now) -> bool {
-        let in_force = self.desired.as_ref().is_none_or(|state| !admission::is_expired(state, now.wall_ms));
+        let in_force =
+            self.desired.as_ref().is_none_or(|state| !admission::is_expired(state, now.wall_ms));
         in_force && !self.ledger.removed
     }
 
-    async fn plan_task(&mut self, task: &TaskName, begin: &mut Vec<(TaskName, Step)>) -> Option<u64> {
+    async fn plan_task(
+        &mut self,
+        task: &TaskName,
+        begin: &mut Vec<(TaskName, Step)>,
+    ) -> Option<u64> {
         let desired = self.desired_task(task);
         if !self.ledger.tasks.contains_key(task) {
             let record = TaskRecord::new(desired.clone()?, self.effects.now().boot_ms);
@@ -322,24 +341,31 @@ impl<E: Effects> Driver<E> {
             let mut changed = false;
             until_ms = None;
             for lane in Lane::ALL {
-                let planned = |(other, step): &(TaskName, Step)| other == task && step.lane() == lane;
+                let planned =
+                    |(other, step): &(TaskName, Step)| other == task && step.lane() == lane;
                 if self.under_way.contains_key(&(task.clone(), lane)) || begin.iter().any(planned) {
                     continue;
                 }
                 self.observe(task).await;
                 match self.ask(task, lane, desired.as_ref(), begin) {
-                    Next::Rest { until_ms: rest } => until_ms = [until_ms, rest].into_iter().flatten().min(),
+                    Next::Rest { until_ms: rest } => {
+                        until_ms = [until_ms, rest].into_iter().flatten().min()
+                    }
                     Next::Record(record) => {
                         self.put(task, *record);
                         changed = true;
                     }
                     Next::Act(step) if lane == Lane::Prepare && !self.has_room(begin) => {
-                        tracing::debug!(step = plan::describe(task, &step), "waits for another task's step");
+                        tracing::debug!(
+                            step = plan::describe(task, &step),
+                            "waits for another task's step"
+                        );
                     }
                     Next::Act(step) => {
                         let record = self.ledger.tasks.get(task)?;
                         let (boot_id, start) = (&self.speaker.boot_id, self.ledger.start);
-                        let record = plan::begun(record, &step, boot_id, start, self.effects.now().boot_ms);
+                        let record =
+                            plan::begun(record, &step, boot_id, start, self.effects.now().boot_ms);
                         // A start does what the record written before it says.
                         let step = match (step, &record.active) {
                             (Step::Start(_), Some(active)) => Step::Start(Box::new(active.clone())),
@@ -359,12 +385,21 @@ impl<E: Effects> Driver<E> {
         until_ms
     }
 
-    fn ask(&self, task: &TaskName, lane: Lane, desired: Option<&DesiredTask>, begin: &[(TaskName, Step)]) -> Next {
+    fn ask(
+        &self,
+        task: &TaskName,
+        lane: Lane,
+        desired: Option<&DesiredTask>,
+        begin: &[(TaskName, Step)],
+    ) -> Next {
         let planned = begin.iter().filter(|(other, _)| other == task).map(|(_, step)| step);
         let under_way = self.under_way.iter().filter(|((other, _), _)| other == task);
-        let steps: Vec<&Step> = planned.chain(under_way.map(|(_, under_way)| &under_way.step)).collect();
+        let steps: Vec<&Step> =
+            planned.chain(under_way.map(|(_, under_way)| &under_way.step)).collect();
         let rest = Next::Rest { until_ms: None };
-        let Some(view) = self.views.get(task).filter(|view| view.prepared.is_some() && view.process.is_some()) else {
+        let Some(view) =
+            self.views.get(task).filter(|view| view.prepared.is_some() && view.process.is_some())
+        else {
             return rest;
         };
         self.situation(task, view, desired, &steps).map_or(rest, |situation| match lane {
@@ -421,15 +456,20 @@ impl<E: Effects> Driver<E> {
             Some(_) => false,
         };
         if is_due {
-            view.process = Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
-                Some(process) => self.effects.process(task, process).await,
-                None => ProcessState::None,
-            });
+            view.process =
+                Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
+                    Some(process) => self.effects.process(task, process).await,
+                    None => ProcessState::None,
+                });
             view.look_again = Some(Instant::now() + LOOK_AGAIN);
         }
         if let Some(ProcessState::Alive { pid }) = view.process {
             // An agent that died during the start did not write it down.
-            let record = self.ledger.tasks.get_mut(task).and_then(|record| record.active.as_mut()?.process.as_mut());
+            let record = self
+                .ledger
+                .tasks
+                .get_mut(task)
+                .and_then(|record| record.active.as_mut()?.process.as_mut());
             if let Some(process) = record.filter(|process| process.pid != Some(pid)) {
                 process.pid = Some(pid);
                 self.dirty = true;
@@ -437,16 +477,18 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Deletes what was gathered of contents that are no longer ordered, or that are in their place: a power cut may have
-    /// brought it back.
+    /// Deletes what was gathered of contents that are no longer ordered, or that are in their
+    /// place: a power cut may have brought it back.
     fn keep_ordered_parts(&mut self) {
-        let is_there = |task| self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content);
-        let ordered = self
-            .ledger
-            .tasks
-            .iter()
-            .filter(|(task, record)| record.order.wanted == Wanted::Running && !is_there(*task));
-        let wanted: Vec<Digest> = ordered.map(|(_, record)| record.order.package.content.digest).collect();
+        let is_there = |task| {
+            self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content)
+        };
+        let ordered =
+            self.ledger.tasks.iter().filter(|(task, record)| {
+                record.order.wanted == Wanted::Running && !is_there(*task)
+            });
+        let wanted: Vec<Digest> =
+            ordered.map(|(_, record)| record.order.package.content.digest).collect();
         if self.kept_parts.as_ref() != Some(&wanted) {
             self.effects.keep_parts(&wanted);
             self.kept_parts = Some(wanted);
@@ -468,7 +510,8 @@ impl<E: Effects> Driver<E> {
             view.prepared = None;
             view.progress.remove(&Lane::Prepare);
         }
-        let process = |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
+        let process =
+            |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
         if before.and_then(process) != process(&record) {
             (view.process, view.watched, view.health) = (None, None, Health::Unknown);
         }
@@ -496,7 +539,11 @@ impl<E: Effects> Driver<E> {
         match self.effects.write_ledger(&self.ledger) {
             Ok(()) => {
                 self.dirty = false;
-                self.observed = self.ledger.accepted.as_ref().map_or(Generation(0), |accepted| accepted.generation);
+                self.observed = self
+                    .ledger
+                    .accepted
+                    .as_ref()
+                    .map_or(Generation(0), |accepted| accepted.generation);
                 self.conditions.remove("ledger_unwritable");
             }
             Err(error) => {
@@ -513,7 +560,8 @@ impl<E: Effects> Driver<E> {
     }
 }
 
-/// Whether the robot's labels, which the server's answer to a posted report says, decide if it can run this.
+/// Whether the robot's labels, which the server's answer to a posted report says, decide if it can
+/// run this.
 fn requires_labels(prepared: &Prepared) -> bool {
     prepared.manifest.as_ref().is_some_and(|manifest| !manifest.requires.labels.is_empty())
 }

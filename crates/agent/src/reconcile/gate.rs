@@ -1,7 +1,7 @@
-//! The robot's gate: a program of the robot's owner that is asked before a task is started, stopped or switched, and may
-//! say not now. Exit code 0 is yes, every other is no, and the first lines it wrote are why. It is run with a time limit,
-//! its output is bounded, and nothing of it is left afterwards. When it is asked, and what its answer means, is the
-//! plan's to say.
+//! The robot's gate: a program of the robot's owner that is asked before a task is started, stopped
+//! or switched, and may say not now. Exit code 0 is yes, every other is no, and the first lines it
+//! wrote are why. It is run with a time limit, its output is bounded, and nothing of it is left
+//! afterwards. When it is asked, and what its answer means, is the plan's to say.
 
 use std::collections::BTreeMap;
 use std::io::{self, PipeReader, Read as _};
@@ -71,7 +71,8 @@ impl Gate {
         Self { config, robot, directory: directory.to_owned() }
     }
 
-    /// Asks it, run with `environment`. A failure is the reason of a no; what it is when there is no answer is a setting.
+    /// Asks it, run with `environment`. A failure is the reason of a no; what it is when there is
+    /// no answer is a setting.
     pub async fn ask(
         &self,
         task: &TaskName,
@@ -79,7 +80,9 @@ impl Gate {
         environment: &BTreeMap<String, String>,
     ) -> Result<(), Failure> {
         let error = match self.run(task, question, environment).await {
-            Ok(answer) => return answer.map_err(|reason| Failure::new(FailureCode::GATE_REFUSED, reason)),
+            Ok(answer) => {
+                return answer.map_err(|reason| Failure::new(FailureCode::GATE_REFUSED, reason));
+            }
             Err(error) => error,
         };
         let text = crate::system::error_chain::chain(&error);
@@ -109,14 +112,17 @@ impl Gate {
         let mut environment = environment.clone();
         environment.extend(self.asked(task, question, &mark));
         let mut child =
-            program::spawn_gate(&self.config.command, &self.directory, &environment, writer).map_err(failed)?;
+            program::spawn_gate(&self.config.command, &self.directory, &environment, writer)
+                .map_err(failed)?;
         let reading = tokio::task::spawn_blocking(move || reason(reader));
         let ended = tokio::time::timeout(self.config.timeout, child.wait()).await;
         // The output ends when the last process that could write any has.
         processes.end(KILL_TIMEOUT).await?;
         let status = match ended {
             Ok(status) => ExitStatus::from(status.map_err(failed)?),
-            Err(_) => return Err(GateError::Hung { program: program(), timeout: self.config.timeout }),
+            Err(_) => {
+                return Err(GateError::Hung { program: program(), timeout: self.config.timeout });
+            }
         };
         let reason = match tokio::time::timeout(DRAIN_TIMEOUT, reading).await {
             Ok(Ok(reason)) => reason,
@@ -134,7 +140,12 @@ impl Gate {
     }
 
     /// The question, as variables.
-    fn asked(&self, task: &TaskName, question: &GateQuestion, mark: &Path) -> [(String, String); 7] {
+    fn asked(
+        &self,
+        task: &TaskName,
+        question: &GateQuestion,
+        mark: &Path,
+    ) -> [(String, String); 7] {
         [
             ("TASKD_GATE_STEP", question.step.as_str().to_owned()),
             ("TASKD_TASK", task.to_string()),

@@ -1,5 +1,5 @@
-//! Answers about the robot's ROS graph: what it shows, and calls to its nodes that people asked for. It looks through
-//! the agent's own node and decides nothing.
+//! Answers about the robot's ROS graph: what it shows, and calls to its nodes that people asked
+//! for. It looks through the agent's own node and decides nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -8,7 +8,9 @@ use std::time::Duration;
 use task_proto::TaskName;
 use task_proto::report::Failure;
 use task_proto::request::{Answer, Refusal};
-use task_proto::ros::{GraphName, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
+use task_proto::ros::{
+    GraphName, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition,
+};
 use tokio::task::JoinSet;
 
 use crate::reconcile::robot::Robot;
@@ -40,14 +42,16 @@ impl GraphAnswers {
     pub async fn nodes(&self) -> Result<Answer, Refusal> {
         let picture = self.picture().await?;
         let states = picture.states(picture.snapshot.nodes.iter()).await;
-        let nodes = picture.snapshot.nodes.iter().map(|node| picture.summary(node, &states)).collect();
+        let nodes =
+            picture.snapshot.nodes.iter().map(|node| picture.summary(node, &states)).collect();
         Ok(Answer::Nodes { age_ms: picture.age_ms(), nodes })
     }
 
     /// One node with its endpoints; several, if several have the name.
     pub async fn node(&self, name: &GraphName) -> Result<Answer, Refusal> {
         let picture = self.picture().await?;
-        let found: Vec<&Node> = picture.snapshot.nodes.iter().filter(|node| node.name == *name).collect();
+        let found: Vec<&Node> =
+            picture.snapshot.nodes.iter().filter(|node| node.name == *name).collect();
         if found.is_empty() {
             return Err(picture.no_such_node(name));
         }
@@ -72,9 +76,11 @@ impl GraphAnswers {
     /// All parameters of a node.
     pub async fn parameters(&self, node: &GraphName) -> Result<Answer, Refusal> {
         let graph = self.graph_with(node).await?;
-        let mut parameters: Vec<_> = graph.parameters(node, ANSWER_TIMEOUT).await.map_err(refused)?;
+        let mut parameters: Vec<_> =
+            graph.parameters(node, ANSWER_TIMEOUT).await.map_err(refused)?;
         parameters.sort_by(|one, other| one.0.cmp(&other.0));
-        let parameter = |(name, value): (String, ParameterValue)| Parameter { name, value: value.to_json() };
+        let parameter =
+            |(name, value): (String, ParameterValue)| Parameter { name, value: value.to_json() };
         Ok(Answer::Parameters { parameters: parameters.into_iter().map(parameter).collect() })
     }
 
@@ -82,42 +88,65 @@ impl GraphAnswers {
     pub async fn parameter(&self, node: &GraphName, name: &str) -> Result<Answer, Refusal> {
         let graph = self.graph_with(node).await?;
         match graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)? {
-            ParameterValue::NotSet => Err(refusal("no_such_parameter", format!("{node} has no parameter {name}"))),
-            value => {
-                Ok(Answer::Parameters { parameters: vec![Parameter { name: name.to_owned(), value: value.to_json() }] })
+            ParameterValue::NotSet => {
+                Err(refusal("no_such_parameter", format!("{node} has no parameter {name}")))
             }
+            value => Ok(Answer::Parameters {
+                parameters: vec![Parameter { name: name.to_owned(), value: value.to_json() }],
+            }),
         }
     }
 
     /// Sets a parameter, and gives the value it has then.
-    pub async fn set_parameter(&self, node: &GraphName, parameter: &Parameter) -> Result<Answer, Refusal> {
+    pub async fn set_parameter(
+        &self,
+        node: &GraphName,
+        parameter: &Parameter,
+    ) -> Result<Answer, Refusal> {
         let graph = self.graph_with(node).await?;
         let Parameter { name, value } = parameter;
-        let no_value = || refusal("rejected", format!("{value} is no value that a parameter can have"));
+        let no_value =
+            || refusal("rejected", format!("{value} is no value that a parameter can have"));
         let current = graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)?;
         let wanted = ParameterValue::from_json(value).ok_or_else(no_value)?.fitting(&current);
-        let results = graph.set_parameters(node, vec![(name.clone(), wanted)], WORK_TIMEOUT).await.map_err(refused)?;
+        let results = graph
+            .set_parameters(node, vec![(name.clone(), wanted)], WORK_TIMEOUT)
+            .await
+            .map_err(refused)?;
         if let Some(result) = results.iter().find(|result| !result.successful) {
-            let reason = if result.reason.is_empty() { "it gives no reason" } else { &result.reason };
-            return Err(refusal("rejected", format!("{node} does not accept {name} = {value}: {reason}")));
+            let reason =
+                if result.reason.is_empty() { "it gives no reason" } else { &result.reason };
+            return Err(refusal(
+                "rejected",
+                format!("{node} does not accept {name} = {value}: {reason}"),
+            ));
         }
         let now = graph.parameter(node, name, ANSWER_TIMEOUT).await.map_err(refused)?;
-        Ok(Answer::ParameterSet { parameter: Parameter { name: name.clone(), value: now.to_json() } })
+        Ok(Answer::ParameterSet {
+            parameter: Parameter { name: name.clone(), value: now.to_json() },
+        })
     }
 
     /// Asks for a transition, and gives the state after it.
-    pub async fn lifecycle(&self, node: &GraphName, transition: Transition) -> Result<Answer, Refusal> {
+    pub async fn lifecycle(
+        &self,
+        node: &GraphName,
+        transition: Transition,
+    ) -> Result<Answer, Refusal> {
         let graph = self.graph_with(node).await?;
         let before = graph.lifecycle_state(node, ANSWER_TIMEOUT).await.map_err(refused)?;
         let done = graph.change_state(node, transition, WORK_TIMEOUT).await.map_err(refused)?;
         if !done {
-            let text = format!("{node} does not {}: it is {}", transition.as_str(), before.as_str());
+            let text =
+                format!("{node} does not {}: it is {}", transition.as_str(), before.as_str());
             return Err(refusal("rejected", text));
         }
         match graph.lifecycle_state(node, ANSWER_TIMEOUT).await {
             Ok(state) => Ok(Answer::Lifecycle { state }),
             // A node that was shut down may be gone before it can say so.
-            Err(_) if transition == Transition::Shutdown => Ok(Answer::Lifecycle { state: LifecycleState::Finalized }),
+            Err(_) if transition == Transition::Shutdown => {
+                Ok(Answer::Lifecycle { state: LifecycleState::Finalized })
+            }
             Err(error) => Err(refused(error)),
         }
     }
@@ -147,16 +176,23 @@ impl Picture {
     }
 
     fn no_such_node(&self, name: &GraphName) -> Refusal {
-        let mut there: Vec<&str> = self.snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
+        let mut there: Vec<&str> =
+            self.snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
         there.truncate(20);
         let there = if there.is_empty() { "nothing".to_owned() } else { there.join(", ") };
         refusal("no_such_node", format!("there is no node {name}; on the graph: {there}"))
     }
 
     /// The states of those nodes that have one and say it in time, all asked at once.
-    async fn states(&self, nodes: impl Iterator<Item = &Node>) -> BTreeMap<GraphName, LifecycleState> {
-        let with_state: BTreeSet<GraphName> =
-            nodes.filter(|node| node.has_lifecycle()).map(|node| node.name.clone()).take(MAX_STATES).collect();
+    async fn states(
+        &self,
+        nodes: impl Iterator<Item = &Node>,
+    ) -> BTreeMap<GraphName, LifecycleState> {
+        let with_state: BTreeSet<GraphName> = nodes
+            .filter(|node| node.has_lifecycle())
+            .map(|node| node.name.clone())
+            .take(MAX_STATES)
+            .collect();
         let mut asked = JoinSet::new();
         for name in with_state {
             let graph = self.graph.clone();
@@ -226,7 +262,8 @@ mod tests {
 
     #[test]
     fn a_topic_lists_each_of_its_nodes_once() {
-        let endpoint = |kind: &str| Endpoint { name: "/scan".parse().expect("valid"), kind: kind.to_owned() };
+        let endpoint =
+            |kind: &str| Endpoint { name: "/scan".parse().expect("valid"), kind: kind.to_owned() };
         let node = |name: &str, publishers: Vec<Endpoint>, subscriptions: Vec<Endpoint>| Node {
             name: name.parse().expect("valid"),
             participant: ParticipantId([0; 12]),
@@ -244,6 +281,9 @@ mod tests {
         let [topic] = &found[..] else { panic!("{found:?}") };
         assert_eq!(topic.types, [scan, "std_msgs/msg/String"]);
         assert_eq!(topic.publishers.len(), 1);
-        assert_eq!(topic.subscriptions.iter().map(GraphName::as_str).collect::<Vec<_>>(), ["/mapper", "/odd"]);
+        assert_eq!(
+            topic.subscriptions.iter().map(GraphName::as_str).collect::<Vec<_>>(),
+            ["/mapper", "/odd"]
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! Questions that change something are believed only if the server signed them, for this robot and this start of its agent,
-//! and once: whoever passes messages on may repeat what was said, or say something itself. It never does what is asked.
+//! Questions that change something are believed only if the server signed them, for this robot and
+//! this start of its agent, and once: whoever passes messages on may repeat what was said, or say
+//! something itself. It never does what is asked.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -39,12 +40,19 @@ impl Orders {
         }
         let unsigned = |text: &str| refusal("unsigned", text);
         let envelope = request.signed.as_ref();
-        let envelope = envelope.ok_or_else(|| unsigned("the server has not signed it; it may be too old"))?;
+        let envelope =
+            envelope.ok_or_else(|| unsigned("the server has not signed it; it may be too old"))?;
         let payload = envelope.open(ACTION_TYPE, &self.server_key);
-        let action = payload.ok().and_then(|payload| serde_json::from_slice::<Action>(&payload).ok());
+        let action =
+            payload.ok().and_then(|payload| serde_json::from_slice::<Action>(&payload).ok());
         let action = action.ok_or_else(|| unsigned("it is not signed by this robot's server"))?;
-        if action.robot_id != self.robot_id || action.instance != self.instance || action.id != request.id {
-            return Err(unsigned("it was signed for another robot, start of its agent, or question"));
+        if action.robot_id != self.robot_id
+            || action.instance != self.instance
+            || action.id != request.id
+        {
+            return Err(unsigned(
+                "it was signed for another robot, start of its agent, or question",
+            ));
         }
         let mut done = self.done.lock().unwrap_or_else(PoisonError::into_inner);
         if !done.see(action.id) {
@@ -71,7 +79,10 @@ mod tests {
     fn only_what_the_server_signed_for_this_start_is_done_and_once() {
         let key = SigningKey::random();
         let orders = Orders::new(RobotId::random(), InstanceId::random(), key.public_key());
-        let ask = Ask::Lifecycle { node: "/camera".parse().expect("a name"), transition: Transition::Deactivate };
+        let ask = Ask::Lifecycle {
+            node: "/camera".parse().expect("a name"),
+            transition: Transition::Deactivate,
+        };
         let action = || Action {
             robot_id: orders.robot_id.clone(),
             instance: orders.instance.clone(),
@@ -80,7 +91,10 @@ mod tests {
         };
         let good = request(&action(), &key);
         assert_eq!(orders.meant(&good), Ok(ask.clone()));
-        let activate = Ask::Lifecycle { node: "/camera".parse().expect("a name"), transition: Transition::Activate };
+        let activate = Ask::Lifecycle {
+            node: "/camera".parse().expect("a name"),
+            transition: Transition::Activate,
+        };
         let changed = Request { ask: activate, ..request(&action(), &key) };
         assert_eq!(orders.meant(&changed), Ok(ask.clone()), "what was signed counts");
         let refused = [

@@ -1,5 +1,5 @@
-//! The real robot: each effect is a call to the module that owns it, and its error becomes a failure's code and text.
-//! It holds no state beside its settings.
+//! The real robot: each effect is a call to the module that owns it, and its error becomes a
+//! failure's code and text. It holds no state beside its settings.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -52,8 +52,12 @@ use crate::system::error_chain::chain;
 use crate::system::layout::{DataDir, VersionDir};
 use crate::system::task_user::{TaskUser, TaskUserError};
 use crate::task::effects::{Effects, Now};
-use crate::task::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
-use crate::task::observed::{Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched};
+use crate::task::ledger::{
+    ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord,
+};
+use crate::task::observed::{
+    Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched,
+};
 use crate::task::plan::{Done, StepFailure};
 use crate::telemetry::outputs::{self, OutputOrder, Registry};
 use crate::transfer::parts::Asks;
@@ -69,7 +73,8 @@ mod trees;
 
 /// Written into a version's directory once it is built.
 const BUILT_MARKER: &str = "built";
-/// Written into a run's directory before its start: what the ledger says of the run, should the ledger be lost.
+/// Written into a run's directory before its start: what the ledger says of the run, should the
+/// ledger be lost.
 const RUN_RECORD: &str = "run.json";
 /// How much of a log's end goes, without its times, into a failure's text.
 const TAIL_BYTES: u64 = 3072;
@@ -175,10 +180,12 @@ impl Robot {
 
     /// What this version promises about the ROS graph; nothing, where its manifest is gone.
     fn promise(&self, package: &PackageRef) -> Promise {
-        fetch::stored_manifest(&self.data, package).map_or_else(Promise::default, |manifest| Promise::of(&manifest))
+        fetch::stored_manifest(&self.data, package)
+            .map_or_else(Promise::default, |manifest| Promise::of(&manifest))
     }
 
-    /// What processes have that run as `user` with the home directory `home`, once the way to the task's directories is open.
+    /// What processes have that run as `user` with the home directory `home`, once the way to the
+    /// task's directories is open.
     fn environment_of(
         &self,
         task: &TaskName,
@@ -187,10 +194,12 @@ impl Robot {
     ) -> Result<BTreeMap<String, String>, StepFailure> {
         let mut environment = self.held().environment.clone();
         if let Some(user) = user {
-            let opened = user.make_home(home).and_then(|()| user.let_through(&self.data.way_to(task)));
+            let opened =
+                user.make_home(home).and_then(|()| user.let_through(&self.data.way_to(task)));
             opened.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
             environment.insert("HOME".to_owned(), home.display().to_string());
-            environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
+            environment
+                .extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
         }
         Ok(environment)
     }
@@ -199,7 +208,10 @@ impl Robot {
     fn limits(&self, manifest: &TaskManifest) -> RunLimits {
         let (limits, settings) = (&manifest.limits, self.held().task_limits);
         RunLimits {
-            memory_bytes: limits.memory_mb.map(|megabytes| megabytes << 20).or(settings.memory_bytes),
+            memory_bytes: limits
+                .memory_mb
+                .map(|megabytes| megabytes << 20)
+                .or(settings.memory_bytes),
             cpu_weight: limits.cpu_weight,
             pids: limits.pids.map(u64::from).or(settings.pids),
             filter_calls: self.filter_calls,
@@ -227,7 +239,12 @@ impl Effects for Robot {
     fn robot_facts(&self) -> RobotFacts {
         let installations = Some(self.installations());
         let no_task_user = self.task_user.as_ref().err().map(TaskUserError::to_string);
-        RobotFacts { arch: std::env::consts::ARCH.to_owned(), labels: None, installations, no_task_user }
+        RobotFacts {
+            arch: std::env::consts::ARCH.to_owned(),
+            labels: None,
+            installations,
+            no_task_user,
+        }
     }
 
     async fn look_for_ros(&self) {
@@ -239,7 +256,10 @@ impl Effects for Robot {
         let isolates = self.cgroups.as_ref().is_some_and(Cgroups::isolates);
         HostFacts {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
-            hostname: std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default().trim().to_owned(),
+            hostname: std::fs::read_to_string("/proc/sys/kernel/hostname")
+                .unwrap_or_default()
+                .trim()
+                .to_owned(),
             arch: std::env::consts::ARCH.to_owned(),
             mac: Some(self.mac),
             ros_distros: installation::all_distros(&installations),
@@ -261,9 +281,13 @@ impl Effects for Robot {
         let mut survivors = Vec::new();
         for task in self.data.task_names().unwrap_or_default() {
             let mut last = None;
-            for entry in std::fs::read_dir(self.data.task(&task).run()).into_iter().flatten().flatten() {
+            for entry in
+                std::fs::read_dir(self.data.task(&task).run()).into_iter().flatten().flatten()
+            {
                 let record = std::fs::read(entry.path().join(RUN_RECORD)).ok();
-                let Some(run) = record.and_then(|bytes| serde_json::from_slice::<ActiveRun>(&bytes).ok()) else {
+                let Some(run) =
+                    record.and_then(|bytes| serde_json::from_slice::<ActiveRun>(&bytes).ok())
+                else {
                     continue;
                 };
                 match self.supervisor.observe(&entry.path()).await {
@@ -286,7 +310,8 @@ impl Effects for Robot {
         let version = self.version(package);
         let manifest = fetch::stored_manifest(&self.data, package);
         let content = version.src().is_dir();
-        let needs_build = manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
+        let needs_build =
+            manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
         Prepared {
             content,
             built: content && (!needs_build || version.root().join(BUILT_MARKER).exists()),
@@ -306,9 +331,13 @@ impl Effects for Robot {
             Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
             Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
             Ok(Observed::Exited(status)) => exit(Some(status), None),
-            Ok(Observed::OutOfMemory { limit_bytes }) => exit(Some(ExitStatus::Signal(9)), Some(limit_bytes)),
+            Ok(Observed::OutOfMemory { limit_bytes }) => {
+                exit(Some(ExitStatus::Signal(9)), Some(limit_bytes))
+            }
             Ok(Observed::Gone) => exit(None, None),
-            Err(error) if error.is_malformed() && runs::went_down_with_its_boot(process) => exit(None, None),
+            Err(error) if error.is_malformed() && runs::went_down_with_its_boot(process) => {
+                exit(None, None)
+            }
             Err(error) => {
                 tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
                 ProcessState::Unknown
@@ -347,7 +376,11 @@ impl Effects for Robot {
         self.vouching.as_ref().map(|vouching| vouching.facts()).unwrap_or_default()
     }
 
-    async fn check_signers(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn check_signers(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         self.vouched(package, Use::Begin, cancel).await
     }
 
@@ -357,7 +390,11 @@ impl Effects for Robot {
         }
     }
 
-    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<Done, StepFailure> {
+    async fn pull_manifest(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
         self.still_vouched(package)?;
         pulled(self.fetcher.manifest(package, cancel).await.map(drop))
     }
@@ -394,11 +431,17 @@ impl Effects for Robot {
             Err(error) => return pulled(Err(error)),
         };
         let told = (progress, asks);
-        let done = pulled(self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await)?;
+        let done = pulled(
+            self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await,
+        )?;
         self.seal_pulled(package, &manifest, done).await
     }
 
-    async fn build(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn build(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         self.still_vouched(package)?;
         let manifest = self.manifest(package).await?;
         let (version, tool) = (self.version(package), manifest.build.tool);
@@ -416,7 +459,9 @@ impl Effects for Robot {
             user,
             cgroups: self.cgroups.clone(),
         };
-        builder::build(&order, cancel).await.map_err(|error| build_failure(error, self.data.root()))?;
+        builder::build(&order, cancel)
+            .await
+            .map_err(|error| build_failure(error, self.data.root()))?;
         self.seal(package, tool).await?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|source| {
@@ -436,7 +481,8 @@ impl Effects for Robot {
         let Some(process) = &run.process else {
             return Err(failed(&std::io::Error::other("the ledger names no process to start")));
         };
-        // What was staged long ago may have waited for a person or the gate until its publishers' list was over.
+        // What was staged long ago may have waited for a person or the gate until its publishers'
+        // list was over.
         let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
         self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
@@ -445,13 +491,16 @@ impl Effects for Robot {
         let task_dir = self.data.task(task);
         let run_dir = self.run_dir(task, process);
         // What still ran of it could change what is looked at below.
-        self.end_other_runs(&task_dir.run(), Some(&run_dir)).await.map_err(|error| failed(&error))?;
+        self.end_other_runs(&task_dir.run(), Some(&run_dir))
+            .await
+            .map_err(|error| failed(&error))?;
         self.verify(&run.package, tool, Purpose::Start).await?;
         let user = self.accounts_of(task)?.map(|pair| pair.run);
         let mut environment = self.environment_of(task, user.as_ref(), &task_dir.home())?;
         self.make_work_dir(&run.package, tool, user.clone()).await?;
         environment.extend(ros::node_logs(&version, user.as_ref()).await);
-        durable::write(&version.run_script(), text.as_bytes(), 0o755).map_err(|error| failed(&error))?;
+        durable::write(&version.run_script(), text.as_bytes(), 0o755)
+            .map_err(|error| failed(&error))?;
         task_dir.set_current(&run.package.manifest.digest).map_err(|error| failed(&error))?;
         durable::create_dir_all(&task_dir.logs()).map_err(|error| failed(&error))?;
         let spec = RunSpec {
@@ -468,16 +517,23 @@ impl Effects for Robot {
         };
         let record = serde_json::to_vec(run).map_err(|error| failed(&error))?;
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
-        durable::write(&run_dir.join(RUN_RECORD), &record, 0o600).map_err(|error| failed(&error))?;
+        durable::write(&run_dir.join(RUN_RECORD), &record, 0o600)
+            .map_err(|error| failed(&error))?;
         let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
-        if let Some(what) = environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty()) {
-            let text = format!("nodes here meet by {what}, which the agent does not speak: [ready] can't be watched");
+        if let Some(what) =
+            environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty())
+        {
+            let text = format!(
+                "nodes here meet by {what}, which the agent does not speak: [ready] can't be watched"
+            );
             let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, text);
             return Err(StepFailure { failure, retry_after_ms: None });
         }
         self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
-            // Whoever has the name may go away: a run that was ready before waits for that. So may what is in the graph's way.
-            let may_pass = run.ever_ready || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
+            // Whoever has the name may go away: a run that was ready before waits for that. So may
+            // what is in the graph's way.
+            let may_pass = run.ever_ready
+                || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
             StepFailure { failure, retry_after_ms: may_pass.then_some(0) }
         })?;
         let started = self.supervisor.start(&run_dir, &spec).await;
@@ -488,7 +544,8 @@ impl Effects for Robot {
             tracing::warn!(%task, error = %chain(&error), "cannot end what may have been started");
         }
         let pid = started.map_err(|error| failed(&error))?.task.pid;
-        // What earlier runs left is of no more use; that it can't be deleted is no reason not to run.
+        // What earlier runs left is of no more use; that it can't be deleted is no reason not to
+        // run.
         if let Err(error) = self.forget_runs(&task_dir.run(), Some(&run_dir)).await {
             tracing::warn!(%task, failure = %error.failure, "cannot delete what ended runs left");
         }
@@ -577,11 +634,23 @@ mod tests {
         let tls = task_transport::Trust::by(None).client_config(clock::for_certificates());
         let client = crate::transfer::server::client(tls).expect("a client");
         let server: reqwest::Url = "http://127.0.0.1:9/".parse().expect("a URL");
-        let fetcher =
-            Fetcher::new(client.clone(), server.clone(), "tskr_x".to_owned(), data.clone(), FetchSettings::default());
+        let fetcher = Fetcher::new(
+            client.clone(),
+            server.clone(),
+            "tskr_x".to_owned(),
+            data.clone(),
+            FetchSettings::default(),
+        );
         let registry = Registry::new(client, server, "tskr_x".to_owned());
         let mac = "02:00:00:00:00:01".parse().expect("an address");
-        Robot::new(data, (fetcher, Listening::default()), registry, &config, &RobotId::random(), mac)
+        Robot::new(
+            data,
+            (fetcher, Listening::default()),
+            registry,
+            &config,
+            &RobotId::random(),
+            mac,
+        )
     }
 
     /// The directory of a run in that environment, of which nothing but what it is was written yet.

@@ -1,16 +1,20 @@
-//! The robot's ROS 2 graph: what it shows, calls to nodes, what nodes say. It decides nothing about tasks.
+//! The robot's ROS 2 graph: what it shows, calls to nodes, what nodes say. It decides nothing about
+//! tasks.
 //!
-//! Everybody on the network may send to whatever takes part in a ROS graph, and the bytes are read by a large library. So
-//! the agent, which may be root, does not take part itself: it starts a program for it ([`program`]) that has no rights
-//! and little memory, and speaks with it over pipes ([`protocol`], [`connection`]). This program is the agent itself
-//! ([`serve`]) with a DDS participant ([`participant`]).
+//! Everybody on the network may send to whatever takes part in a ROS graph, and the bytes are read
+//! by a large library. So the agent, which may be root, does not take part itself: it starts a
+//! program for it ([`program`]) that has no rights and little memory, and speaks with it over pipes
+//! ([`protocol`], [`connection`]). This program is the agent itself ([`serve`]) with a DDS
+//! participant ([`participant`]).
 //!
-//! These modules are the only place that names `ros2-client`. Of it the graph uses the message types and the DDS library
-//! below it (RustDDS), not its `Node`, `Spinner` and `Client`: those fix the length of a gid when they are compiled, so one
-//! agent could not serve Humble and newer robots, keep 8 events and lose the rest, never take back an endpoint they
-//! announced, and take whatever a stranger says about its nodes.
+//! These modules are the only place that names `ros2-client`. Of it the graph uses the message
+//! types and the DDS library below it (RustDDS), not its `Node`, `Spinner` and `Client`: those fix
+//! the length of a gid when they are compiled, so one agent could not serve Humble and newer
+//! robots, keep 8 events and lose the rest, never take back an endpoint they announced, and take
+//! whatever a stranger says about its nodes.
 //!
-//! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS (Zenoh), or DDS Security.
+//! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS
+//! (Zenoh), or DDS Security.
 
 pub mod entities;
 pub mod feeds;
@@ -63,8 +67,8 @@ pub struct GraphSettings {
     pub localhost_only: bool,
     /// The agent's node. Two agents on one host, or in one domain, need two names.
     pub node_name: GraphName,
-    /// The distribution of the robot's nodes, which decides the form in which the agent's node is announced; nodes of all
-    /// distributions are understood.
+    /// The distribution of the robot's nodes, which decides the form in which the agent's node is
+    /// announced; nodes of all distributions are understood.
     pub distro: Option<String>,
 }
 
@@ -178,7 +182,11 @@ struct Shared {
 
 impl GraphSettings {
     fn check(&self) -> Result<(), GraphError> {
-        if self.domain_id > MAX_DOMAIN_ID { Err(GraphError::DomainId(self.domain_id)) } else { Ok(()) }
+        if self.domain_id > MAX_DOMAIN_ID {
+            Err(GraphError::DomainId(self.domain_id))
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -190,13 +198,18 @@ impl GraphError {
 
 impl Graph {
     /// Takes part in the domain, by a program that is started for it.
-    pub async fn open(settings: &GraphSettings, program: &GraphProgram) -> Result<Self, GraphError> {
+    pub async fn open(
+        settings: &GraphSettings,
+        program: &GraphProgram,
+    ) -> Result<Self, GraphError> {
         settings.check()?;
         let closing = CancellationToken::new();
         let closes_with_this = closing.clone().drop_guard();
         let tracker = TaskTracker::new();
-        let (connection, snapshot) = Connection::open(settings.clone(), program, &closing, &tracker).await?;
-        let shared = Shared { connection, snapshot, closing, tracker, _closes_with_this: closes_with_this };
+        let (connection, snapshot) =
+            Connection::open(settings.clone(), program, &closing, &tracker).await?;
+        let shared =
+            Shared { connection, snapshot, closing, tracker, _closes_with_this: closes_with_this };
         Ok(Self { shared: Arc::new(shared) })
     }
 
@@ -205,7 +218,8 @@ impl Graph {
         self.shared.snapshot.borrow().clone()
     }
 
-    /// Wakes when the graph shows something else, many changes at once as one. It ends when the graph is closed.
+    /// Wakes when the graph shows something else, many changes at once as one. It ends when the
+    /// graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
     }
@@ -215,10 +229,15 @@ impl Graph {
         self.shared.connection.pid()
     }
 
-    /// Which of the participants in this snapshot live in these processes: only what a task started is its own.
+    /// Which of the participants in this snapshot live in these processes: only what a task started
+    /// is its own.
     pub async fn owners(snapshot: Arc<Snapshot>, pids: Vec<u32>) -> Owners {
-        let unknown = Owners { unknown: snapshot.participants.keys().copied().collect(), ..Owners::default() };
-        let asked = tokio::task::spawn_blocking(move || Owners::of(&snapshot.participants, &pids)).await;
+        let unknown = Owners {
+            unknown: snapshot.participants.keys().copied().collect(),
+            ..Owners::default()
+        };
+        let asked =
+            tokio::task::spawn_blocking(move || Owners::of(&snapshot.participants, &pids)).await;
         asked.unwrap_or(unknown)
     }
 
@@ -227,8 +246,8 @@ impl Graph {
         tokio::task::spawn_blocking(move || Owners::process_of(&participant)).await.ok().flatten()
     }
 
-    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
-    /// starts later finds it there, and answers the sooner.
+    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need
+    /// for this node. A node that starts later finds it there, and answers the sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
         match self.call(Call::Prepare { node: node.clone() }, Duration::ZERO).await? {
             Answer::Done => Ok(()),
@@ -236,8 +255,9 @@ impl Graph {
         }
     }
 
-    /// Waits until a server of this service would hear a request, and its answer would be heard; says which participants
-    /// have one. Without `kind` the service's type is taken from what the graph shows.
+    /// Waits until a server of this service would hear a request, and its answer would be heard;
+    /// says which participants have one. Without `kind` the service's type is taken from what the
+    /// graph shows.
     pub async fn service_answers(
         &self,
         service: &GraphName,
@@ -252,15 +272,20 @@ impl Graph {
     }
 
     /// The state this lifecycle node is in.
-    pub async fn lifecycle_state(&self, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
+    pub async fn lifecycle_state(
+        &self,
+        node: &GraphName,
+        within: Duration,
+    ) -> Result<LifecycleState, GraphError> {
         match self.call(Call::LifecycleState { node: node.clone() }, within).await? {
             Answer::State(state) => Ok(state),
             _ => Err(GraphError::Malformed { service: node.clone() }),
         }
     }
 
-    /// Asks this lifecycle node for a transition, once; says whether it made it. After [`GraphError::NoAnswer`] it may
-    /// have, and so after [`GraphError::Closed`]: ask for its state.
+    /// Asks this lifecycle node for a transition, once; says whether it made it. After
+    /// [`GraphError::NoAnswer`] it may have, and so after [`GraphError::Closed`]: ask for its
+    /// state.
     pub async fn change_state(
         &self,
         node: &GraphName,
@@ -292,7 +317,10 @@ impl Graph {
         name: &str,
         within: Duration,
     ) -> Result<ParameterValue, GraphError> {
-        match self.call(Call::Parameter { node: node.clone(), name: name.to_owned() }, within).await? {
+        match self
+            .call(Call::Parameter { node: node.clone(), name: name.to_owned() }, within)
+            .await?
+        {
             Answer::Parameter(value) => Ok(value),
             _ => Err(GraphError::Malformed { service: node.clone() }),
         }
@@ -311,8 +339,8 @@ impl Graph {
         }
     }
 
-    /// What nodes log, from now on; the first who asks also gets the last lines from before, for nodes keep them. A
-    /// listener that is too slow is told how many lines it missed.
+    /// What nodes log, from now on; the first who asks also gets the last lines from before, for
+    /// nodes keep them. A listener that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let listener = self.shared.connection.rosout()?;
         self.shared.connection.say(Request::Listen(Feed::Rosout))?;
@@ -331,7 +359,8 @@ impl Graph {
         self.shared.connection.missed_messages()
     }
 
-    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings are.
+    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings
+    /// are.
     pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<RateMeter, GraphError> {
         names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
         Connection::meter(&self.shared.connection, topic, kind)

@@ -1,6 +1,7 @@
-//! When the agent takes part in the ROS graph: from the first time that a task or a question needs it, on a robot that has
-//! ROS 2, until the agent ends, or until somebody needs another domain and nobody this one any more; anew, should it have been
-//! thrown out. A robot without ROS 2 never opens a socket for it. It looks at nothing itself.
+//! When the agent takes part in the ROS graph: from the first time that a task or a question needs
+//! it, on a robot that has ROS 2, until the agent ends, or until somebody needs another domain and
+//! nobody this one any more; anew, should it have been thrown out. A robot without ROS 2 never
+//! opens a socket for it. It looks at nothing itself.
 
 use std::sync::{Arc, Weak};
 use std::time::Duration;
@@ -19,7 +20,8 @@ use crate::ros::graph::{Graph, GraphProgram, GraphSettings, Snapshot};
 use crate::ros::node_logs;
 use crate::system::layout::DataDir;
 
-/// How long discovery may take until the graph shows who was there before: nodes announce themselves every 3 s.
+/// How long discovery may take until the graph shows who was there before: nodes announce
+/// themselves every 3 s.
 const DISCOVERY: Duration = Duration::from_millis(3500);
 /// When to try again after the graph was lost, or could not be opened: at first, and at most.
 const FIRST_RETRY: Duration = Duration::from_millis(500);
@@ -56,7 +58,8 @@ enum GraphState {
         graph: Graph,
         since: Instant,
         domain_id: u16,
-        /// What nodes say is kept as long: nobody else may write it, and the graph is not held open for it.
+        /// What nodes say is kept as long: nobody else may write it, and the graph is not held open
+        /// for it.
         _keeping: DropGuard,
     },
     Failed {
@@ -66,19 +69,22 @@ enum GraphState {
 }
 
 impl GraphAccess {
-    /// Closed at first; `program` takes part. The node is named for the robot, because two agents on one host, or in one
-    /// domain, need two names. What nodes say is kept in `data` while it is open.
+    /// Closed at first; `program` takes part. The node is named for the robot, because two agents
+    /// on one host, or in one domain, need two names. What nodes say is kept in `data` while it is
+    /// open.
     pub fn of_robot(mac: MacAddress, data: DataDir, program: GraphProgram) -> Self {
         let (log_bytes, state) = (watch::Sender::new(None), Mutex::default());
         Self { inner: Arc::new(Inner { mac, data, program, log_bytes, state }) }
     }
 
-    /// Lets a file of what nodes say have no more than `log_bytes`, from the next time that the graph is opened.
+    /// Lets a file of what nodes say have no more than `log_bytes`, from the next time that the
+    /// graph is opened.
     pub fn limit(&self, log_bytes: Option<u64>) {
         self.inner.log_bytes.send_replace(log_bytes);
     }
 
-    /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen last.
+    /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen
+    /// last.
     pub async fn open(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
         self.inner.opened(facts).await.map(|(graph, _)| graph)
     }
@@ -92,7 +98,10 @@ impl GraphAccess {
 }
 
 impl Inner {
-    async fn opened(self: &Arc<Self>, facts: Option<&RosFacts>) -> Result<(Graph, Instant), Failure> {
+    async fn opened(
+        self: &Arc<Self>,
+        facts: Option<&RosFacts>,
+    ) -> Result<(Graph, Instant), Failure> {
         let mut state = self.state.lock().await;
         state.notice_loss();
         match &state.graph {
@@ -102,18 +111,29 @@ impl Inner {
             {
                 return Ok((graph.clone(), *since));
             }
-            GraphState::Failed { failure, retry_at } if Instant::now() < *retry_at => return Err(failure.clone()),
+            GraphState::Failed { failure, retry_at } if Instant::now() < *retry_at => {
+                return Err(failure.clone());
+            }
             GraphState::Closed | GraphState::Open { .. } | GraphState::Failed { .. } => {}
         }
         let settings = self.settings(facts)?;
         match Graph::open(&settings, &self.program).await {
             Ok(graph) => {
-                tracing::info!(domain_id = settings.domain_id, localhost_only = settings.localhost_only, "graph open");
+                tracing::info!(
+                    domain_id = settings.domain_id,
+                    localhost_only = settings.localhost_only,
+                    "graph open"
+                );
                 let since = Instant::now();
                 let over = CancellationToken::new();
-                let keep = node_logs::keep(graph.clone(), self.data.clone(), *self.log_bytes.borrow());
+                let keep =
+                    node_logs::keep(graph.clone(), self.data.clone(), *self.log_bytes.borrow());
                 tokio::spawn(over.clone().run_until_cancelled_owned(keep));
-                tokio::spawn(reopen_when_lost(Arc::downgrade(self), graph.changes(), facts.cloned()));
+                tokio::spawn(reopen_when_lost(
+                    Arc::downgrade(self),
+                    graph.changes(),
+                    facts.cloned(),
+                ));
                 let (domain_id, _keeping) = (settings.domain_id, over.drop_guard());
                 state.graph = GraphState::Open { graph: graph.clone(), since, domain_id, _keeping };
                 Ok((graph, since))
@@ -127,11 +147,16 @@ impl Inner {
 
     fn settings(&self, facts: Option<&RosFacts>) -> Result<GraphSettings, Failure> {
         let found = facts.and_then(|facts| Some((facts, facts.domain_id?)));
-        let none =
-            || Failure::new(FailureCode::GRAPH_UNAVAILABLE, "this robot has no ROS 2, whose graph could be watched");
+        let none = || {
+            Failure::new(
+                FailureCode::GRAPH_UNAVAILABLE,
+                "this robot has no ROS 2, whose graph could be watched",
+            )
+        };
         let (facts, domain_id) = found.ok_or_else(none)?;
         let name = format!("/task_agent_{}", self.mac.to_string().replace(':', ""));
-        let unnamed = |error: InvalidId| Failure::new(FailureCode::GRAPH_UNAVAILABLE, error.to_string());
+        let unnamed =
+            |error: InvalidId| Failure::new(FailureCode::GRAPH_UNAVAILABLE, error.to_string());
         Ok(GraphSettings {
             domain_id,
             localhost_only: facts.localhost_only,
@@ -142,7 +167,8 @@ impl Inner {
 }
 
 impl State {
-    /// Takes in that the graph has closed by itself, if it has: because its program was killed, or its listening ended.
+    /// Takes in that the graph has closed by itself, if it has: because its program was killed, or
+    /// its listening ended.
     fn notice_loss(&mut self) {
         let GraphState::Open { graph, since, .. } = &self.graph else { return };
         if graph.is_closed() {
@@ -168,8 +194,8 @@ fn backoff(failures: u32) -> Duration {
     rand::rng().random_range(most / 2..=most)
 }
 
-/// Opens the graph again once it is lost, whether anybody asks for it or not: what nodes say is to be kept. It holds
-/// neither the graph nor the access to it.
+/// Opens the graph again once it is lost, whether anybody asks for it or not: what nodes say is to
+/// be kept. It holds neither the graph nor the access to it.
 fn reopen_when_lost(
     access: Weak<Inner>,
     mut changes: watch::Receiver<Arc<Snapshot>>,
@@ -204,10 +230,14 @@ mod tests {
 
     #[test]
     fn retries_come_later_each_time_and_never_at_one_time() {
-        for (failures, most_ms) in [(0, 500), (1, 1000), (4, 8000), (6, 30_000), (u32::MAX, 30_000)] {
+        for (failures, most_ms) in [(0, 500), (1, 1000), (4, 8000), (6, 30_000), (u32::MAX, 30_000)]
+        {
             let most = Duration::from_millis(most_ms);
             let waits: Vec<_> = (0..50).map(|_| backoff(failures)).collect();
-            assert!(waits.iter().all(|wait| (most / 2..=most).contains(wait)), "{failures}: {waits:?}");
+            assert!(
+                waits.iter().all(|wait| (most / 2..=most).contains(wait)),
+                "{failures}: {waits:?}"
+            );
             assert!(waits.windows(2).any(|pair| pair[0] != pair[1]), "{failures}: no jitter");
         }
     }

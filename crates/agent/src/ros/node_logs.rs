@@ -1,5 +1,6 @@
-//! What nodes say on `/rosout` and `/diagnostics`, kept beside the task whose process said it, in the form that consoles
-//! show. What is of no task is kept apart. It decides nothing by what is said.
+//! What nodes say on `/rosout` and `/diagnostics`, kept beside the task whose process said it, in
+//! the form that consoles show. What is of no task is kept apart. It decides nothing by what is
+//! said.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
@@ -83,7 +84,8 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
             },
         };
         let missed_so_far = graph.missed_messages();
-        let more = missed_so_far.saturating_sub(std::mem::replace(&mut missed_before, missed_so_far));
+        let more =
+            missed_so_far.saturating_sub(std::mem::replace(&mut missed_before, missed_so_far));
         missed = u64::saturating_add(missed, more);
         if missed > 0 && messages.try_send(Message::Missed(missed)).is_ok() {
             missed = 0;
@@ -118,10 +120,13 @@ impl Owners {
         self.looked_at = Some(Instant::now());
         self.known.retain(|participant, _| snapshot.participants.contains_key(participant));
         let data = self.data.clone();
-        let pids = tokio::task::spawn_blocking(move || pids_by_task(&data)).await.unwrap_or_default();
+        let pids =
+            tokio::task::spawn_blocking(move || pids_by_task(&data)).await.unwrap_or_default();
         for (task, pids) in pids {
             let owners = Graph::owners(snapshot.clone(), pids).await;
-            self.known.extend(owners.theirs.into_iter().map(|participant| (participant, Some(task.clone()))));
+            self.known.extend(
+                owners.theirs.into_iter().map(|participant| (participant, Some(task.clone()))),
+            );
         }
         self.known.entry(participant).or_default().clone()
     }
@@ -131,11 +136,14 @@ impl Owners {
 fn pids_by_task(data: &DataDir) -> Vec<(TaskName, Vec<u32>)> {
     let tasks = data.task_names().unwrap_or_default();
     let mut found: BTreeMap<TaskName, Vec<u32>> = BTreeMap::new();
-    let run_dirs =
-        environments::look(ProcessEntry::all().unwrap_or_default(), |process| process.variable(RUN_DIR_VARIABLE));
+    let run_dirs = environments::look(ProcessEntry::all().unwrap_or_default(), |process| {
+        process.variable(RUN_DIR_VARIABLE)
+    });
     for (process, run_dir) in run_dirs {
         let Some(run_dir) = run_dir else { continue };
-        let task = tasks.iter().find(|task| std::path::Path::new(&run_dir).starts_with(data.task(task).run()));
+        let task = tasks
+            .iter()
+            .find(|task| std::path::Path::new(&run_dir).starts_with(data.task(task).run()));
         if let Some(task) = task {
             found.entry(task.clone()).or_default().push(process.pid);
         }
@@ -211,8 +219,9 @@ impl Recorder {
             tracing::debug!(%error, "what nodes say can't be kept");
         }
         if !path.exists() {
-            // It was never begun, or its task was removed with it: what was open then is no file of the next one. Nor is
-            // that of any other that was removed, which would keep its bytes on the disk.
+            // It was never begun, or its task was removed with it: what was open then is no file of
+            // the next one. Nor is that of any other that was removed, which would keep its bytes
+            // on the disk.
             let data = &self.data;
             self.logs.retain(|task, _| path_in(data, task.as_ref()).exists());
         }

@@ -1,5 +1,6 @@
-//! Looks into ROS installations: sources the setup files as a task would, under the same account, and lists the packages
-//! that can be found then. Bounded in time and in what is listed; what can't be seen stays unknown. It chooses nothing.
+//! Looks into ROS installations: sources the setup files as a task would, under the same account,
+//! and lists the packages that can be found then. Bounded in time and in what is listed; what can't
+//! be seen stays unknown. It chooses nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
@@ -78,7 +79,8 @@ async fn source(
     let mut environment = environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.display().to_string());
     if let Some(user) = user {
-        let way: Vec<PathBuf> = dir.parent().into_iter().chain([dir.as_path()]).map(Path::to_owned).collect();
+        let way: Vec<PathBuf> =
+            dir.parent().into_iter().chain([dir.as_path()]).map(Path::to_owned).collect();
         user.let_through(&way)?;
         environment.insert("HOME".to_owned(), dir.display().to_string());
         environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
@@ -97,7 +99,9 @@ async fn source(
         return Err(io::Error::other(status.to_string()));
     }
     // A process that got away may hold its end open.
-    tokio::time::timeout(KILL_TIMEOUT, reading).await.map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??
+    tokio::time::timeout(KILL_TIMEOUT, reading)
+        .await
+        .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??
 }
 
 fn read_answer(answer: PipeReader) -> io::Result<Vec<String>> {
@@ -106,7 +110,11 @@ fn read_answer(answer: PipeReader) -> io::Result<Vec<String>> {
     let values: Vec<String> =
         bytes.split(|byte| *byte == 0).map(|value| String::from_utf8_lossy(value).into()).collect();
     // The last value is ended too, which gives an empty text after it.
-    if values.len() == VARIABLES.len() + 1 { Ok(values) } else { Err(io::Error::other("the answer is not complete")) }
+    if values.len() == VARIABLES.len() + 1 {
+        Ok(values)
+    } else {
+        Err(io::Error::other("the answer is not complete"))
+    }
 }
 
 async fn look_into(installation: &mut Installation, answer: Vec<String>, user: Option<&TaskUser>) {
@@ -114,7 +122,8 @@ async fn look_into(installation: &mut Installation, answer: Vec<String>, user: O
         let at = VARIABLES.iter().position(|variable| *variable == name);
         at.and_then(|at| answer.get(at)).filter(|value| !value.is_empty()).cloned()
     };
-    let paths = |name: &str| std::env::split_paths(&value(name).unwrap_or_default()).collect::<Vec<_>>();
+    let paths =
+        |name: &str| std::env::split_paths(&value(name).unwrap_or_default()).collect::<Vec<_>>();
     if installation.distros.is_empty() {
         installation.distros.extend(value("ROS_DISTRO").map(|distro| distro.to_ascii_lowercase()));
     }
@@ -130,7 +139,9 @@ async fn look_into(installation: &mut Installation, answer: Vec<String>, user: O
     places.prefixes.extend(paths("CMAKE_PREFIX_PATH"));
     places.sources = paths("ROS_PACKAGE_PATH");
     if let Some(venv) = value("VIRTUAL_ENV").map(PathBuf::from) {
-        places.pythons.extend(children(&venv.join("lib")).map(|python| python.join("site-packages")));
+        places
+            .pythons
+            .extend(children(&venv.join("lib")).map(|python| python.join("site-packages")));
         places.prefixes.push(venv);
     }
     if installation.versions.contains(&RosVersion::Ros1) {
@@ -151,16 +162,25 @@ struct Places {
 }
 
 impl Places {
-    /// Everything that could be meant by a package's name. Rather too much than too little: what is missing is refused.
+    /// Everything that could be meant by a package's name. Rather too much than too little: what is
+    /// missing is refused.
     fn packages(&self) -> BTreeSet<String> {
         let mut found = BTreeSet::new();
         for prefix in self.prefixes.iter().take(MAX_DIRECTORIES) {
             let share = prefix.join("share");
             let indexes = ["ament_index/resource_index/packages", "colcon-core/packages"];
-            found.extend(indexes.iter().flat_map(|index| names(&share.join(index))).take(MAX_PACKAGES));
+            found.extend(
+                indexes.iter().flat_map(|index| names(&share.join(index))).take(MAX_PACKAGES),
+            );
             // catkin's devel spaces have only CMake files there.
-            let is_package = |path: &PathBuf| path.join("package.xml").is_file() || path.join("cmake").is_dir();
-            found.extend(children(&share).filter(is_package).filter_map(|path| name(&path)).take(MAX_PACKAGES));
+            let is_package =
+                |path: &PathBuf| path.join("package.xml").is_file() || path.join("cmake").is_dir();
+            found.extend(
+                children(&share)
+                    .filter(is_package)
+                    .filter_map(|path| name(&path))
+                    .take(MAX_PACKAGES),
+            );
         }
         for directory in &self.pythons {
             found.extend(names(directory).take(MAX_PACKAGES));
@@ -227,12 +247,19 @@ mod tests {
              ROS_PACKAGE_PATH={at}/src ROS_DISTRO=Jazzy ROS_VERSION=2 RMW_IMPLEMENTATION=rmw_cyclonedds_cpp\n"
         );
         write(root.join("my setup.bash"), &text);
-        let given = Installation { setups: vec![root.join("my setup.bash")], ..Installation::default() };
+        let given =
+            Installation { setups: vec![root.join("my setup.bash")], ..Installation::default() };
         let seen = survey(vec![given], &system(), &root.join("survey"), None).await.remove(0);
-        assert_eq!((seen.distros, seen.versions), (vec!["jazzy".to_owned()], vec![RosVersion::Ros2]));
+        assert_eq!(
+            (seen.distros, seen.versions),
+            (vec!["jazzy".to_owned()], vec![RosVersion::Ros2])
+        );
         assert_eq!(seen.rmw.as_deref(), Some("rmw_cyclonedds_cpp"));
         let packages: Vec<_> = seen.packages.expect("seen").into_iter().collect();
-        assert_eq!(packages, ["made_here", "nav_msgs", "plain_cmake", "robot_driver", "vendor_lib"]);
+        assert_eq!(
+            packages,
+            ["made_here", "nav_msgs", "plain_cmake", "robot_driver", "vendor_lib"]
+        );
     }
 
     #[tokio::test]
@@ -240,8 +267,10 @@ mod tests {
         let temp = tempfile::tempdir().expect("a directory");
         write(temp.path().join("exits.bash"), "exit 3\n");
         for setup in ["exits.bash", "absent.bash"] {
-            let given = Installation { setups: vec![temp.path().join(setup)], ..Installation::default() };
-            let seen = survey(vec![given.clone()], &system(), &temp.path().join("survey"), None).await;
+            let given =
+                Installation { setups: vec![temp.path().join(setup)], ..Installation::default() };
+            let seen =
+                survey(vec![given.clone()], &system(), &temp.path().join("survey"), None).await;
             assert_eq!(seen, [given]);
         }
     }

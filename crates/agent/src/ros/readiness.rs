@@ -1,6 +1,6 @@
-//! What "running" means for one run of a task: what `[ready]` and `[parameters]` promise, held against what the robot's
-//! ROS graph shows of the run's own processes. Pure: looks and answers come in, what to ask next and the run's health go
-//! out. It touches neither ROS nor clocks.
+//! What "running" means for one run of a task: what `[ready]` and `[parameters]` promise, held
+//! against what the robot's ROS graph shows of the run's own processes. Pure: looks and answers
+//! come in, what to ask next and the run's health go out. It touches neither ROS nor clocks.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,9 +21,11 @@ use bring_up::BringUp;
 pub use bring_up::{Answer, Ask, Question};
 use rate::Rate;
 
-/// How long something may be missing from a graph that was complete before it counts: discovery has its hiccups.
+/// How long something may be missing from a graph that was complete before it counts: discovery has
+/// its hiccups.
 const GRACE_MS: u64 = 2000;
-/// How long somebody else's node must be there to count: it takes a moment to tell whose a new participant is.
+/// How long somebody else's node must be there to count: it takes a moment to tell whose a new
+/// participant is.
 const FOREIGN_MS: u64 = 1000;
 /// How long a node that is up may answer nothing before it counts as inactive.
 const SILENCE_MS: u64 = 10_000;
@@ -47,8 +49,8 @@ pub struct Promise {
     pub hold_s: u32,
 }
 
-/// What the graph shows, and whose it is. A participant that is in none of the three sets does not count: what discovery
-/// still knows of it may be long past.
+/// What the graph shows, and whose it is. A participant that is in none of the three sets does not
+/// count: what discovery still knows of it may be long past.
 #[derive(Debug, Clone, Copy)]
 pub struct Look<'a> {
     /// The graph.
@@ -114,18 +116,26 @@ impl Promise {
     /// What this manifest promises; its names were checked when it was made.
     pub fn of(manifest: &TaskManifest) -> Self {
         let ready = &manifest.ready;
-        let names =
-            |texts: &[String]| texts.iter().filter_map(|text| text.parse().ok()).collect::<BTreeSet<GraphName>>();
+        let names = |texts: &[String]| {
+            texts.iter().filter_map(|text| text.parse().ok()).collect::<BTreeSet<GraphName>>()
+        };
         let parameters = manifest.parameters.iter();
-        let parameters: BTreeMap<GraphName, _> =
-            parameters.filter_map(|(node, values)| Some((node.parse().ok()?, values.clone()))).collect();
+        let parameters: BTreeMap<GraphName, _> = parameters
+            .filter_map(|(node, values)| Some((node.parse().ok()?, values.clone())))
+            .collect();
         let lifecycle = names(&ready.lifecycle);
         let topics = ready.topics.iter();
         Self {
-            nodes: names(&ready.nodes).into_iter().chain(lifecycle.clone()).chain(parameters.keys().cloned()).collect(),
+            nodes: names(&ready.nodes)
+                .into_iter()
+                .chain(lifecycle.clone())
+                .chain(parameters.keys().cloned())
+                .collect(),
             lifecycle,
             services: names(&ready.services),
-            topics: topics.filter_map(|(name, topic)| Some((name.parse().ok()?, topic.min_hz))).collect(),
+            topics: topics
+                .filter_map(|(name, topic)| Some((name.parse().ok()?, topic.min_hz)))
+                .collect(),
             parameters,
             hold_s: ready.hold_s,
         }
@@ -137,16 +147,29 @@ impl Promise {
     }
 
     /// Why the run can't be started: a living process has one of its names already.
-    pub fn taken(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> Option<Failure> {
-        let texts: Vec<String> = self.foreign(snapshot, others).map(|(name, whose)| taken(name, &whose)).collect();
+    pub fn taken(
+        &self,
+        snapshot: &Snapshot,
+        others: &BTreeMap<ParticipantId, String>,
+    ) -> Option<Failure> {
+        let texts: Vec<String> =
+            self.foreign(snapshot, others).map(|(name, whose)| taken(name, &whose)).collect();
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
     /// Those of the others that have a promised name.
-    pub fn takers(&self, snapshot: &Snapshot, others: &BTreeMap<ParticipantId, String>) -> BTreeSet<ParticipantId> {
+    pub fn takers(
+        &self,
+        snapshot: &Snapshot,
+        others: &BTreeMap<ParticipantId, String>,
+    ) -> BTreeSet<ParticipantId> {
         let named = self.nodes.iter().flat_map(|name| snapshot.named(name));
         let offering = self.services.iter().flat_map(|name| snapshot.servers_of(name));
-        named.chain(offering).map(|node| node.participant).filter(|id| others.contains_key(id)).collect()
+        named
+            .chain(offering)
+            .map(|node| node.participant)
+            .filter(|id| others.contains_key(id))
+            .collect()
     }
 
     /// Promised names that somebody else has, and who that is.
@@ -171,7 +194,10 @@ impl Promise {
 impl Readiness {
     /// Of a run that has just been started, or of one that an earlier agent saw ready.
     pub fn new(promise: Promise, was_ready: bool) -> Self {
-        let rates = promise.topics.iter().filter_map(|(topic, min_hz)| Some((topic.clone(), Rate::of((*min_hz)?))));
+        let rates = promise
+            .topics
+            .iter()
+            .filter_map(|(topic, min_hz)| Some((topic.clone(), Rate::of((*min_hz)?))));
         Self {
             rates: rates.collect(),
             promise,
@@ -221,53 +247,77 @@ impl Readiness {
 
     /// Notices nodes that are new, or back in another process.
     fn meet(&mut self, look: &Look<'_>) {
-        let offer = self.promise.services.iter().flat_map(|service| look.snapshot.servers_of(service));
-        let offering: BTreeSet<&GraphName> =
-            offer.filter(|node| look.ours.contains(&node.participant)).map(|node| &node.name).collect();
+        let offer =
+            self.promise.services.iter().flat_map(|service| look.snapshot.servers_of(service));
+        let offering: BTreeSet<&GraphName> = offer
+            .filter(|node| look.ours.contains(&node.participant))
+            .map(|node| &node.name)
+            .collect();
         for name in self.promise.nodes.iter().chain(offering.iter().copied()) {
-            let here = || look.snapshot.named(name).filter(|node| look.ours.contains(&node.participant));
+            let here =
+                || look.snapshot.named(name).filter(|node| look.ours.contains(&node.participant));
             let known = self.nodes.get(name).map(BringUp::instance);
             let Some(first) = here().next() else { continue };
             if !here().any(|node| Some(node.participant) == known) {
                 let lifecycle = self.promise.lifecycle.contains(name);
                 let is_up = self.adopted && known.is_none();
                 let parameters = self.promise.parameters.get(name);
-                let node = BringUp::new(name.clone(), first.participant, lifecycle, parameters, is_up);
+                let node =
+                    BringUp::new(name.clone(), first.participant, lifecycle, parameters, is_up);
                 self.nodes.insert(name.clone(), node);
             }
             let answers = format!("{name}/get_parameters");
-            let can_answer = here().any(|node| node.services.iter().any(|service| service.name.as_str() == answers));
-            if let Some(node) = self.nodes.get_mut(name).filter(|_| offering.contains(name) && can_answer) {
+            let can_answer = here()
+                .any(|node| node.services.iter().any(|service| service.name.as_str() == answers));
+            if let Some(node) =
+                self.nodes.get_mut(name).filter(|_| offering.contains(name) && can_answer)
+            {
                 node.must_answer();
             }
         }
     }
 
     fn shortfalls(&self, look: &Look<'_>, now_ms: u64) -> Vec<Shortfall> {
-        let foreign = self.promise.foreign(look.snapshot, look.others).map(|(name, seen)| Shortfall {
-            item: Item::Alone(name.clone()),
-            code: FailureCode::NODE_NAME_TAKEN,
-            what: format!("`{name}` was not free"),
-            seen,
-            certain: false,
-        });
+        let foreign =
+            self.promise.foreign(look.snapshot, look.others).map(|(name, seen)| Shortfall {
+                item: Item::Alone(name.clone()),
+                code: FailureCode::NODE_NAME_TAKEN,
+                what: format!("`{name}` was not free"),
+                seen,
+                certain: false,
+            });
         let mut shortfalls: Vec<Shortfall> = foreign.collect();
         for name in &self.promise.nodes {
             let here = look.snapshot.named(name).any(|node| look.ours.contains(&node.participant));
-            shortfalls.extend(if here { self.unprepared(name, now_ms) } else { Some(self.absent(name, look)) });
+            shortfalls.extend(if here {
+                self.unprepared(name, now_ms)
+            } else {
+                Some(self.absent(name, look))
+            });
         }
-        shortfalls.extend(self.promise.services.iter().filter_map(|name| self.unanswered(name, look)));
-        shortfalls.extend(self.promise.topics.keys().filter_map(|name| self.unpublished(name, look)));
+        shortfalls
+            .extend(self.promise.services.iter().filter_map(|name| self.unanswered(name, look)));
+        shortfalls
+            .extend(self.promise.topics.keys().filter_map(|name| self.unpublished(name, look)));
         shortfalls
     }
 
     fn absent(&self, name: &GraphName, look: &Look<'_>) -> Shortfall {
         let gone = self.nodes.get(name).is_some_and(|node| look.gone.contains(&node.instance()));
         let (what, seen) = match self.was_ready {
-            true => (format!("`{name}` left the graph"), if gone { "its process is gone" } else { "" }.to_owned()),
+            true => (
+                format!("`{name}` left the graph"),
+                if gone { "its process is gone" } else { "" }.to_owned(),
+            ),
             false => (format!("`{name}` did not appear"), on_the_graph(look.snapshot)),
         };
-        Shortfall { item: Item::Node(name.clone()), code: FailureCode::NODE_VANISHED, what, seen, certain: gone }
+        Shortfall {
+            item: Item::Node(name.clone()),
+            code: FailureCode::NODE_VANISHED,
+            what,
+            seen,
+            certain: gone,
+        }
     }
 
     /// What a node that is there still lacks.
@@ -276,8 +326,9 @@ impl Readiness {
         let silent_ms = node.silent_since_ms().map(|since_ms| now_ms.saturating_sub(since_ms));
         // What came back in a new process is as good as gone until it is up.
         let certain = !node.is_up();
-        let shortfall =
-            |item, code, what, seen: &str| Some(Shortfall { item, code, what, seen: seen.to_owned(), certain });
+        let shortfall = |item, code, what, seen: &str| {
+            Some(Shortfall { item, code, what, seen: seen.to_owned(), certain })
+        };
         if self.promise.lifecycle.contains(name) {
             let too_silent = silent_ms.is_some_and(|ms| ms >= SILENCE_MS);
             let active = node.state() == Some(LifecycleState::Active) && !too_silent;
@@ -293,7 +344,12 @@ impl Readiness {
                     true => format!("`{name}` is not active any more"),
                     false => format!("`{name}` did not become active"),
                 };
-                return shortfall(Item::Lifecycle(name.clone()), FailureCode::NODE_INACTIVE, what, &seen);
+                return shortfall(
+                    Item::Lifecycle(name.clone()),
+                    FailureCode::NODE_INACTIVE,
+                    what,
+                    &seen,
+                );
             }
         }
         if node.has_its_parameters() {
@@ -305,27 +361,37 @@ impl Readiness {
     }
 
     fn unanswered(&self, name: &GraphName, look: &Look<'_>) -> Option<Shortfall> {
-        let offering = || look.snapshot.servers_of(name).filter(|node| look.ours.contains(&node.participant));
+        let offering =
+            || look.snapshot.servers_of(name).filter(|node| look.ours.contains(&node.participant));
         let answers = |node: &Node| self.nodes.get(&node.name).is_none_or(BringUp::answers);
         let (what, seen) = match offering().next() {
-            None if self.was_ready => (format!("the service `{name}` is not offered any more"), String::new()),
+            None if self.was_ready => {
+                (format!("the service `{name}` is not offered any more"), String::new())
+            }
             None => (format!("the service `{name}` was not offered"), String::new()),
             Some(_) if self.was_ready || offering().any(answers) => return None,
-            Some(node) => (format!("the service `{name}` did not answer"), format!("`{}` answers nothing", node.name)),
+            Some(node) => (
+                format!("the service `{name}` did not answer"),
+                format!("`{}` answers nothing", node.name),
+            ),
         };
         let (item, code) = (Item::Service(name.clone()), FailureCode::SERVICE_LOST);
         Some(Shortfall { item, code, what, seen, certain: false })
     }
 
     fn unpublished(&self, name: &GraphName, look: &Look<'_>) -> Option<Shortfall> {
-        let published = look.snapshot.publishers_of(name).any(|node| look.ours.contains(&node.participant));
+        let published =
+            look.snapshot.publishers_of(name).any(|node| look.ours.contains(&node.participant));
         let (what, seen) = match (published, self.rates.get(name)) {
-            (false, _) if self.was_ready => (format!("nobody publishes `{name}` any more"), String::new()),
+            (false, _) if self.was_ready => {
+                (format!("nobody publishes `{name}` any more"), String::new())
+            }
             (false, _) => (format!("nobody published `{name}`"), String::new()),
             (true, None) => return None,
             (true, Some(rate)) => match rate.suffices() {
                 Some(true) => return None,
-                // Right after a restart of the agent nothing was counted yet; that is no reason to doubt.
+                // Right after a restart of the agent nothing was counted yet; that is no reason to
+                // doubt.
                 None if self.was_ready => return None,
                 None => (format!("`{name}` was not heard for long enough"), String::new()),
                 Some(false) => {
@@ -333,7 +399,10 @@ impl Readiness {
                         true => format!("`{name}` does not come at {} Hz any more", rate.min_hz()),
                         false => format!("`{name}` did not come at {} Hz", rate.min_hz()),
                     };
-                    (what, rate.hz().map_or_else(String::new, |hz| format!("it came at {hz:.1} Hz")))
+                    (
+                        what,
+                        rate.hz().map_or_else(String::new, |hz| format!("it came at {hz:.1} Hz")),
+                    )
                 }
             },
         };
@@ -346,7 +415,8 @@ impl Readiness {
         let mut counted = Vec::new();
         for shortfall in shortfalls {
             let item = shortfall.item.clone();
-            let mut lasting = before.get(&item).cloned().unwrap_or(Lasting { since_ms: now_ms, said: None });
+            let mut lasting =
+                before.get(&item).cloned().unwrap_or(Lasting { since_ms: now_ms, said: None });
             let needed_ms = match item {
                 // Nothing becomes ready while anything is in doubt.
                 _ if !self.was_ready || shortfall.certain => 0,
@@ -374,12 +444,14 @@ impl Readiness {
             Some(refused) => Some((refused.code, refused.text, String::new())),
             None => in_words(&counted),
         };
-        let is_strangers = !counted.is_empty() && counted.iter().all(|lacks| matches!(lacks.item, Item::Alone(_)));
+        let is_strangers =
+            !counted.is_empty() && counted.iter().all(|lacks| matches!(lacks.item, Item::Alone(_)));
         self.health = match (lacking, &self.health) {
             (None, Health::Holds { since_ms }) => Health::Holds { since_ms: *since_ms },
             (None, _) => Health::Holds { since_ms: now_ms },
             (Some((code, what, seen)), before) => {
-                let since_ms = if let Health::Missing(missing) = before { missing.since_ms } else { now_ms };
+                let since_ms =
+                    if let Health::Missing(missing) = before { missing.since_ms } else { now_ms };
                 Health::Missing(Missing { since_ms, code, what, seen, is_its_own: !is_strangers })
             }
         };
@@ -395,7 +467,9 @@ impl Readiness {
     /// A name that somebody else has had for long enough.
     fn taken(&self, now_ms: u64) -> Option<Failure> {
         self.lasting.iter().find_map(|(item, lasting)| match (item, &lasting.said) {
-            (Item::Alone(name), Some(said)) if now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS => {
+            (Item::Alone(name), Some(said))
+                if now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS =>
+            {
                 Some(Failure::new(said.code.clone(), taken(name, &said.seen)))
             }
             _ => None,
@@ -406,7 +480,8 @@ impl Readiness {
 /// What lacks, by the code of the first, and what is there instead; each said once.
 fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
     let code = counted.first()?.code.clone();
-    let what = counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
+    let what =
+        counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
     let mut seen: Vec<&str> = Vec::new();
     for shortfall in counted.iter().filter(|shortfall| !shortfall.seen.is_empty()) {
         if !seen.contains(&shortfall.seen.as_str()) {
@@ -427,7 +502,12 @@ fn on_the_graph(snapshot: &Snapshot) -> String {
     if names.is_empty() {
         return "the graph is empty".to_owned();
     }
-    let listed = names.iter().take(MAX_LISTED).map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+    let listed = names
+        .iter()
+        .take(MAX_LISTED)
+        .map(|name| format!("`{name}`"))
+        .collect::<Vec<_>>()
+        .join(", ");
     match names.len().saturating_sub(MAX_LISTED) {
         0 => format!("on the graph: {listed}"),
         more => format!("on the graph: {listed} and {more} more"),

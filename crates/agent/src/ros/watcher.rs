@@ -1,5 +1,6 @@
-//! Watches runs on the ROS graph: looks, asks and measures what [`crate::ros::readiness`] wants to know, and tells what came of
-//! it. Each watched run has one task, which ends with its receiver. What running means is not decided here.
+//! Watches runs on the ROS graph: looks, asks and measures what [`crate::ros::readiness`] wants to
+//! know, and tells what came of it. Each watched run has one task, which ends with its receiver.
+//! What running means is not decided here.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -34,7 +35,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 const WORK_TIMEOUT: Duration = Duration::from_secs(15);
 /// How long the names of what was just stopped may take to leave the graph.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
-/// When to ask again for a graph that could not be opened. How often it is tried is not decided here.
+/// When to ask again for a graph that could not be opened. How often it is tried is not decided
+/// here.
 const RETRY: Duration = Duration::from_secs(2);
 /// A parameter that every node has.
 const EVERYWHERE: &str = "use_sim_time";
@@ -64,8 +66,13 @@ impl Watcher {
         Self { access, supervisor, watches: Arc::default() }
     }
 
-    /// Makes sure, before anything of a run is started, that its graph can be watched and that none of its names is taken.
-    pub async fn before_start(&self, promise: &Promise, facts: Option<&RosFacts>) -> Result<(), Failure> {
+    /// Makes sure, before anything of a run is started, that its graph can be watched and that none
+    /// of its names is taken.
+    pub async fn before_start(
+        &self,
+        promise: &Promise,
+        facts: Option<&RosFacts>,
+    ) -> Result<(), Failure> {
         if promise.is_empty() {
             return Ok(());
         }
@@ -92,7 +99,12 @@ impl Watcher {
     }
 
     /// Watches a run until the receiver is dropped, or until [`Self::wind_down`].
-    pub fn watch(&self, run: Watched, promise: Promise, facts: Option<RosFacts>) -> watch::Receiver<Health> {
+    pub fn watch(
+        &self,
+        run: Watched,
+        promise: Promise,
+        facts: Option<RosFacts>,
+    ) -> watch::Receiver<Health> {
         if promise.is_empty() {
             let (health, seen) = watch::channel(Health::Holds { since_ms: run.started_ms });
             tokio::spawn(async move { health.closed().await });
@@ -107,7 +119,8 @@ impl Watcher {
             let watching = watch_run(run, promise, facts, &access, supervisor, &health);
             tokio::select! {
                 () = watching => {}
-                // Cancel-safe: both can be awaited again, and the watch changes nothing that it would have to undo.
+                // Cancel-safe: both can be awaited again, and the watch changes nothing that it
+                // would have to undo.
                 () = health.closed() => {}
                 () = over.cancelled() => health.closed().await,
             }
@@ -117,9 +130,15 @@ impl Watcher {
         seen
     }
 
-    /// Ends the watch of a run and, within `time`, takes its lifecycle nodes down in good order. What fails is logged: the
-    /// signals that follow end it anyway.
-    pub async fn wind_down(&self, dir: &Path, promise: &Promise, facts: Option<&RosFacts>, time: Duration) {
+    /// Ends the watch of a run and, within `time`, takes its lifecycle nodes down in good order.
+    /// What fails is logged: the signals that follow end it anyway.
+    pub async fn wind_down(
+        &self,
+        dir: &Path,
+        promise: &Promise,
+        facts: Option<&RosFacts>,
+        time: Duration,
+    ) {
         if let Some(over) = lock(&self.watches).remove(dir) {
             over.cancel();
         }
@@ -143,8 +162,12 @@ impl Watcher {
         };
         match timeout(time, winding_down).await {
             Ok(Ok(())) => {}
-            Ok(Err(reason)) => tracing::warn!(%reason, "lifecycle nodes are stopped without being shut down"),
-            Err(_) => tracing::warn!(?time, "lifecycle nodes are stopped before they were shut down"),
+            Ok(Err(reason)) => {
+                tracing::warn!(%reason, "lifecycle nodes are stopped without being shut down")
+            }
+            Err(_) => {
+                tracing::warn!(?time, "lifecycle nodes are stopped before they were shut down")
+            }
         }
     }
 }
@@ -162,8 +185,12 @@ async fn take_down(graph: &Graph, node: &GraphName, time: Duration) {
     for transition in steps.into_iter().flatten() {
         match graph.change_state(node, transition, WORK_TIMEOUT.min(time)).await {
             Ok(true) => {}
-            Ok(false) => tracing::warn!(%node, transition = transition.as_str(), "a node refused a transition"),
-            Err(error) => tracing::warn!(%node, transition = transition.as_str(), %error, "a node made no transition"),
+            Ok(false) => {
+                tracing::warn!(%node, transition = transition.as_str(), "a node refused a transition")
+            }
+            Err(error) => {
+                tracing::warn!(%node, transition = transition.as_str(), %error, "a node made no transition")
+            }
         }
     }
 }
@@ -279,7 +306,11 @@ impl Eyes {
         let whose = Whose::look(snapshot.clone(), self.pids.clone(), &ours, self.started).await;
         self.whose = whose.naming_takers(readiness.promise(), snapshot).await;
         self.meter(snapshot);
-        let counts = self.meters.iter().map(|(topic, meter)| (topic.clone(), meter.rate().samples)).collect();
+        let counts = self
+            .meters
+            .iter()
+            .map(|(topic, meter)| (topic.clone(), meter.rate().samples))
+            .collect();
         let Whose { ours, others, gone, .. } = &self.whose;
         readiness.see(&Look { snapshot, ours, others, gone, counts: &counts }, clock::boot_ms());
     }
@@ -291,11 +322,19 @@ impl Eyes {
                 continue;
             }
             let mut publishers = snapshot.publishers_of(topic);
-            let Some(node) = publishers.find(|node| self.whose.ours.contains(&node.participant)) else { continue };
-            let Some(published) = node.publishers.iter().find(|published| published.name == *topic) else { continue };
+            let Some(node) = publishers.find(|node| self.whose.ours.contains(&node.participant))
+            else {
+                continue;
+            };
+            let Some(published) = node.publishers.iter().find(|published| published.name == *topic)
+            else {
+                continue;
+            };
             match self.graph.rate(topic, &published.kind) {
                 Ok(meter) => drop(self.meters.insert(topic.clone(), meter)),
-                Err(error) => tracing::warn!(%topic, %error, "the messages of a topic can't be counted"),
+                Err(error) => {
+                    tracing::warn!(%topic, %error, "the messages of a topic can't be counted")
+                }
             }
         }
     }
@@ -304,7 +343,9 @@ impl Eyes {
 async fn ask(graph: &Graph, question: &Question) -> Answer {
     let node = &question.node;
     let answer = match &question.ask {
-        Ask::Anything => graph.parameter(node, EVERYWHERE, ANSWER_TIMEOUT).await.map(|_| Answer::Something),
+        Ask::Anything => {
+            graph.parameter(node, EVERYWHERE, ANSWER_TIMEOUT).await.map(|_| Answer::Something)
+        }
         Ask::State => graph.lifecycle_state(node, ANSWER_TIMEOUT).await.map(Answer::State),
         Ask::Transition(transition) => {
             tracing::info!(%node, transition = transition.as_str(), "asks for a lifecycle transition");
@@ -324,7 +365,8 @@ async fn set(
     node: &GraphName,
     parameters: &[(String, serde_json::Value)],
 ) -> Result<Vec<Result<(), String>>, GraphError> {
-    let current: BTreeMap<_, _> = graph.parameters(node, ANSWER_TIMEOUT).await?.into_iter().collect();
+    let current: BTreeMap<_, _> =
+        graph.parameters(node, ANSWER_TIMEOUT).await?.into_iter().collect();
     let mut results: Vec<Result<(), String>> = Vec::new();
     let mut asked = Vec::new();
     for (name, value) in parameters {

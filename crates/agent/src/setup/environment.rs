@@ -1,5 +1,6 @@
-//! The environment that builds and tasks start with: a short explicit list, nothing else of the agent's own. What the
-//! agent was started with (tokens, a virtual environment, `_ROS_WHEELS_BOOTSTRAP_COMPLETE`) never reaches a task.
+//! The environment that builds and tasks start with: a short explicit list, nothing else of the
+//! agent's own. What the agent was started with (tokens, a virtual environment,
+//! `_ROS_WHEELS_BOOTSTRAP_COMPLETE`) never reaches a task.
 
 use std::collections::BTreeMap;
 
@@ -17,8 +18,9 @@ const PASSED_ON: [(&str, Option<&str>); 6] = [
     ("TZ", None),
 ];
 
-/// Variables that say how a robot's nodes find each other and what carries them; tasks get the agent's, where it has them.
-/// `ROS_DOMAIN_ID` is not among them: it is a setting, whose default is the agent's variable.
+/// Variables that say how a robot's nodes find each other and what carries them; tasks get the
+/// agent's, where it has them. `ROS_DOMAIN_ID` is not among them: it is a setting, whose default is
+/// the agent's variable.
 pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
@@ -52,18 +54,20 @@ pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str
     }
 }
 
-/// The environment made of the robot's settings (`ROS_DOMAIN_ID` and the like, which win) and of what `inherited` says
-/// about the few variables every program expects.
+/// The environment made of the robot's settings (`ROS_DOMAIN_ID` and the like, which win) and of
+/// what `inherited` says about the few variables every program expects.
 pub fn explicit(
     settings: &BTreeMap<String, String>,
     inherited: impl Fn(&str) -> Option<String>,
 ) -> BTreeMap<String, String> {
     let passed_on = PASSED_ON.into_iter().filter_map(|(name, default)| {
-        let value = inherited(name).filter(|value| !value.is_empty()).or(default.map(str::to_owned))?;
+        let value =
+            inherited(name).filter(|value| !value.is_empty()).or(default.map(str::to_owned))?;
         Some((name.to_owned(), value))
     });
     let mut environment: BTreeMap<_, _> = passed_on.collect();
-    // Without it Python holds a task's lines back until a buffer is full, and the log of a killed task misses its end.
+    // Without it Python holds a task's lines back until a buffer is full, and the log of a killed
+    // task misses its end.
     environment.insert("PYTHONUNBUFFERED".to_owned(), "1".to_owned());
     environment.extend(settings.clone());
     environment
@@ -74,15 +78,20 @@ pub fn of_this_robot(settings: &BTreeMap<String, String>) -> BTreeMap<String, St
     explicit(settings, |name| std::env::var(name).ok())
 }
 
-/// How tasks that ask for nothing special meet ROS: the best of `installations` under their `environment`. `None` where
-/// there is no ROS.
-pub fn ros_facts(installations: &[Installation], environment: &BTreeMap<String, String>) -> Option<RosFacts> {
+/// How tasks that ask for nothing special meet ROS: the best of `installations` under their
+/// `environment`. `None` where there is no ROS.
+pub fn ros_facts(
+    installations: &[Installation],
+    environment: &BTreeMap<String, String>,
+) -> Option<RosFacts> {
     let best = installations.last()?;
-    let variable = |name: &str| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
+    let variable =
+        |name: &str| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
     let distro = best.distros.last().map_or("unknown", String::as_str).to_owned();
     if best.versions == [RosVersion::Ros1] {
         let own = variable("ROS_HOSTNAME").or(variable("ROS_IP"));
-        let localhost_only = own.is_some_and(|name| name == "localhost" || name.starts_with("127.") || name == "::1");
+        let localhost_only = own
+            .is_some_and(|name| name == "localhost" || name.starts_with("127.") || name == "::1");
         return Some(RosFacts { distro, rmw: None, domain_id: None, localhost_only });
     }
     let default = if distro == "galactic" { "rmw_cyclonedds_cpp" } else { "rmw_fastrtps_cpp" };
@@ -100,14 +109,23 @@ mod tests {
     #[test]
     fn a_robot_says_how_its_tasks_meet_ros() {
         let environment = |pairs: &[(&str, &str)]| {
-            pairs.iter().map(|(name, value)| ((*name).to_owned(), (*value).to_owned())).collect::<BTreeMap<_, _>>()
+            pairs
+                .iter()
+                .map(|(name, value)| ((*name).to_owned(), (*value).to_owned()))
+                .collect::<BTreeMap<_, _>>()
         };
         assert_eq!(ros_facts(&[], &environment(&[])), None);
         assert_eq!(
-            unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"), ("ROS_DISCOVERY_SERVER", "")])),
+            unheard_of(&environment(&[
+                ("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"),
+                ("ROS_DISCOVERY_SERVER", "")
+            ])),
             None
         );
-        assert_eq!(unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")])), Some("Zenoh"));
+        assert_eq!(
+            unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")])),
+            Some("Zenoh")
+        );
         assert!(unheard_of(&environment(&[("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")])).is_some());
         let installation = |distro: &str, version| Installation {
             distros: vec![distro.to_owned()],
@@ -115,20 +133,38 @@ mod tests {
             ..Installation::default()
         };
         let facts = |distro: &str, rmw: Option<&str>, domain_id, localhost_only| {
-            Some(RosFacts { distro: distro.to_owned(), rmw: rmw.map(str::to_owned), domain_id, localhost_only })
+            Some(RosFacts {
+                distro: distro.to_owned(),
+                rmw: rmw.map(str::to_owned),
+                domain_id,
+                localhost_only,
+            })
         };
-        let all = [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
-        assert_eq!(ros_facts(&all, &environment(&[])), facts("humble", Some("rmw_fastrtps_cpp"), Some(0), false));
-        let given = [("ROS_DOMAIN_ID", "7"), ("ROS_LOCALHOST_ONLY", "1"), ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")];
-        assert_eq!(ros_facts(&all, &environment(&given)), facts("humble", Some("rmw_cyclonedds_cpp"), Some(7), true));
+        let all =
+            [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
+        assert_eq!(
+            ros_facts(&all, &environment(&[])),
+            facts("humble", Some("rmw_fastrtps_cpp"), Some(0), false)
+        );
+        let given = [
+            ("ROS_DOMAIN_ID", "7"),
+            ("ROS_LOCALHOST_ONLY", "1"),
+            ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp"),
+        ];
+        assert_eq!(
+            ros_facts(&all, &environment(&given)),
+            facts("humble", Some("rmw_cyclonedds_cpp"), Some(7), true)
+        );
         let given = environment(&[("ROS_IP", "127.0.0.1"), ("ROS_DOMAIN_ID", "7")]);
         assert_eq!(ros_facts(&all[..1], &given), facts("noetic", None, None, true));
     }
 
     #[test]
     fn only_what_is_listed_passes_and_settings_win() {
-        let settings =
-            BTreeMap::from([("ROS_DOMAIN_ID".to_owned(), "7".to_owned()), ("TZ".to_owned(), "UTC".to_owned())]);
+        let settings = BTreeMap::from([
+            ("ROS_DOMAIN_ID".to_owned(), "7".to_owned()),
+            ("TZ".to_owned(), "UTC".to_owned()),
+        ]);
         let environment = explicit(&settings, |name| match name {
             "HOME" => Some("/home/robot".to_owned()),
             "LANG" => Some(String::new()),

@@ -1,5 +1,6 @@
-//! What starts a task: `ros2 launch`, ROS 1's `roslaunch`, or a command of the package's own. One launcher each; all of
-//! them give a [`Launch`], which is everything that scripts and stops need to know about them. Pure.
+//! What starts a task: `ros2 launch`, ROS 1's `roslaunch`, or a command of the package's own. One
+//! launcher each; all of them give a [`Launch`], which is everything that scripts and stops need to
+//! know about them. Pure.
 
 use std::collections::BTreeMap;
 
@@ -28,8 +29,9 @@ pub enum Interrupt {
     /// The whole process group, as Ctrl-C in a terminal does it: a shell script passes nothing on.
     #[default]
     Group,
-    /// The first process alone, which ends its children in its own order. Without a terminal `ros2 launch` sends each
-    /// node a SIGINT of its own; a second one would break into the node's clean-up.
+    /// The first process alone, which ends its children in its own order. Without a terminal
+    /// `ros2 launch` sends each node a SIGINT of its own; a second one would break into the node's
+    /// clean-up.
     Leader,
 }
 
@@ -52,22 +54,42 @@ pub fn of(manifest: &TaskManifest) -> Launch {
 
 fn ros2_launch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Launch {
     let command = words(&["ros2", "launch"], file, arguments);
-    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros2), package: Some("ros2launch") }
+    Launch {
+        command,
+        interrupt: Interrupt::Leader,
+        ros: Some(RosVersion::Ros2),
+        package: Some("ros2launch"),
+    }
 }
 
-/// It puts the master and each node in a session of its own and ends them in that order; a group would miss them.
+/// It puts the master and each node in a session of its own and ends them in that order; a group
+/// would miss them.
 fn roslaunch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Launch {
     let command = words(&["roslaunch"], file, arguments);
-    Launch { command, interrupt: Interrupt::Leader, ros: Some(RosVersion::Ros1), package: Some("roslaunch") }
+    Launch {
+        command,
+        interrupt: Interrupt::Leader,
+        ros: Some(RosVersion::Ros1),
+        package: Some("roslaunch"),
+    }
 }
 
 fn exec(command: &[String]) -> Launch {
     Launch { command: command.to_vec(), interrupt: Interrupt::Group, ros: None, package: None }
 }
 
-fn words(launcher: &[&str], file: &[String; 2], arguments: &BTreeMap<String, String>) -> Vec<String> {
+fn words(
+    launcher: &[&str],
+    file: &[String; 2],
+    arguments: &BTreeMap<String, String>,
+) -> Vec<String> {
     let arguments = arguments.iter().map(|(name, value)| format!("{name}:={value}"));
-    launcher.iter().map(|word| (*word).to_owned()).chain(file.iter().cloned()).chain(arguments).collect()
+    launcher
+        .iter()
+        .map(|word| (*word).to_owned())
+        .chain(file.iter().cloned())
+        .chain(arguments)
+        .collect()
 }
 
 #[cfg(test)]
@@ -91,9 +113,18 @@ mod tests {
         };
         let (leader, group) = (Interrupt::Leader, Interrupt::Group);
         let arguments = "base|base.launch|frame:=a b|map:=x:=y";
-        assert_eq!(of("colcon", &run), (format!("ros2|launch|{arguments}"), leader, Some(RosVersion::Ros2)));
-        assert_eq!(of("none", &run), (format!("ros2|launch|{arguments}"), leader, Some(RosVersion::Ros2)));
-        assert_eq!(of("catkin", &run), (format!("roslaunch|{arguments}"), leader, Some(RosVersion::Ros1)));
+        assert_eq!(
+            of("colcon", &run),
+            (format!("ros2|launch|{arguments}"), leader, Some(RosVersion::Ros2))
+        );
+        assert_eq!(
+            of("none", &run),
+            (format!("ros2|launch|{arguments}"), leader, Some(RosVersion::Ros2))
+        );
+        assert_eq!(
+            of("catkin", &run),
+            (format!("roslaunch|{arguments}"), leader, Some(RosVersion::Ros1))
+        );
         let run = serde_json::json!({"exec": ["./start.sh", "a b"]});
         assert_eq!(of("none", &run), ("./start.sh|a b".to_owned(), group, None));
         assert_eq!(of("catkin", &run).2, Some(RosVersion::Ros1));

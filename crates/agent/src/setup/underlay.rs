@@ -1,6 +1,6 @@
-//! The ROS installations that a task builds and runs on: the ones a person configured, else what is in `/opt/ros` and the
-//! ROS 1 of the operating system. It finds and names them; sourcing them is the generated scripts' work. Nothing is ever
-//! written into an underlay.
+//! The ROS installations that a task builds and runs on: the ones a person configured, else what is
+//! in `/opt/ros` and the ROS 1 of the operating system. It finds and names them; sourcing them is
+//! the generated scripts' work. Nothing is ever written into an underlay.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -8,8 +8,8 @@ use std::path::{Path, PathBuf};
 
 use crate::setup::installation::{Installation, NoInstallation, RosVersion, choose};
 
-/// The distribution's name where ROS 1 comes with the operating system (Debian and Ubuntu have `catkin` and `roslaunch`
-/// in `/usr`, without a setup file): what it calls itself, in lower case.
+/// The distribution's name where ROS 1 comes with the operating system (Debian and Ubuntu have
+/// `catkin` and `roslaunch` in `/usr`, without a setup file): what it calls itself, in lower case.
 const SYSTEM_DISTRO: &str = "debian";
 
 /// Where to look.
@@ -39,13 +39,21 @@ impl Places {
     }
 }
 
-/// What tasks can use, the best last: the `configured` setup files, which are sourced all together, or everything there
-/// is, ROS 2 after ROS 1 and newer after older (the names of distributions rise with the alphabet).
+/// What tasks can use, the best last: the `configured` setup files, which are sourced all together,
+/// or everything there is, ROS 2 after ROS 1 and newer after older (the names of distributions rise
+/// with the alphabet).
 pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
     let mut found: Vec<Installation> = Vec::new();
-    if ["catkin", "roslaunch"].iter().any(|name| places.system.join("share").join(name).join("package.xml").is_file()) {
+    if ["catkin", "roslaunch"]
+        .iter()
+        .any(|name| places.system.join("share").join(name).join("package.xml").is_file())
+    {
         let distros = vec![SYSTEM_DISTRO.to_owned()];
-        found.push(Installation { distros, versions: vec![RosVersion::Ros1], ..Installation::default() });
+        found.push(Installation {
+            distros,
+            versions: vec![RosVersion::Ros1],
+            ..Installation::default()
+        });
     }
     if !configured.is_empty() {
         found.push(together(configured));
@@ -67,25 +75,32 @@ pub fn by_settings(underlays: &[PathBuf], workspace: Option<&Path>) -> Vec<Insta
     }
 }
 
-/// What was `found` with a person's own `workspace` on top of each installation of the same ROS, or alone where there is none.
+/// What was `found` with a person's own `workspace` on top of each installation of the same ROS, or
+/// alone where there is none.
 pub fn with_workspace(mut found: Vec<Installation>, workspace: &Path) -> Vec<Installation> {
     let devel = workspace.join("devel/setup.bash");
     let setup = if devel.is_file() { devel } else { workspace.join("install/setup.bash") };
-    let is_ros_1 = setup.parent().is_some_and(|dir| dir.ends_with("devel") || dir.join(".catkin").exists());
+    let is_ros_1 =
+        setup.parent().is_some_and(|dir| dir.ends_with("devel") || dir.join(".catkin").exists());
     let version = if is_ros_1 { RosVersion::Ros1 } else { RosVersion::Ros2 };
-    let fits =
-        |installation: &&mut Installation| installation.versions.is_empty() || installation.versions.contains(&version);
+    let fits = |installation: &&mut Installation| {
+        installation.versions.is_empty() || installation.versions.contains(&version)
+    };
     let mut below = found.iter_mut().filter(fits).peekable();
     if below.peek().is_none() {
-        found.push(Installation { versions: vec![version], setups: vec![setup], ..Installation::default() });
+        found.push(Installation {
+            versions: vec![version],
+            setups: vec![setup],
+            ..Installation::default()
+        });
         return found;
     }
     below.for_each(|installation| installation.setups.push(setup.clone()));
     found
 }
 
-/// The setup files for a task that needs `version` (`None`: any) of one of `distros` (none: any), in the order to source
-/// them.
+/// The setup files for a task that needs `version` (`None`: any) of one of `distros` (none: any),
+/// in the order to source them.
 pub fn setup_files(
     installations: &[Installation],
     version: Option<RosVersion>,
@@ -122,15 +137,20 @@ fn version_of(setup: &Path) -> Option<RosVersion> {
     (holds_ros_2 || is_below_ros(dir)).then_some(RosVersion::Ros2)
 }
 
-/// The distribution a setup file belongs to: what its installation says, else the ROS wheels in its virtual environment
-/// (which may well be called `ros`), else the directory's name below `ros`.
+/// The distribution a setup file belongs to: what its installation says, else the ROS wheels in its
+/// virtual environment (which may well be called `ros`), else the directory's name below `ros`.
 fn distro_of(setup: &Path) -> Option<String> {
     let dir = setup.parent()?;
-    let said = fs::read_to_string(dir.join("share/ros_environment/environment/1.ros_distro.dsv")).ok();
-    if let Some(distro) = said.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;")) {
+    let said =
+        fs::read_to_string(dir.join("share/ros_environment/environment/1.ros_distro.dsv")).ok();
+    if let Some(distro) =
+        said.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;"))
+    {
         return Some(distro.to_owned());
     }
-    wheels_of(dir).or_else(|| is_below_ros(dir).then(|| dir.file_name()?.to_str().map(str::to_owned)).flatten())
+    wheels_of(dir).or_else(|| {
+        is_below_ros(dir).then(|| dir.file_name()?.to_str().map(str::to_owned)).flatten()
+    })
 }
 
 /// The distribution of the ROS wheels in the virtual environment whose programs are in `bin`.
@@ -151,7 +171,8 @@ fn wheel_distro(name: &str) -> Option<String> {
 }
 
 fn children(dir: &Path) -> Vec<PathBuf> {
-    let mut paths: Vec<_> = fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+    let mut paths: Vec<_> =
+        fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
     paths.sort();
     paths
 }
@@ -175,7 +196,8 @@ mod tests {
     fn the_newest_installed_distribution_is_used_unless_the_task_says_which() {
         let temp = tempfile::tempdir().unwrap();
         let places = places(temp.path());
-        let [humble, jazzy] = ["humble", "jazzy"].map(|distro| touch(places.distros.join(distro).join("setup.bash")));
+        let [humble, jazzy] =
+            ["humble", "jazzy"].map(|distro| touch(places.distros.join(distro).join("setup.bash")));
         // Its name comes last, but it is of ROS 1.
         let noetic = touch(places.distros.join("noetic/setup.bash"));
         touch(places.distros.join("noetic/.catkin"));
@@ -198,7 +220,10 @@ mod tests {
         let activate = touch(venv.join("bin/activate"));
         touch(venv.join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
         let found = find(std::slice::from_ref(&activate), &places(temp.path()));
-        assert_eq!((all_distros(&found), &found[0].versions), (vec!["kilted".to_owned()], &vec![RosVersion::Ros2]));
+        assert_eq!(
+            (all_distros(&found), &found[0].versions),
+            (vec!["kilted".to_owned()], &vec![RosVersion::Ros2])
+        );
         assert_eq!(setup_files(&found, None, &[]), Ok(vec![activate]));
         let gone = temp.path().join("gone/setup.bash");
         let found = find(std::slice::from_ref(&gone), &places(temp.path()));
@@ -229,11 +254,18 @@ mod tests {
             setups: vec![setup.into()],
             ..Installation::default()
         };
-        let found = vec![installed("/opt/ros/noetic/setup.bash", RosVersion::Ros1), installed("/j", RosVersion::Ros2)];
-        let setups = |found: &[Installation]| found.iter().map(|one| one.setups.clone()).collect::<Vec<_>>();
+        let found = vec![
+            installed("/opt/ros/noetic/setup.bash", RosVersion::Ros1),
+            installed("/j", RosVersion::Ros2),
+        ];
+        let setups =
+            |found: &[Installation]| found.iter().map(|one| one.setups.clone()).collect::<Vec<_>>();
         let install = dir.path().join("install/setup.bash");
         let on_ros_2 = with_workspace(found.clone(), dir.path());
-        assert_eq!(setups(&on_ros_2), [vec!["/opt/ros/noetic/setup.bash".into()], vec!["/j".into(), install.clone()]]);
+        assert_eq!(
+            setups(&on_ros_2),
+            [vec!["/opt/ros/noetic/setup.bash".into()], vec!["/j".into(), install.clone()]]
+        );
         assert_eq!(
             setup_files(&on_ros_2, Some(RosVersion::Ros2), &[]),
             Err(UnderlayError::Missing("/j".into())),
@@ -244,6 +276,9 @@ mod tests {
         fs::create_dir(devel.parent().unwrap()).unwrap();
         fs::write(&devel, "").unwrap();
         let on_ros_1 = with_workspace(found, dir.path());
-        assert_eq!(setups(&on_ros_1), [vec!["/opt/ros/noetic/setup.bash".into(), devel], vec!["/j".into()]]);
+        assert_eq!(
+            setups(&on_ros_1),
+            [vec!["/opt/ros/noetic/setup.bash".into(), devel], vec!["/j".into()]]
+        );
     }
 }

@@ -1,7 +1,8 @@
-//! Which account each task runs under, where the agent is root: two user ids of the range in the settings, one for its
-//! processes and one for its builds, so that neither a neighbour nor an older version that still runs has rights over
-//! either. The ids stay the task's own for as long as its directory is there, and are the last to be given to another task
-//! afterwards. The groups are those of `task_user`. Nothing is entered in the system's list of accounts.
+//! Which account each task runs under, where the agent is root: two user ids of the range in the
+//! settings, one for its processes and one for its builds, so that neither a neighbour nor an older
+//! version that still runs has rights over either. The ids stay the task's own for as long as its
+//! directory is there, and are the last to be given to another task afterwards. The groups are
+//! those of `task_user`. Nothing is entered in the system's list of accounts.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -62,9 +63,12 @@ impl Accounts {
         self.range.is_some()
     }
 
-    /// The accounts of `task`, which are its own from now on, also after a power cut. They have the groups of `base`.
+    /// The accounts of `task`, which are its own from now on, also after a power cut. They have the
+    /// groups of `base`.
     pub fn of(&self, task: &TaskName, base: &TaskUser) -> io::Result<AccountPair> {
-        let Some(range) = &self.range else { return Ok(AccountPair { run: base.clone(), build: base.clone() }) };
+        let Some(range) = &self.range else {
+            return Ok(AccountPair { run: base.clone(), build: base.clone() });
+        };
         let mut book = self.book.lock().unwrap_or_else(PoisonError::into_inner);
         let known = match &mut *book {
             Some(known) => known,
@@ -76,7 +80,9 @@ impl Accounts {
                 let mut next = known.clone();
                 let id = next.assign(task, range, &|id| self.is_free(id)).ok_or_else(|| {
                     let (first, last) = (range.start(), range.end());
-                    io::Error::other(format!("task_uids: no two user ids from {first} to {last} are free"))
+                    io::Error::other(format!(
+                        "task_uids: no two user ids from {first} to {last} are free"
+                    ))
                 })?;
                 self.write(&next)?;
                 *known = next;
@@ -128,9 +134,11 @@ impl Accounts {
         durable::write(&self.data.accounts(), &serde_json::to_vec_pretty(book)?, 0o600)
     }
 
-    /// Whether nobody has this id: no account of the system, and no file where everybody may leave one.
+    /// Whether nobody has this id: no account of the system, and no file where everybody may leave
+    /// one.
     fn is_free(&self, id: u32) -> bool {
-        let text = |path: &str| String::from_utf8_lossy(&fs::read(path).unwrap_or_default()).into_owned();
+        let text =
+            |path: &str| String::from_utf8_lossy(&fs::read(path).unwrap_or_default()).into_owned();
         let is_listed = |path: &str| {
             let id = id.to_string();
             text(path).lines().any(|line| line.split(':').nth(2) == Some(id.as_str()))
@@ -140,16 +148,29 @@ impl Accounts {
 }
 
 impl Book {
-    /// Gives `task` the first id of a pair: the one that it had, else one that nobody had, else the one that was given back
-    /// first.
-    fn assign(&mut self, task: &TaskName, range: &RangeInclusive<u32>, is_free: &impl Fn(u32) -> bool) -> Option<u32> {
+    /// Gives `task` the first id of a pair: the one that it had, else one that nobody had, else the
+    /// one that was given back first.
+    fn assign(
+        &mut self,
+        task: &TaskName,
+        range: &RangeInclusive<u32>,
+        is_free: &impl Fn(u32) -> bool,
+    ) -> Option<u32> {
         self.tasks.remove(task);
-        let had = self.former.iter().find(|(name, id)| name == task && has_pair(range, *id)).map(|(_, id)| *id);
-        let used: BTreeSet<u32> = self.tasks.values().copied().chain(self.former.iter().map(|(_, id)| *id)).collect();
-        let overlaps = |id: u32| used.contains(&id) || used.contains(&(id + 1)) || (id > 0 && used.contains(&(id - 1)));
+        let had = self
+            .former
+            .iter()
+            .find(|(name, id)| name == task && has_pair(range, *id))
+            .map(|(_, id)| *id);
+        let used: BTreeSet<u32> =
+            self.tasks.values().copied().chain(self.former.iter().map(|(_, id)| *id)).collect();
+        let overlaps = |id: u32| {
+            used.contains(&id) || used.contains(&(id + 1)) || (id > 0 && used.contains(&(id - 1)))
+        };
         let pair_is_free = |id: u32| is_free(id) && is_free(id + 1);
         let fresh = || {
-            let mut pairs = range.clone().step_by(PER_TASK as usize).filter(|id| has_pair(range, *id));
+            let mut pairs =
+                range.clone().step_by(PER_TASK as usize).filter(|id| has_pair(range, *id));
             pairs.find(|id| !overlaps(*id) && pair_is_free(*id))
         };
         let again = || {
@@ -171,7 +192,9 @@ fn has_pair(range: &RangeInclusive<u32>, id: u32) -> bool {
 fn owns_public_files(id: u32) -> bool {
     let owns_in = |dir: &str| {
         let entries = fs::read_dir(Path::new(dir)).into_iter().flatten().flatten();
-        entries.into_iter().any(|entry| entry.metadata().is_ok_and(|about| about.uid() == id || about.gid() == id))
+        entries
+            .into_iter()
+            .any(|entry| entry.metadata().is_ok_and(|about| about.uid() == id || about.gid() == id))
     };
     PUBLIC_DIRECTORIES.iter().any(|dir| owns_in(dir))
 }
@@ -198,16 +221,27 @@ mod tests {
     fn ids_are_a_tasks_own_over_restarts_and_come_with_the_groups_of_the_task_user() {
         let temp = tempfile::tempdir().expect("a directory");
         let first = accounts(temp.path(), RANGE).of(&name("a"), &base()).expect("assigned");
-        let expected =
-            TaskUser { name: "3000000".to_owned(), uid: 3_000_000, gid: 3_000_000, groups: vec![995, 20, 44] };
-        assert_eq!((&first.run, first.build.uid, first.build.gid), (&expected, 3_000_001, 3_000_001));
+        let expected = TaskUser {
+            name: "3000000".to_owned(),
+            uid: 3_000_000,
+            gid: 3_000_000,
+            groups: vec![995, 20, 44],
+        };
+        assert_eq!(
+            (&first.run, first.build.uid, first.build.gid),
+            (&expected, 3_000_001, 3_000_001)
+        );
         let again = accounts(temp.path(), RANGE);
         assert_eq!(again.of(&name("b"), &base()).expect("assigned").run.uid, 3_000_002);
         assert_eq!(again.of(&name("a"), &base()).expect("known"), first);
         assert_eq!(accounts(temp.path(), RANGE).of(&name("a"), &base()).expect("known"), first);
         // Another range: those outside of it are given up.
         assert_eq!(
-            accounts(temp.path(), 3_000_010..=3_000_011).of(&name("a"), &base()).expect("known").run.uid,
+            accounts(temp.path(), 3_000_010..=3_000_011)
+                .of(&name("a"), &base())
+                .expect("known")
+                .run
+                .uid,
             3_000_010
         );
     }
@@ -216,7 +250,8 @@ mod tests {
     fn id_of_a_removed_task_is_the_last_to_be_given_to_another() {
         let temp = tempfile::tempdir().expect("a directory");
         let accounts = accounts(temp.path(), RANGE);
-        let id = |task: &str| accounts.of(&name(task), &base()).map(|pair| pair.run.uid - RANGE.start());
+        let id =
+            |task: &str| accounts.of(&name(task), &base()).map(|pair| pair.run.uid - RANGE.start());
         assert_eq!((id("a").expect("free"), id("b").expect("free")), (0, 2));
         accounts.release(&name("a")).expect("noted");
         assert_eq!(id("c").expect("free"), 4);

@@ -8,12 +8,14 @@ pub const SUPPLIES: &str = "/sys/class/power_supply";
 
 /// How full the first battery in `supplies` is; `None` where there is none that says so.
 pub fn percent(supplies: &Path) -> Option<u8> {
-    let mut names: Vec<_> = fs::read_dir(supplies).ok()?.flatten().map(|entry| entry.path()).collect();
+    let mut names: Vec<_> =
+        fs::read_dir(supplies).ok()?.flatten().map(|entry| entry.path()).collect();
     names.sort();
     names.iter().find_map(|supply| {
         let says = |file: &str| Some(fs::read_to_string(supply.join(file)).ok()?.trim().to_owned());
         // The battery of a mouse is one too, of another scope.
-        let is_of_robot = says("type")? == "Battery" && says("scope").is_none_or(|scope| scope != "Device");
+        let is_of_robot =
+            says("type")? == "Battery" && says("scope").is_none_or(|scope| scope != "Device");
         says("capacity").filter(|_| is_of_robot)?.parse().ok().filter(|percent| *percent <= 100)
     })
 }
@@ -27,7 +29,9 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let supply = |name: &str, files: &[(&str, &str)]| {
             fs::create_dir(dir.path().join(name)).unwrap();
-            files.iter().for_each(|(file, text)| fs::write(dir.path().join(name).join(file), text).unwrap());
+            files.iter().for_each(|(file, text)| {
+                fs::write(dir.path().join(name).join(file), text).unwrap()
+            });
         };
         assert_eq!(percent(dir.path()), None);
         assert_eq!(percent(&dir.path().join("absent")), None);

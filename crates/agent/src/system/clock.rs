@@ -1,5 +1,6 @@
-//! The only place that reads the time. Waits and elapsed times use milliseconds since boot, suspend included, because a
-//! robot's wall clock may jump; the wall clock is only asked whether a signed state or a certificate has expired.
+//! The only place that reads the time. Waits and elapsed times use milliseconds since boot, suspend
+//! included, because a robot's wall clock may jump; the wall clock is only asked whether a signed
+//! state or a certificate has expired.
 
 use std::io;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -15,11 +16,14 @@ pub fn boot_id() -> io::Result<String> {
     Ok(std::fs::read_to_string("/proc/sys/kernel/random/boot_id")?.trim().to_owned())
 }
 
-/// How long the machine has been up, suspended time included: the clock that process start times are given in.
+/// How long the machine has been up, suspended time included: the clock that process start times
+/// are given in.
 pub fn uptime() -> io::Result<Duration> {
     let text = std::fs::read_to_string("/proc/uptime")?;
     let seconds = text.split_ascii_whitespace().next().and_then(|first| first.parse().ok());
-    seconds.map(Duration::from_secs_f64).ok_or_else(|| io::Error::other("/proc/uptime is not a number of seconds"))
+    seconds
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| io::Error::other("/proc/uptime is not a number of seconds"))
 }
 
 /// Milliseconds since the Unix epoch, or what the robot takes for it.
@@ -28,7 +32,8 @@ pub fn wall_ms() -> u64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, millis)
 }
 
-/// Milliseconds since the Unix epoch before which this program did not exist: a wall clock that shows less is wrong.
+/// Milliseconds since the Unix epoch before which this program did not exist: a wall clock that
+/// shows less is wrong.
 pub const PROGRAM_EXISTS_SINCE_MS: u64 = task_transport::BUILT_MS;
 
 /// The wall clock as certificates are judged by it.

@@ -1,5 +1,5 @@
-//! Whether a package fits on the disk: blob, unpacked tree, build and a reserve, checked before anything travels.
-//! It never frees anything.
+//! Whether a package fits on the disk: blob, unpacked tree, build and a reserve, checked before
+//! anything travels. It never frees anything.
 
 use std::io;
 use std::path::Path;
@@ -97,7 +97,10 @@ impl Room {
 pub fn room(path: &Path) -> io::Result<Room> {
     let stat = nix::sys::statvfs::statvfs(path)?;
     let block = stat.fragment_size();
-    Ok(Room { free: stat.blocks_available().saturating_mul(block), total: stat.blocks().saturating_mul(block) })
+    Ok(Room {
+        free: stat.blocks_available().saturating_mul(block),
+        total: stat.blocks().saturating_mul(block),
+    })
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
-//! Changes to the file system that survive a power cut: once a function here returns, a reader finds the new state, and
-//! until then the old one, never half of it. It knows nothing of what the files mean.
+//! Changes to the file system that survive a power cut: once a function here returns, a reader
+//! finds the new state, and until then the old one, never half of it. It knows nothing of what the
+//! files mean.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -14,10 +15,12 @@ mod removal;
 
 pub use removal::remove_dir_all;
 
-/// Replaces the file at `path` by one that holds `bytes` and has `mode`. One writer per path at a time.
+/// Replaces the file at `path` by one that holds `bytes` and has `mode`. One writer per path at a
+/// time.
 pub fn write(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = beside(path, ".tmp");
-    // What a crash left behind must not lend the new file its mode, nor be followed if it is a link.
+    // What a crash left behind must not lend the new file its mode, nor be followed if it is a
+    // link.
     remove_file(&temporary)?;
     let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&temporary)?;
     file.set_permissions(fs::Permissions::from_mode(mode))?;
@@ -64,8 +67,9 @@ pub fn remove_file(path: &Path) -> io::Result<()> {
     absent_is_fine(fs::remove_file(path))
 }
 
-/// Brings everything written on the file system that holds the directory `path` to the disk. One call for a whole tree:
-/// syncing its files one by one takes many times as long. A link, pipe or device in its place is refused unopened.
+/// Brings everything written on the file system that holds the directory `path` to the disk. One
+/// call for a whole tree: syncing its files one by one takes many times as long. A link, pipe or
+/// device in its place is refused unopened.
 pub fn sync_file_system(path: &Path) -> io::Result<()> {
     Ok(nix::unistd::syncfs(open_dir(path, OFlag::O_NOFOLLOW)?)?)
 }
@@ -75,8 +79,8 @@ pub fn sync_dir(path: &Path) -> io::Result<()> {
     open_dir(path, OFlag::empty())?.sync_all()
 }
 
-/// Opens a directory. Anything else is refused without being opened: a pipe would keep the caller waiting, and opening a
-/// device may already change something.
+/// Opens a directory. Anything else is refused without being opened: a pipe would keep the caller
+/// waiting, and opening a device may already change something.
 fn open_dir(path: &Path, flags: OFlag) -> io::Result<File> {
     let flags = OFlag::O_DIRECTORY | flags;
     OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)

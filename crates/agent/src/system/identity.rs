@@ -36,7 +36,8 @@ pub struct Identity {
     pub server: String,
     /// The key that signs its desired states.
     pub server_key: PublicKey,
-    /// The certificate authority that made the server's certificate; absent: the system's roots vouch for it, if it has one.
+    /// The certificate authority that made the server's certificate; absent: the system's roots
+    /// vouch for it, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
     /// The key that it shows where clients are asked for a certificate.
@@ -79,7 +80,9 @@ pub enum IdentityError {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MacError {
     /// There is no physical network interface.
-    #[error("no physical network interface with an address was found: give the robot's MAC with --mac")]
+    #[error(
+        "no physical network interface with an address was found: give the robot's MAC with --mac"
+    )]
     NoneFound,
     /// All there are have addresses that were made up.
     #[error(
@@ -95,7 +98,9 @@ impl Identity {
         match std::fs::read(path) {
             Ok(bytes) => serde_json::from_slice(&bytes)
                 .map_err(|source| IdentityError::Malformed { path: path.to_owned(), source }),
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Err(IdentityError::Missing(path.to_owned())),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                Err(IdentityError::Missing(path.to_owned()))
+            }
             Err(source) => Err(IdentityError::Io { path: path.to_owned(), source }),
         }
     }
@@ -104,7 +109,8 @@ impl Identity {
     pub fn write(&self, path: &Path) -> Result<(), IdentityError> {
         let bytes = serde_json::to_vec_pretty(self)
             .map_err(|source| IdentityError::Malformed { path: path.to_owned(), source })?;
-        durable::write(path, &bytes, 0o600).map_err(|source| IdentityError::Io { path: path.to_owned(), source })
+        durable::write(path, &bytes, 0o600)
+            .map_err(|source| IdentityError::Io { path: path.to_owned(), source })
     }
 }
 
@@ -114,18 +120,31 @@ pub fn find_own_mac() -> Result<MacAddress, MacError> {
     find_mac(Path::new(INTERFACES), |name| permanent_address::of(name).ok().flatten())
 }
 
-/// The MAC to register by: the permanent address of the first physical interface below `interfaces`, by name, so that
-/// `eth0` comes before `wlan0`. For one that uses another address `permanent` tells the hardware's own, if it can.
-pub fn find_mac(interfaces: &Path, permanent: impl Fn(&str) -> Option<MacAddress>) -> Result<MacAddress, MacError> {
-    let read = |dir: &Path, file: &str| std::fs::read_to_string(dir.join(file)).map(|text| text.trim().to_owned());
-    let mut dirs: Vec<PathBuf> =
-        std::fs::read_dir(interfaces).into_iter().flatten().flatten().map(|entry| entry.path()).collect();
+/// The MAC to register by: the permanent address of the first physical interface below
+/// `interfaces`, by name, so that `eth0` comes before `wlan0`. For one that uses another address
+/// `permanent` tells the hardware's own, if it can.
+pub fn find_mac(
+    interfaces: &Path,
+    permanent: impl Fn(&str) -> Option<MacAddress>,
+) -> Result<MacAddress, MacError> {
+    let read = |dir: &Path, file: &str| {
+        std::fs::read_to_string(dir.join(file)).map(|text| text.trim().to_owned())
+    };
+    let mut dirs: Vec<PathBuf> = std::fs::read_dir(interfaces)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path())
+        .collect();
     dirs.sort();
     let mut made_up = Vec::new();
     for dir in dirs {
         // A bridge, a tunnel or a container's interface has no device behind it.
         let is_physical = dir.join("device").exists();
-        let Some(mac) = read(&dir, "address").ok().and_then(|text| text.parse::<MacAddress>().ok()) else { continue };
+        let Some(mac) = read(&dir, "address").ok().and_then(|text| text.parse::<MacAddress>().ok())
+        else {
+            continue;
+        };
         if !is_physical {
             continue;
         }
@@ -137,7 +156,11 @@ pub fn find_mac(interfaces: &Path, permanent: impl Fn(&str) -> Option<MacAddress
         }
         made_up.push(format!("{name} {mac}"));
     }
-    if made_up.is_empty() { Err(MacError::NoneFound) } else { Err(MacError::MadeUp(made_up.join(", "))) }
+    if made_up.is_empty() {
+        Err(MacError::NoneFound)
+    } else {
+        Err(MacError::MadeUp(made_up.join(", ")))
+    }
 }
 
 #[cfg(test)]
@@ -165,13 +188,25 @@ mod tests {
         assert_eq!(find_mac(root.path(), |_| None), Err(MacError::NoneFound));
         interface(root.path(), "eth0", "02:11:22:33:44:51", "0", true);
         interface(root.path(), "usb0", "00:11:22:33:44:52", "1", true);
-        let error = find_mac(root.path(), |_| None).expect_err("only made-up addresses").to_string();
-        assert!(error.contains("eth0 02:11:22:33:44:51") && error.contains("usb0") && error.contains("--mac"));
+        let error =
+            find_mac(root.path(), |_| None).expect_err("only made-up addresses").to_string();
+        assert!(
+            error.contains("eth0 02:11:22:33:44:51")
+                && error.contains("usb0")
+                && error.contains("--mac")
+        );
         // The Wi-Fi made one up, but its hardware has one.
-        let burned_in = |name: &str| (name == "usb0").then(|| "00:11:22:33:44:99".parse().expect("valid"));
-        assert_eq!(find_mac(root.path(), burned_in).expect("found").to_string(), "00:11:22:33:44:99");
+        let burned_in =
+            |name: &str| (name == "usb0").then(|| "00:11:22:33:44:99".parse().expect("valid"));
+        assert_eq!(
+            find_mac(root.path(), burned_in).expect("found").to_string(),
+            "00:11:22:33:44:99"
+        );
         interface(root.path(), "wlan0", "00:11:22:33:44:53", "0", true);
-        assert_eq!(find_mac(root.path(), |_| None).expect("found").to_string(), "00:11:22:33:44:53");
+        assert_eq!(
+            find_mac(root.path(), |_| None).expect("found").to_string(),
+            "00:11:22:33:44:53"
+        );
     }
 
     #[test]

@@ -39,8 +39,8 @@ use crate::system::durable;
 /// The flag file by which `hold` and `release` speak to the agent.
 pub const HOLD_FILE: &str = "hold";
 
-/// What a directory is called while it is being removed; no task or version can have such a name. Were it removed in
-/// place, a power cut would leave half a tree where a whole one is expected.
+/// What a directory is called while it is being removed; no task or version can have such a name.
+/// Were it removed in place, a power cut would leave half a tree where a whole one is expected.
 const REMOVED: &str = ".removed-";
 /// What follows a version's name in that of the file with its signatures.
 const SIGNATURES: &str = ".signatures";
@@ -131,18 +131,23 @@ impl DataDir {
         [self.root.clone(), self.tasks(), self.task(name).root]
     }
 
-    /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at start: a pull in
-    /// progress would lose its tree. What can't be removed keeps nothing else from it.
+    /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at
+    /// start: a pull in progress would lose its tree. What can't be removed keeps nothing else from
+    /// it.
     pub fn clean_leftovers(&self) -> io::Result<()> {
         let tasks = entries(&self.tasks())?;
         let mut outcomes = vec![durable::remove_dir_all(&self.staging()), remove_marked(&tasks)];
-        outcomes.extend(tasks.iter().filter(|path| path.is_dir()).map(|task| remove_marked(&entries(task)?)));
+        outcomes.extend(
+            tasks.iter().filter(|path| path.is_dir()).map(|task| remove_marked(&entries(task)?)),
+        );
         outcomes.into_iter().collect()
     }
 
     /// Removes all gathered bytes except those of the blobs in `wanted`.
     pub fn clean_parts(&self, wanted: &[Digest]) -> io::Result<()> {
-        let of_blob = |digest| [self.blob_part(digest), self.blob_parts(digest), self.blob_parts_note(digest)];
+        let of_blob = |digest| {
+            [self.blob_part(digest), self.blob_parts(digest), self.blob_parts_note(digest)]
+        };
         let keep: Vec<PathBuf> = wanted.iter().flat_map(of_blob).collect();
         for path in entries(&self.blobs())? {
             if !keep.contains(&path) {
@@ -154,7 +159,10 @@ impl DataDir {
 
     /// The names of all tasks that have a directory.
     pub fn task_names(&self) -> io::Result<Vec<TaskName>> {
-        Ok(entries(&self.tasks())?.iter().filter_map(|path| file_name(path)?.parse().ok()).collect())
+        Ok(entries(&self.tasks())?
+            .iter()
+            .filter_map(|path| file_name(path)?.parse().ok())
+            .collect())
     }
 
     fn blobs(&self) -> PathBuf {
@@ -207,7 +215,8 @@ impl TaskDir {
         self.root.join("build_home")
     }
 
-    /// Which uploads of its files are under way: out of the task's reach, because it says where the robot's token goes.
+    /// Which uploads of its files are under way: out of the task's reach, because it says where the
+    /// robot's token goes.
     pub fn uploads(&self) -> PathBuf {
         self.root.join("uploads.json")
     }
@@ -242,7 +251,8 @@ impl TaskDir {
         Ok(entries(&self.root)?.iter().filter_map(|path| digest_of(path)).collect())
     }
 
-    /// Removes every version except those in `kept` and the current one, and what is left of earlier ones.
+    /// Removes every version except those in `kept` and the current one, and what is left of
+    /// earlier ones.
     pub fn prune(&self, kept: &[Digest]) -> io::Result<()> {
         remove_marked(&entries(&self.root)?)?;
         let current = self.current();
@@ -253,7 +263,9 @@ impl TaskDir {
         }
         for path in entries(&self.root)? {
             let version = file_name(&path)
-                .and_then(|name| [SIGNATURES, SEAL].iter().find_map(|suffix| name.strip_suffix(suffix)))
+                .and_then(|name| {
+                    [SIGNATURES, SEAL].iter().find_map(|suffix| name.strip_suffix(suffix))
+                })
                 .map(Path::new);
             let version = version.and_then(digest_of);
             if version.is_some_and(|digest| !kept.contains(&digest) && current != Some(digest)) {
@@ -284,7 +296,8 @@ impl VersionDir {
         self.root.join("task.json")
     }
 
-    /// The unpacked package. It exists only whole: it is renamed here when all of it is on the disk.
+    /// The unpacked package. It exists only whole: it is renamed here when all of it is on the
+    /// disk.
     pub fn src(&self) -> PathBuf {
         self.root.join("src")
     }
@@ -315,8 +328,8 @@ impl VersionDir {
     }
 }
 
-/// Removes a directory so that it is there whole or not at all, at any moment. It is not done while anything is left of it,
-/// also of an earlier try.
+/// Removes a directory so that it is there whole or not at all, at any moment. It is not done while
+/// anything is left of it, also of an earlier try.
 fn remove_whole(dir: &Path) -> io::Result<()> {
     let Some(name) = file_name(dir) else { return Ok(()) };
     let removed = dir.with_file_name(format!("{REMOVED}{name}"));
@@ -331,7 +344,8 @@ fn remove_whole(dir: &Path) -> io::Result<()> {
 /// Removes what is marked as being removed, all that can be.
 fn remove_marked(paths: &[PathBuf]) -> io::Result<()> {
     let is_marked = |path: &&PathBuf| file_name(path).is_some_and(|name| name.starts_with(REMOVED));
-    let outcomes: Vec<_> = paths.iter().filter(is_marked).map(|path| durable::remove_dir_all(path)).collect();
+    let outcomes: Vec<_> =
+        paths.iter().filter(is_marked).map(|path| durable::remove_dir_all(path)).collect();
     outcomes.into_iter().collect()
 }
 
@@ -379,8 +393,14 @@ mod tests {
         let mut left = vec![previous, current];
         left.sort();
         assert_eq!((task.current(), task.versions().unwrap()), (Some(current), left));
-        assert_eq!([old, previous, current].map(|digest| task.signatures(&digest).exists()), [false, true, true]);
-        assert_eq!([old, previous, current].map(|digest| task.seal(&digest).exists()), [false, true, true]);
+        assert_eq!(
+            [old, previous, current].map(|digest| task.signatures(&digest).exists()),
+            [false, true, true]
+        );
+        assert_eq!(
+            [old, previous, current].map(|digest| task.seal(&digest).exists()),
+            [false, true, true]
+        );
         assert_eq!(data.task_names().unwrap(), ["talker".parse().unwrap()]);
         task.remove().unwrap();
         assert_eq!(data.task_names().unwrap(), []);
@@ -400,7 +420,8 @@ mod tests {
         durable::create_dir_all(&data.tasks().join(".removed-gone/run")).unwrap();
         durable::create_dir_all(&data.staging().join("x")).unwrap();
         assert_eq!((task.versions().unwrap(), data.task_names().unwrap().len()), (vec![kept], 1));
-        // The version comes back and is removed again while the rest of the first removal is still there.
+        // The version comes back and is removed again while the rest of the first removal is still
+        // there.
         durable::create_dir_all(&task.version(&half).src()).unwrap();
         task.prune(&[kept]).unwrap();
         assert!(!marked.exists() && !task.version(&half).root().exists());
@@ -447,7 +468,8 @@ mod tests {
             fs::write(data.blob_parts_note(&digest), "…").unwrap();
         }
         data.clean_parts(&[wanted]).unwrap();
-        let left = [data.blob_part(&wanted), data.blob_parts(&wanted), data.blob_parts_note(&wanted)];
+        let left =
+            [data.blob_part(&wanted), data.blob_parts(&wanted), data.blob_parts_note(&wanted)];
         assert_eq!(entries(&data.blobs()).unwrap(), left);
     }
 }

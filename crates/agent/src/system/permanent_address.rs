@@ -1,5 +1,6 @@
-//! The address a network interface was made with, whatever it uses now: a robot's Wi-Fi may make up a new one for each
-//! network. It asks the kernel by the ioctl that `ethtool -P` uses, and nothing else.
+//! The address a network interface was made with, whatever it uses now: a robot's Wi-Fi may make up
+//! a new one for each network. It asks the kernel by the ioctl that `ethtool -P` uses, and nothing
+//! else.
 
 use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -31,18 +32,22 @@ struct Question {
     rest: [u8; 16],
 }
 
-/// The permanent address of `interface`; `None` where the kernel knows none, as for interfaces without hardware.
+/// The permanent address of `interface`; `None` where the kernel knows none, as for interfaces
+/// without hardware.
 pub fn of(interface: &str) -> io::Result<Option<MacAddress>> {
-    let mut question = Question { name: [0; libc::IFNAMSIZ], answer: std::ptr::null_mut(), rest: [0; 16] };
+    let mut question =
+        Question { name: [0; libc::IFNAMSIZ], answer: std::ptr::null_mut(), rest: [0; 16] };
     if interface.len() >= libc::IFNAMSIZ {
         return Err(io::Error::from(io::ErrorKind::InvalidInput));
     }
     question.name[..interface.len()].copy_from_slice(interface.as_bytes());
-    let mut answer = Answer { command: ETHTOOL_GPERMADDR, size: MAX_ADDRESS as u32, address: [0; MAX_ADDRESS] };
+    let mut answer =
+        Answer { command: ETHTOOL_GPERMADDR, size: MAX_ADDRESS as u32, address: [0; MAX_ADDRESS] };
     question.answer = &raw mut answer;
     // Any socket leads to the network's interfaces; nothing is sent over it.
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
-    // SAFETY: both structures are laid out as the kernel's, outlive the call, and `size` is the room in `answer`.
+    // SAFETY: both structures are laid out as the kernel's, outlive the call, and `size` is the
+    // room in `answer`.
     let result = unsafe { libc::ioctl(socket.as_raw_fd(), SIOCETHTOOL as _, &raw mut question) };
     match Errno::result(result) {
         Ok(_) => Ok(parse(&answer)),
@@ -79,11 +84,15 @@ mod tests {
     /// What the kernel says in /sys of this machine's own interfaces, it says here too.
     #[test]
     fn hardware_that_uses_its_own_address_has_it_as_the_permanent_one() {
-        let read = |path: &Path| std::fs::read_to_string(path).unwrap_or_default().trim().to_owned();
+        let read =
+            |path: &Path| std::fs::read_to_string(path).unwrap_or_default().trim().to_owned();
         let mut seen = 0;
         for entry in std::fs::read_dir("/sys/class/net").expect("interfaces").flatten() {
-            let is_own = read(&entry.path().join("addr_assign_type")) == "0" && entry.path().join("device").exists();
-            let Some(used) = read(&entry.path().join("address")).parse::<MacAddress>().ok().filter(|_| is_own) else {
+            let is_own = read(&entry.path().join("addr_assign_type")) == "0"
+                && entry.path().join("device").exists();
+            let Some(used) =
+                read(&entry.path().join("address")).parse::<MacAddress>().ok().filter(|_| is_own)
+            else {
                 continue;
             };
             assert_eq!(of(&entry.file_name().to_string_lossy()).expect("asked"), Some(used));
@@ -101,7 +110,18 @@ mod tests {
     fn an_interface_without_hardware_has_none() {
         let looked = std::thread::spawn(|| {
             nix::sched::unshare(nix::sched::CloneFlags::CLONE_NEWNET).ok()?;
-            let words = ["link", "add", "one", "address", "00:11:22:33:44:55", "type", "veth", "peer", "name", "two"];
+            let words = [
+                "link",
+                "add",
+                "one",
+                "address",
+                "00:11:22:33:44:55",
+                "type",
+                "veth",
+                "peer",
+                "name",
+                "two",
+            ];
             let made = std::process::Command::new("ip").args(words).status().ok()?;
             made.success().then(|| (of("one").expect("asked"), of("two").expect("asked")))
         });

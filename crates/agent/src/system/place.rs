@@ -1,7 +1,8 @@
-//! Where an agent runs: the lock file that it holds, during one boot of one machine. A copy of the data directory has
-//! another lock file, and a machine that was started again another boot. An agent that comes with the same place has had to
-//! wait for the lock, and so for the end of the agent before it: by that a server tells a restart from a copy. It is found
-//! out at each start and written down nowhere.
+//! Where an agent runs: the lock file that it holds, during one boot of one machine. A copy of the
+//! data directory has another lock file, and a machine that was started again another boot. An
+//! agent that comes with the same place has had to wait for the lock, and so for the end of the
+//! agent before it: by that a server tells a restart from a copy. It is found out at each start and
+//! written down nowhere.
 
 use std::fs::File;
 use std::io;
@@ -15,9 +16,15 @@ use super::clock;
 /// The place of whatever holds this lock file.
 pub fn of(lock: &File) -> io::Result<Digest> {
     let about = lock.metadata()?;
-    // Not all file systems know it. It tells files apart that got the number of one that was removed.
-    let born = about.created().ok().and_then(|born| born.duration_since(UNIX_EPOCH).ok()).unwrap_or_default();
-    let place = format!("{} {} {} {}", clock::boot_id()?, about.dev(), about.ino(), born.as_nanos());
+    // Not all file systems know it. It tells files apart that got the number of one that was
+    // removed.
+    let born = about
+        .created()
+        .ok()
+        .and_then(|born| born.duration_since(UNIX_EPOCH).ok())
+        .unwrap_or_default();
+    let place =
+        format!("{} {} {} {}", clock::boot_id()?, about.dev(), about.ino(), born.as_nanos());
     Ok(Digest::of(place.as_bytes()))
 }
 

@@ -1,6 +1,7 @@
-//! The account that tasks take their groups from where the agent is root, found by name or number, and what accounts are
-//! given of the agent's directories: their own files, the way to them, and to read what they run. It reads `/etc/passwd` and `/etc/group`
-//! itself, because a static program can't load the system's name services. It never creates an account.
+//! The account that tasks take their groups from where the agent is root, found by name or number,
+//! and what accounts are given of the agent's directories: their own files, the way to them, and to
+//! read what they run. It reads `/etc/passwd` and `/etc/group` itself, because a static program
+//! can't load the system's name services. It never creates an account.
 
 use std::fs;
 use std::io;
@@ -64,7 +65,9 @@ pub enum TaskUserError {
         data: PathBuf,
     },
     /// Only root may run things as somebody else.
-    #[error("task_user is {name:?}, but the agent does not run as root and can't start anything as another user")]
+    #[error(
+        "task_user is {name:?}, but the agent does not run as root and can't start anything as another user"
+    )]
     NotRoot {
         /// The name.
         name: String,
@@ -74,22 +77,33 @@ pub enum TaskUserError {
 impl TaskUser {
     /// The account that `setting` means; `None`: builds and tasks run as whoever the agent is.
     pub fn find(setting: Option<&str>) -> Result<Option<Self>, TaskUserError> {
-        let text = |path: &str| fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
-        let (passwd, group) = (text("/etc/passwd").unwrap_or_default(), text("/etc/group").unwrap_or_default());
+        let text =
+            |path: &str| fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+        let (passwd, group) =
+            (text("/etc/passwd").unwrap_or_default(), text("/etc/group").unwrap_or_default());
         Self::choose(setting, nix::unistd::geteuid().as_raw(), &passwd, &group)
     }
 
-    fn choose(setting: Option<&str>, own: u32, passwd: &str, group: &str) -> Result<Option<Self>, TaskUserError> {
+    fn choose(
+        setting: Option<&str>,
+        own: u32,
+        passwd: &str,
+        group: &str,
+    ) -> Result<Option<Self>, TaskUserError> {
         if setting.is_none() && own != 0 {
             return Ok(None);
         }
         let name = setting.unwrap_or(DEFAULT_NAME);
-        let user =
-            Self::look_up(name, passwd, group).ok_or_else(|| TaskUserError::Missing { name: name.to_owned() })?;
+        let user = Self::look_up(name, passwd, group)
+            .ok_or_else(|| TaskUserError::Missing { name: name.to_owned() })?;
         if user.uid == own {
             return Ok(None);
         }
-        if own == 0 { Ok(Some(user)) } else { Err(TaskUserError::NotRoot { name: name.to_owned() }) }
+        if own == 0 {
+            Ok(Some(user))
+        } else {
+            Err(TaskUserError::NotRoot { name: name.to_owned() })
+        }
     }
 
     fn look_up(name: &str, passwd: &str, group: &str) -> Option<Self> {
@@ -97,7 +111,8 @@ impl TaskUser {
         let listed = passwd.lines().find_map(|line| {
             let mut fields = line.split(':');
             let (listed, _) = (fields.next()?, fields.next()?);
-            let (uid, gid): (u32, u32) = (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
+            let (uid, gid): (u32, u32) =
+                (fields.next()?.parse().ok()?, fields.next()?.parse().ok()?);
             (listed == name || Some(uid) == number).then(|| (listed.to_owned(), uid, gid))
         });
         let (name, uid, gid) = listed.or_else(|| Some((name.to_owned(), number?, number?)))?;
@@ -111,20 +126,22 @@ impl TaskUser {
         Some(Self { name, uid, gid, groups })
     }
 
-    /// The account, if it can get to the data directory `data`: the agent opens that and what is in it to its tasks, but
-    /// not what lies above it, which is its administrator's.
+    /// The account, if it can get to the data directory `data`: the agent opens that and what is in
+    /// it to its tasks, but not what lies above it, which is its administrator's.
     pub fn admitted_to(self, data: &Path) -> Result<Self, TaskUserError> {
         let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
         // What can't be told here is seen at the first start.
-        let shut =
-            self.with_its_rights(|| data.ancestors().skip(1).filter(|dir| is_shut(dir)).last().map(Path::to_owned));
+        let shut = self.with_its_rights(|| {
+            data.ancestors().skip(1).filter(|dir| is_shut(dir)).last().map(Path::to_owned)
+        });
         match shut {
             Ok(Some(dir)) => Err(TaskUserError::ShutOut { user: self.name, dir, data }),
             Ok(None) | Err(_) => Ok(self),
         }
     }
 
-    /// An account for one task, which has this one's groups, its own included: what they open of the hardware.
+    /// An account for one task, which has this one's groups, its own included: what they open of
+    /// the hardware.
     pub fn with_id(&self, id: u32) -> Self {
         let groups = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         Self { name: id.to_string(), uid: id, gid: id, groups }
@@ -160,9 +177,10 @@ impl TaskUser {
         self.hand_over(dir)
     }
 
-    /// Makes the tree at `dir` the account's, for nobody else. `dir` itself comes last, so that a tree that was handed
-    /// over in part is done again, and a tree that is the account's is not touched: what a task made of it is its own
-    /// affair, and nothing that it put there is followed.
+    /// Makes the tree at `dir` the account's, for nobody else. `dir` itself comes last, so that a
+    /// tree that was handed over in part is done again, and a tree that is the account's is not
+    /// touched: what a task made of it is its own affair, and nothing that it put there is
+    /// followed.
     pub fn hand_over(&self, dir: &Path) -> io::Result<()> {
         let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
@@ -178,8 +196,9 @@ impl TaskUser {
         Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
     }
 
-    /// Does `work`, which must not touch what is the agent's alone, with the account's rights to files and no others: where
-    /// a task may exchange any file or directory for a link, what it can't read itself can't be read for it.
+    /// Does `work`, which must not touch what is the agent's alone, with the account's rights to
+    /// files and no others: where a task may exchange any file or directory for a link, what it
+    /// can't read itself can't be read for it.
     pub fn with_its_rights<T: Send>(&self, work: impl FnOnce() -> T + Send) -> io::Result<T> {
         // The thread ends with the work, so there are no rights to be taken back.
         std::thread::scope(|scope| {
@@ -188,10 +207,12 @@ impl TaskUser {
         })
     }
 
-    /// Leaves the calling thread, and it alone, the account's rights to files and no capability. Its user id stays root's, or
-    /// every process of the account could end the agent by a signal to this thread.
+    /// Leaves the calling thread, and it alone, the account's rights to files and no capability.
+    /// Its user id stays root's, or every process of the account could end the agent by a signal to
+    /// this thread.
     fn take_file_rights(&self) -> io::Result<()> {
-        let groups: Vec<libc::gid_t> = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
+        let groups: Vec<libc::gid_t> =
+            std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         // SAFETY: the list outlives the call. The C library's own call would change all threads.
         Errno::result(unsafe { libc::syscall(SETGROUPS, groups.len(), groups.as_ptr()) })?;
         // They tell what was before, and nothing of a failure; an id that is none changes nothing.
@@ -222,8 +243,9 @@ fn is_shut(dir: &Path) -> bool {
     fs::metadata(dir.join(".")).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
 }
 
-/// Makes what the account `uid` owns in the tree at `dir` root's: for everybody to read, as the account could, and for nobody
-/// to change. What is somebody else's stays as it is, and no link is followed. No process of the account may be left.
+/// Makes what the account `uid` owns in the tree at `dir` root's: for everybody to read, as the
+/// account could, and for nobody to change. What is somebody else's stays as it is, and no link is
+/// followed. No process of the account may be left.
 pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
     let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     let opened = match nix::fcntl::open(dir, flags, Mode::empty()) {
@@ -247,15 +269,17 @@ pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
     take(&opened, &fstat(&opened)?)
 }
 
-/// Does `work` with each entry below `dir`, the directories after what is in them. What is looked at is what is worked on,
-/// whatever takes its name in between.
+/// Does `work` with each entry below `dir`, the directories after what is in them. What is looked
+/// at is what is worked on, whatever takes its name in between.
 fn each_below(
     dir: &OwnedFd,
     depth: usize,
     work: &mut impl FnMut(&OwnedFd, &FileStat) -> io::Result<()>,
 ) -> io::Result<()> {
     if depth > MAX_DEPTH {
-        return Err(io::Error::other(format!("a directory lies more than {MAX_DEPTH} levels deep")));
+        return Err(io::Error::other(format!(
+            "a directory lies more than {MAX_DEPTH} levels deep"
+        )));
     }
     for entry in fs::read_dir(by_descriptor(dir))? {
         let name = entry?.file_name();
@@ -274,7 +298,8 @@ fn by_descriptor(descriptor: &OwnedFd) -> PathBuf {
     format!("/proc/self/fd/{}", descriptor.as_raw_fd()).into()
 }
 
-/// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks run as whoever it is.
+/// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks
+/// run as whoever it is.
 pub async fn do_as<T: Send + 'static>(
     user: Option<&TaskUser>,
     work: impl FnOnce() -> T + Send + 'static,
@@ -287,14 +312,16 @@ pub async fn do_as<T: Send + 'static>(
     working.await.map_err(io::Error::other).flatten()
 }
 
-/// Leaves the calling thread, and it alone, without capabilities. Another user id for files takes away only those that are
-/// about the modes of files: the rest would still open what `/proc` says of other processes.
+/// Leaves the calling thread, and it alone, without capabilities. Another user id for files takes
+/// away only those that are about the modes of files: the rest would still open what `/proc` says
+/// of other processes.
 fn give_up_capabilities() -> io::Result<()> {
     /// What the kernel calls `_LINUX_CAPABILITY_VERSION_3`: two words for each set.
     const VERSION: u32 = 0x2008_0522;
     let header: [u32; 2] = [VERSION, 0];
     let none = [0_u32; 6];
-    // SAFETY: both arrays have the kernel's layout (version and thread; three sets of two words) and outlive the call.
+    // SAFETY: both arrays have the kernel's layout (version and thread; three sets of two words)
+    // and outlive the call.
     Errno::result(unsafe { libc::syscall(libc::SYS_capset, header.as_ptr(), none.as_ptr()) })?;
     Ok(())
 }
@@ -307,7 +334,8 @@ fn is_kind(stat: &FileStat, kind: SFlag) -> bool {
 mod tests {
     use super::*;
 
-    const PASSWD: &str = "root:x:0:0:root:/root:/bin/bash\nbroken line\ntaskd-task:x:997:995::/:/bin/false\n";
+    const PASSWD: &str =
+        "root:x:0:0:root:/root:/bin/bash\nbroken line\ntaskd-task:x:997:995::/:/bin/false\n";
     const GROUP: &str = "dialout:x:20:alice,taskd-task\nvideo:x:44:taskd-task\nsudo:x:27:alice\ntaskd-task:x:995:\n";
 
     fn choose(setting: Option<&str>, own: u32) -> Result<Option<TaskUser>, TaskUserError> {
@@ -316,10 +344,12 @@ mod tests {
 
     #[test]
     fn root_uses_the_task_account_with_its_groups() {
-        let user = TaskUser { name: DEFAULT_NAME.to_owned(), uid: 997, gid: 995, groups: vec![20, 44] };
+        let user =
+            TaskUser { name: DEFAULT_NAME.to_owned(), uid: 997, gid: 995, groups: vec![20, 44] };
         assert_eq!(choose(None, 0), Ok(Some(user.clone())));
         assert_eq!(choose(Some("997"), 0), Ok(Some(user)));
-        let by_number = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
+        let by_number =
+            TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
         assert_eq!(choose(Some("4711"), 0), Ok(Some(by_number)));
     }
 
@@ -327,8 +357,13 @@ mod tests {
     fn root_must_be_said_and_a_missing_account_is_never_replaced_by_it() {
         assert_eq!(choose(Some("root"), 0), Ok(None));
         assert_eq!(choose(Some("0"), 0), Ok(None));
-        let missing = TaskUser::choose(None, 0, "root:x:0:0::/:/bin/sh\n", "").expect_err("refused").to_string();
-        assert!(missing.contains("useradd --system taskd-task") && missing.contains("task_user"), "{missing}");
+        let missing = TaskUser::choose(None, 0, "root:x:0:0::/:/bin/sh\n", "")
+            .expect_err("refused")
+            .to_string();
+        assert!(
+            missing.contains("useradd --system taskd-task") && missing.contains("task_user"),
+            "{missing}"
+        );
         assert!(choose(Some("tasks"), 0).expect_err("refused").to_string().contains("\"tasks\""));
     }
 
@@ -362,17 +397,27 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let (home, data) = (temp.path().join("home"), temp.path().join("home/agent/data"));
         fs::create_dir_all(&data).expect("made");
-        let let_all = |dir: &Path, mode| fs::set_permissions(dir, fs::Permissions::from_mode(mode)).expect("set");
+        let let_all = |dir: &Path, mode| {
+            fs::set_permissions(dir, fs::Permissions::from_mode(mode)).expect("set")
+        };
         let_all(temp.path(), 0o711);
         let_all(&home, 0o700);
         let_all(&data, 0o700);
-        let user = || TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
+        let user =
+            || TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
         let refused = user().admitted_to(&data).expect_err("shut out");
-        assert!(matches!(&refused, TaskUserError::ShutOut { dir, .. } if *dir == home), "{refused}");
+        assert!(
+            matches!(&refused, TaskUserError::ShutOut { dir, .. } if *dir == home),
+            "{refused}"
+        );
         let chmod = format!("chmod o+x {}`", home.display());
         assert!(refused.to_string().contains(&chmod), "{refused}");
         let_all(&home, 0o711);
-        assert_eq!(user().admitted_to(&data), Ok(user()), "the data directory itself is the agent's to open");
+        assert_eq!(
+            user().admitted_to(&data),
+            Ok(user()),
+            "the data directory itself is the agent's to open"
+        );
     }
 
     #[test]

@@ -1,6 +1,7 @@
-//! Reading files that lie where a task may write. A link, pipe, device or endless file that a task puts in the place of a
-//! file neither leads elsewhere nor is opened nor keeps the reader waiting. A [`Directory`] is entered one component at a
-//! time, so that no link on the way is followed either; [`open`] does not look at the directories above its file.
+//! Reading files that lie where a task may write. A link, pipe, device or endless file that a task
+//! puts in the place of a file neither leads elsewhere nor is opened nor keeps the reader waiting.
+//! A [`Directory`] is entered one component at a time, so that no link on the way is followed
+//! either; [`open`] does not look at the directories above its file.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -60,7 +61,9 @@ impl Directory {
         let last = names.pop().ok_or(io::ErrorKind::InvalidInput)?;
         let mut dir = None;
         for name in names {
-            let Component::Normal(name) = name else { return Err(io::ErrorKind::InvalidInput.into()) };
+            let Component::Normal(name) = name else {
+                return Err(io::ErrorKind::InvalidInput.into());
+            };
             let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
             dir = Some(openat(dir.as_ref().unwrap_or(&self.0), name, flags, Mode::empty())?);
         }

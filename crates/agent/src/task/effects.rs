@@ -1,5 +1,6 @@
-//! What the driver may do to the robot, behind one trait, so that its logic is tested against a fake without disk,
-//! processes or time. [`crate::reconcile::robot::Robot`] is the real one. Effects decide nothing.
+//! What the driver may do to the robot, behind one trait, so that its logic is tested against a
+//! fake without disk, processes or time. [`crate::reconcile::robot::Robot`] is the real one.
+//! Effects decide nothing.
 
 use std::future::Future;
 
@@ -10,7 +11,9 @@ use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::task::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
+use crate::task::ledger::{
+    ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord,
+};
 use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts};
 use crate::task::plan::{Done, StepFailure};
 use crate::transfer::parts::Asks;
@@ -24,7 +27,8 @@ pub struct Now {
     pub wall_ms: u64,
 }
 
-/// Everything the driver does to the robot. Each method may be called again after a crash: doing it twice is harmless.
+/// Everything the driver does to the robot. Each method may be called again after a crash: doing it
+/// twice is harmless.
 pub trait Effects: Send + Sync + 'static {
     /// What the clocks show.
     fn now(&self) -> Now;
@@ -38,8 +42,8 @@ pub trait Effects: Send + Sync + 'static {
     /// Whether the robot has a gate that is to be asked.
     fn is_gated(&self) -> bool;
 
-    /// What packages may require of this robot, apart from the labels the server knows better, with the ROS that was
-    /// last seen.
+    /// What packages may require of this robot, apart from the labels the server knows better, with
+    /// the ROS that was last seen.
     fn robot_facts(&self) -> RobotFacts;
 
     /// Looks at what ROS there is now: a person may have installed what a task lacked.
@@ -48,28 +52,38 @@ pub trait Effects: Send + Sync + 'static {
     /// What the reports say of the machine.
     fn host_facts(&self) -> HostFacts;
 
-    /// Each task's last run, found without the ledger: one that lives, else one that has ended, so that a job that was
-    /// done is not done again.
+    /// Each task's last run, found without the ledger: one that lives, else one that has ended, so
+    /// that a job that was done is not done again.
     fn survivors(&self) -> impl Future<Output = Vec<(TaskName, ActiveRun)>> + Send;
 
     /// What is on the disk of this version.
     fn prepared(&self, package: &PackageRef) -> impl Future<Output = Prepared> + Send;
 
     /// What became of a process.
-    fn process(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ProcessState> + Send;
+    fn process(
+        &self,
+        task: &TaskName,
+        process: &ProcessRecord,
+    ) -> impl Future<Output = ProcessState> + Send;
 
     /// Resolves when a process that lived has ended. Dropping it does nothing to the process.
-    fn process_ended(&self, task: &TaskName, process: &ProcessRecord) -> impl Future<Output = ()> + Send;
+    fn process_ended(
+        &self,
+        task: &TaskName,
+        process: &ProcessRecord,
+    ) -> impl Future<Output = ()> + Send;
 
-    /// Begins to compare what ROS says of this run, whose process lives, with what its package promises, bringing its
-    /// lifecycle nodes to active and setting its parameters unless `process.ready` says that this was done. It goes on
-    /// until the receiver is dropped. A package that promises nothing holds since its process was started.
+    /// Begins to compare what ROS says of this run, whose process lives, with what its package
+    /// promises, bringing its lifecycle nodes to active and setting its parameters unless
+    /// `process.ready` says that this was done. It goes on until the receiver is dropped. A package
+    /// that promises nothing holds since its process was started.
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
 
     /// How many versions may be prepared at the same time.
     fn parallel_tasks(&self) -> usize;
 
-    /// Notes what a desired state says of who has signed what, and begins to get it; and takes on the settings in it.
+    /// Notes what a desired state says of who has signed what, and begins to get it; and takes on
+    /// the settings in it.
     fn heed(&self, state: &DesiredState);
 
     /// What the robot goes by when it asks who has signed a package.
@@ -92,7 +106,8 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Takes blobs that came with an order and are what their digests say; those that came before are of no more use.
+    /// Takes blobs that came with an order and are what their digests say; those that came before
+    /// are of no more use.
     fn offer(&self, blobs: Vec<(BlobRef, Bytes)>);
 
     /// Pulls and unpacks the content, likewise.
@@ -103,7 +118,8 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Gathers the parts of the content that the server pushes, pulls what does not come, and unpacks it.
+    /// Gathers the parts of the content that the server pushes, pulls what does not come, and
+    /// unpacks it.
     fn gather_content(
         &self,
         package: &PackageRef,
@@ -126,12 +142,21 @@ pub trait Effects: Send + Sync + 'static {
         question: &GateQuestion,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Makes the run's version the current one and starts the process that its record names; gives the process id.
-    fn start(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<u32, StepFailure>> + Send;
+    /// Makes the run's version the current one and starts the process that its record names; gives
+    /// the process id.
+    fn start(
+        &self,
+        task: &TaskName,
+        run: &ActiveRun,
+    ) -> impl Future<Output = Result<u32, StepFailure>> + Send;
 
-    /// Stops the run's process and all it started, in good order: its lifecycle nodes first. Afterwards none of it is
-    /// left on the graph.
-    fn stop(&self, task: &TaskName, run: &ActiveRun) -> impl Future<Output = Result<(), StepFailure>> + Send;
+    /// Stops the run's process and all it started, in good order: its lifecycle nodes first.
+    /// Afterwards none of it is left on the graph.
+    fn stop(
+        &self,
+        task: &TaskName,
+        run: &ActiveRun,
+    ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Brings the files of an ended run to the server.
     fn collect(

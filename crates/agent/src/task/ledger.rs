@@ -1,7 +1,8 @@
-//! The ledger: what the agent accepted, what it was doing and what it started. Written before each step, so that after
-//! kill -9 or a power cut the next agent goes on where this one was. Ledger types are neither wire types nor what is
-//! observed; times are [`crate::system::clock`]'s milliseconds since boot and mean something only in the boot they name.
-//! It decides nothing: that is the plan's work.
+//! The ledger: what the agent accepted, what it was doing and what it started. Written before each
+//! step, so that after kill -9 or a power cut the next agent goes on where this one was. Ledger
+//! types are neither wire types nor what is observed; times are [`crate::system::clock`]'s
+//! milliseconds since boot and mean something only in the boot they name. It decides nothing: that
+//! is the plan's work.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -22,8 +23,8 @@ mod rules;
 pub use asked::{GateAnswer, GateQuestion, GateRecord, GateStep};
 pub use rules::RunRules;
 
-/// A run that is restarted more often than this without a calm stretch has failed. At the longest backoff that is over an
-/// hour: enough for a sensor to be plugged in again.
+/// A run that is restarted more often than this without a calm stretch has failed. At the longest
+/// backoff that is over an hour: enough for a sensor to be plugged in again.
 pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
 
 /// The version of the file's format that this agent reads and writes.
@@ -53,7 +54,8 @@ pub struct Ledger {
     pub tasks: BTreeMap<TaskName, TaskRecord>,
 }
 
-/// A desired state that was verified and accepted. It is kept as it was signed and verified again at each start.
+/// A desired state that was verified and accepted. It is kept as it was signed and verified again
+/// at each start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Accepted {
     /// Its generation.
@@ -69,7 +71,8 @@ pub struct TaskRecord {
     pub order: DesiredTask,
     /// How far the ordered version has come before its start.
     pub preparation: Preparation,
-    /// The run that is kept alive, of the ordered version or, until that is staged, of the one before.
+    /// The run that is kept alive, of the ordered version or, until that is staged, of the one
+    /// before.
     pub active: Option<ActiveRun>,
     /// The run that comes back should the active one, which took its place, not get ready.
     #[serde(default)]
@@ -243,8 +246,9 @@ pub enum Found {
 }
 
 impl Ledger {
-    /// The ledger of a robot that was never started, or whose ledger was lost. A start counter above all earlier ones
-    /// makes the server take this agent's reports for newer than those before the loss.
+    /// The ledger of a robot that was never started, or whose ledger was lost. A start counter
+    /// above all earlier ones makes the server take this agent's reports for newer than those
+    /// before the loss.
     pub fn new(start: u64) -> Self {
         Self {
             format: FORMAT,
@@ -263,7 +267,9 @@ impl Ledger {
             "" => String::new(),
             because => format!(" ({because})"),
         };
-        let text = || format!("the server does not accept this robot's token{because}: nothing new is begun");
+        let text = || {
+            format!("the server does not accept this robot's token{because}: nothing new is begun")
+        };
         self.removed.then(text)
     }
 
@@ -289,7 +295,9 @@ impl Ledger {
     pub fn peek(path: &Path) -> Result<Option<Self>, LedgerError> {
         let failed = |source| LedgerError { path: path.to_owned(), source };
         match read_limited(path) {
-            Ok(bytes) => serde_json::from_slice(&bytes).map(Some).map_err(|error| failed(error.into())),
+            Ok(bytes) => {
+                serde_json::from_slice(&bytes).map(Some).map_err(|error| failed(error.into()))
+            }
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(failed(error)),
         }
@@ -302,7 +310,8 @@ impl Ledger {
         durable::write(path, &bytes, 0o600).map_err(failed)
     }
 
-    /// Takes out of the records what means nothing to a new agent, and in a new boot the times of the one before.
+    /// Takes out of the records what means nothing to a new agent, and in a new boot the times of
+    /// the one before.
     pub fn enter_boot(&mut self, boot_id: &str, now_ms: u64) {
         for record in self.tasks.values_mut() {
             // The robot may have been given a load since it said yes.
@@ -374,8 +383,8 @@ impl TaskRecord {
         record
     }
 
-    /// The record of a run that was found alive when the ledger was lost: as if it were ordered, until the server has
-    /// said what is.
+    /// The record of a run that was found alive when the ledger was lost: as if it were ordered,
+    /// until the server has said what is.
     pub fn of_survivor(task: TaskName, run: ActiveRun, now_ms: u64) -> Self {
         let order = DesiredTask {
             task,
@@ -397,27 +406,39 @@ impl TaskRecord {
         if let Some(active) = self.active.as_ref().filter(|active| active.is_for(&self.order)) {
             return active.end.as_ref();
         }
-        let same = |run: &&FinishedRun| run.deployment == self.order.deployment && run.run == self.order.run;
+        let same = |run: &&FinishedRun| {
+            run.deployment == self.order.deployment && run.run == self.order.run
+        };
         self.finished.iter().rev().find(same).map(|run| &run.end)
     }
 
     /// Where the order stands.
     pub fn standing(&self) -> (Phase, Option<&Failure>) {
         let active = self.active.as_ref().filter(|active| active.is_for(&self.order));
-        if self.order.wanted == Wanted::Stopped && self.active.as_ref().is_none_or(|active| active.process.is_none()) {
+        if self.order.wanted == Wanted::Stopped
+            && self.active.as_ref().is_none_or(|active| active.process.is_none())
+        {
             return (Phase::Stopped, None);
         }
-        if let Some((_, refusal)) = self.refusal().filter(|(question, _)| self.concerns_order(question)) {
+        if let Some((_, refusal)) =
+            self.refusal().filter(|(question, _)| self.concerns_order(question))
+        {
             return (Phase::Deferred, Some(refusal));
         }
-        if self.collections.iter().any(|files| files.kind == TaskKind::Job && files.is_for(&self.order)) {
+        if self
+            .collections
+            .iter()
+            .any(|files| files.kind == TaskKind::Job && files.is_for(&self.order))
+        {
             return (Phase::Running, None);
         }
         if let Some(end) = self.end_of_order() {
             return (end.phase, end.failure.as_ref());
         }
         match active {
-            Some(active) if active.process.as_ref().is_some_and(|process| process.ready) => (Phase::Running, None),
+            Some(active) if active.process.as_ref().is_some_and(|process| process.ready) => {
+                (Phase::Running, None)
+            }
             Some(active) if active.process.is_none() && self.preparation.is_under_way() => {
                 (self.preparation.phase, self.preparation.failure.as_ref())
             }
@@ -429,12 +450,15 @@ impl TaskRecord {
     /// What the robot's gate forbids, and why.
     pub fn refusal(&self) -> Option<(&GateQuestion, &Failure)> {
         match &self.gate {
-            Some(GateRecord { question, answer: Some(GateAnswer::Refused(failure)), .. }) => Some((question, failure)),
+            Some(GateRecord { question, answer: Some(GateAnswer::Refused(failure)), .. }) => {
+                Some((question, failure))
+            }
             _ => None,
         }
     }
 
-    /// Whether what the gate is asked decides where the order stands, and not only whether an older run goes on.
+    /// Whether what the gate is asked decides where the order stands, and not only whether an older
+    /// run goes on.
     pub fn concerns_order(&self, question: &GateQuestion) -> bool {
         let same = question.deployment == self.order.deployment && question.run == self.order.run;
         question.step == GateStep::Stop || same
@@ -449,16 +473,19 @@ impl TaskRecord {
         }
     }
 
-    /// Makes place for `successor`: remembers how the active run ended, its version and, if it was good and does not
-    /// come back anyway, the run itself.
+    /// Makes place for `successor`: remembers how the active run ended, its version and, if it was
+    /// good and does not come back anyway, the run itself.
     pub fn retire_active(&mut self, successor: &ActiveRun) {
-        let is_good = |run: &&mut ActiveRun| run.ever_ready && run.end.is_none() && run.rules.kind == TaskKind::Service;
+        let is_good = |run: &&mut ActiveRun| {
+            run.ever_ready && run.end.is_none() && run.rules.kind == TaskKind::Service
+        };
         if let Some(good) = self.active.as_mut().filter(is_good) {
             (good.process, good.retry_at_ms, good.restarts_in_a_row) = (None, 0, 0);
             self.fallback.clone_from(&self.active);
         }
         self.lay_down_active(&successor.package);
-        // A job that failed has failed: what it has done can't be undone by starting something else.
+        // A job that failed has failed: what it has done can't be undone by starting something
+        // else.
         let is_job = successor.rules.kind == TaskKind::Job;
         self.fallback.take_if(|fallback| is_job || fallback.package == successor.package);
         if let Some(fallback) = &self.fallback {
@@ -470,12 +497,15 @@ impl TaskRecord {
     pub fn forget_stopped(&mut self, next: &DesiredTask, now_ms: u64) {
         self.fallback = None;
         match &mut self.active {
-            Some(active) if active.is_for(next) => (active.ever_ready, active.first_start_ms) = (false, now_ms),
+            Some(active) if active.is_for(next) => {
+                (active.ever_ready, active.first_start_ms) = (false, now_ms)
+            }
             _ => self.lay_down_active(&next.package),
         }
     }
 
-    /// Takes the active run away and remembers how it ended and, unless that is the next one's, its version.
+    /// Takes the active run away and remembers how it ended and, unless that is the next one's, its
+    /// version.
     fn lay_down_active(&mut self, next: &PackageRef) {
         let Some(active) = self.active.take() else { return };
         if active.package != *next {
@@ -494,11 +524,15 @@ impl TaskRecord {
         self.finished.drain(..surplus);
     }
 
-    /// The versions that must stay on disk: ordered, active, the one that may come back, and the one before while there is room
-    /// for what is ordered: it lies there only so that a later rollback need not fetch it.
+    /// The versions that must stay on disk: ordered, active, the one that may come back, and the
+    /// one before while there is room for what is ordered: it lies there only so that a later
+    /// rollback need not fetch it.
     pub fn kept_versions(&self) -> Vec<Digest> {
-        let lacks_room =
-            self.preparation.failure.as_ref().is_some_and(|failure| failure.code == FailureCode::DISK_FULL);
+        let lacks_room = self
+            .preparation
+            .failure
+            .as_ref()
+            .is_some_and(|failure| failure.code == FailureCode::DISK_FULL);
         let previous = self.previous.iter().filter(|_| !lacks_room);
         let runs = [&self.active, &self.fallback].into_iter().flatten().map(|run| &run.package);
         let files = self.collections.iter().map(|files| &files.package);
@@ -517,13 +551,19 @@ fn digest_of(package: &PackageRef) -> Digest {
 impl ActiveRun {
     /// Whether this is the run that `order` asks for.
     pub fn is_for(&self, order: &DesiredTask) -> bool {
-        self.deployment == order.deployment && self.run == order.run && self.package == order.package
+        self.deployment == order.deployment
+            && self.run == order.run
+            && self.package == order.package
     }
 
     /// Whether it was good, and was given up only for being started again too often in one boot.
     fn is_worn_out(&self) -> bool {
-        let is_up_at_boot = self.rules.kind == TaskKind::Service && self.rules.on_boot == OnBoot::Start;
-        self.end.is_some() && self.ever_ready && is_up_at_boot && self.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW
+        let is_up_at_boot =
+            self.rules.kind == TaskKind::Service && self.rules.on_boot == OnBoot::Start;
+        self.end.is_some()
+            && self.ever_ready
+            && is_up_at_boot
+            && self.restarts_in_a_row >= MAX_RESTARTS_IN_A_ROW
     }
 
     /// Whether this is the same run, perhaps with another process.
@@ -531,7 +571,8 @@ impl ActiveRun {
         self.deployment == other.deployment && self.run == other.run
     }
 
-    /// Whether a process of it was started before. An earlier agent wrote down only that one was ready.
+    /// Whether a process of it was started before. An earlier agent wrote down only that one was
+    /// ready.
     pub fn has_started(&self) -> bool {
         self.ever_started || self.ever_ready
     }
@@ -594,11 +635,14 @@ mod tests {
         let path = dir.path().join("ledger.json");
         Ledger::new(3).write(&path).expect("written");
         let whole = std::fs::read(&path).expect("read");
-        let newer = String::from_utf8(whole.clone()).expect("text").replace("\"format\":1", "\"format\":2");
+        let newer =
+            String::from_utf8(whole.clone()).expect("text").replace("\"format\":1", "\"format\":2");
         let cuts = (0..whole.len()).step_by(7).map(|length| whole[..length].to_vec());
         for bytes in cuts.chain([newer.into_bytes(), vec![0; 4096]]) {
             std::fs::write(&path, &bytes).expect("written");
-            let Ok(Found::Unreadable(aside)) = Ledger::read(&path) else { panic!("taken for a ledger: {bytes:?}") };
+            let Ok(Found::Unreadable(aside)) = Ledger::read(&path) else {
+                panic!("taken for a ledger: {bytes:?}")
+            };
             assert!(!path.exists());
             assert_eq!(std::fs::read(&aside).expect("kept"), bytes);
         }
@@ -613,7 +657,8 @@ mod tests {
             "name": "talker", "version": "1.0", "run": {"exec": ["true"]},
             "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
         });
-        let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("manifest"));
+        let rules =
+            RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("manifest"));
         record.active = Some(ActiveRun {
             process: Some(ProcessRecord {
                 dir: "d.1.1.1".to_owned(),
@@ -629,7 +674,8 @@ mod tests {
         let mut old = serde_json::to_value(&ledger).expect("json");
         let task = &mut old["tasks"]["talker"];
         let mut drop = |at: &str, keys: &[&str]| {
-            let table = task.pointer_mut(at).and_then(serde_json::Value::as_object_mut).expect("a table");
+            let table =
+                task.pointer_mut(at).and_then(serde_json::Value::as_object_mut).expect("a table");
             keys.iter().for_each(|key| assert!(table.remove(*key).is_some(), "{at} has no {key}"));
         };
         drop("", &["fallback", "gate", "starts", "collections", "lost"]);
@@ -642,7 +688,10 @@ mod tests {
     #[test]
     fn the_version_before_makes_room_for_the_ordered_one() {
         let mut record = TaskRecord::new(order(), 1);
-        let before = PackageRef { manifest: BlobRef { digest: Digest::of(b"before"), size: 1 }, ..order().package };
+        let before = PackageRef {
+            manifest: BlobRef { digest: Digest::of(b"before"), size: 1 },
+            ..order().package
+        };
         record.previous = Some(before.clone());
         assert!(record.kept_versions().contains(&before.manifest.digest));
         record.preparation.failure = Some(Failure::new(FailureCode::DISK_FULL, "the disk is full"));
@@ -671,18 +720,28 @@ mod tests {
                 "name": "talker", "version": "1.0", "run": {"exec": ["true"], "on_boot": on_boot},
                 "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
             });
-            let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("manifest"));
+            let rules = RunRules::from(
+                &serde_json::from_value::<TaskManifest>(manifest).expect("manifest"),
+            );
             let end = Some(End { phase: Phase::Failed, failure: None });
             let run = ActiveRun::of(&order, rules, 1);
             record.active = Some(ActiveRun { end, ever_ready: true, restarts_in_a_row, ..run });
             ledger.tasks.insert(order.task.clone(), record);
             ledger.enter_boot("second", 10);
             let record = &ledger.tasks[&order.task];
-            assert_eq!(record.active.as_ref().expect("active").restarts_in_a_row, 0, "each boot has its own");
+            assert_eq!(
+                record.active.as_ref().expect("active").restarts_in_a_row,
+                0,
+                "each boot has its own"
+            );
             record.standing().0
         };
         assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "start"), Phase::Starting);
         assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW, "hold"), Phase::Failed);
-        assert_eq!(after_boot(MAX_RESTARTS_IN_A_ROW - 1, "start"), Phase::Failed, "it has ended for something else");
+        assert_eq!(
+            after_boot(MAX_RESTARTS_IN_A_ROW - 1, "start"),
+            Phase::Failed,
+            "it has ended for something else"
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! What is true on the robot, whatever the ledger says: processes, what ROS sees of them, and what lies on the disk.
-//! Plain values, filled by the effects and read by the plan. Times are milliseconds since boot.
+//! What is true on the robot, whatever the ledger says: processes, what ROS sees of them, and what
+//! lies on the disk. Plain values, filled by the effects and read by the plan. Times are
+//! milliseconds since boot.
 
 use std::collections::BTreeSet;
 
@@ -92,7 +93,8 @@ pub enum Health {
     },
     /// Something is missing, and may yet come.
     Missing(Missing),
-    /// What no waiting mends: `node_name_taken`, `parameter_rejected`, `lifecycle_failed`. Only before it was ready.
+    /// What no waiting mends: `node_name_taken`, `parameter_rejected`, `lifecycle_failed`. Only
+    /// before it was ready.
     Refused(Failure),
 }
 
@@ -101,15 +103,15 @@ pub enum Health {
 pub struct Missing {
     /// Since when anything has been missing, without a break.
     pub since_ms: u64,
-    /// What it means once the task was ready: `node_vanished`, `node_inactive`, `topic_silent`, `service_lost`,
-    /// `graph_unavailable`.
+    /// What it means once the task was ready: `node_vanished`, `node_inactive`, `topic_silent`,
+    /// `service_lost`, `graph_unavailable`.
     pub code: FailureCode,
     /// What is missing, a sentence without its end: "`/mapper` did not appear".
     pub what: String,
     /// What is there instead: "on the graph: `/lidar`, `/odom`". May be empty.
     pub seen: String,
-    /// Whether the run itself lacks something, so that another start may mend it: what a stranger does is not, nor that the
-    /// agent sees nothing.
+    /// Whether the run itself lacks something, so that another start may mend it: what a stranger
+    /// does is not, nor that the agent sees nothing.
     pub is_its_own: bool,
 }
 
@@ -134,7 +136,8 @@ impl RobotFacts {
             || !manifest.exec_depends.is_empty()
     }
 
-    /// What `manifest` needs and this robot lacks, each as a sentence part; empty when it has all that can be told.
+    /// What `manifest` needs and this robot lacks, each as a sentence part; empty when it has all
+    /// that can be told.
     pub fn lacks(&self, manifest: &TaskManifest) -> Vec<String> {
         let requires = &manifest.requires;
         let mut lacks = Vec::new();
@@ -154,11 +157,16 @@ impl RobotFacts {
             let needed = manifest.exec_depends.iter().map(String::as_str).chain(launcher.package);
             chosen.lacks(needed).into_iter().map(|name| format!("ROS package {name}")).collect()
         };
-        lacks.extend(match installation::choose(installations, launcher.ros, &requires.ros_distro) {
-            Ok(Some(chosen)) => lacks_of(chosen),
-            Ok(None) => lacks_of(&Installation { packages: Some(BTreeSet::new()), ..Installation::default() }),
-            Err(error) => vec![error.to_string()],
-        });
+        lacks.extend(
+            match installation::choose(installations, launcher.ros, &requires.ros_distro) {
+                Ok(Some(chosen)) => lacks_of(chosen),
+                Ok(None) => lacks_of(&Installation {
+                    packages: Some(BTreeSet::new()),
+                    ..Installation::default()
+                }),
+                Err(error) => vec![error.to_string()],
+            },
+        );
         lacks
     }
 }
@@ -190,7 +198,8 @@ impl Exit {
     pub fn failure(&self) -> Failure {
         let (code, end) = match (self.out_of_memory_bytes, self.status) {
             (Some(limit), _) => {
-                let end = format!("killed: it used more than the {} MiB of memory it may", limit >> 20);
+                let end =
+                    format!("killed: it used more than the {} MiB of memory it may", limit >> 20);
                 (FailureCode::OUT_OF_MEMORY, end)
             }
             (None, Some(status)) => (FailureCode::PROCESS_EXITED, status.to_string()),
@@ -226,7 +235,12 @@ mod tests {
 
     fn robot(installations: Vec<Installation>) -> RobotFacts {
         let installations = Some(installations);
-        RobotFacts { arch: "x86_64".to_owned(), labels: Some(Labels::new()), installations, no_task_user: None }
+        RobotFacts {
+            arch: "x86_64".to_owned(),
+            labels: Some(Labels::new()),
+            installations,
+            no_task_user: None,
+        }
     }
 
     fn jazzy() -> Installation {
@@ -259,9 +273,14 @@ mod tests {
     #[test]
     fn what_is_lacking_is_listed_by_the_packages_keys() {
         let mut robot = robot(vec![jazzy()]);
-        robot.labels = Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into());
-        let mut manifest = manifest("colcon", &["std_msgs", "nav2_bringup", "python3-numpy", "slam_toolbox"]);
-        manifest.requires.labels.insert("base".parse().expect("valid"), "turtlebot".parse().expect("valid"));
+        robot.labels =
+            Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into());
+        let mut manifest =
+            manifest("colcon", &["std_msgs", "nav2_bringup", "python3-numpy", "slam_toolbox"]);
+        manifest
+            .requires
+            .labels
+            .insert("base".parse().expect("valid"), "turtlebot".parse().expect("valid"));
         manifest.requires.arch = vec!["aarch64".to_owned()];
         assert_eq!(
             robot.lacks(&manifest),
@@ -272,7 +291,8 @@ mod tests {
                 "ROS package slam_toolbox",
             ]
         );
-        manifest.requires = Requires { ros_distro: vec!["humble".to_owned()], ..Requires::default() };
+        manifest.requires =
+            Requires { ros_distro: vec!["humble".to_owned()], ..Requires::default() };
         assert_eq!(robot.lacks(&manifest), ["ros_distro humble (it has jazzy)"]);
         manifest.requires.ros_distro = vec!["jazzy".to_owned()];
         manifest.exec_depends.truncate(1);
@@ -284,7 +304,10 @@ mod tests {
         let robot = robot(Vec::new());
         assert_eq!(robot.lacks(&manifest("colcon", &["rclpy"])), ["ROS 2 (no ROS 2 found)"]);
         assert_eq!(robot.lacks(&manifest("catkin", &["rospy"])), ["ROS 1 (no ROS 1 found)"]);
-        assert_eq!(robot.lacks(&manifest("none", &["nav_msgs", "ffmpeg"])), ["ROS package nav_msgs"]);
+        assert_eq!(
+            robot.lacks(&manifest("none", &["nav_msgs", "ffmpeg"])),
+            ["ROS package nav_msgs"]
+        );
         assert!(robot.lacks(&manifest("none", &["ffmpeg"])).is_empty());
         assert!(!RobotFacts::must_know_ros(&manifest("none", &[])));
         assert!(RobotFacts::must_know_ros(&manifest("colcon", &[])));

@@ -1,7 +1,8 @@
-//! The plan: what to do next about one task. Pure: desired state, ledger record and observation in, next step out; time
-//! and randomness are arguments. It never touches disk, network or processes.
+//! The plan: what to do next about one task. Pure: desired state, ledger record and observation in,
+//! next step out; time and randomness are arguments. It never touches disk, network or processes.
 //!
-//! Two things go on side by side. A version that was ordered is prepared while the one before it keeps running:
+//! Two things go on side by side. A version that was ordered is prepared while the one before it
+//! keeps running:
 //!
 //! ```text
 //! assigned ─► fetching ─► unpacking ─► building ─► staged ──► (handed to the active run)
@@ -19,10 +20,11 @@
 //!     └── restart policy, reboot: after a backoff
 //! ```
 //!
-//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is started. The old run
-//! stays in the record until the new one is ready; if that never comes, the old one becomes the active run again and the
-//! order has ended as `rolled_back`. Each half has at most one step under way ([`Lane`]); a process is only ever started
-//! by the second, so there are never two of a task.
+//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is
+//! started. The old run stays in the record until the new one is ready; if that never comes, the
+//! old one becomes the active run again and the order has ended as `rolled_back`. Each half has at
+//! most one step under way ([`Lane`]); a process is only ever started by the second, so there are
+//! never two of a task.
 
 use std::time::Duration;
 
@@ -31,7 +33,9 @@ use task_proto::report::{Failure, FailureCode, Phase};
 use task_proto::{Digest, TaskName};
 
 use crate::task::ledger::MAX_RESTARTS_IN_A_ROW;
-use crate::task::ledger::{ActiveRun, Collection, GateQuestion, ProcessRecord, RunRules, TaskRecord};
+use crate::task::ledger::{
+    ActiveRun, Collection, GateQuestion, ProcessRecord, RunRules, TaskRecord,
+};
 use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, Vouched};
 use gate::Verdict;
 
@@ -107,7 +111,8 @@ pub enum Step {
     PullManifest(PackageRef),
     /// Look at what ROS there is, to tell whether the version can run here.
     LookForRos(PackageRef),
-    /// Get and unpack the content: as parts that the server pushes, and what does not come so by a pull.
+    /// Get and unpack the content: as parts that the server pushes, and what does not come so by a
+    /// pull.
     PullContent {
         /// Of which package.
         package: PackageRef,
@@ -166,8 +171,8 @@ impl Step {
         }
     }
 
-    /// How long it may take. What moves many bytes watches over their flow instead, since a large package on a bad link
-    /// takes its time, and a build over its own limits.
+    /// How long it may take. What moves many bytes watches over their flow instead, since a large
+    /// package on a bad link takes its time, and a build over its own limits.
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
             Self::PullContent { .. } | Self::Build(_) | Self::Collect(_) => return None,
@@ -186,19 +191,18 @@ impl Step {
         matches!(self, Self::Prune { .. } | Self::Remove)
     }
 
-    /// Whether this step, already under way, still serves what is desired. If not it is interrupted; steps of
-    /// [`Lane::Run`] are short and are finished.
+    /// Whether this step, already under way, still serves what is desired. If not it is
+    /// interrupted; steps of [`Lane::Run`] are short and are finished.
     pub fn is_wanted(&self, desired: Option<&DesiredTask>, record: Option<&TaskRecord>) -> bool {
         match self {
-            Self::Ask(question) => {
-                record.and_then(|record| record.gate.as_ref()).is_some_and(|gate| gate.question == *question)
-            }
+            Self::Ask(question) => record
+                .and_then(|record| record.gate.as_ref())
+                .is_some_and(|gate| gate.question == *question),
             Self::CheckSigners(package)
             | Self::PullManifest(package)
             | Self::LookForRos(package)
-            | Self::Build(package) => {
-                desired.is_some_and(|task| task.wanted == Wanted::Running && task.package == *package)
-            }
+            | Self::Build(package) => desired
+                .is_some_and(|task| task.wanted == Wanted::Running && task.package == *package),
             Self::PullContent { package, is_pushed } => desired.is_some_and(|task| {
                 let is_same = task.package == *package && task.delivery.is_pushed() == *is_pushed;
                 task.wanted == Wanted::Running && is_same
@@ -221,9 +225,12 @@ pub const CALM_MS: u64 = 10 * 60 * 1000;
 /// When to look again at a process of which nothing could be told.
 pub const LOOK_AGAIN_MS: u64 = 5000;
 
-/// Tasks in the order in which they get what not all can have at once: those of higher priority first, then by name.
+/// Tasks in the order in which they get what not all can have at once: those of higher priority
+/// first, then by name.
 pub fn in_turn(mut tasks: Vec<(TaskName, i32)>) -> Vec<TaskName> {
-    tasks.sort_by(|(name, priority), (other, other_priority)| other_priority.cmp(priority).then(name.cmp(other)));
+    tasks.sort_by(|(name, priority), (other, other_priority)| {
+        other_priority.cmp(priority).then(name.cmp(other))
+    });
     tasks.dedup_by(|(name, _), (other, _)| name == other);
     tasks.into_iter().map(|(name, _)| name).collect()
 }
@@ -254,7 +261,10 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.desired != Some(order)
         || order.wanted == Wanted::Stopped
         || s.record.end_of_order().is_some()
-        || s.record.active.as_ref().is_some_and(|active| active.is_for(order) && !is_lost(s, active))
+        || s.record
+            .active
+            .as_ref()
+            .is_some_and(|active| active.is_for(order) && !is_lost(s, active))
         || preparation.phase.is_final()
         || !s.may_begin
         || s.deleting
@@ -264,11 +274,14 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.now_ms < preparation.retry_at_ms {
         return Next::Rest { until_ms: Some(preparation.retry_at_ms) };
     }
-    // Before anything of it is fetched, and again whenever it turns out that the signatures are not enough any more.
+    // Before anything of it is fetched, and again whenever it turns out that the signatures are not
+    // enough any more.
     if s.prepared.vouched != Vouched::Yes {
         return Next::Act(Step::CheckSigners(order.package.clone()));
     }
-    let Some(manifest) = &s.prepared.manifest else { return Next::Act(Step::PullManifest(order.package.clone())) };
+    let Some(manifest) = &s.prepared.manifest else {
+        return Next::Act(Step::PullManifest(order.package.clone()));
+    };
     if s.robot.labels.is_none() && !manifest.requires.labels.is_empty() {
         return NOTHING;
     }
@@ -281,8 +294,12 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     }
     let lacks = s.robot.lacks(manifest);
     if !lacks.is_empty() {
-        let text =
-            format!("this robot lacks what {} {} requires: {}", order.task, order.package.version, lacks.join(", "));
+        let text = format!(
+            "this robot lacks what {} {} requires: {}",
+            order.task,
+            order.package.version,
+            lacks.join(", ")
+        );
         let failure = Failure::new(FailureCode::REQUIREMENTS_UNMET, text);
         return record(transition::prepared_to(s, Phase::Unmet, Some(failure)));
     }
@@ -299,7 +316,11 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     } else {
         (Phase::Staged, None)
     };
-    if preparation.phase == phase { NOTHING } else { record(transition::prepared_to(s, phase, failure)) }
+    if preparation.phase == phase {
+        NOTHING
+    } else {
+        record(transition::prepared_to(s, phase, failure))
+    }
 }
 
 /// Whether the ordered version may take over now.
@@ -318,7 +339,8 @@ fn takes_over(s: &Situation<'_>) -> bool {
 fn with_process(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     let replaced = !active.is_for(&s.record.order) && takes_over(s);
     let wanted = s.desired.is_some_and(|task| task.wanted == Wanted::Running);
-    let stops = (!wanted || replaced) && process.condemned.is_none() && gate::verdict(s) == Verdict::Go;
+    let stops =
+        (!wanted || replaced) && process.condemned.is_none() && gate::verdict(s) == Verdict::Go;
     if stops { alive::stop(s, active) } else { alive::next(s, active, process) }
 }
 
@@ -346,7 +368,8 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     {
         // A run that was replaced and is ordered again goes on as the good one it was.
         let before = s.record.fallback.as_ref().filter(|run| run.is_for(order)).cloned();
-        let run = before.unwrap_or_else(|| ActiveRun::of(order, RunRules::from(manifest), s.now_ms));
+        let run =
+            before.unwrap_or_else(|| ActiveRun::of(order, RunRules::from(manifest), s.now_ms));
         return start(s, &run);
     }
     let Some(active) = active.filter(|active| active.end.is_none()) else { return tidy(s, None) };
@@ -365,8 +388,8 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     start(s, active)
 }
 
-/// Whether what `active` is to run is not on the disk any more: it was deleted because it had been changed, and is
-/// prepared anew.
+/// Whether what `active` is to run is not on the disk any more: it was deleted because it had been
+/// changed, and is prepared anew.
 fn is_lost(s: &Situation<'_>, active: &ActiveRun) -> bool {
     let is_whole = s.prepared.content && s.prepared.built;
     active.is_for(&s.record.order) && active.process.is_none() && active.end.is_none() && !is_whole
@@ -391,8 +414,8 @@ fn record(record: TaskRecord) -> Next {
     Next::Record(Box::new(record))
 }
 
-/// The name of a run's directory: one for each start, never used twice. `start` counts the agent's starts, `starts` the
-/// task's.
+/// The name of a run's directory: one for each start, never used twice. `start` counts the agent's
+/// starts, `starts` the task's.
 pub fn run_dir_name(run: &ActiveRun, start: u64, starts: u64) -> String {
     format!("{}.{}.{start}.{starts}", run.deployment, run.run)
 }
@@ -402,14 +425,22 @@ pub fn describe(task: &TaskName, step: &Step) -> String {
     match step {
         Step::CheckSigners(package) => format!("look who has signed {task} {}", package.version),
         Step::PullManifest(package) => format!("pull the manifest of {task} {}", package.version),
-        Step::LookForRos(package) => format!("look for the ROS that {task} {} needs", package.version),
-        Step::PullContent { package, is_pushed: false } => format!("pull {task} {}", package.version),
-        Step::PullContent { package, is_pushed: true } => format!("gather {task} {}", package.version),
+        Step::LookForRos(package) => {
+            format!("look for the ROS that {task} {} needs", package.version)
+        }
+        Step::PullContent { package, is_pushed: false } => {
+            format!("pull {task} {}", package.version)
+        }
+        Step::PullContent { package, is_pushed: true } => {
+            format!("gather {task} {}", package.version)
+        }
         Step::Build(package) => format!("build {task} {}", package.version),
         Step::Ask(question) => format!("ask the gate about {task} {}", question.version),
         Step::Start(run) => format!("start {task} {} (run {})", run.package.version, run.run),
         Step::Stop(_) => format!("stop {task}"),
-        Step::Collect(files) => format!("bring back the files of {task} {} (run {})", files.package.version, files.run),
+        Step::Collect(files) => {
+            format!("bring back the files of {task} {} (run {})", files.package.version, files.run)
+        }
         Step::Prune { .. } => format!("delete old versions of {task}"),
         Step::Remove => format!("remove {task}"),
     }

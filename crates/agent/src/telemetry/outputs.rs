@@ -1,6 +1,7 @@
-//! Brings files of an ended run to the server: finds them, pushes each as a blob, then says which run they are of. The
-//! order of things is the registry's: nothing is listed before all of it is there. Doing it again after a crash is
-//! harmless and sends only what the server lacks. It decides nothing about the run.
+//! Brings files of an ended run to the server: finds them, pushes each as a blob, then says which
+//! run they are of. The order of things is the registry's: nothing is listed before all of it is
+//! there. Doing it again after a crash is harmless and sends only what the server lacks. It decides
+//! nothing about the run.
 
 mod find;
 mod push;
@@ -127,10 +128,14 @@ impl OutputError {
         match self {
             Self::Unreachable(_) | Self::Note { .. } | Self::Cancelled => Some(Duration::ZERO),
             // What can't be read now may be readable once a file system is back.
-            Self::Read { .. } | Self::User(_) | Self::Garbled { .. } => Some(Duration::from_secs(30)),
+            Self::Read { .. } | Self::User(_) | Self::Garbled { .. } => {
+                Some(Duration::from_secs(30))
+            }
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
             // A robot that is enrolled anew, or replaces its token, is known again.
-            Self::NotTheServer { .. } | Self::Refused { status: 401, .. } => Some(Duration::from_secs(30)),
+            Self::NotTheServer { .. } | Self::Refused { status: 401, .. } => {
+                Some(Duration::from_secs(30))
+            }
             Self::Pattern { .. } | Self::TooMuch(_) | Self::Refused { .. } => None,
         }
     }

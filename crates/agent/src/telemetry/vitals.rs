@@ -1,5 +1,6 @@
-//! How the machine does, from what the kernel shows in /proc and /sys. A [`Gauge`] looks; [`Sender`] says it once a minute,
-//! over the MQTT session or, while there is none, over HTTP. Nothing is decided by it, and what was lost is not sent again.
+//! How the machine does, from what the kernel shows in /proc and /sys. A [`Gauge`] looks;
+//! [`Sender`] says it once a minute, over the MQTT session or, while there is none, over HTTP.
+//! Nothing is decided by it, and what was lost is not sent again.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -68,14 +69,15 @@ impl Gauge {
         Self { places, before: None, last: Vitals::default() }
     }
 
-    /// How the machine does at `now`. The first look knows no shares and rates; one that comes too soon after the one before
-    /// shows that again.
+    /// How the machine does at `now`. The first look knows no shares and rates; one that comes too
+    /// soon after the one before shows that again.
     pub fn look(&mut self, now: Instant) -> Vitals {
         if self.before.is_some_and(|(at, _)| now.duration_since(at) < LEAST_SPAN) {
             return self.last;
         }
         let counters = Counters { cpu: self.cpu(), network: self.network() };
-        let (before_at, before) = self.before.replace((now, counters)).unwrap_or((now, Counters::default()));
+        let (before_at, before) =
+            self.before.replace((now, counters)).unwrap_or((now, Counters::default()));
         let seconds = now.duration_since(before_at).as_secs_f64();
         let network = counters.network.zip(before.network).filter(|_| seconds > 0.0);
         let rate = |now: u64, before: u64| (now.saturating_sub(before) as f64 / seconds) as u64;
@@ -83,14 +85,19 @@ impl Gauge {
         let room = disk::room(&self.places.data).ok();
         self.last = Vitals {
             at_ms: clock::wall_ms(),
-            cpu_percent: counters.cpu.zip(before.cpu).and_then(|(now, before)| busy_percent(now, before)),
+            cpu_percent: counters
+                .cpu
+                .zip(before.cpu)
+                .and_then(|(now, before)| busy_percent(now, before)),
             memory_used_bytes,
             memory_total_bytes,
             disk_used_bytes: room.map(|room| room.total.saturating_sub(room.free)),
             disk_total_bytes: room.map(|room| room.total),
             network_in_bytes_per_s: network.map(|(now, before)| rate(now.0, before.0)),
             network_out_bytes_per_s: network.map(|(now, before)| rate(now.1, before.1)),
-            load_1m: self.proc("loadavg").and_then(|text| text.split_whitespace().next()?.parse().ok()),
+            load_1m: self
+                .proc("loadavg")
+                .and_then(|text| text.split_whitespace().next()?.parse().ok()),
             battery_percent: battery::percent(&self.places.sys.join("class/power_supply")),
             temperature_c: self.temperature(),
         };
@@ -105,7 +112,8 @@ impl Gauge {
         let text = self.proc("stat")?;
         let line = text.lines().find_map(|line| line.strip_prefix("cpu "))?;
         // What guests used is in what their hosts did already.
-        let ticks: Vec<u64> = line.split_whitespace().take(8).map_while(|number| number.parse().ok()).collect();
+        let ticks: Vec<u64> =
+            line.split_whitespace().take(8).map_while(|number| number.parse().ok()).collect();
         let idle = ticks.get(3)?.saturating_add(ticks.get(4).copied().unwrap_or(0));
         let all = ticks.iter().copied().fold(0, u64::saturating_add);
         Some((all, all.saturating_sub(idle)))
@@ -122,19 +130,26 @@ impl Gauge {
         Some((total, total.saturating_sub(bytes("MemAvailable")?)))
     }
 
-    /// Of the interfaces that are devices; where there are none, as in a container, of all but the loopback. Bridges and
-    /// the like would count everything twice.
+    /// Of the interfaces that are devices; where there are none, as in a container, of all but the
+    /// loopback. Bridges and the like would count everything twice.
     fn network(&self) -> Option<(u64, u64)> {
         let text = self.proc("net/dev")?;
         let all = text.lines().filter_map(|line| {
             let (name, figures) = line.split_once(':')?;
             let figures: Vec<&str> = figures.split_whitespace().collect();
-            Some((name.trim(), figures.first()?.parse::<u64>().ok()?, figures.get(8)?.parse::<u64>().ok()?))
+            Some((
+                name.trim(),
+                figures.first()?.parse::<u64>().ok()?,
+                figures.get(8)?.parse::<u64>().ok()?,
+            ))
         });
         let all: Vec<_> = all.filter(|(name, ..)| *name != "lo").collect();
-        let devices: BTreeSet<&str> = all.iter().map(|(name, ..)| *name).filter(|name| self.is_device(name)).collect();
+        let devices: BTreeSet<&str> =
+            all.iter().map(|(name, ..)| *name).filter(|name| self.is_device(name)).collect();
         let counted = all.iter().filter(|(name, ..)| devices.is_empty() || devices.contains(name));
-        Some(counted.fold((0, 0), |sum, (_, r#in, out)| (sum.0.saturating_add(*r#in), sum.1.saturating_add(*out))))
+        Some(counted.fold((0, 0), |sum, (_, r#in, out)| {
+            (sum.0.saturating_add(*r#in), sum.1.saturating_add(*out))
+        }))
     }
 
     fn is_device(&self, interface: &str) -> bool {
@@ -143,10 +158,14 @@ impl Gauge {
 
     fn temperature(&self) -> Option<f32> {
         let zones = fs::read_dir(self.places.sys.join("class/thermal")).ok()?.flatten();
-        let zones = zones.filter(|zone| zone.file_name().to_string_lossy().starts_with("thermal_zone"));
-        let read = |zone: fs::DirEntry| fs::read_to_string(zone.path().join("temp")).ok()?.trim().parse::<i32>().ok();
+        let zones =
+            zones.filter(|zone| zone.file_name().to_string_lossy().starts_with("thermal_zone"));
+        let read = |zone: fs::DirEntry| {
+            fs::read_to_string(zone.path().join("temp")).ok()?.trim().parse::<i32>().ok()
+        };
         // A zone without a sensor says something that no robot survives.
-        let hottest = zones.filter_map(read).filter(|milli| (-40_000..=150_000).contains(milli)).max()?;
+        let hottest =
+            zones.filter_map(read).filter(|milli| (-40_000..=150_000).contains(milli)).max()?;
         Some(tenths(f64::from(hottest) / 1000.0))
     }
 }
@@ -185,7 +204,8 @@ impl Asked {
         Self { gauge: Arc::new(Mutex::new(Gauge::new(places))) }
     }
 
-    /// How the machine does. After nobody has asked for a while it looks twice, or shares and rates would be over all that time.
+    /// How the machine does. After nobody has asked for a while it looks twice, or shares and rates
+    /// would be over all that time.
     pub async fn now(&self) -> Vitals {
         const FRESH: Duration = Duration::from_secs(10);
         let mut gauge = self.gauge.lock().await;
@@ -237,7 +257,8 @@ impl<S: Source> Sender<S> {
                 // Cancel-safe: a token can be awaited again.
                 () = shared.shutdown.cancelled() => return,
             }
-            let telemetry = Telemetry { robot_id: self.robot_id.clone(), vitals: self.source.look() };
+            let telemetry =
+                Telemetry { robot_id: self.robot_id.clone(), vitals: self.source.look() };
             if *shared.mqtt_up.borrow() {
                 say(&messages, &telemetry);
             } else if Instant::now() >= not_before
@@ -255,10 +276,14 @@ fn pause(error: &ServerError) -> Duration {
     match error {
         ServerError::TokenRefused(_) => REFUSED_POLL.mul_f64(spread()),
         // It is let in at any time.
-        ServerError::Refused { code, .. } if code == AWAITS_APPROVAL => REFUSED_POLL.mul_f64(spread()),
+        ServerError::Refused { code, .. } if code == AWAITS_APPROVAL => {
+            REFUSED_POLL.mul_f64(spread())
+        }
         ServerError::Refused { .. } => UNKNOWN_PAUSE,
         ServerError::Busy { retry_after: Some(wait), .. } => (*wait).min(REFUSED_POLL),
-        ServerError::Busy { .. } | ServerError::Unreachable(_) | ServerError::NotTheServer(_) => Duration::ZERO,
+        ServerError::Busy { .. } | ServerError::Unreachable(_) | ServerError::NotTheServer(_) => {
+            Duration::ZERO
+        }
     }
 }
 
@@ -291,12 +316,15 @@ mod tests {
 
         fn gauge(&self) -> Gauge {
             let root = self.dir.path();
-            Gauge::new(Places { proc: root.join("proc"), sys: root.join("sys"), data: root.to_owned() })
+            Gauge::new(Places {
+                proc: root.join("proc"),
+                sys: root.join("sys"),
+                data: root.to_owned(),
+            })
         }
     }
 
-    const NET_HEAD: &str =
-        "Inter-|   Receive                            |  Transmit\n face |bytes    packets |bytes    packets\n";
+    const NET_HEAD: &str = "Inter-|   Receive                            |  Transmit\n face |bytes    packets |bytes    packets\n";
 
     fn interface(name: &str, r#in: u64, out: u64) -> String {
         format!("  {name}: {in} 1 0 0 0 0 0 0 {out} 1 0 0 0 0 0 0\n")
@@ -306,18 +334,26 @@ mod tests {
     fn shares_and_rates_are_over_the_time_between_two_looks() {
         let machine = Machine::new();
         machine.write("proc/stat", "cpu  100 0 100 700 100 0 0 0 50 0\ncpu0 1 2 3\n");
-        machine.write("proc/net/dev", &format!("{NET_HEAD}{}{}", interface("lo", 9, 9), interface("eth0", 1000, 100)));
+        machine.write(
+            "proc/net/dev",
+            &format!("{NET_HEAD}{}{}", interface("lo", 9, 9), interface("eth0", 1000, 100)),
+        );
         let mut gauge = machine.gauge();
         let begun = Instant::now();
         let first = gauge.look(begun);
         assert_eq!((first.cpu_percent, first.network_in_bytes_per_s), (None, None));
         machine.write("proc/stat", "cpu  150 0 125 900 125 0 0 0 60 0\n");
-        machine
-            .write("proc/net/dev", &format!("{NET_HEAD}{}{}", interface("lo", 99, 99), interface("eth0", 3000, 400)));
+        machine.write(
+            "proc/net/dev",
+            &format!("{NET_HEAD}{}{}", interface("lo", 99, 99), interface("eth0", 3000, 400)),
+        );
         assert_eq!(gauge.look(begun + LEAST_SPAN / 2), first, "too soon");
         let second = gauge.look(begun + Duration::from_secs(2));
         assert_eq!(second.cpu_percent, Some(25.0));
-        assert_eq!((second.network_in_bytes_per_s, second.network_out_bytes_per_s), (Some(1000), Some(150)));
+        assert_eq!(
+            (second.network_in_bytes_per_s, second.network_out_bytes_per_s),
+            (Some(1000), Some(150))
+        );
         // An interface was taken away, and counters began anew.
         machine.write("proc/net/dev", NET_HEAD);
         machine.write("proc/stat", "cpu  1 0 1 1 1 0 0 0 0 0\n");
@@ -328,7 +364,9 @@ mod tests {
     #[test]
     fn bridges_do_not_count_where_there_are_devices() {
         let machine = Machine::new();
-        let net = |eth, bridge| format!("{NET_HEAD}{}{}", interface("eth0", eth, 0), interface("docker0", bridge, 0));
+        let net = |eth, bridge| {
+            format!("{NET_HEAD}{}{}", interface("eth0", eth, 0), interface("docker0", bridge, 0))
+        };
         machine.write("proc/net/dev", &net(0, 0));
         machine.write("sys/class/net/eth0/device/uevent", "");
         let mut gauge = machine.gauge();
@@ -341,7 +379,10 @@ mod tests {
     #[test]
     fn what_the_kernel_shows_of_memory_heat_and_load() {
         let machine = Machine::new();
-        machine.write("proc/meminfo", "MemTotal:        4000 kB\nMemFree:  100 kB\nMemAvailable:    1000 kB\n");
+        machine.write(
+            "proc/meminfo",
+            "MemTotal:        4000 kB\nMemFree:  100 kB\nMemAvailable:    1000 kB\n",
+        );
         machine.write("proc/loadavg", "0.42 0.30 0.20 1/100 4711\n");
         machine.write("sys/class/thermal/thermal_zone0/temp", "51340\n");
         machine.write("sys/class/thermal/thermal_zone1/temp", "-274000\n");
@@ -349,8 +390,14 @@ mod tests {
         machine.write("sys/class/power_supply/BAT0/type", "Battery\n");
         machine.write("sys/class/power_supply/BAT0/capacity", "80\n");
         let seen = machine.gauge().look(Instant::now());
-        assert_eq!((seen.memory_total_bytes, seen.memory_used_bytes), (Some(4_096_000), Some(3_072_000)));
-        assert_eq!((seen.load_1m, seen.temperature_c, seen.battery_percent), (Some(0.42), Some(51.3), Some(80)));
+        assert_eq!(
+            (seen.memory_total_bytes, seen.memory_used_bytes),
+            (Some(4_096_000), Some(3_072_000))
+        );
+        assert_eq!(
+            (seen.load_1m, seen.temperature_c, seen.battery_percent),
+            (Some(0.42), Some(51.3), Some(80))
+        );
         assert!(seen.disk_used_bytes <= seen.disk_total_bytes && seen.disk_total_bytes > Some(0));
     }
 
@@ -365,17 +412,24 @@ mod tests {
         gauge.look(begun);
         let seen = gauge.look(begun + Duration::from_secs(1));
         let disk = (seen.disk_used_bytes, seen.disk_total_bytes);
-        let nothing =
-            Vitals { at_ms: seen.at_ms, disk_used_bytes: disk.0, disk_total_bytes: disk.1, ..Vitals::default() };
+        let nothing = Vitals {
+            at_ms: seen.at_ms,
+            disk_used_bytes: disk.0,
+            disk_total_bytes: disk.1,
+            ..Vitals::default()
+        };
         assert_eq!(seen, nothing);
     }
 
     #[test]
     fn a_server_that_says_no_is_left_alone() {
-        let refused = |code: &str| ServerError::Refused { code: code.to_owned(), message: String::new() };
+        let refused =
+            |code: &str| ServerError::Refused { code: code.to_owned(), message: String::new() };
         let busy = |retry_after| ServerError::Busy { status: 503, retry_after };
         let some_minutes = REFUSED_POLL / 2..=REFUSED_POLL.mul_f64(1.5);
-        assert!(some_minutes.contains(&pause(&ServerError::TokenRefused("no such token".to_owned()))));
+        assert!(
+            some_minutes.contains(&pause(&ServerError::TokenRefused("no such token".to_owned())))
+        );
         assert!(some_minutes.contains(&pause(&refused(AWAITS_APPROVAL))), "it may be let in soon");
         assert_eq!(pause(&refused("not_found")), UNKNOWN_PAUSE);
         assert_eq!(pause(&busy(Some(Duration::from_secs(7)))), Duration::from_secs(7));
@@ -417,7 +471,10 @@ mod tests {
     async fn this_machine_answers_whoever_asks() {
         let asked = Asked::new(Places::of_this_machine(Path::new("/")));
         let seen = asked.now().await;
-        assert!(seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)), "{seen:?}");
+        assert!(
+            seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)),
+            "{seen:?}"
+        );
         assert!(seen.memory_used_bytes < seen.memory_total_bytes, "{seen:?}");
     }
 }

@@ -1,5 +1,5 @@
-//! The robot's token as everything that talks to the server holds it: one value, which may change while the agent runs.
-//! It reads and writes no file.
+//! The robot's token as everything that talks to the server holds it: one value, which may change
+//! while the agent runs. It reads and writes no file.
 
 use std::sync::{Arc, PoisonError, RwLock};
 

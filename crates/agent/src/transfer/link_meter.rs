@@ -1,5 +1,6 @@
-//! What transfers teach about the way to the server: how fast, how far, how often it broke. Server and agent judge by it
-//! how a package should travel. It measures nothing itself and never reads the time.
+//! What transfers teach about the way to the server: how fast, how far, how often it broke. Server
+//! and agent judge by it how a package should travel. It measures nothing itself and never reads
+//! the time.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -42,7 +43,8 @@ impl LinkMeter {
     /// So long it took from a short question to its answer.
     pub fn round_trip(&self, took: Duration) {
         let mut measured = self.measured();
-        measured.round_trip_ms = Some(averaged(measured.round_trip_ms, took.as_secs_f64() * 1000.0));
+        measured.round_trip_ms =
+            Some(averaged(measured.round_trip_ms, took.as_secs_f64() * 1000.0));
     }
 
     /// A session had to be begun again.
@@ -59,7 +61,8 @@ impl LinkMeter {
     pub fn facts(&self, now: Instant) -> Option<LinkFacts> {
         let measured = self.measured();
         let recent = |events: &VecDeque<Instant>| {
-            let count = events.iter().filter(|at| now.saturating_duration_since(**at) < MEMORY).count();
+            let count =
+                events.iter().filter(|at| now.saturating_duration_since(**at) < MEMORY).count();
             u32::try_from(count).unwrap_or(u32::MAX)
         };
         let facts = LinkFacts {
@@ -78,11 +81,14 @@ impl LinkMeter {
     }
 }
 
-/// Whether `now` says something about the link that `before` did not: what differs a little is no news.
+/// Whether `now` says something about the link that `before` did not: what differs a little is no
+/// news.
 pub fn is_news(before: Option<&LinkFacts>, now: Option<&LinkFacts>) -> bool {
     let (Some(before), Some(now)) = (before, now) else { return before.is_some() != now.is_some() };
     let differs = |before: Option<u64>, now: Option<u64>, least: u64| match (before, now) {
-        (Some(before), Some(now)) => before.abs_diff(now) > least && before.max(now) > 2 * before.min(now),
+        (Some(before), Some(now)) => {
+            before.abs_diff(now) > least && before.max(now) > 2 * before.min(now)
+        }
         (before, now) => before != now,
     };
     differs(before.throughput_bytes_per_s, now.throughput_bytes_per_s, 0)
@@ -142,7 +148,12 @@ mod tests {
 
     #[test]
     fn only_what_differs_much_is_news() {
-        let facts = |rate, rtt, losses| LinkFacts { throughput_bytes_per_s: rate, rtt_ms: rtt, reconnects: 0, losses };
+        let facts = |rate, rtt, losses| LinkFacts {
+            throughput_bytes_per_s: rate,
+            rtt_ms: rtt,
+            reconnects: 0,
+            losses,
+        };
         let before = facts(Some(1_000_000), Some(10), 0);
         for (now, news) in [
             (facts(Some(1_900_000), Some(29), 0), false),

@@ -1,6 +1,7 @@
-//! Whose parts this robot wants to hear: what the MQTT session subscribes to, and the way of a part from the session to
-//! whoever gathers it. A part is acknowledged when its [`Arrived`] is dropped, so who is slow to write slows the sender
-//! down and nothing piles up here. It knows neither MQTT's packets nor the disk.
+//! Whose parts this robot wants to hear: what the MQTT session subscribes to, and the way of a part
+//! from the session to whoever gathers it. A part is acknowledged when its [`Arrived`] is dropped,
+//! so who is slow to write slows the sender down and nothing piles up here. It knows neither MQTT's
+//! packets nor the disk.
 
 use std::collections::BTreeMap;
 use task_proto::part::PartRange;
@@ -14,7 +15,8 @@ use tokio::sync::{mpsc, watch};
 pub struct Asks {
     /// What its next report says, whatever that is sent for.
     pub missing: Option<Vec<PartRange>>,
-    /// Counts up each time that a report is to be sent for it, also if it says the same as the last one.
+    /// Counts up each time that a report is to be sent for it, also if it says the same as the last
+    /// one.
     pub times: u32,
 }
 
@@ -123,7 +125,12 @@ impl Listening {
 
     /// The contents that are wanted.
     pub fn wanted(&self) -> Vec<Wish> {
-        self.0.borrow().wanted.iter().map(|(digest, wanted)| Wish { digest: *digest, number: wanted.number }).collect()
+        self.0
+            .borrow()
+            .wanted
+            .iter()
+            .map(|(digest, wanted)| Wish { digest: *digest, number: wanted.number })
+            .collect()
     }
 
     /// The largest content that is wanted.
@@ -138,13 +145,15 @@ impl Listening {
 
     /// Says how the subscription stands that was made for this wish.
     pub fn tell(&self, wish: &Wish, hearing: Hearing) {
-        if let Some(wanted) = self.0.borrow().wanted.get(&wish.digest).filter(|wanted| wanted.number == wish.number) {
+        if let Some(wanted) =
+            self.0.borrow().wanted.get(&wish.digest).filter(|wanted| wanted.number == wish.number)
+        {
             wanted.hearing.send_replace(hearing);
         }
     }
 
-    /// Says whether there is a session; either way there are no subscriptions yet. Until it was said there may be one
-    /// soon.
+    /// Says whether there is a session; either way there are no subscriptions yet. Until it was
+    /// said there may be one soon.
     pub fn session(&self, is_up: bool) {
         self.0.send_modify(|wishes| {
             wishes.is_away = !is_up;
@@ -175,7 +184,8 @@ impl Acknowledgement {
 
 impl Drop for Acknowledgement {
     fn drop(&mut self) {
-        // Without its session there is nobody to acknowledge it to; brokers have far fewer messages in flight than fit.
+        // Without its session there is nobody to acknowledge it to; brokers have far fewer messages
+        // in flight than fit.
         let _ = self.acknowledge.try_send(self.due);
     }
 }

@@ -1,5 +1,6 @@
-//! By what a registry is known (OCI distribution specification): the header that names the bytes it has, and the error body when
-//! it refuses. Who answers with anything else is a proxy or a portal, and not the server.
+//! By what a registry is known (OCI distribution specification): the header that names the bytes it
+//! has, and the error body when it refuses. Who answers with anything else is a proxy or a portal,
+//! and not the server.
 
 use std::borrow::Cow;
 
@@ -38,7 +39,9 @@ impl RegistryWords {
     fn of(body: &[u8]) -> Self {
         let parsed: serde_json::Value = serde_json::from_slice(body).unwrap_or_default();
         let [code, message] = ["code", "message"].map(|key| parsed["errors"][0][key].as_str());
-        let text = message.map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed).replace(char::is_control, " ");
+        let text = message
+            .map_or_else(|| String::from_utf8_lossy(body), Cow::Borrowed)
+            .replace(char::is_control, " ");
         Self { code: code.unwrap_or_default().to_owned(), text }
     }
 
@@ -55,9 +58,14 @@ mod tests {
     #[test]
     fn a_refusal_is_told_in_the_servers_words() {
         let error = br#"{"errors":[{"code":"SIZE_INVALID","message":"the output\nhas 9 bytes","detail":{}}]}"#;
-        let words = RegistryWords { code: "SIZE_INVALID".to_owned(), text: "the output has 9 bytes".to_owned() };
+        let words = RegistryWords {
+            code: "SIZE_INVALID".to_owned(),
+            text: "the output has 9 bytes".to_owned(),
+        };
         assert_eq!(RegistryWords::of(error), words);
-        for other in ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#, "[]", ""] {
+        for other in
+            ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#, "[]", ""]
+        {
             let words = RegistryWords::of(other.as_bytes());
             assert_eq!((words.are_a_registrys(), words.text.as_str()), (false, other));
         }

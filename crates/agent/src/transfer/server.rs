@@ -1,5 +1,6 @@
-//! The HTTP half of the link: enrol, ask for the desired state, deliver reports. It tells "the server said no" from
-//! "something else answered" (a captive portal, a proxy); it never retries and decides nothing.
+//! The HTTP half of the link: enrol, ask for the desired state, deliver reports. It tells "the
+//! server said no" from "something else answered" (a captive portal, a proxy); it never retries and
+//! decides nothing.
 
 use std::time::Duration;
 
@@ -9,7 +10,8 @@ use rustls::ClientConfig;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use task_proto::api::{
-    EnrollRequest, EnrollResponse, ErrorBody, INSTANCE_HEADER, MqttEndpoint, PLACE_HEADER, ReportReply, RobotToken,
+    EnrollRequest, EnrollResponse, ErrorBody, INSTANCE_HEADER, MqttEndpoint, PLACE_HEADER,
+    ReportReply, RobotToken,
 };
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
@@ -24,8 +26,8 @@ const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 /// How long a whole request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long a connection is kept for the next request: a pull makes several in a row, then nothing for minutes, and a fleet's
-/// idle connections would cost the server more than its sessions.
+/// How long a connection is kept for the next request: a pull makes several in a row, then nothing
+/// for minutes, and a fleet's idle connections would cost the server more than its sessions.
 pub const KEPT_CONNECTION: Duration = Duration::from_secs(3);
 
 /// Why there is no answer to use.
@@ -97,20 +99,30 @@ pub async fn enroll(
     token: &str,
     request: &EnrollRequest,
 ) -> Result<EnrollResponse, ServerError> {
-    let answer = send(client, Method::POST, at(base, "enroll"), token, Some(request), HeaderMap::new()).await?;
+    let answer =
+        send(client, Method::POST, at(base, "enroll"), token, Some(request), HeaderMap::new())
+            .await?;
     parse(&answer.body)
 }
 
 impl Server {
     /// The server at `base`, for the robot with this token.
-    pub fn new(client: reqwest::Client, base: Url, robot: RobotId, token: impl Into<Credential>) -> Self {
+    pub fn new(
+        client: reqwest::Client,
+        base: Url,
+        robot: RobotId,
+        token: impl Into<Credential>,
+    ) -> Self {
         Self { client, base, robot, token: token.into(), said: HeaderMap::new() }
     }
 
-    /// The same, as the agent `instance` that runs at `place`: to another one the server gives nothing for a while.
+    /// The same, as the agent `instance` that runs at `place`: to another one the server gives
+    /// nothing for a while.
     pub fn speaking_as(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
-        let said =
-            [(INSTANCE_HEADER, Some(instance.to_string())), (PLACE_HEADER, place.map(|place| place.to_string()))];
+        let said = [
+            (INSTANCE_HEADER, Some(instance.to_string())),
+            (PLACE_HEADER, place.map(|place| place.to_string())),
+        ];
         for (name, value) in said {
             if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
                 self.said.insert(name, value);
@@ -211,22 +223,34 @@ async fn send<B: Serialize>(
     let mut bytes = Vec::new();
     while let Some(chunk) = response.chunk().await.map_err(ServerError::Unreachable)? {
         if bytes.len() + chunk.len() > MAX_ANSWER_BYTES {
-            return Err(ServerError::NotTheServer(format!("an answer of more than {MAX_ANSWER_BYTES} bytes")));
+            return Err(ServerError::NotTheServer(format!(
+                "an answer of more than {MAX_ANSWER_BYTES} bytes"
+            )));
         }
         bytes.extend_from_slice(&chunk);
     }
     let answer = Answer { status, headers, body: bytes };
-    if status.is_success() || status == StatusCode::NOT_MODIFIED { Ok(answer) } else { Err(refusal(&answer)) }
+    if status.is_success() || status == StatusCode::NOT_MODIFIED {
+        Ok(answer)
+    } else {
+        Err(refusal(&answer))
+    }
 }
 
 fn refusal(answer: &Answer) -> ServerError {
     let status = answer.status;
     if status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS {
-        let seconds = answer.headers.get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
-        return ServerError::Busy { status: status.as_u16(), retry_after: seconds.map(Duration::from_secs) };
+        let seconds =
+            answer.headers.get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+        return ServerError::Busy {
+            status: status.as_u16(),
+            retry_after: seconds.map(Duration::from_secs),
+        };
     }
     // A proxy also says 401 or 403; only the server says it in its own words.
-    let Ok(body) = serde_json::from_slice::<ErrorBody>(&answer.body) else { return not_the_server(answer) };
+    let Ok(body) = serde_json::from_slice::<ErrorBody>(&answer.body) else {
+        return not_the_server(answer);
+    };
     if status == StatusCode::UNAUTHORIZED {
         return ServerError::TokenRefused(body.error.message);
     }
@@ -234,13 +258,15 @@ fn refusal(answer: &Answer) -> ServerError {
 }
 
 fn not_the_server(answer: &Answer) -> ServerError {
-    let start = String::from_utf8_lossy(&answer.body[..answer.body.len().min(80)]).replace(char::is_control, " ");
+    let start = String::from_utf8_lossy(&answer.body[..answer.body.len().min(80)])
+        .replace(char::is_control, " ");
     ServerError::NotTheServer(format!("status {}, {start:?}", answer.status.as_u16()))
 }
 
 fn parse<T: DeserializeOwned>(body: &[u8]) -> Result<T, ServerError> {
     serde_json::from_slice(body).map_err(|_| {
-        let start = String::from_utf8_lossy(&body[..body.len().min(80)]).replace(char::is_control, " ");
+        let start =
+            String::from_utf8_lossy(&body[..body.len().min(80)]).replace(char::is_control, " ");
         ServerError::NotTheServer(format!("{start:?} where JSON should be"))
     })
 }

@@ -1,5 +1,5 @@
-//! The agent's HTTP half against a server that misbehaves: what it takes for a refusal, what for a stranger's answer, and
-//! what it obeys.
+//! The agent's HTTP half against a server that misbehaves: what it takes for a refusal, what for a
+//! stranger's answer, and what it obeys.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -67,7 +67,8 @@ async fn answer_canned(State(fake): State<Arc<Fake>>, headers: HeaderMap) -> Res
 
 /// A client that never meets a certificate.
 fn plain_client() -> reqwest::Client {
-    server::client(Trust::System.client_config(task_agent::system::clock::for_certificates())).unwrap()
+    server::client(Trust::System.client_config(task_agent::system::clock::for_certificates()))
+        .unwrap()
 }
 
 fn server(url: &reqwest::Url, robot: &RobotId) -> Server {
@@ -97,15 +98,23 @@ async fn only_the_servers_own_no_is_a_refusal() {
     let server = server(&url, &RobotId::random());
     assert!(matches!(server.desired(None).await, Err(ServerError::TokenRefused(_))));
     for status in [200, 302, 401, 403, 404] {
-        fake.set((status, "text/html", "<html>Please sign in to the hotel's network</html>".to_owned()));
+        fake.set((
+            status,
+            "text/html",
+            "<html>Please sign in to the hotel's network</html>".to_owned(),
+        ));
         let error = server.desired(None).await.unwrap_err();
         assert!(matches!(error, ServerError::NotTheServer(_)), "{status}: {error:?}");
     }
     fake.set((503, "text/html", "<html>".to_owned()));
     let busy = server.desired(None).await.unwrap_err();
-    assert!(matches!(busy, ServerError::Busy { status: 503, retry_after: Some(wait) } if wait.as_secs() == 7));
+    assert!(
+        matches!(busy, ServerError::Busy { status: 503, retry_after: Some(wait) } if wait.as_secs() == 7)
+    );
     fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
-    assert!(matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged"));
+    assert!(
+        matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged")
+    );
     fake.set((304, "application/json", String::new()));
     assert!(server.desired(None).await.unwrap().is_none());
 }
@@ -140,12 +149,15 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
     let credential = Credential::from("old".to_owned());
     let server = Server::new(plain_client(), url.clone(), robot, credential.clone());
     let lifetime = Duration::from_secs(3600);
-    let mut rotation = Rotation { server, credential: credential.clone(), identity, path: path.clone(), lifetime };
+    let mut rotation =
+        Rotation { server, credential: credential.clone(), identity, path: path.clone(), lifetime };
     let tokens = || {
         let Identity { token, next_token, .. } = Identity::read(&path).unwrap();
         (token, next_token, credential.current())
     };
-    let is = |token: &str, next: Option<&str>| (token.to_owned(), next.map(str::to_owned), token.to_owned());
+    let is = |token: &str, next: Option<&str>| {
+        (token.to_owned(), next.map(str::to_owned), token.to_owned())
+    };
 
     rotation.step(1_000 + 3_599_999).await;
     assert_eq!(tokens(), is("old", None), "too young");
@@ -226,9 +238,15 @@ async fn a_report_is_sent_again_until_it_is_stored() {
         }
     };
     tokio::time::timeout(PATIENCE, asked).await.unwrap();
-    fake.set((200, "application/json", r#"{"generation":0,"name":"atlas","labels":{}}"#.to_owned()));
+    fake.set((
+        200,
+        "application/json",
+        r#"{"generation":0,"name":"atlas","labels":{}}"#.to_owned(),
+    ));
     let confirmed = tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(confirmed, Heard::Confirmed { seq: 1, reply: Some(reply) } if reply.name.as_str() == "atlas"));
+    assert!(
+        matches!(confirmed, Heard::Confirmed { seq: 1, reply: Some(reply) } if reply.name.as_str() == "atlas")
+    );
     shared.shutdown.cancel();
     posting.await.unwrap();
 }
@@ -248,7 +266,9 @@ async fn polling_goes_on_after_every_kind_of_answer() {
         fake.set(answer);
         loop {
             match next().await {
-                Heard::Withheld { code, .. } if !is_state => break assert_eq!(code, "server_unreachable"),
+                Heard::Withheld { code, .. } if !is_state => {
+                    break assert_eq!(code, "server_unreachable");
+                }
                 Heard::Desired { .. } if is_state => break,
                 _ => {}
             }
@@ -276,7 +296,8 @@ async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_
     fake.set(sealed(&state(&robot, 2), &key));
     let is_found = |heard| match heard {
         Heard::Desired { envelope, .. } => {
-            admission::open(&envelope, &key.public_key(), &robot).unwrap().generation == Generation(2)
+            admission::open(&envelope, &key.public_key(), &robot).unwrap().generation
+                == Generation(2)
         }
         _ => false,
     };
@@ -305,8 +326,12 @@ async fn a_state_is_sent_once_and_again_only_to_a_robot_that_does_not_keep_to_it
     let shared = Shared::new(CancellationToken::new());
     let (heard, mut messages) = mpsc::channel(1);
     let never = Duration::from_secs(3600);
-    let polling =
-        tokio::spawn(state::poll(server(&url, &robot), shared.clone(), Intervals { slow: never, fast: never }, heard));
+    let polling = tokio::spawn(state::poll(
+        server(&url, &robot),
+        shared.clone(),
+        Intervals { slow: never, fast: never },
+        heard,
+    ));
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
     assert!(matches!(next().await, Heard::Desired { .. }));
 

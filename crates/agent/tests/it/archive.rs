@@ -70,7 +70,8 @@ impl Tar {
 
     pub fn typed(self, kind: u8, name: &str, content: &[u8]) -> Self {
         let size = content.len() as u64;
-        self.header(Header { name: name.as_bytes(), kind, size, ..Header::default() }).content(content)
+        self.header(Header { name: name.as_bytes(), kind, size, ..Header::default() })
+            .content(content)
     }
 
     pub fn file(self, name: &str, content: &[u8]) -> Self {
@@ -82,7 +83,12 @@ impl Tar {
     }
 
     pub fn link(self, kind: u8, name: &str, target: &str) -> Self {
-        self.header(Header { name: name.as_bytes(), kind, link: target.as_bytes(), ..Header::default() })
+        self.header(Header {
+            name: name.as_bytes(),
+            kind,
+            link: target.as_bytes(),
+            ..Header::default()
+        })
     }
 
     pub fn symlink(self, name: &str, target: &str) -> Self {
@@ -106,7 +112,11 @@ impl Tar {
     }
 
     pub fn facts(&self) -> ContentFacts {
-        ContentFacts { tar_digest: Digest::of(&self.bytes), tar_size: self.bytes.len() as u64, entries: self.entries }
+        ContentFacts {
+            tar_digest: Digest::of(&self.bytes),
+            tar_size: self.bytes.len() as u64,
+            entries: self.entries,
+        }
     }
 
     pub fn compressed(&self) -> Vec<u8> {
@@ -120,7 +130,8 @@ pub fn compress(bytes: &[u8]) -> Vec<u8> {
 
 fn pax_record(key: &str, value: &str) -> String {
     let rest = format!(" {key}={value}\n");
-    let length = (rest.len()..).find(|length| length.to_string().len() + rest.len() == *length).unwrap();
+    let length =
+        (rest.len()..).find(|length| length.to_string().len() + rest.len() == *length).unwrap();
     format!("{length}{rest}")
 }
 

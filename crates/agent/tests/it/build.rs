@@ -1,4 +1,5 @@
-//! Packages are built: by the real colcon where that matters, by stand-ins where it is about limits.
+//! Packages are built: by the real colcon where that matters, by stand-ins where it is about
+//! limits.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -56,8 +57,12 @@ impl TestBuild {
         let mut build = Self::new(Vec::new());
         let bin = build.dir.path().join("bin");
         write(&bin.join("colcon"), &format!("#!/bin/bash\n{script}\n"));
-        std::fs::set_permissions(bin.join("colcon"), std::fs::Permissions::from_mode(0o755)).expect("executable");
-        build.order.environment.insert("PATH".to_owned(), format!("{}:/usr/bin:/bin", bin.display()));
+        std::fs::set_permissions(bin.join("colcon"), std::fs::Permissions::from_mode(0o755))
+            .expect("executable");
+        build
+            .order
+            .environment
+            .insert("PATH".to_owned(), format!("{}:/usr/bin:/bin", bin.display()));
         build
     }
 
@@ -148,8 +153,11 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
     }))
     .expect("manifest");
     let version = &build.order.version;
-    std::fs::write(version.run_script(), script::run_script(&manifest, version, &build.order.underlays))
-        .expect("script");
+    std::fs::write(
+        version.run_script(),
+        script::run_script(&manifest, version, &build.order.underlays),
+    )
+    .expect("script");
     work_dir::refresh(BuildTool::Colcon, version, None).expect("made");
     let run_dir = build.dir.path().join("run");
     let spec = RunSpec {
@@ -191,9 +199,15 @@ async fn a_catkin_package_is_built_and_installed() {
          install(PROGRAMS mapper.sh DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n",
     );
     write(&build.src("mapper.sh"), "#!/bin/sh\n");
-    build.run().await.unwrap_or_else(|error| panic!("{error}: ./scripts/test installs what this needs"));
+    build
+        .run()
+        .await
+        .unwrap_or_else(|error| panic!("{error}: ./scripts/test installs what this needs"));
     let install = build.order.version.install();
-    assert!(install.join("lib/mapper/mapper.sh").is_file() && install.join("local_setup.bash").is_file());
+    assert!(
+        install.join("lib/mapper/mapper.sh").is_file()
+            && install.join("local_setup.bash").is_file()
+    );
 }
 
 #[tokio::test]
@@ -211,7 +225,10 @@ async fn a_package_that_colcon_passes_over_is_no_success() {
     let build = TestBuild::new(vec![ros()]);
     write(&build.src("readme.txt"), "no package here");
     let error = build.run().await.expect_err("failed");
-    assert!(matches!(&error, BuildError::NotInstalled { missing, .. } if missing.contains("package.xml")), "{error}");
+    assert!(
+        matches!(&error, BuildError::NotInstalled { missing, .. } if missing.contains("package.xml")),
+        "{error}"
+    );
 }
 
 #[tokio::test]
@@ -239,7 +256,8 @@ async fn a_build_is_optimised_and_leaves_tests_out() {
     write(&build.src("CMakeLists.txt"), cmake);
     build.run().await.unwrap_or_else(|error| panic!("{error}\n{}", build.log()));
     let kind =
-        std::fs::read_to_string(build.order.version.install().join("plain/share/plain/kind")).expect("installed");
+        std::fs::read_to_string(build.order.version.install().join("plain/share/plain/kind"))
+            .expect("installed");
     assert_eq!(kind, "Release");
     // A colcon that knows nothing of cmake is asked nothing about it.
     let bare = TestBuild::with_colcon("echo \"asked: $*\"; mkdir -p install/talker");
@@ -249,18 +267,23 @@ async fn a_build_is_optimised_and_leaves_tests_out() {
 
 #[tokio::test]
 async fn a_build_is_nice_and_limited() {
-    let mut build = TestBuild::with_colcon("echo nice $(nice), memory $(ulimit -d); mkdir -p install/talker; exit 0");
+    let mut build = TestBuild::with_colcon(
+        "echo nice $(nice), memory $(ulimit -d); mkdir -p install/talker; exit 0",
+    );
     build.order.limits.memory_bytes = Some(1 << 30);
     build.run().await.expect("built");
     assert!(build.log().contains("nice 10, memory 1048576"), "{}", build.log());
     let big = TestBuild::with_colcon("tail /dev/zero");
     let mut limited = big.order.clone();
     limited.limits.memory_bytes = Some(100 << 20);
-    let error = within("the build", builder::build(&limited, &CancellationToken::new())).await.expect_err("failed");
+    let error = within("the build", builder::build(&limited, &CancellationToken::new()))
+        .await
+        .expect_err("failed");
     assert!(error.to_string().contains("memory exhausted"), "{error}");
 }
 
-const ENDLESS: &str = "trap '' INT TERM; (setsid sleep 1000 &); echo compiling; sleep 1000; sleep 1000";
+const ENDLESS: &str =
+    "trap '' INT TERM; (setsid sleep 1000 &); echo compiling; sleep 1000; sleep 1000";
 
 #[tokio::test]
 async fn a_cancelled_build_ends_with_everything_it_started() {
@@ -330,7 +353,10 @@ async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
     build.order.user = Some(user.clone());
     build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
     let log = build.log().replace('\t', "");
-    assert!(log.contains(&format!("{}\nCapBnd:0000000000000000\nNoNewPrivs:1\n", user.uid)), "{log}");
+    assert!(
+        log.contains(&format!("{}\nCapBnd:0000000000000000\nNoNewPrivs:1\n", user.uid)),
+        "{log}"
+    );
     assert!(!log.contains("GOT"), "{log}");
     // All of it is root's now, for everybody to read who gets there, and nobody to change.
     let about = |name: &str| {
@@ -346,7 +372,8 @@ async fn a_process_that_got_away_from_a_build_holds_nobody_up() {
     let build = TestBuild::with_colcon(ESCAPE);
     let error = build.run().await.expect_err("colcon failed");
     let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
-    let escaped = program::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
+    let escaped =
+        program::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
     escaped.expect("it still lives").signal(nix::sys::signal::Signal::SIGKILL).expect("killed");
     assert!(matches!(error, BuildError::Failed { status: ExitStatus::Code(3), .. }), "{error:?}");
 }

@@ -1,5 +1,5 @@
-//! What a task can't do: outlive its stop, starve its neighbours, become root, look into the agent. On machines without
-//! the means for one of these it is tested what holds there instead.
+//! What a task can't do: outlive its stop, starve its neighbours, become root, look into the agent.
+//! On machines without the means for one of these it is tested what holds there instead.
 
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::os::unix::process::CommandExt as _;
@@ -26,7 +26,11 @@ while :; do sleep 1000; done
 "#;
 
 async fn start(run: &TestRun) -> u32 {
-    within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started").task.pid
+    within("the start", run.supervisor.start(&run.run_dir(), &run.spec))
+        .await
+        .expect("started")
+        .task
+        .pid
 }
 
 async fn stop(run: &TestRun) -> Observed {
@@ -55,14 +59,21 @@ fn living(pids: &[u32]) -> Vec<u32> {
 fn threads_of(uid: u32) -> usize {
     let table = ProcessEntry::all().expect("process table");
     let owned = table.iter().filter(|entry| {
-        !entry.is_zombie && std::fs::metadata(format!("/proc/{}", entry.pid)).is_ok_and(|data| data.uid() == uid)
+        !entry.is_zombie
+            && std::fs::metadata(format!("/proc/{}", entry.pid)).is_ok_and(|data| data.uid() == uid)
     });
-    owned.map(|entry| std::fs::read_dir(format!("/proc/{}/task", entry.pid)).map_or(0, Iterator::count)).sum()
+    owned
+        .map(|entry| {
+            std::fs::read_dir(format!("/proc/{}/task", entry.pid)).map_or(0, Iterator::count)
+        })
+        .sum()
 }
 
 /// A task of the same user that says again and again that it can still do something.
 async fn neighbour(user: &TaskUser) -> TestRun {
-    let mut run = TestRun::grouped("count=0; while sleep 0.02; do count=$((count + 1)); echo beat $count; done");
+    let mut run = TestRun::grouped(
+        "count=0; while sleep 0.02; do count=$((count + 1)); echo beat $count; done",
+    );
     run.run_as(user);
     start(&run).await;
     run.wrote("beat 1\n").await;
@@ -71,7 +82,10 @@ async fn neighbour(user: &TaskUser) -> TestRun {
 
 async fn goes_on(neighbour: &TestRun) {
     let count = neighbour.log().lines().count();
-    eventually("the neighbour to go on", || (neighbour.log().lines().count() > count + 5).then_some(())).await;
+    eventually("the neighbour to go on", || {
+        (neighbour.log().lines().count() > count + 5).then_some(())
+    })
+    .await;
 }
 
 #[tokio::test]
@@ -93,15 +107,20 @@ async fn a_start_that_hangs_is_ended_with_its_control_group() {
         return eprintln!("unavailable: this machine has no control groups that may be written to");
     };
     let dir = RunDir::create(&run.run_dir()).expect("dir");
-    // What enters a frozen group gets no further, as where its directory is on a file system that does not answer.
+    // What enters a frozen group gets no further, as where its directory is on a file system that
+    // does not answer.
     let group = cgroups.create(dir.path(), &RunLimits::default()).expect("made");
     std::fs::write(group.path().join("cgroup.freeze"), "1").expect("frozen");
     tokio::select! {
         started = run.supervisor.start(dir.path(), &run.spec) => panic!("{started:?}"),
         () = eventually("it hangs", || group.pids().is_ok_and(|pids| !pids.is_empty()).then_some(())) => {}
     }
-    let observed = within("the stop", run.supervisor.stop(dir.path(), Duration::ZERO)).await.expect("stopped");
-    assert!(matches!(observed, Observed::Running { .. } | Observed::Exited(ExitStatus::Signal(9))), "{observed:?}");
+    let observed =
+        within("the stop", run.supervisor.stop(dir.path(), Duration::ZERO)).await.expect("stopped");
+    assert!(
+        matches!(observed, Observed::Running { .. } | Observed::Exited(ExitStatus::Signal(9))),
+        "{observed:?}"
+    );
     let ended = within("its end", run.supervisor.wait(dir.path())).await.expect("observed");
     assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
     assert!(!run.log().contains("up") && !group.path().exists());
@@ -114,20 +133,25 @@ async fn nothing_outlives_a_task_that_ends_by_itself() {
     for run in [TestRun::of(&script), TestRun::grouped(&script)] {
         let task = start(&run).await;
         let pids = runaways(&run).await;
-        let task = task_agent::process::program::ProcessIdentity::of(task).expect("stat").expect("alive");
+        let task =
+            task_agent::process::program::ProcessIdentity::of(task).expect("stat").expect("alive");
         task.signal(Signal::SIGKILL).expect("killed");
         let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
         assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
         assert_eq!(living(&pids), Vec::<u32>::new());
-        eventually("the control group's end", || run.cgroup().is_none_or(|cgroup| !cgroup.exists()).then_some(()))
-            .await;
+        eventually("the control group's end", || {
+            run.cgroup().is_none_or(|cgroup| !cgroup.exists()).then_some(())
+        })
+        .await;
     }
 }
 
 #[tokio::test]
 async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environment() {
     let run = TestRun::grouped(RUNAWAY);
-    let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec))
+        .await
+        .expect("started");
     let Some(cgroup) = run.cgroup() else {
         eprintln!("unavailable: this machine has no control groups that may be written to");
         return;
@@ -137,7 +161,8 @@ async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environm
     let name = cgroup.file_name().and_then(|name| name.to_str()).expect("a name");
     assert!(group.lines().any(|line| line.starts_with("0::") && line.ends_with(name)), "{group}");
     started.shim.signal(Signal::SIGKILL).expect("killed");
-    // Another supervisor, as after a restart of the agent; only the run directory tells it of the group.
+    // Another supervisor, as after a restart of the agent; only the run directory tells it of the
+    // group.
     let observed = within("the notice", supervisor().wait(&run.run_dir())).await.expect("observed");
     assert_eq!(observed, Observed::Gone);
     assert_eq!(living(&pids), Vec::<u32>::new());
@@ -154,7 +179,8 @@ async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
     start(&bomb).await;
     bomb.wrote("Resource temporarily unavailable").await;
     let most = threads_of(user.uid);
-    // The neighbour has two or three; without a controller what ran at the start is added to the limit.
+    // The neighbour has two or three; without a controller what ran at the start is added to the
+    // limit.
     assert!((10..=72).contains(&most), "{most}");
     goes_on(&neighbour).await;
     let stopped = stop(&bomb).await;
@@ -169,7 +195,8 @@ async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
 async fn a_task_that_wants_eight_gigabytes_gets_its_limit_and_says_so() {
     let Some(user) = other_user() else { return };
     let neighbour = neighbour(&user).await;
-    let mut greedy = TestRun::grouped("head -c 8G /dev/zero | tail -n 1 >/dev/null; exit ${PIPESTATUS[1]}");
+    let mut greedy =
+        TestRun::grouped("head -c 8G /dev/zero | tail -n 1 >/dev/null; exit ${PIPESTATUS[1]}");
     greedy.run_as(&user);
     greedy.spec.limits.memory_bytes = Some(256 << 20);
     let ended = run_to_end(&greedy).await;
@@ -186,8 +213,13 @@ async fn a_task_that_wants_eight_gigabytes_gets_its_limit_and_says_so() {
 
 #[tokio::test]
 async fn a_task_goes_before_its_agent_and_shim_when_the_machine_runs_out_of_memory() {
-    let run = TestRun::grouped("cat /proc/self/oom_score_adj /proc/$PPID/oom_score_adj; sleep 1000");
-    let before: i32 = std::fs::read_to_string("/proc/self/oom_score_adj").expect("own").trim().parse().expect("number");
+    let run =
+        TestRun::grouped("cat /proc/self/oom_score_adj /proc/$PPID/oom_score_adj; sleep 1000");
+    let before: i32 = std::fs::read_to_string("/proc/self/oom_score_adj")
+        .expect("own")
+        .trim()
+        .parse()
+        .expect("number");
     start(&run).await;
     run.wrote("300\n").await;
     let scores: Vec<i32> = eventually("both scores", || {
@@ -246,9 +278,11 @@ async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
     let mut run = TestRun::grouped(BURGLAR);
     run.run_as(&user);
     std::fs::write(run.path("identity.json"), "secret").expect("identity");
-    std::fs::set_permissions(run.path("identity.json"), std::fs::Permissions::from_mode(0o600)).expect("its mode");
+    std::fs::set_permissions(run.path("identity.json"), std::fs::Permissions::from_mode(0o600))
+        .expect("its mode");
     std::fs::copy("/usr/bin/id", run.path("set-id-root")).expect("copied");
-    std::fs::set_permissions(run.path("set-id-root"), std::fs::Permissions::from_mode(0o4755)).expect("set-id");
+    std::fs::set_permissions(run.path("set-id-root"), std::fs::Permissions::from_mode(0o4755))
+        .expect("set-id");
     run.spec.environment.insert("DATA".to_owned(), run.path("").display().to_string());
     run.spec.environment.insert("AGENT".to_owned(), std::process::id().to_string());
     assert_eq!(run_to_end(&run).await, Observed::Exited(ExitStatus::Code(0)), "{}", run.log());
@@ -257,27 +291,48 @@ async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
     assert!(log.contains(&format!("root again: {}\n", user.uid)), "{log}");
     assert!(log.contains(&format!("ids: {0} {0} {0} {1}\n", user.uid, user.groups[0])), "{log}");
     let none = "0000000000000000";
-    let powers = format!("CapInh:{none} CapPrm:{none} CapEff:{none} CapBnd:{none} CapAmb:{none} NoNewPrivs:1 ");
+    let powers = format!(
+        "CapInh:{none} CapPrm:{none} CapEff:{none} CapBnd:{none} CapAmb:{none} NoNewPrivs:1 "
+    );
     assert!(log.contains(&powers), "{log}");
     assert!(log.contains("own directory: writable\nby name: works\n"), "{log}");
     assert_eq!(std::fs::metadata(run.spec.directory.join("mine")).expect("made").uid(), user.uid);
     let names = log.lines().last().expect("the environment");
-    let expected = ["AGENT", "DATA", "HOME", "LANG", "LOGNAME", "OLDPWD", "PATH", "PWD", "PYTHONUNBUFFERED", "SHLVL"];
+    let expected = [
+        "AGENT",
+        "DATA",
+        "HOME",
+        "LANG",
+        "LOGNAME",
+        "OLDPWD",
+        "PATH",
+        "PWD",
+        "PYTHONUNBUFFERED",
+        "SHLVL",
+    ];
     let others = ["TASKD_ASSIGNMENT", "TASKD_RUN_DIR", "TZ", "USER", "_"];
-    let unexpected: Vec<_> =
-        names.split_whitespace().filter(|name| !expected.contains(name) && !others.contains(name)).collect();
+    let unexpected: Vec<_> = names
+        .split_whitespace()
+        .filter(|name| !expected.contains(name) && !others.contains(name))
+        .collect();
     assert_eq!(unexpected, Vec::<&str>::new());
 }
 
 /// What a task may put in the place of the directory that it runs in, which it owns the way to.
-const EXCHANGES: [&str; 4] =
-    ["mkfifo src", "mkfifo pipe; ln -s pipe src", "ln -s \"$ROOTS_PIPE\" src", "ln -s /dev/watchdog src"];
+const EXCHANGES: [&str; 4] = [
+    "mkfifo src",
+    "mkfifo pipe; ln -s pipe src",
+    "ln -s \"$ROOTS_PIPE\" src",
+    "ln -s /dev/watchdog src",
+];
 
 #[tokio::test]
 async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
     let Some(user) = other_user() else { return };
     for exchange in EXCHANGES {
-        let mut run = TestRun::grouped(&format!("cd ..; rm -r src; {exchange}; trap 'exit 0' INT; sleep 1000 & wait"));
+        let mut run = TestRun::grouped(&format!(
+            "cd ..; rm -r src; {exchange}; trap 'exit 0' INT; sleep 1000 & wait"
+        ));
         let work = run.path("work");
         run.run_as(&user);
         run.spec.directory = work.join("src");
@@ -287,11 +342,18 @@ async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
         run.spec.environment.insert("ROOTS_PIPE".to_owned(), pipe.display().to_string());
         run.spec.has_outputs = true;
-        let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+        let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec))
+            .await
+            .expect("started");
         let kind = || std::fs::symlink_metadata(&run.spec.directory).ok();
         let exchanged = || kind().filter(|about| !about.is_dir()).map(drop);
         eventually("the exchange", exchanged).await;
-        assert_eq!(stop(&run).await, Observed::Exited(ExitStatus::Code(0)), "{exchange}: {}", run.log());
+        assert_eq!(
+            stop(&run).await,
+            Observed::Exited(ExitStatus::Code(0)),
+            "{exchange}: {}",
+            run.log()
+        );
         eventually("the shim to end", || (!started.shim.is_alive()).then_some(())).await;
     }
 }
@@ -301,8 +363,10 @@ async fn a_start_in_a_place_the_task_user_cannot_reach_says_so() {
     let Some(user) = other_user() else { return };
     let mut run = TestRun::grouped("true");
     run.run_as(&user);
-    std::fs::set_permissions(run.path("."), std::fs::Permissions::from_mode(0o700)).expect("closed");
-    let error = run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
+    std::fs::set_permissions(run.path("."), std::fs::Permissions::from_mode(0o700))
+        .expect("closed");
+    let error =
+        run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
     assert!(error.contains("run.sh") && error.contains("Permission denied"), "{error}");
 }
 
@@ -337,7 +401,8 @@ fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
     let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
     std::fs::create_dir_all(tree.join("deep")).expect("tree");
     std::fs::write(tree.join("deep/file"), "").expect("file");
-    std::fs::set_permissions(tree.join("deep/file"), std::fs::Permissions::from_mode(0o2700)).expect("set");
+    std::fs::set_permissions(tree.join("deep/file"), std::fs::Permissions::from_mode(0o2700))
+        .expect("set");
     user.hand_over(&tree).expect("handed over");
     std::fs::write(&outside, "secret").expect("outside");
     std::fs::set_permissions(&outside, std::fs::Permissions::from_mode(0o600)).expect("closed");
@@ -354,7 +419,10 @@ fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
 }
 
 #[test]
-#[expect(clippy::disallowed_methods, reason = "starts the shim as the agent does, with less rights")]
+#[expect(
+    clippy::disallowed_methods,
+    reason = "starts the shim as the agent does, with less rights"
+)]
 fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
     let Some(user) = other_user() else { return };
     // As by `sudo`: what the task starts there is root's, and nobody else may signal it.
@@ -377,6 +445,7 @@ fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
     assert!(shim.output().expect("runs").status.success());
     let ended = dir.ended().expect("readable").expect("written");
     assert_eq!(ended.status, ExitStatus::Code(3));
-    let pid: u32 = std::fs::read_to_string(run.path("pid")).expect("a pid").trim().parse().expect("a pid");
+    let pid: u32 =
+        std::fs::read_to_string(run.path("pid")).expect("a pid").trim().parse().expect("a pid");
     assert!(lives(pid), "it could not be ended, or this test shows nothing");
 }

@@ -38,9 +38,14 @@ fn doctor(data: &Path, environment: &[(&str, &str)]) -> Vec<Value> {
 #[track_caller]
 fn assert_found(checks: &[Value], check: &str, verdict: &str, words: &str) {
     let matches = |found: &&Value| {
-        found["check"] == check && found["verdict"] == verdict && found["found"].as_str().unwrap().contains(words)
+        found["check"] == check
+            && found["verdict"] == verdict
+            && found["found"].as_str().unwrap().contains(words)
     };
-    assert!(checks.iter().any(|found| matches(&found)), "{check}: {verdict} with {words:?} is not in {checks:?}");
+    assert!(
+        checks.iter().any(|found| matches(&found)),
+        "{check}: {verdict} with {words:?} is not in {checks:?}"
+    );
 }
 
 pub fn write_identity(data: &Path, server: &str) {
@@ -65,9 +70,16 @@ fn a_robot_that_is_not_set_up_is_told_what_is_missing() {
     let checks = doctor(dir.path(), &[]);
     assert_found(&checks, "identity", "bad", "this robot is not registered");
     assert_found(&checks, "settings", "good", "can be used");
-    assert!(checks.iter().all(|check| (check["verdict"] == "good") == check["mend"].is_null()), "{checks:?}");
+    assert!(
+        checks.iter().all(|check| (check["verdict"] == "good") == check["mend"].is_null()),
+        "{checks:?}"
+    );
     let ran = agent(&["doctor", "--data", dir.path().to_str().unwrap()], &[]);
-    assert!(ran.stdout.contains("✗ identity ") && ran.stdout.contains("→ enrol: task-agent enroll"), "{}", ran.stdout);
+    assert!(
+        ran.stdout.contains("✗ identity ") && ran.stdout.contains("→ enrol: task-agent enroll"),
+        "{}",
+        ran.stdout
+    );
 }
 
 #[test]
@@ -80,7 +92,12 @@ fn data_that_the_tasks_account_can_not_get_to_is_named_with_the_directory_in_the
     std::fs::create_dir(&data).unwrap();
     std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o700)).unwrap();
     let checks = doctor(&data, &[("TASK_AGENT_TASK_USER", "4711")]);
-    assert_found(&checks, "task user", "bad", &format!("which may not enter {}, where", dir.path().display()));
+    assert_found(
+        &checks,
+        "task user",
+        "bad",
+        &format!("which may not enter {}, where", dir.path().display()),
+    );
     std::fs::set_permissions(dir.path(), std::fs::Permissions::from_mode(0o711)).unwrap();
     let checks = doctor(&data, &[("TASK_AGENT_TASK_USER", "4711")]);
     assert_found(&checks, "task user", "good", "with the groups of 4711");
@@ -101,7 +118,10 @@ fn a_setting_that_is_wrong_is_named() {
     assert_found(&doctor(dir.path(), &nobody), "task user", "bad", "nobody-of-this-name");
     let setup = dir.path().join("setup.bash");
     std::fs::write(&setup, "").unwrap();
-    let checks = doctor(dir.path(), &[("PATH", "/nowhere"), ("TASK_AGENT_UNDERLAYS", setup.to_str().unwrap())]);
+    let checks = doctor(
+        dir.path(),
+        &[("PATH", "/nowhere"), ("TASK_AGENT_UNDERLAYS", setup.to_str().unwrap())],
+    );
     assert_found(&checks, "build", "notice", "neither colcon nor catkin_make");
     assert!(checks.iter().any(|check| check["check"] == "disk"), "{checks:?}");
 }
@@ -119,7 +139,8 @@ async fn a_server_that_can_not_be_reached_is_told_apart_from_another_program() {
     write_identity(dir.path(), "http://nowhere.invalid:8080");
     assert_found(&doctor(dir.path(), &[]), "dns", "bad", "nowhere.invalid");
 
-    // It answers to everything as a server would that stands in another year, and whose tokens are others.
+    // It answers to everything as a server would that stands in another year, and whose tokens are
+    // others.
     let date = [("date", "Sun, 06 Nov 1994 08:49:37 GMT")];
     let refusal = r#"{"error":{"code":"unauthorized","message":"no such token"}}"#;
     let routes = axum::Router::new()
@@ -144,7 +165,11 @@ async fn a_token_for_a_server_that_encrypts_is_shown_to_no_other() {
     let dir = tempfile::tempdir().unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let pin = CaPin::of(b"an authority");
-    write_identity_with(dir.path(), &format!("http://{}", listener.local_addr().unwrap()), json!({ "ca_pin": pin }));
+    write_identity_with(
+        dir.path(),
+        &format!("http://{}", listener.local_addr().unwrap()),
+        json!({ "ca_pin": pin }),
+    );
     let (asked, mut heard) = tokio::sync::mpsc::unbounded_channel();
     let routes = axum::Router::new().fallback(move || async move { asked.send(()).unwrap() });
     tokio::spawn(async move { axum::serve(listener, routes).await });
@@ -162,9 +187,11 @@ async fn mqtt_is_looked_for_where_the_server_says_and_by_the_ways_that_are_allow
     write_identity(dir.path(), &format!("http://{address}"));
     // Neither way leads to MQTT.
     let endpoint = json!({ "host": null, "port": address.port(), "prefix": "taskd/v1" });
-    let routes = axum::Router::new()
-        .route("/healthz", axum::routing::get(|| async { "{}" }))
-        .route("/api/v1/robots/{id}/mqtt", axum::routing::get(move || async move { axum::Json(endpoint) }));
+    let routes =
+        axum::Router::new().route("/healthz", axum::routing::get(|| async { "{}" })).route(
+            "/api/v1/robots/{id}/mqtt",
+            axum::routing::get(move || async move { axum::Json(endpoint) }),
+        );
     tokio::spawn(async move { axum::serve(listener, routes).await });
     let with = async |transport: &'static str| {
         let data = dir.path().to_owned();
@@ -204,9 +231,19 @@ fn what_the_server_has_set_is_looked_at_too() {
     let mut ledger = Ledger::new(0);
     ledger.accepted = Some(Accepted { generation: state.generation, envelope });
     ledger.write(&dir.path().join("ledger.json")).unwrap();
-    assert_found(&doctor(dir.path(), &[]), "ros", "bad", "/nowhere/ws/install/setup.bash is not there");
+    assert_found(
+        &doctor(dir.path(), &[]),
+        "ros",
+        "bad",
+        "/nowhere/ws/install/setup.bash is not there",
+    );
     let own = [("TASK_AGENT_WORKSPACE", "/elsewhere/ws")];
-    assert_found(&doctor(dir.path(), &own), "ros", "bad", "/elsewhere/ws/install/setup.bash is not there");
+    assert_found(
+        &doctor(dir.path(), &own),
+        "ros",
+        "bad",
+        "/elsewhere/ws/install/setup.bash is not there",
+    );
 }
 
 #[test]
@@ -215,7 +252,10 @@ fn each_subcommand_has_a_man_page() {
     let pages = dir.path().join("man1");
     assert_eq!(agent(&["man", pages.to_str().unwrap()], &[]).code, Some(0));
     for page in ["task-agent.1", "task-agent-enroll.1", "task-agent-doctor.1"] {
-        assert!(std::fs::read_to_string(pages.join(page)).unwrap().contains(".SH SYNOPSIS"), "{page}");
+        assert!(
+            std::fs::read_to_string(pages.join(page)).unwrap().contains(".SH SYNOPSIS"),
+            "{page}"
+        );
     }
     assert!(!pages.join("task-agent-shim.1").exists(), "nobody calls it");
 }

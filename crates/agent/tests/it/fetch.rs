@@ -23,7 +23,10 @@ async fn a_package_gets_its_place_once() {
     let manifest = site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap();
     assert_eq!(manifest, site.manifest);
     let progress = watch::Sender::new(Progress { done: 0, total: 0 });
-    site.fetcher.content(&site.package, &manifest, &progress, &CancellationToken::new()).await.unwrap();
+    site.fetcher
+        .content(&site.package, &manifest, &progress, &CancellationToken::new())
+        .await
+        .unwrap();
     site.assert_in_place();
     let size = site.content.len() as u64;
     assert_eq!(*progress.borrow(), Progress { done: size, total: size });
@@ -33,7 +36,10 @@ async fn a_package_gets_its_place_once() {
     site.pull().await.unwrap();
     assert_eq!(site.asked(), [0; 0], "what is there is not pulled again");
     fs::write(site.version().manifest(), "{}").unwrap();
-    assert_eq!(site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap(), manifest);
+    assert_eq!(
+        site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap(),
+        manifest
+    );
 }
 
 #[tokio::test]
@@ -52,7 +58,9 @@ async fn archive_with_another_tar_digest_is_refused_and_leaves_nothing() {
     let tar = tar();
     let facts = ContentFacts { tar_digest: Digest::of(b"another archive"), ..tar.facts() };
     let site = Site::with_content(tar.compressed(), facts, settings()).await;
-    let Err(FetchError::ArchiveRefused(refusal)) = site.pull().await else { panic!("it is in place") };
+    let Err(FetchError::ArchiveRefused(refusal)) = site.pull().await else {
+        panic!("it is in place")
+    };
     assert!(refusal.to_string().contains("content.tar_digest"), "{refusal}");
     site.assert_nothing_staged();
     assert!(!site.version().src().exists() && !site.part().exists());
@@ -74,7 +82,8 @@ async fn cuts_end_no_pull_that_gets_on() {
     let often = 2 * 5;
     // The same over and over would compress to nothing.
     let noise = noise();
-    let parts = (0..6u8).flat_map(|part| noise.iter().map(move |byte| byte.rotate_left(part.into()) ^ part));
+    let parts = (0..6u8)
+        .flat_map(|part| noise.iter().map(move |byte| byte.rotate_left(part.into()) ^ part));
     let site = Site::new(&Tar::default().file("data", &parts.collect::<Vec<_>>()).end()).await;
     site.answers((0..often).map(|_| Answer::Cut(3 << 19)));
     site.pull().await.unwrap();
@@ -104,10 +113,13 @@ async fn a_cancelled_pull_leaves_only_the_part() {
     let progress = watch::Sender::new(Progress { done: 0, total: 0 });
     let cancel = CancellationToken::new();
     let mut arrived = progress.subscribe();
-    let (result, _) = tokio::join!(site.fetcher.content(&site.package, &site.manifest, &progress, &cancel), async {
-        arrived.wait_for(|progress| progress.done == 1 << 20).await.unwrap();
-        cancel.cancel();
-    });
+    let (result, _) = tokio::join!(
+        site.fetcher.content(&site.package, &site.manifest, &progress, &cancel),
+        async {
+            arrived.wait_for(|progress| progress.done == 1 << 20).await.unwrap();
+            cancel.cancel();
+        }
+    );
     assert!(matches!(result, Err(FetchError::Cancelled)), "{result:?}");
     assert_eq!(fs::read(site.part()).unwrap(), site.content[..1 << 20]);
     site.assert_nothing_staged();
@@ -155,12 +167,17 @@ async fn a_part_that_a_power_cut_spoiled_is_thrown_away() {
 #[tokio::test]
 async fn wrong_bytes_are_never_used_nor_kept() {
     let size = tar().compressed().len() as u64;
-    for answer in [Answer::OtherBytes, Answer::Endless, Answer::Length(size - 1), Answer::Length(size + 1)] {
+    for answer in
+        [Answer::OtherBytes, Answer::Endless, Answer::Length(size - 1), Answer::Length(size + 1)]
+    {
         let site = Site::new(&tar()).await;
         site.answers(vec![answer.clone(); 200]);
         let error = site.pull().await.unwrap_err();
         assert!(matches!(error, FetchError::DigestMismatch { .. }), "{answer:?}: {error:?}");
-        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), true));
+        assert_eq!(
+            (error.code(), error.is_retryable()),
+            (Some(FailureCode::DIGEST_MISMATCH), true)
+        );
         assert_eq!(error.retry_after(), Some(Duration::from_secs(60)));
         assert!(error.to_string().ends_with("the server's copy is damaged"), "{error}");
         assert!(!site.part().exists() && !site.version().src().exists());
@@ -185,7 +202,11 @@ async fn content_heals_where_every_long_transfer_has_a_flipped_byte() {
         let flipped = site.behind_flips(fault).await;
         site.pull().await.unwrap();
         site.assert_in_place();
-        assert_eq!(flipped.load(Ordering::Relaxed), 3, "each transfer of the whole, and none of a range");
+        assert_eq!(
+            flipped.load(Ordering::Relaxed),
+            3,
+            "each transfer of the whole, and none of a range"
+        );
     }
 }
 
@@ -222,7 +243,11 @@ async fn manifest_heals_whose_first_transfers_have_a_flipped_byte() {
     let site = Site::new(&tar()).await;
     site.answers(vec![Answer::OtherBytes; 100]);
     let error = site.fetcher.manifest(&site.package, &cancel).await.unwrap_err();
-    assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DIGEST_MISMATCH), true), "{error}");
+    assert_eq!(
+        (error.code(), error.is_retryable()),
+        (Some(FailureCode::DIGEST_MISMATCH), true),
+        "{error}"
+    );
     assert!(!site.version().manifest().exists());
 }
 
@@ -237,17 +262,28 @@ async fn blob_that_is_said_once_not_to_be_there_is_asked_for_again() {
 #[tokio::test]
 async fn what_is_not_the_server_counts_as_not_reached() {
     let login = vec![("location", "/login")];
-    let mut answers =
-        vec![Answer::Html(200), Answer::Html(404), Answer::Html(302), Answer::Anonymous, Answer::Status(204, login)];
+    let mut answers = vec![
+        Answer::Html(200),
+        Answer::Html(404),
+        Answer::Html(302),
+        Answer::Anonymous,
+        Answer::Status(204, login),
+    ];
     // A proxy whose server restarts.
-    answers.extend([403, 404, 410, 451].map(|status| Answer::Status(status, vec![("content-type", "text/plain")])));
+    answers.extend(
+        [403, 404, 410, 451]
+            .map(|status| Answer::Status(status, vec![("content-type", "text/plain")])),
+    );
     for answer in answers {
         let site = Site::new(&tar()).await;
         site.put_part(&site.content[..1000]);
         site.answers([answer.clone()]);
         let error = site.pull().await.unwrap_err();
         assert!(matches!(error, FetchError::NotTheServer(_)), "{answer:?}: {error:?}");
-        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::SERVER_UNREACHABLE), true));
+        assert_eq!(
+            (error.code(), error.is_retryable()),
+            (Some(FailureCode::SERVER_UNREACHABLE), true)
+        );
         assert_eq!(fs::metadata(site.part()).unwrap().len(), 1000);
     }
 }
@@ -263,7 +299,10 @@ async fn statuses_say_whether_to_come_back() {
         (401, None, FailureCode::UNAUTHORIZED, true, None),
     ] {
         let site = Site::new(&tar()).await;
-        site.answers([Answer::Status(status, retry_after.map(|value| ("retry-after", value)).into_iter().collect())]);
+        site.answers([Answer::Status(
+            status,
+            retry_after.map(|value| ("retry-after", value)).into_iter().collect(),
+        )]);
         let error = site.pull().await.unwrap_err();
         assert_eq!(
             (error.code(), error.is_retryable(), error.retry_after()),
@@ -275,7 +314,11 @@ async fn statuses_say_whether_to_come_back() {
         let site = Site::new(&tar()).await;
         site.answers(vec![Answer::Refused(status); 2]);
         let error = site.pull().await.unwrap_err();
-        assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::PACKAGE_UNAVAILABLE), false), "{status}");
+        assert_eq!(
+            (error.code(), error.is_retryable()),
+            (Some(FailureCode::PACKAGE_UNAVAILABLE), false),
+            "{status}"
+        );
     }
 }
 
@@ -308,7 +351,10 @@ async fn what_came_with_the_order_is_not_pulled() {
     let config = serde_json::to_vec(&site.manifest).unwrap();
     let (package, cancel) = (&site.package, CancellationToken::new());
     let blobs = |config: &[u8], content: &[u8]| {
-        [(package.config, Bytes::copy_from_slice(config)), (package.content, Bytes::copy_from_slice(content))]
+        [
+            (package.config, Bytes::copy_from_slice(config)),
+            (package.content, Bytes::copy_from_slice(content)),
+        ]
     };
     // Others than the state names are as good as none.
     site.fetcher.offer(blobs(&config[1..], &site.content[1..]));
@@ -327,7 +373,13 @@ async fn what_came_with_the_order_is_not_pulled() {
 async fn transfers_teach_about_the_link() {
     let mut site = Site::new(&tar()).await;
     let meter = LinkMeter::default();
-    let fetcher = Fetcher::new(client(), site.server.clone(), TOKEN.to_owned(), site.data.clone(), settings());
+    let fetcher = Fetcher::new(
+        client(),
+        site.server.clone(),
+        TOKEN.to_owned(),
+        site.data.clone(),
+        settings(),
+    );
     site.fetcher = fetcher.measured_by(meter.clone());
     site.answers([Answer::Cut(1 << 20)]);
     site.pull().await.unwrap();
@@ -338,7 +390,11 @@ async fn transfers_teach_about_the_link() {
 
 #[tokio::test]
 async fn a_server_that_stalls_is_given_up() {
-    let site = Site::with(&tar(), FetchSettings { stall_timeout: Duration::from_millis(50), ..settings() }).await;
+    let site = Site::with(
+        &tar(),
+        FetchSettings { stall_timeout: Duration::from_millis(50), ..settings() },
+    )
+    .await;
     site.answers(vec![Answer::Stall(0); 6]);
     let error = site.pull().await.unwrap_err();
     assert!(matches!(error, FetchError::Stalled(_)) && error.is_retryable(), "{error:?}");
@@ -346,7 +402,11 @@ async fn a_server_that_stalls_is_given_up() {
 
 #[tokio::test]
 async fn slow_retrieval_is_cut_by_a_least_rate() {
-    let site = Site::with(&tar(), FetchSettings { stall_timeout: Duration::from_millis(300), ..settings() }).await;
+    let site = Site::with(
+        &tar(),
+        FetchSettings { stall_timeout: Duration::from_millis(300), ..settings() },
+    )
+    .await;
     site.answers(vec![Answer::Drip; 6]);
     let error = site.pull().await.unwrap_err();
     assert!(matches!(error, FetchError::Stalled(_)), "{error:?}");

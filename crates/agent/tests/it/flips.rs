@@ -1,4 +1,5 @@
-//! A proxy that flips bytes on their way, as memory that fails in a switch does after the checksums were made anew.
+//! A proxy that flips bytes on their way, as memory that fails in a switch does after the checksums
+//! were made anew.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -7,7 +8,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
-/// Which byte of the answer's body is flipped, by the number of its connection; nothing for one without a fault.
+/// Which byte of the answer's body is flipped, by the number of its connection; nothing for one
+/// without a fault.
 pub type Fault = fn(u64) -> Option<u64>;
 
 /// Where the proxy for `server` listens, and how many bytes it has flipped.
@@ -25,7 +27,12 @@ pub async fn proxy(server: SocketAddr, fault: Fault) -> (SocketAddr, Arc<AtomicU
     (address, flipped)
 }
 
-async fn carry(client: TcpStream, upstream: TcpStream, fault: Option<u64>, flipped: Arc<AtomicU64>) {
+async fn carry(
+    client: TcpStream,
+    upstream: TcpStream,
+    fault: Option<u64>,
+    flipped: Arc<AtomicU64>,
+) {
     let (mut from_client, mut to_client) = client.into_split();
     let (mut from_server, mut to_server) = upstream.into_split();
     let up = async {
@@ -33,7 +40,8 @@ async fn carry(client: TcpStream, upstream: TcpStream, fault: Option<u64>, flipp
         let _ = to_server.shutdown().await;
     };
     let down = async {
-        // Of the first answer of the connection; how much of its body has passed, once its head has.
+        // Of the first answer of the connection; how much of its body has passed, once its head
+        // has.
         let (mut head, mut passed) = (Vec::new(), None);
         let mut buffer = vec![0; 64 * 1024];
         while let Ok(count @ 1..) = from_server.read(&mut buffer).await {

@@ -15,14 +15,24 @@ use task_proto::{DeploymentId, RobotId, TaskName};
 use crate::harness::eventually;
 
 /// Asks a gate that is `script`; the directory is where it ran.
-async fn ask(dir: &Path, script: &str, timeout: Duration, default: GateDefault) -> Result<(), Failure> {
+async fn ask(
+    dir: &Path,
+    script: &str,
+    timeout: Duration,
+    default: GateDefault,
+) -> Result<(), Failure> {
     let program = dir.join("gate.sh");
     std::fs::write(&program, format!("#!/bin/bash\n{script}\n")).expect("written");
     std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("executable");
     ask_program(dir, &program, timeout, default).await
 }
 
-async fn ask_program(dir: &Path, program: &Path, timeout: Duration, default: GateDefault) -> Result<(), Failure> {
+async fn ask_program(
+    dir: &Path,
+    program: &Path,
+    timeout: Duration,
+    default: GateDefault,
+) -> Result<(), Failure> {
     let command = vec![program.display().to_string(), "an argument".to_owned()];
     let robot: RobotId = "r0123456789abcdef".parse().expect("valid");
     let environment = BTreeMap::from([("PATH".to_owned(), "/usr/bin:/bin".to_owned())]);
@@ -49,11 +59,27 @@ async fn it_is_told_what_is_about_to_happen_and_says_why_not() {
     let asked = "[ \"$TASKD_GATE_STEP $TASKD_TASK $TASKD_VERSION $TASKD_RUN $1\" = 'switch talker 1.1 3 an argument' ] \
                  && [ -n \"$TASKD_DEPLOYMENT\" ] && [ $TASKD_ROBOT = r0123456789abcdef ]";
     assert_eq!(ask(dir.path(), asked, LONG, GateDefault::Deny).await, Ok(()));
-    let refusal = ask(dir.path(), "echo; echo carries a load; echo at dock 3 >&2; exit 7", LONG, GateDefault::Allow);
-    assert_eq!(refusal.await.expect_err("no").to_string(), "gate_refused: carries a load\nat dock 3");
+    let refusal = ask(
+        dir.path(),
+        "echo; echo carries a load; echo at dock 3 >&2; exit 7",
+        LONG,
+        GateDefault::Allow,
+    );
+    assert_eq!(
+        refusal.await.expect_err("no").to_string(),
+        "gate_refused: carries a load\nat dock 3"
+    );
     let silent = ask(dir.path(), "exit 7", LONG, GateDefault::Allow).await.expect_err("no");
-    assert_eq!(silent.to_string(), "gate_refused: the gate said no and gave no reason (exit code 7)");
-    let flood = ask(dir.path(), "head -c 10000000 /dev/zero | tr '\\0' x; exit 1", LONG, GateDefault::Allow);
+    assert_eq!(
+        silent.to_string(),
+        "gate_refused: the gate said no and gave no reason (exit code 7)"
+    );
+    let flood = ask(
+        dir.path(),
+        "head -c 10000000 /dev/zero | tr '\\0' x; exit 1",
+        LONG,
+        GateDefault::Allow,
+    );
     assert_eq!(flood.await.expect_err("no").text.len(), 1024);
 }
 
@@ -66,11 +92,15 @@ async fn without_an_answer_the_setting_decides_and_nothing_is_left_of_it() {
     let failure = ask(dir.path(), hang, short, GateDefault::Deny).await.expect_err("no");
     assert!(failure.to_string().starts_with("gate_failed: the gate "), "{failure}");
     assert!(failure.text.contains("did not answer"), "{failure}");
-    let left = Containment::new(&dir.path().join("gate/talker"), None, None).members().expect("the process table");
+    let left = Containment::new(&dir.path().join("gate/talker"), None, None)
+        .members()
+        .expect("the process table");
     assert_eq!(left, []);
     let crash = ask(dir.path(), "kill -SEGV $$", LONG, GateDefault::Deny).await.expect_err("no");
     assert!(crash.text.contains("crashed: killed by SIGSEGV"), "{crash}");
-    let none = ask_program(dir.path(), Path::new("/nonexistent/gate"), LONG, GateDefault::Deny).await.expect_err("no");
+    let none = ask_program(dir.path(), Path::new("/nonexistent/gate"), LONG, GateDefault::Deny)
+        .await
+        .expect_err("no");
     assert!(none.text.starts_with("cannot run the gate /nonexistent/gate: No such file"), "{none}");
 }
 

@@ -1,6 +1,9 @@
-//! The graph against real rclpy nodes. Each test has a domain of its own, and nothing leaves this host.
+//! The graph against real rclpy nodes. Each test has a domain of its own, and nothing leaves this
+//! host.
 
-use task_agent::ros::graph::{DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot};
+use task_agent::ros::graph::{
+    DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot,
+};
 use task_proto::log::LogLevel;
 use task_proto::ros::{Endpoint, LifecycleState, Transition};
 
@@ -8,7 +11,11 @@ use crate::harness::{eventually, within};
 use crate::ros::{CALL, RosNode, name, open, open_as, program};
 
 /// Waits until the graph shows it.
-async fn shows(graph: &Graph, what: &str, condition: impl Fn(&Snapshot) -> bool) -> std::sync::Arc<Snapshot> {
+async fn shows(
+    graph: &Graph,
+    what: &str,
+    condition: impl Fn(&Snapshot) -> bool,
+) -> std::sync::Arc<Snapshot> {
     let mut changes = graph.changes();
     let found = within(what, changes.wait_for(|snapshot| condition(snapshot))).await;
     found.expect("the graph is open").clone()
@@ -51,7 +58,10 @@ async fn a_node_appears_with_its_endpoints_and_vanishes() {
     assert_eq!(snapshot.servers_of(&name("/robot/ask")).count(), 0);
     assert!(!snapshot.participants[&talker.participant].locators.is_empty());
     node.leave().await;
-    shows(&graph, "the talker gone", |snapshot| snapshot.nodes.is_empty() && snapshot.participants.is_empty()).await;
+    shows(&graph, "the talker gone", |snapshot| {
+        snapshot.nodes.is_empty() && snapshot.participants.is_empty()
+    })
+    .await;
     graph.close().await;
 }
 
@@ -101,7 +111,10 @@ async fn a_lifecycle_node_is_brought_to_active_and_shut_down() {
         assert_eq!(graph.lifecycle_state(&mapper, CALL).await.unwrap(), state);
     }
     // Its services may answer before it has said that they are its own.
-    shows(&graph, "the mapper with its lifecycle", |snapshot| snapshot.named(&mapper).any(Node::has_lifecycle)).await;
+    shows(&graph, "the mapper with its lifecycle", |snapshot| {
+        snapshot.named(&mapper).any(Node::has_lifecycle)
+    })
+    .await;
     node.leave().await;
 }
 
@@ -112,7 +125,10 @@ async fn parameters_are_read_and_set_and_refused_with_the_nodes_reason() {
     let talker = name("/talker");
     let all = graph.parameters(&talker, CALL).await.unwrap();
     assert!(all.contains(&("rate".to_owned(), ParameterValue::Double(1.5))), "{all:?}");
-    assert!(all.contains(&("gains".to_owned(), ParameterValue::Integers(vec![1, 2, 3]))), "{all:?}");
+    assert!(
+        all.contains(&("gains".to_owned(), ParameterValue::Integers(vec![1, 2, 3]))),
+        "{all:?}"
+    );
     let set = vec![
         ("mode".to_owned(), ParameterValue::String("run".to_owned())),
         ("rate".to_owned(), ParameterValue::Double(-1.0)),
@@ -121,11 +137,18 @@ async fn parameters_are_read_and_set_and_refused_with_the_nodes_reason() {
         ("rate".to_owned(), ParameterValue::Integer(3).fitting(&ParameterValue::Double(1.5))),
     ];
     let results = graph.set_parameters(&talker, set, CALL).await.unwrap();
-    let successful: Vec<_> = results.iter().map(|result| (result.name.as_str(), result.successful)).collect();
-    assert_eq!(successful, [("mode", true), ("rate", false), ("rate", false), ("unknown", false), ("rate", true)]);
+    let successful: Vec<_> =
+        results.iter().map(|result| (result.name.as_str(), result.successful)).collect();
+    assert_eq!(
+        successful,
+        [("mode", true), ("rate", false), ("rate", false), ("unknown", false), ("rate", true)]
+    );
     assert_eq!(results[1].reason, "rate must be above 0");
     assert!(!results[2].reason.is_empty() && !results[3].reason.is_empty(), "{results:?}");
-    assert_eq!(graph.parameter(&talker, "mode", CALL).await.unwrap(), ParameterValue::String("run".to_owned()));
+    assert_eq!(
+        graph.parameter(&talker, "mode", CALL).await.unwrap(),
+        ParameterValue::String("run".to_owned())
+    );
     assert_eq!(graph.parameter(&talker, "rate", CALL).await.unwrap(), ParameterValue::Double(3.0));
     assert_eq!(graph.parameter(&talker, "nothing", CALL).await.unwrap(), ParameterValue::NotSet);
     node.leave().await;
@@ -134,13 +157,18 @@ async fn parameters_are_read_and_set_and_refused_with_the_nodes_reason() {
 #[tokio::test(flavor = "multi_thread")]
 async fn two_nodes_of_one_name_are_told_apart_by_their_processes() {
     let graph = open(86).await;
-    let (first, second) = (RosNode::start("talker.py", 86, &[]).await, RosNode::start("talker.py", 86, &[]).await);
+    let (first, second) =
+        (RosNode::start("talker.py", 86, &[]).await, RosNode::start("talker.py", 86, &[]).await);
     let talker = name("/talker");
     let both = shows(&graph, "two talkers", |snapshot| snapshot.named(&talker).count() == 2).await;
     let mut found = Vec::new();
     for node in [&first, &second] {
         let owners = Graph::owners(both.clone(), vec![node.pid()]).await;
-        assert_eq!((owners.theirs.len(), owners.others.len(), owners.unknown.len()), (1, 1, 0), "{owners:?}");
+        assert_eq!(
+            (owners.theirs.len(), owners.others.len(), owners.unknown.len()),
+            (1, 1, 0),
+            "{owners:?}"
+        );
         found.extend(owners.theirs);
     }
     assert_ne!(found[0], found[1]);
@@ -164,7 +192,10 @@ async fn rates_are_counted_of_reliable_and_of_best_effort_publishers() {
     })
     .await;
     node.leave().await;
-    eventually("both topics silent", || (chatter.rate().hz == 0.0 && scan.rate().hz == 0.0).then_some(())).await;
+    eventually("both topics silent", || {
+        (chatter.rate().hz == 0.0 && scan.rate().hz == 0.0).then_some(())
+    })
+    .await;
     assert!(chatter.rate().since_last > Some(task_agent::ros::graph::rate::WINDOW));
     assert!(matches!(graph.rate(&name("/scan"), "String"), Err(GraphError::Kind(_))));
 }
@@ -180,8 +211,14 @@ async fn log_lines_are_heard_also_by_a_late_joiner() {
     node.order("warn said afterwards").await;
     let line = next().await;
     assert_eq!((line.text.as_str(), line.level), ("said afterwards", LogLevel::Warn));
-    assert_eq!((line.node.clone(), line.logger.as_str(), line.lost), (Some(name("/robot/talker")), "robot.talker", 0));
-    assert!(line.file.ends_with("talker.py") && line.line > 0 && line.at_ms > 1_700_000_000_000, "{line:?}");
+    assert_eq!(
+        (line.node.clone(), line.logger.as_str(), line.lost),
+        (Some(name("/robot/talker")), "robot.talker", 0)
+    );
+    assert!(
+        line.file.ends_with("talker.py") && line.line > 0 && line.at_ms > 1_700_000_000_000,
+        "{line:?}"
+    );
     let snapshot = shows(&graph, "the talker", |snapshot| has(snapshot, "/robot/talker")).await;
     assert_eq!(line.participant, only(&snapshot, "/robot/talker").participant);
     node.leave().await;
@@ -192,7 +229,10 @@ async fn diagnostics_are_heard() {
     let graph = open(89).await;
     let mut statuses = graph.diagnostics().unwrap();
     let mut node = RosNode::start("talker.py", 89, &[]).await;
-    shows(&graph, "the talker", |snapshot| snapshot.publishers_of(&name("/diagnostics")).next().is_some()).await;
+    shows(&graph, "the talker", |snapshot| {
+        snapshot.publishers_of(&name("/diagnostics")).next().is_some()
+    })
+    .await;
     // A status that is sent before both sides have met is lost, so it is sent until one arrives.
     let status = loop {
         node.order("diagnose battery is low").await;
@@ -209,30 +249,44 @@ async fn diagnostics_are_heard() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn domains_do_not_mix_and_two_agents_on_one_host_do_not_confuse_each_other() {
-    let (here, beside, elsewhere) =
-        (open_as(90, "/taskd_one").await, open_as(90, "/taskd_two").await, open_as(232, "/taskd_one").await);
+    let (here, beside, elsewhere) = (
+        open_as(90, "/taskd_one").await,
+        open_as(90, "/taskd_two").await,
+        open_as(232, "/taskd_one").await,
+    );
     let node = RosNode::start("talker.py", 90, &[]).await;
     let other = RosNode::start("talker.py", 232, &["--ros-args", "-r", "__node:=stranger"]).await;
     let seen = |own: &'static str, also: &'static str| {
-        move |snapshot: &Snapshot| has(snapshot, "/talker") && has(snapshot, also) && !has(snapshot, own)
+        move |snapshot: &Snapshot| {
+            has(snapshot, "/talker") && has(snapshot, also) && !has(snapshot, own)
+        }
     };
     shows(&here, "the talker and the other agent", seen("/taskd_one", "/taskd_two")).await;
     shows(&beside, "the talker and the other agent", seen("/taskd_two", "/taskd_one")).await;
     let alone = shows(&elsewhere, "the stranger", |snapshot| has(snapshot, "/stranger")).await;
     assert_eq!(alone.nodes.len(), 1);
-    let both = [&here, &beside].map(|graph| async { graph.parameter(&name("/talker"), "rate", CALL).await.unwrap() });
+    let both = [&here, &beside]
+        .map(|graph| async { graph.parameter(&name("/talker"), "rate", CALL).await.unwrap() });
     for value in futures_util::future::join_all(both).await {
         assert_eq!(value, ParameterValue::Double(1.5));
     }
     beside.close().await;
-    shows(&here, "the other agent gone", |snapshot| !has(snapshot, "/taskd_two") && has(snapshot, "/talker")).await;
+    shows(&here, "the other agent gone", |snapshot| {
+        !has(snapshot, "/taskd_two") && has(snapshot, "/talker")
+    })
+    .await;
     other.leave().await;
     node.leave().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_domain_that_does_not_exist_is_refused_by_its_key() {
-    let settings = GraphSettings { domain_id: 233, localhost_only: true, node_name: name("/taskd_test"), distro: None };
+    let settings = GraphSettings {
+        domain_id: 233,
+        localhost_only: true,
+        node_name: name("/taskd_test"),
+        distro: None,
+    };
     let refused = Graph::open(&settings, &program()).await.err().expect("a refusal");
     assert_eq!(refused.to_string(), "ros_domain_id: 233 is not from 0 to 232");
 }
@@ -273,9 +327,11 @@ async fn a_killed_node_is_not_taken_for_the_one_started_after_it() {
     // It gets the ports that have become free, which the killed one's participant still announces.
     let started = RosNode::start("talker.py", 97, &[]).await;
     let is_new = |node: &Node| node.name == name("/talker") && node.participant != ghost;
-    let after = shows(&graph, "the second talker", |snapshot| snapshot.nodes.iter().any(is_new)).await;
+    let after =
+        shows(&graph, "the second talker", |snapshot| snapshot.nodes.iter().any(is_new)).await;
     let owners = Graph::owners(after.clone(), vec![started.pid()]).await;
-    let new: Vec<_> = after.nodes.iter().filter(|node| is_new(node)).map(|node| node.participant).collect();
+    let new: Vec<_> =
+        after.nodes.iter().filter(|node| is_new(node)).map(|node| node.participant).collect();
     assert_eq!(owners.theirs.iter().copied().collect::<Vec<_>>(), new);
     assert_eq!(owners.gone.contains(&ghost), after.participants.contains_key(&ghost), "{owners:?}");
     started.leave().await;

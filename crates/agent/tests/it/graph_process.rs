@@ -1,5 +1,5 @@
-//! The process that takes part in the ROS graph for the agent: what it may do, what strangers can do to it, and that its
-//! loss is no more than a moment without a graph.
+//! The process that takes part in the ROS graph for the agent: what it may do, what strangers can
+//! do to it, and that its loss is no more than a moment without a graph.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
@@ -21,7 +21,12 @@ use crate::rtps;
 const GROWTH_BYTES: u64 = 64 << 20;
 
 fn facts(domain_id: u16) -> RosFacts {
-    RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(domain_id), localhost_only: true }
+    RosFacts {
+        distro: "jazzy".to_owned(),
+        rmw: None,
+        domain_id: Some(domain_id),
+        localhost_only: true,
+    }
 }
 
 fn status_of(pid: u32, key: &str) -> String {
@@ -32,7 +37,9 @@ fn status_of(pid: u32, key: &str) -> String {
 
 async fn answers(graph: &Graph) {
     let talker = name("/talker");
-    let shown = async { graph.changes().wait_for(|snapshot| snapshot.named(&talker).next().is_some()).await.is_ok() };
+    let shown = async {
+        graph.changes().wait_for(|snapshot| snapshot.named(&talker).next().is_some()).await.is_ok()
+    };
     assert!(within("the talker", shown).await);
     let value = graph.parameter(&talker, "rate", CALL).await.unwrap();
     assert_eq!(value, ParameterValue::Double(1.5));
@@ -54,7 +61,10 @@ async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
     if nix::unistd::geteuid().is_root() {
         let ids = status_of(pid, "Uid");
         assert!(ids.split_whitespace().all(|id| id != "0"), "{ids}");
-        assert_eq!(status_of(pid, "Groups").split_whitespace().filter(|group| *group == "0").count(), 0);
+        assert_eq!(
+            status_of(pid, "Groups").split_whitespace().filter(|group| *group == "0").count(),
+            0
+        );
         for set in ["CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"] {
             assert_eq!(status_of(pid, set), "0000000000000000", "{set}");
         }
@@ -63,15 +73,18 @@ async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
     let limits = std::fs::read_to_string(format!("{proc}/limits")).unwrap();
     let data = limits.lines().find(|line| line.starts_with("Max data size")).unwrap();
     assert!(data.contains(&MEMORY_BYTES.to_string()), "{data}");
-    let score: i32 = std::fs::read_to_string(format!("{proc}/oom_score_adj")).unwrap().trim().parse().unwrap();
+    let score: i32 =
+        std::fs::read_to_string(format!("{proc}/oom_score_adj")).unwrap().trim().parse().unwrap();
     assert!(score > 0, "{score}");
     if nix::unistd::geteuid().is_root() {
         assert!(std::fs::read(format!("{proc}/environ")).unwrap().is_empty());
         // Its own: standard streams, sockets, what it waits with. None of the agent's files.
         for file in std::fs::read_dir(format!("{proc}/fd")).unwrap() {
             let target = std::fs::read_link(file.unwrap().path()).unwrap().display().to_string();
-            let number_of_a_kind = ["pipe:", "socket:", "anon_inode:"].iter().any(|kind| target.starts_with(kind));
-            let is_stderr = std::fs::read_link("/proc/self/fd/2").is_ok_and(|own| own.display().to_string() == target);
+            let number_of_a_kind =
+                ["pipe:", "socket:", "anon_inode:"].iter().any(|kind| target.starts_with(kind));
+            let is_stderr = std::fs::read_link("/proc/self/fd/2")
+                .is_ok_and(|own| own.display().to_string() == target);
             assert!(number_of_a_kind || is_stderr, "{target}");
         }
     }
@@ -97,11 +110,16 @@ async fn packets_that_state_gigabytes_cost_no_memory_and_the_graph_still_answers
         rtps::send(&socket, DOMAIN, datagrams);
     }
     answers(&graph).await;
-    for ((pid, before), what) in [pid, own].into_iter().zip(before).zip(["the program", "the agent"]) {
+    for ((pid, before), what) in
+        [pid, own].into_iter().zip(before).zip(["the program", "the agent"])
+    {
         let after = rtps::memory_of(pid);
         assert!(after.0 < before.0 + GROWTH_BYTES, "{what}: {before:?} became {after:?}");
         // This process runs other tests as well, whose threads take address space.
-        assert!(pid == own || after.1 < before.1 + GROWTH_BYTES, "{what}: {before:?} became {after:?}");
+        assert!(
+            pid == own || after.1 < before.1 + GROWTH_BYTES,
+            "{what}: {before:?} became {after:?}"
+        );
     }
     assert_eq!(graph.pid(), pid);
     assert!(lives(pid));
@@ -110,11 +128,20 @@ async fn packets_that_state_gigabytes_cost_no_memory_and_the_graph_still_answers
 }
 
 /// Announces a participant and says which samples it has: whoever believes it asks for them.
-fn is_matched(socket: &UdpSocket, domain_id: u16, prefix: [u8; 12], number: u32, port: u16) -> bool {
+fn is_matched(
+    socket: &UdpSocket,
+    domain_id: u16,
+    prefix: [u8; 12],
+    number: u32,
+    port: u16,
+) -> bool {
     rtps::send(
         socket,
         domain_id,
-        [rtps::announcement(prefix, number, port), rtps::heartbeat(prefix, rtps::PUBLICATIONS, 5, number)],
+        [
+            rtps::announcement(prefix, number, port),
+            rtps::heartbeat(prefix, rtps::PUBLICATIONS, 5, number),
+        ],
     );
     socket.set_read_timeout(Some(Duration::from_millis(100))).unwrap();
     let mut bytes = [0; 65_536];
@@ -149,14 +176,22 @@ async fn packets_about_all_numbers_there_are_take_neither_time_nor_memory() {
             DOMAIN,
             [
                 rtps::heartbeat(prefix, rtps::PUBLICATIONS, i64::MAX, 2 * count),
-                rtps::gap(prefix, rtps::PUBLICATIONS, i64::from(count) * 1000, i64::MAX - i64::from(count)),
+                rtps::gap(
+                    prefix,
+                    rtps::PUBLICATIONS,
+                    i64::from(count) * 1000,
+                    i64::MAX - i64::from(count),
+                ),
                 rtps::heartbeat(prefix, rtps::PUBLICATIONS, i64::MAX - 1, 2 * count + 1),
             ],
         );
     }
     answers(&graph).await;
     let after = rtps::memory_of(pid);
-    assert!(after.0 < before.0 + GROWTH_BYTES && after.1 < before.1 + GROWTH_BYTES, "{before:?} became {after:?}");
+    assert!(
+        after.0 < before.0 + GROWTH_BYTES && after.1 < before.1 + GROWTH_BYTES,
+        "{before:?} became {after:?}"
+    );
     assert!(lives(pid) && started.elapsed() < Duration::from_secs(30));
     node.leave().await;
     graph.close().await;
@@ -167,7 +202,8 @@ async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
     const DOMAIN: u16 = 101;
     let graph = open(DOMAIN).await;
     let sockets = std::fs::read_to_string("/proc/net/udp").unwrap();
-    let ports: Vec<u16> = [0, 1].into_iter().chain(10..24).map(|port| 7400 + 250 * DOMAIN + port).collect();
+    let ports: Vec<u16> =
+        [0, 1].into_iter().chain(10..24).map(|port| 7400 + 250 * DOMAIN + port).collect();
     let bound: Vec<&str> = sockets
         .lines()
         .filter_map(|line| line.split_whitespace().nth(1)?.split_once(':'))
@@ -175,7 +211,8 @@ async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
         .map(|(address, _)| address)
         .collect();
     // Loopback, and the group 239.255.0.1, as the kernel prints them.
-    let [loopback, group] = [[127, 0, 0, 1], [239, 255, 0, 1]].map(|ip| format!("{:08X}", u32::from_ne_bytes(ip)));
+    let [loopback, group] =
+        [[127, 0, 0, 1], [239, 255, 0, 1]].map(|ip| format!("{:08X}", u32::from_ne_bytes(ip)));
     assert!(bound.len() >= 4, "{bound:?}");
     assert!(bound.iter().all(|address| **address == loopback || **address == group), "{bound:?}");
     graph.close().await;
@@ -185,7 +222,8 @@ async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
 async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
-    let access = GraphAccess::of_robot("02:00:00:00:00:02".parse().unwrap(), data.clone(), program());
+    let access =
+        GraphAccess::of_robot("02:00:00:00:00:02".parse().unwrap(), data.clone(), program());
     let facts = facts(102);
     let first = access.open(Some(&facts)).await.unwrap();
     let mut node = RosNode::start("talker.py", 102, &[]).await;
@@ -194,7 +232,10 @@ async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
     signal(first.pid(), Signal::SIGKILL);
     let closed = async { while changes.changed().await.is_ok() {} };
     within("the loss to be noticed", closed).await;
-    assert!(matches!(first.parameter(&name("/talker"), "rate", CALL).await, Err(GraphError::Closed)));
+    assert!(matches!(
+        first.parameter(&name("/talker"), "rate", CALL).await,
+        Err(GraphError::Closed)
+    ));
     let refused = access.open(Some(&facts)).await.err().expect("a refusal while it is away");
     assert_eq!(refused.code, FailureCode::GRAPH_UNAVAILABLE);
     // Nobody asks for it: what nodes say is kept again all the same.

@@ -1,4 +1,5 @@
-//! What the tests share: a deadline for everything that is awaited, and a run of a script under the real shim.
+//! What the tests share: a deadline for everything that is awaited, and a run of a script under the
+//! real shim.
 
 use std::collections::BTreeMap;
 use std::future::Future;
@@ -23,10 +24,13 @@ const DEADLINE: Duration = Duration::from_secs(60);
 
 /// `future`'s output, or a panic that says what did not happen.
 pub async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
-    tokio::time::timeout(DEADLINE, future).await.unwrap_or_else(|_| panic!("not within {DEADLINE:?}: {what}"))
+    tokio::time::timeout(DEADLINE, future)
+        .await
+        .unwrap_or_else(|_| panic!("not within {DEADLINE:?}: {what}"))
 }
 
-/// Waits until `condition` gives a value. The one place that looks again and again: for what has no event to wait for.
+/// Waits until `condition` gives a value. The one place that looks again and again: for what has no
+/// event to wait for.
 pub async fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let mut tick = tokio::time::interval(Duration::from_millis(20));
     within(what, async {
@@ -75,11 +79,13 @@ impl TestRun {
         run
     }
 
-    /// Makes it run as `user`, in a directory of that user's own, below one that it can only pass through.
+    /// Makes it run as `user`, in a directory of that user's own, below one that it can only pass
+    /// through.
     pub fn run_as(&mut self, user: &TaskUser) {
         self.spec.directory = self.path("work");
         user.make_home(&self.spec.directory).expect("handed over");
-        std::fs::set_permissions(self.path("."), std::fs::Permissions::from_mode(0o700)).expect("closed");
+        std::fs::set_permissions(self.path("."), std::fs::Permissions::from_mode(0o700))
+            .expect("closed");
         user.let_through(&[self.path(".")]).expect("let through");
         self.spec.user = Some(user.clone());
     }
@@ -90,7 +96,12 @@ impl TestRun {
 
     /// The run's control group, as a new agent finds it.
     pub fn cgroup(&self) -> Option<PathBuf> {
-        RunDir::create(&self.run_dir()).expect("run dir").spec().expect("spec").expect("written").cgroup
+        RunDir::create(&self.run_dir())
+            .expect("run dir")
+            .spec()
+            .expect("spec")
+            .expect("written")
+            .cgroup
     }
 
     /// Where the script runs.
@@ -112,14 +123,19 @@ impl TestRun {
 
     /// Waits until the task has written `text`.
     pub async fn wrote(&self, text: &str) {
-        eventually(&format!("the output {text:?}"), || self.log().contains(text).then_some(())).await;
+        eventually(&format!("the output {text:?}"), || self.log().contains(text).then_some(()))
+            .await;
     }
 
     /// The processes that carry this run's assignment.
     pub fn survivors(&self) -> Vec<u32> {
         let marker = format!("TASKD_ASSIGNMENT={}", self.spec.assignment);
         let table = ProcessEntry::all().expect("process table");
-        table.iter().filter(|e| !e.is_zombie && e.was_started_with(&marker)).map(|e| e.pid).collect()
+        table
+            .iter()
+            .filter(|e| !e.is_zombie && e.was_started_with(&marker))
+            .map(|e| e.pid)
+            .collect()
     }
 }
 
@@ -131,7 +147,8 @@ impl Drop for TestRun {
     }
 }
 
-/// A supervisor whose shims are the binary under test, and that uses the machine's control groups, if it may.
+/// A supervisor whose shims are the binary under test, and that uses the machine's control groups,
+/// if it may.
 pub fn grouped_supervisor() -> Supervisor {
     Supervisor::new(env!("CARGO_BIN_EXE_task-agent"), Cgroups::find())
 }

@@ -36,10 +36,21 @@ fn agent_as_init(data: &Path) -> Namespace {
     Namespace(command.spawn().unwrap())
 }
 
-#[expect(clippy::disallowed_methods, reason = "the test puts orphans into the namespace of the program it tests")]
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the test puts orphans into the namespace of the program it tests"
+)]
 fn leave_orphans_to(init: u32) -> bool {
     let mut command = std::process::Command::new("nsenter");
-    command.args(["--target", &init.to_string(), "--pid", "--mount", "sh", "-c", "sleep 1000 & sleep 1000 &"]);
+    command.args([
+        "--target",
+        &init.to_string(),
+        "--pid",
+        "--mount",
+        "sh",
+        "-c",
+        "sleep 1000 & sleep 1000 &",
+    ]);
     command.stdin(Stdio::null()).status().unwrap().success()
 }
 
@@ -65,13 +76,17 @@ async fn agent_as_process_1_collects_orphans_and_ends_in_good_order() {
     let init = eventually("process 1", only_child(namespace.0.id())).await;
     let agent = eventually("the agent below it", only_child(init)).await;
     assert!(leave_orphans_to(init));
-    let orphans = eventually("the orphans", || Some(children_of(init)).filter(|children| children.len() == 3)).await;
+    let orphans = eventually("the orphans", || {
+        Some(children_of(init)).filter(|children| children.len() == 3)
+    })
+    .await;
     for orphan in orphans.iter().filter(|entry| entry.pid != agent) {
         kill(Pid::from_raw(orphan.pid.try_into().unwrap()), Signal::SIGKILL).unwrap();
     }
     eventually("nothing but the agent", || (children_of(init).len() == 1).then_some(())).await;
 
-    eventually("the agent to handle signals", || handles(agent, Signal::SIGTERM).then_some(())).await;
+    eventually("the agent to handle signals", || handles(agent, Signal::SIGTERM).then_some(()))
+        .await;
     kill(Pid::from_raw(init.try_into().unwrap()), Signal::SIGTERM).unwrap();
     let ended = eventually("the end", || namespace.0.try_wait().unwrap()).await;
     assert!(ended.success(), "{ended}");

@@ -1,4 +1,5 @@
-//! Launchers: what reaches `ros2 launch`, and who is asked to end. A recorded `ros2` stands in for the real one.
+//! Launchers: what reaches `ros2 launch`, and who is asked to end. A recorded `ros2` stands in for
+//! the real one.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt;
@@ -41,10 +42,14 @@ impl Launched {
         write(&version.install().join("local_setup.bash"), "export OVERLAY=sourced\n");
         std::fs::create_dir_all(version.work()).expect("a working directory");
         let underlay = run.path("setup.bash");
-        write(&underlay, &format!("export UNDERLAY=sourced PATH=\"{}:$PATH\"\n", run.path("bin").display()));
+        write(
+            &underlay,
+            &format!("export UNDERLAY=sourced PATH=\"{}:$PATH\"\n", run.path("bin").display()),
+        );
         let program = run.path("bin/ros2");
         write(&program, ros2);
-        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("executable");
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755))
+            .expect("executable");
         write(&run.spec.script, &script::run_script(&manifest, &version, &[underlay]));
         run.spec.interrupt = launch::of(&manifest).interrupt;
         run.spec.directory = version.work();
@@ -53,11 +58,15 @@ impl Launched {
     }
 
     async fn start(&self) {
-        within("the start", self.run.supervisor.start(&self.run.run_dir(), &self.run.spec)).await.expect("started");
+        within("the start", self.run.supervisor.start(&self.run.run_dir(), &self.run.spec))
+            .await
+            .expect("started");
     }
 
     async fn stop(&self) -> Observed {
-        within("the stop", self.run.supervisor.stop(&self.run.run_dir(), LONG_GRACE)).await.expect("stopped")
+        within("the stop", self.run.supervisor.stop(&self.run.run_dir(), LONG_GRACE))
+            .await
+            .expect("stopped")
     }
 }
 
@@ -78,27 +87,35 @@ async fn launch_arguments_reach_ros2_as_they_are() {
         ("f_assignment", "x:=y"),
         ("g_option", "--ros-args"),
     ];
-    let record =
-        "#!/bin/bash\nprintf '%s\\0' \"$@\" > argv\nenv -0 > environment\ngrep SigIgn /proc/self/status\npwd -P\n";
+    let record = "#!/bin/bash\nprintf '%s\\0' \"$@\" > argv\nenv -0 > environment\ngrep SigIgn /proc/self/status\npwd -P\n";
     let launched = Launched::by(record, &arguments);
     launched.start().await;
-    let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir())).await.expect("observed");
+    let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir()))
+        .await
+        .expect("observed");
     let log = launched.run.log();
     assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)), "{log}");
 
     let root = launched.version.work();
-    let mut expected = vec!["launch".to_owned(), "talker".to_owned(), "talker.launch.py".to_owned()];
+    let mut expected =
+        vec!["launch".to_owned(), "talker".to_owned(), "talker.launch.py".to_owned()];
     expected.extend(arguments.iter().map(|(name, value)| format!("{name}:={value}")));
     assert_eq!(texts(root.join("argv")), expected);
     assert!(!root.join("escaped").exists(), "a value became shell");
     assert!(log.contains(&root.canonicalize().expect("there").display().to_string()), "{log}");
     let ignored = log.lines().find_map(|line| line.strip_prefix("SigIgn:\t")).expect("recorded");
     let ignored = u64::from_str_radix(ignored, 16).expect("a mask");
-    assert_eq!(ignored & 0x7fff_ffff, 0, "signals a person can send are not ignored, SIGINT least of all");
+    assert_eq!(
+        ignored & 0x7fff_ffff,
+        0,
+        "signals a person can send are not ignored, SIGINT least of all"
+    );
 
     let environment: BTreeMap<String, String> = texts(root.join("environment"))
         .iter()
-        .filter_map(|entry| entry.split_once('=').map(|(name, value)| (name.to_owned(), value.to_owned())))
+        .filter_map(|entry| {
+            entry.split_once('=').map(|(name, value)| (name.to_owned(), value.to_owned()))
+        })
         .collect();
     let assignment = launched.run.spec.assignment.to_string();
     for (name, value) in [
@@ -110,12 +127,15 @@ async fn launch_arguments_reach_ros2_as_they_are() {
     ] {
         assert_eq!(environment.get(name).map(String::as_str), Some(value), "{name}");
     }
-    let inherited = environment.keys().filter(|name| name.starts_with("CARGO") || name.starts_with("TASKD_TEST"));
+    let inherited = environment
+        .keys()
+        .filter(|name| name.starts_with("CARGO") || name.starts_with("TASKD_TEST"));
     assert_eq!(inherited.collect::<Vec<_>>(), Vec::<&String>::new());
 }
 
-/// Behaves as `ros2 launch` without a terminal: it starts a node in its own process group and sends it a SIGINT when it
-/// gets one. The node counts those that reach it until its launcher has seen the first.
+/// Behaves as `ros2 launch` without a terminal: it starts a node in its own process group and sends
+/// it a SIGINT when it gets one. The node counts those that reach it until its launcher has seen
+/// the first.
 const LAUNCHER: &str = r#"#!/usr/bin/env python3
 import os, signal, subprocess, sys
 NODE = '''
@@ -155,13 +175,18 @@ async fn a_stop_asks_the_launcher_alone_which_asks_its_nodes() {
 
 #[tokio::test]
 async fn a_launcher_that_dies_leaves_no_node() {
-    let launched = Launched::by(&LAUNCHER.replace("text=True)", "text=True, start_new_session=True)"), &[]);
+    let launched =
+        Launched::by(&LAUNCHER.replace("text=True)", "text=True, start_new_session=True)"), &[]);
     launched.start().await;
     launched.run.wrote("launched").await;
-    let started =
-        task_agent::process::run_dir::RunDir::create(&launched.run.run_dir()).expect("dir").started().expect("read");
+    let started = task_agent::process::run_dir::RunDir::create(&launched.run.run_dir())
+        .expect("dir")
+        .started()
+        .expect("read");
     started.expect("started").task.signal(nix::sys::signal::Signal::SIGKILL).expect("killed");
-    let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir())).await.expect("observed");
+    let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir()))
+        .await
+        .expect("observed");
     assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
     assert_eq!(launched.run.survivors(), Vec::<u32>::new());
 }
@@ -171,6 +196,9 @@ async fn a_stop_is_noticed_while_an_underlay_is_sourced() {
     let launched = Launched::by("#!/bin/bash\necho never\n", &[]);
     write(&launched.run.path("setup.bash"), "echo sourcing; while :; do sleep 0.05; done\n");
     launched.start().await;
-    eventually("the underlay to be sourced", || launched.run.log().contains("sourcing").then_some(())).await;
+    eventually("the underlay to be sourced", || {
+        launched.run.log().contains("sourcing").then_some(())
+    })
+    .await;
     assert_eq!(launched.stop().await, Observed::Exited(ExitStatus::Code(130)));
 }

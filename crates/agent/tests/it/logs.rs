@@ -25,12 +25,15 @@ async fn what_nodes_say_is_kept_with_their_task() {
     let keeping = tokio::spawn(node_logs::keep(graph.clone(), data.clone(), None));
     let in_namespace = |namespace| ["--ros-args", "-r", namespace];
     let environment = [("TASKD_RUN_DIR", run_dir.as_path())];
-    let mut ours = RosNode::start_with("talker.py", 118, &in_namespace("__ns:=/ours"), &environment).await;
+    let mut ours =
+        RosNode::start_with("talker.py", 118, &in_namespace("__ns:=/ours"), &environment).await;
     let mut other = RosNode::start("talker.py", 118, &in_namespace("__ns:=/other")).await;
     let logs = Logs::new(data);
     let kept = async |task: Option<&str>| -> Vec<LogLine> {
         let task = task.map(|task| task.parse().unwrap());
-        logs.kept(Wanted { task, level: LogLevel::Warn, since_ms: None, max_lines: 1000 }).await.unwrap()
+        logs.kept(Wanted { task, level: LogLevel::Warn, since_ms: None, max_lines: 1000 })
+            .await
+            .unwrap()
     };
     let has = |lines: &[LogLine], text: &str| lines.iter().any(|line| line.text == text);
     // What is sent before both sides have met is lost, so it is sent until it arrives.
@@ -42,7 +45,10 @@ async fn what_nodes_say_is_kept_with_their_task() {
             other.order("warn a neighbour").await;
             ours.order("diagnose battery is low").await;
             let lines = kept(Some("talker")).await;
-            if has(&lines, "low") && has(&lines, "battery: battery is low") && has(&kept(None).await, "a neighbour") {
+            if has(&lines, "low")
+                && has(&lines, "battery: battery is low")
+                && has(&kept(None).await, "a neighbour")
+            {
                 return lines;
             }
         }
@@ -64,9 +70,15 @@ async fn what_nodes_say_is_kept_with_their_task() {
 async fn what_nodes_say_is_kept_in_files_of_the_size_that_is_set_when_the_graph_is_opened() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
-    let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data.clone(), program());
+    let access =
+        GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data.clone(), program());
     access.limit(Some(4096));
-    let facts = RosFacts { distro: "jazzy".to_owned(), rmw: None, domain_id: Some(119), localhost_only: true };
+    let facts = RosFacts {
+        distro: "jazzy".to_owned(),
+        rmw: None,
+        domain_id: Some(119),
+        localhost_only: true,
+    };
     let graph = access.open(Some(&facts)).await.unwrap();
     let mut node = RosNode::start("talker.py", 119, &[]).await;
     let rotated = data.ros_log().with_extension("log.1");

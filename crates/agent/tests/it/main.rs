@@ -1,4 +1,5 @@
-//! Tests of the agent through its public modules, against real files, processes and sockets on loopback.
+//! Tests of the agent through its public modules, against real files, processes and sockets on
+//! loopback.
 
 #![expect(clippy::unwrap_used, reason = "a helper that cannot go on ends its test")]
 

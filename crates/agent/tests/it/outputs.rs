@@ -1,5 +1,5 @@
-//! Bringing files back, to what is no registry and from under a task that goes on writing. The way to a real one is in the
-//! tests of the whole.
+//! Bringing files back, to what is no registry and from under a task that goes on writing. The way
+//! to a real one is in the tests of the whole.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -54,7 +54,8 @@ impl Left {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let base = format!("http://{}", listener.local_addr().unwrap()).parse().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
-        let client = reqwest::Client::builder().no_proxy().redirect(reqwest::redirect::Policy::none());
+        let client =
+            reqwest::Client::builder().no_proxy().redirect(reqwest::redirect::Policy::none());
         let registry = Registry::new(client.build().unwrap(), base, "token".to_owned());
         let progress = watch::Sender::new(Progress { done: 0, total: 0 });
         bring_back(&registry, &self.order, &progress, &CancellationToken::new()).await
@@ -63,7 +64,8 @@ impl Left {
 
 fn answer(status: u16, headers: &[(&str, String)], body: impl Into<Body>) -> Response {
     let response = Response::builder().status(status);
-    let response = headers.iter().fold(response, |response, (name, value)| response.header(*name, value));
+    let response =
+        headers.iter().fold(response, |response, (name, value)| response.header(*name, value));
     response.body(body.into()).unwrap()
 }
 
@@ -82,11 +84,15 @@ async fn what_is_not_the_server_takes_no_files_and_loses_none() {
     for status in [200, 201, 202, 302, 403, 404, 405] {
         for kind in ["text/html", "text/plain"] {
             let portal = move || async move {
-                let headers = [("content-type", kind.to_owned()), ("location", "/login".to_owned())];
+                let headers =
+                    [("content-type", kind.to_owned()), ("location", "/login".to_owned())];
                 answer(status, &headers, "please sign in")
             };
             let error = left.bring_to(Router::new().fallback(portal)).await.unwrap_err();
-            assert!(matches!(error, OutputError::NotTheServer { .. }), "{status} {kind}: {error:?}");
+            assert!(
+                matches!(error, OutputError::NotTheServer { .. }),
+                "{status} {kind}: {error:?}"
+            );
             assert!(error.retry_after().is_some(), "{error}");
         }
     }
@@ -96,14 +102,16 @@ async fn what_is_not_the_server_takes_no_files_and_loses_none() {
 async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() {
     // A file in one piece or in parts, and what is made of it.
     let bodies = [(1, "its own "), (MANY, "its own "), (1, "{"), (1, "{\"schemaVersion\"")];
-    for ((times, garbled), faults) in bodies.into_iter().flat_map(|body| [(body, 2), (body, 1000)]) {
+    for ((times, garbled), faults) in bodies.into_iter().flat_map(|body| [(body, 2), (body, 1000)])
+    {
         let is_brought = faults == 2;
         let left = Left::new();
         std::fs::write(left.map(), "its own ".repeat(times)).unwrap();
         let left = Left { order: OutputOrder { max_bytes: 1 << 24, ..left.order.clone() }, ..left };
         let parts = Arc::<Mutex<Vec<u8>>>::default();
         let (faults, listed) = (Arc::new(AtomicU32::new(faults)), Arc::<AtomicU32>::default());
-        let garbles = move || faults.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1)).is_ok();
+        let garbles =
+            move || faults.fetch_update(Relaxed, Relaxed, |left| left.checked_sub(1)).is_ok();
         // A registry that has nothing, and receives another byte in the first of these bodies.
         let registry = move |request: Request| {
             let (garbles, listed, parts) = (garbles.clone(), listed.clone(), parts.clone());
@@ -113,7 +121,8 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
                 if body.starts_with(garbled.as_bytes()) && garbles() {
                     body[0] ^= 0x10;
                 }
-                let created = || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
+                let created =
+                    || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
                 match method {
                     Method::POST if path.ends_with("/uploads/") => {
                         parts.lock().unwrap().clear();
@@ -127,9 +136,15 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
                         let whole = Digest::of(&parts.lock().unwrap());
                         let has_come = path.ends_with(&format!("?digest={whole}"));
                         let headers = [("docker-content-digest", whole.to_string())];
-                        if has_come { answer(201, &headers, "") } else { refusal(400, "DIGEST_INVALID") }
+                        if has_come {
+                            answer(201, &headers, "")
+                        } else {
+                            refusal(400, "DIGEST_INVALID")
+                        }
                     }
-                    Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => created(),
+                    Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => {
+                        created()
+                    }
                     Method::POST => refusal(400, "DIGEST_INVALID"),
                     Method::PUT if serde_json::from_slice::<serde_json::Value>(&body).is_err() => {
                         refusal(400, "MANIFEST_INVALID")
@@ -154,19 +169,23 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
 async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
     let left = Left::new();
     let map = left.map();
-    // A registry that has nothing; between a look at what it has and the sending, the task writes once more.
+    // A registry that has nothing; between a look at what it has and the sending, the task writes
+    // once more.
     let registry = move |request: Request| {
         let map = map.clone();
         async move {
             let (method, path) = (request.method().clone(), request.uri().to_string());
             let body = to_bytes(request.into_body(), 1 << 20).await.unwrap();
-            let created = || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
+            let created =
+                || answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "");
             match method {
                 Method::HEAD => {
                     std::fs::write(map, "another map..").unwrap();
                     answer(404, &[], "")
                 }
-                Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => created(),
+                Method::POST if path.ends_with(&format!("?digest={}", Digest::of(&body))) => {
+                    created()
+                }
                 Method::POST => refusal(400, "DIGEST_INVALID"),
                 _ => refusal(404, "MANIFEST_BLOB_UNKNOWN"),
             }
@@ -179,7 +198,8 @@ async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
 
 #[tokio::test]
 async fn directory_exchanged_for_a_link_while_files_are_sent_is_not_followed() {
-    // A file that is sent in one request is held against its digest before, one that is sent in parts is not.
+    // A file that is sent in one request is held against its digest before, one that is sent in
+    // parts is not.
     for times in [1, MANY] {
         exchange_while_files_are_sent(times).await;
     }
@@ -196,7 +216,11 @@ async fn exchange_while_files_are_sent(times: usize) {
     // Both have the same size.
     std::fs::write(root.join("run/maps/key.pgm"), "its own ".repeat(times)).unwrap();
     std::fs::write(root.join("secrets/key.pgm"), "a secret".repeat(times)).unwrap();
-    let order = OutputOrder { patterns: vec!["maps/*.pgm".to_owned()], max_bytes: 1 << 24, ..left.order.clone() };
+    let order = OutputOrder {
+        patterns: vec!["maps/*.pgm".to_owned()],
+        max_bytes: 1 << 24,
+        ..left.order.clone()
+    };
     let left = Left { order, ..left };
     let (told, mut sent) = tokio::sync::mpsc::unbounded_channel();
     let registry = move |request: Request| {
@@ -210,10 +234,13 @@ async fn exchange_while_files_are_sent(times: usize) {
                 Method::PATCH => begun(),
                 Method::HEAD => {
                     std::fs::rename(root.join("run/maps"), root.join("run/moved")).unwrap();
-                    std::os::unix::fs::symlink(root.join("secrets"), root.join("run/maps")).unwrap();
+                    std::os::unix::fs::symlink(root.join("secrets"), root.join("run/maps"))
+                        .unwrap();
                     answer(404, &[], "")
                 }
-                Method::POST => answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], ""),
+                Method::POST => {
+                    answer(201, &[("docker-content-digest", Digest::of(&body).to_string())], "")
+                }
                 _ => refusal(404, "MANIFEST_BLOB_UNKNOWN"),
             }
         }

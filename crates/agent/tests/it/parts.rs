@@ -1,4 +1,5 @@
-//! Packages that the server pushes as parts: through the agent's real session, from a peer and a server that misbehave.
+//! Packages that the server pushes as parts: through the agent's real session, from a peer and a
+//! server that misbehave.
 
 use std::fs;
 use std::sync::Arc;
@@ -62,9 +63,19 @@ impl Rig {
             prefix: TopicPrefix::default(),
             robot: RobotId::random(),
             token: Credential::from("token".to_owned()),
-            status: Status { online: true, start: 1, instance: InstanceId::random(), connection: 0, place: None },
+            status: Status {
+                online: true,
+                start: 1,
+                instance: InstanceId::random(),
+                connection: 0,
+                place: None,
+            },
             message_bytes: mqtt::MESSAGE_BYTES,
-            ways: Ways::new(&"http://127.0.0.1".parse().unwrap(), Arc::new(tls), MqttTransport::Tcp),
+            ways: Ways::new(
+                &"http://127.0.0.1".parse().unwrap(),
+                Arc::new(tls),
+                MqttTransport::Tcp,
+            ),
         };
         let (heard, _) = mpsc::channel(1);
         let (requests, _) = mpsc::channel(1);
@@ -80,7 +91,9 @@ impl Rig {
         let (progress, asks) = (self.progress.clone(), self.asks.clone());
         tokio::spawn(async move {
             let (package, manifest) = (&site.package, &site.manifest);
-            site.fetcher.pushed_content(package, manifest, &shared.listening, (&progress, &asks), &cancel).await
+            site.fetcher
+                .pushed_content(package, manifest, &shared.listening, (&progress, &asks), &cancel)
+                .await
         })
     }
 
@@ -103,7 +116,9 @@ impl Rig {
     }
 
     fn push(&self, parts: impl IntoIterator<Item = u32>) {
-        parts.into_iter().for_each(|index| self.peer.publish(&self.topic(), 1, &self.message(index)));
+        parts
+            .into_iter()
+            .for_each(|index| self.peer.publish(&self.topic(), 1, &self.message(index)));
     }
 
     /// Waits until so many bytes are there.
@@ -114,15 +129,21 @@ impl Rig {
 
     /// Waits until the agent asks for these parts.
     async fn asked(&self, ranges: &[(u32, u32)]) {
-        let ranges: Vec<PartRange> = ranges.iter().map(|&(from, to)| PartRange { from, to }).collect();
+        let ranges: Vec<PartRange> =
+            ranges.iter().map(|&(from, to)| PartRange { from, to }).collect();
         let mut asks = self.asks.subscribe();
-        within("what is lacking", asks.wait_for(|asks| asks.missing.as_ref() == Some(&ranges))).await.unwrap();
+        within("what is lacking", asks.wait_for(|asks| asks.missing.as_ref() == Some(&ranges)))
+            .await
+            .unwrap();
     }
 
     async fn ends_well(&self, gathering: Gathering) {
         within("the package", gathering).await.unwrap().unwrap();
         self.site.assert_in_place();
-        for path in [self.site.data.blob_parts(&self.digest()), self.site.data.blob_parts_note(&self.digest())] {
+        for path in [
+            self.site.data.blob_parts(&self.digest()),
+            self.site.data.blob_parts_note(&self.digest()),
+        ] {
             assert!(!path.exists(), "{} is left", path.display());
         }
         assert_eq!(self.asks.borrow().missing, None);
@@ -222,7 +243,12 @@ async fn hostile_messages_are_passed_over() {
     // Of another package, and again what is there, with other bytes.
     rig.peer.publish("taskd/v1/p/sha256:00", 1, &good);
     rig.peer.publish("taskd/v1/r/r00000000000000a1/desired", 1, b"{");
-    let double = Part { index: 0, count: rig.cut.count(), part_bytes: PART_BYTES, bytes: &[7; PART_BYTES as usize] };
+    let double = Part {
+        index: 0,
+        count: rig.cut.count(),
+        part_bytes: PART_BYTES,
+        bytes: &[7; PART_BYTES as usize],
+    };
     rig.peer.publish(&rig.topic(), 1, &double.encode());
     rig.push(0..rig.cut.count());
     rig.ends_well(gathering).await;
@@ -234,7 +260,12 @@ async fn hostile_messages_are_passed_over() {
 async fn wrong_bytes_are_found_by_the_digest_and_pulled() {
     let rig = Rig::new(patient()).await;
     let gathering = rig.listen().await;
-    let wrong = Part { index: 5, count: rig.cut.count(), part_bytes: PART_BYTES, bytes: &[7; PART_BYTES as usize] };
+    let wrong = Part {
+        index: 5,
+        count: rig.cut.count(),
+        part_bytes: PART_BYTES,
+        bytes: &[7; PART_BYTES as usize],
+    };
     rig.peer.publish(&rig.topic(), 1, &wrong.encode());
     rig.push(0..rig.cut.count());
     rig.ends_well(gathering).await;
@@ -278,10 +309,12 @@ async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out()
     let site = Site::with(&tar(), patient()).await;
     let listening = task_agent::transfer::parts::Listening::default();
     listening.session(false);
-    let (progress, asks) = (watch::Sender::new(Progress { done: 0, total: 0 }), watch::Sender::default());
+    let (progress, asks) =
+        (watch::Sender::new(Progress { done: 0, total: 0 }), watch::Sender::default());
     let cancel = CancellationToken::new();
     let told = (&progress, &asks);
-    let pull = site.fetcher.pushed_content(&site.package, &site.manifest, &listening, told, &cancel);
+    let pull =
+        site.fetcher.pushed_content(&site.package, &site.manifest, &listening, told, &cancel);
     within("the pull", pull).await.unwrap();
     site.assert_in_place();
 
@@ -370,10 +403,15 @@ async fn a_note_that_is_wrong_is_no_note() {
 #[tokio::test]
 async fn a_pull_goes_on_from_the_parts_that_are_there() {
     let rig = ended_half_way().await;
-    let (progress, cancel) = (watch::Sender::new(Progress { done: 0, total: 0 }), CancellationToken::new());
+    let (progress, cancel) =
+        (watch::Sender::new(Progress { done: 0, total: 0 }), CancellationToken::new());
     // As when the server has told the robot to pull.
     rig.site.answers([Answer::Well]);
-    rig.site.fetcher.content(&rig.site.package, &rig.site.manifest, &progress, &cancel).await.unwrap();
+    rig.site
+        .fetcher
+        .content(&rig.site.package, &rig.site.manifest, &progress, &cancel)
+        .await
+        .unwrap();
     rig.site.assert_in_place();
     assert_eq!(rig.site.asked(), [4 * u64::from(PART_BYTES)]);
     assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
@@ -382,7 +420,8 @@ async fn a_pull_goes_on_from_the_parts_that_are_there() {
 #[tokio::test]
 async fn too_little_room_is_said_before_anything_is_pushed() {
     let rig = Rig::new(FetchSettings { reserve_bytes: u64::MAX, ..patient() }).await;
-    let error = within("the refusal", rig.gather(&CancellationToken::new())).await.unwrap().unwrap_err();
+    let error =
+        within("the refusal", rig.gather(&CancellationToken::new())).await.unwrap().unwrap_err();
     assert!(matches!(error, FetchError::DiskFull(_)), "{error:?}");
     assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
     assert_eq!((rig.site.asked(), rig.asks.borrow().times), (Vec::new(), 0));
@@ -396,7 +435,8 @@ async fn who_does_not_write_gets_no_more() {
     let before = rig.peer.seen.borrow().acknowledged;
     rig.push(0..rig.cut.count());
     let first = within("a part", ear.parts.recv()).await.unwrap();
-    eventually("the queue is full", || (ear.parts.len() == ear.parts.max_capacity()).then_some(())).await;
+    eventually("the queue is full", || (ear.parts.len() == ear.parts.max_capacity()).then_some(()))
+        .await;
     assert_eq!(rig.peer.seen.borrow().acknowledged, before, "nothing was written");
     drop(first);
     for _ in 1..rig.cut.count() {

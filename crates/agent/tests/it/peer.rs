@@ -1,5 +1,6 @@
-//! An MQTT 3.1.1 peer for the agent's sessions that does what a test says: refuses subscriptions, keeps its own time,
-//! sends what no honest broker would, breaks off. It knows as much of the protocol as an agent uses.
+//! An MQTT 3.1.1 peer for the agent's sessions that does what a test says: refuses subscriptions,
+//! keeps its own time, sends what no honest broker would, breaks off. It knows as much of the
+//! protocol as an agent uses.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
@@ -48,7 +49,8 @@ impl Peer {
             session: Arc::default(),
             next_id: Mutex::new(0),
         };
-        let (seen, allows, current) = (peer.seen.clone(), peer.allows_parts.clone(), peer.session.clone());
+        let (seen, allows, current) =
+            (peer.seen.clone(), peer.allows_parts.clone(), peer.session.clone());
         tokio::spawn(async move {
             while let Ok((stream, _)) = listener.accept().await {
                 let end = CancellationToken::new();
@@ -70,7 +72,8 @@ impl Peer {
 
     /// Waits until the agent subscribes to a topic that ends so.
     pub async fn subscribed(&self, end: &str) {
-        self.until("a subscription", |seen| seen.topics.iter().any(|topic| topic.ends_with(end))).await;
+        self.until("a subscription", |seen| seen.topics.iter().any(|topic| topic.ends_with(end)))
+            .await;
     }
 
     /// Publishes to the session that there is, whatever it is subscribed to.

@@ -38,7 +38,8 @@ pub async fn open(domain_id: u16) -> Graph {
 
 /// The same with a name of its own.
 pub async fn open_as(domain_id: u16, node_name: &str) -> Graph {
-    let settings = GraphSettings { domain_id, localhost_only: true, node_name: name(node_name), distro: None };
+    let settings =
+        GraphSettings { domain_id, localhost_only: true, node_name: name(node_name), distro: None };
     within("the graph to open", Graph::open(&settings, &program())).await.expect("the graph")
 }
 
@@ -56,7 +57,12 @@ impl RosNode {
     }
 
     /// The same with more in its environment.
-    pub async fn start_with(script: &str, domain_id: u16, arguments: &[&str], environment: &[(&str, &Path)]) -> Self {
+    pub async fn start_with(
+        script: &str,
+        domain_id: u16,
+        arguments: &[&str],
+        environment: &[(&str, &Path)],
+    ) -> Self {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/it/ros").join(script);
         let mut child = Command::new(ros().join("bin/python3"))
             .arg(path)

@@ -3,7 +3,12 @@
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 
 /// `DATA_FRAG`: it says how large the whole sample is.
-pub fn data_frag(prefix: [u8; 12], endpoints: Endpoints, number: u32, stated_bytes: u32) -> Vec<u8> {
+pub fn data_frag(
+    prefix: [u8; 12],
+    endpoints: Endpoints,
+    number: u32,
+    stated_bytes: u32,
+) -> Vec<u8> {
     let payload = [0x5a; 64];
     let mut body = vec![0, 0, 28, 0];
     body.extend(endpoints.ids());
@@ -110,13 +115,14 @@ pub fn kinds(datagram: &[u8]) -> Vec<u8> {
     kinds
 }
 
-/// The ports at which the first participant of this domain listens: for discovery and for what it is sent.
+/// The ports at which the first participant of this domain listens: for discovery and for what it
+/// is sent.
 fn ports(domain_id: u16) -> [u16; 2] {
     [10, 11].map(|port| 7400 + 250 * domain_id + port)
 }
 
-/// Sends each of these to the first participant of this domain on this host. The others have parsers of their own, of which
-/// some bear less.
+/// Sends each of these to the first participant of this domain on this host. The others have
+/// parsers of their own, of which some bear less.
 pub fn send(socket: &UdpSocket, domain_id: u16, datagrams: impl IntoIterator<Item = Vec<u8>>) {
     for datagram in datagrams {
         for port in ports(domain_id) {

@@ -1,4 +1,5 @@
-//! A server that answers for a package's blobs as a test says, and a robot's data directory beside it.
+//! A server that answers for a package's blobs as a test says, and a robot's data directory beside
+//! it.
 
 use std::fs;
 use std::path::PathBuf;
@@ -26,7 +27,8 @@ use crate::flips::{self, Fault};
 
 const CHUNK_BYTES: usize = 64 * 1024;
 /// A refusal in a registry's words.
-pub const BLOB_UNKNOWN: &str = r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
+pub const BLOB_UNKNOWN: &str =
+    r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
 pub const TOKEN: &str = "the robot's token";
 /// Whatever a server does, a pull has ended by then.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -92,7 +94,11 @@ impl Site {
         Self::with_content(tar.compressed(), tar.facts(), settings).await
     }
 
-    pub async fn with_content(content: Vec<u8>, facts: ContentFacts, settings: FetchSettings) -> Self {
+    pub async fn with_content(
+        content: Vec<u8>,
+        facts: ContentFacts,
+        settings: FetchSettings,
+    ) -> Self {
         let manifest = manifest(facts);
         let config = serde_json::to_vec(&manifest).unwrap();
         let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
@@ -103,20 +109,33 @@ impl Site {
             config: blob(&config),
             content: blob(&content),
         };
-        let script = Arc::new(Mutex::new(Script { blobs: vec![content.clone(), config], ..Script::default() }));
-        let router = Router::new().route("/v2/{name}/blobs/{digest}", get(answer)).with_state(script.clone());
+        let script = Arc::new(Mutex::new(Script {
+            blobs: vec![content.clone(), config],
+            ..Script::default()
+        }));
+        let router = Router::new()
+            .route("/v2/{name}/blobs/{digest}", get(answer))
+            .with_state(script.clone());
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let server: reqwest::Url = format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
+        let server: reqwest::Url =
+            format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
-        let fetcher = Fetcher::new(client(), server.clone(), TOKEN.to_owned(), data.clone(), settings);
+        let fetcher =
+            Fetcher::new(client(), server.clone(), TOKEN.to_owned(), data.clone(), settings);
         Self { script, fetcher, data, package, manifest, content, server, _dir: dir }
     }
 
     /// As after a new start of the agent.
     pub fn restart(&mut self, settings: FetchSettings) {
-        self.fetcher = Fetcher::new(client(), self.server.clone(), TOKEN.to_owned(), self.data.clone(), settings);
+        self.fetcher = Fetcher::new(
+            client(),
+            self.server.clone(),
+            TOKEN.to_owned(),
+            self.data.clone(),
+            settings,
+        );
     }
 
     /// Pulls by way of a proxy that flips bytes; gives how many it has.
@@ -141,7 +160,10 @@ impl Site {
         let cancel = CancellationToken::new();
         let pull = self.fetcher.content(&self.package, &self.manifest, &progress, &cancel);
         let ended = tokio::time::timeout(PATIENCE, pull).await.expect("the pull ends");
-        assert!(progress.borrow().done <= self.package.content.size, "more was read than was ordered");
+        assert!(
+            progress.borrow().done <= self.package.content.size,
+            "more was read than was ordered"
+        );
         ended
     }
 
@@ -171,7 +193,11 @@ impl Site {
 }
 
 pub fn settings() -> FetchSettings {
-    FetchSettings { reserve_bytes: 0, reconnect_wait: Duration::from_millis(1), ..FetchSettings::default() }
+    FetchSettings {
+        reserve_bytes: 0,
+        reconnect_wait: Duration::from_millis(1),
+        ..FetchSettings::default()
+    }
 }
 
 pub fn client() -> reqwest::Client {
@@ -191,9 +217,13 @@ async fn answer(
     Path((name, digest)): Path<(String, String)>,
     headers: HeaderMap,
 ) -> Response<Body> {
-    assert_eq!((name.as_str(), headers["authorization"].to_str().unwrap()), ("plain", "Bearer the robot's token"));
+    assert_eq!(
+        (name.as_str(), headers["authorization"].to_str().unwrap()),
+        ("plain", "Bearer the robot's token")
+    );
     let range = headers.get("range").map(|range| {
-        let (first, last) = range.to_str().unwrap().strip_prefix("bytes=").unwrap().split_once('-').unwrap();
+        let (first, last) =
+            range.to_str().unwrap().strip_prefix("bytes=").unwrap().split_once('-').unwrap();
         (first.parse::<usize>().unwrap(), last.parse::<usize>().ok())
     });
     let (offset, last) = range.unwrap_or_default();
@@ -201,13 +231,15 @@ async fn answer(
         let mut script = script.lock().unwrap();
         script.asked.push(offset as u64);
         let blob = script.blobs.iter().find(|blob| Digest::of(blob).to_string() == digest).cloned();
-        let answer = if script.answers.is_empty() { Answer::Well } else { script.answers.remove(0) };
+        let answer =
+            if script.answers.is_empty() { Answer::Well } else { script.answers.remove(0) };
         (blob.expect("a blob of the package"), answer)
     };
     let total = blob.len();
     let start = if matches!(answer, Answer::IgnoreRange) { 0 } else { offset };
     let mut response = Response::builder().header("docker-content-digest", &digest);
-    let end = last.filter(|_| !matches!(answer, Answer::IgnoreRange)).map_or(total, |last| last + 1);
+    let end =
+        last.filter(|_| !matches!(answer, Answer::IgnoreRange)).map_or(total, |last| last + 1);
     if start > 0 || end < total {
         let range = format!("bytes {start}-{}/{total}", end - 1);
         response = response.status(StatusCode::PARTIAL_CONTENT).header("content-range", range);
@@ -228,7 +260,9 @@ async fn answer(
             });
             exact(response).body(Body::from_stream(drops))
         }
-        Answer::Refused(status) => Response::builder().status(status).body(Body::from(BLOB_UNKNOWN)),
+        Answer::Refused(status) => {
+            Response::builder().status(status).body(Body::from(BLOB_UNKNOWN))
+        }
         Answer::Status(status, headers) => {
             let response = Response::builder().status(status);
             headers
@@ -242,11 +276,17 @@ async fn answer(
             .body(Body::from("<html>Please sign in</html>")),
         Answer::OtherBytes => exact(response).body(Body::from(vec![7; length])),
         Answer::Endless => {
-            let chunks = stream::repeat_with(|| Ok::<_, std::io::Error>(Bytes::from_static(&[7; CHUNK_BYTES])));
+            let chunks = stream::repeat_with(|| {
+                Ok::<_, std::io::Error>(Bytes::from_static(&[7; CHUNK_BYTES]))
+            });
             response.body(Body::from_stream(chunks))
         }
-        Answer::Length(length) => response.header("content-length", length).body(Body::from(vec![7; length as usize])),
-        Answer::Anonymous => Response::builder().header("content-length", length).body(Body::from(bytes)),
+        Answer::Length(length) => {
+            response.header("content-length", length).body(Body::from(vec![7; length as usize]))
+        }
+        Answer::Anonymous => {
+            Response::builder().header("content-length", length).body(Body::from(bytes))
+        }
         Answer::OtherRange => Response::builder()
             .status(StatusCode::PARTIAL_CONTENT)
             .header("docker-content-digest", &digest)
@@ -257,7 +297,10 @@ async fn answer(
 }
 
 fn chunks(bytes: Vec<u8>, count: usize) -> Vec<Result<Bytes, std::io::Error>> {
-    bytes[..count.min(bytes.len())].chunks(CHUNK_BYTES).map(|chunk| Ok(Bytes::copy_from_slice(chunk))).collect()
+    bytes[..count.min(bytes.len())]
+        .chunks(CHUNK_BYTES)
+        .map(|chunk| Ok(Bytes::copy_from_slice(chunk)))
+        .collect()
 }
 
 fn cut(bytes: Vec<u8>, after: usize) -> Body {

@@ -1,4 +1,5 @@
-//! Tasks under the real shim: they outlive whoever started them, are found again, and end without a trace.
+//! Tasks under the real shim: they outlive whoever started them, are found again, and end without a
+//! trace.
 
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -31,12 +32,16 @@ async fn the_exit_code_and_the_signal_are_kept() {
     let (run, _) = run_to_end("exit 3").await;
     let text = std::fs::read_to_string(run.run_dir().join("exit.json")).expect("exit file");
     assert!(text.starts_with(r#"{"code":3,"at_uptime_ms":"#), "{text}");
-    assert_eq!(supervisor().observe(&run.run_dir()).await.expect("observed"), Observed::Exited(ExitStatus::Code(3)));
+    assert_eq!(
+        supervisor().observe(&run.run_dir()).await.expect("observed"),
+        Observed::Exited(ExitStatus::Code(3))
+    );
 }
 
 #[tokio::test]
 async fn a_task_gets_the_environment_it_was_promised_and_nothing_else() {
-    let (run, _) = run_to_end("env; echo descriptors $(ls /proc/self/fd); cat; echo stdin is empty").await;
+    let (run, _) =
+        run_to_end("env; echo descriptors $(ls /proc/self/fd); cat; echo stdin is empty").await;
     let log = run.log();
     let names: Vec<_> = log.lines().filter_map(|line| Some(line.split_once('=')?.0)).collect();
     let expected = [
@@ -64,9 +69,13 @@ async fn a_task_gets_the_environment_it_was_promised_and_nothing_else() {
 async fn a_start_that_cannot_be_says_why_and_leaves_nothing() {
     let mut run = TestRun::of("true");
     run.spec.directory = PathBuf::from("/nonexistent/place");
-    let error = run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
+    let error =
+        run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
     assert!(error.contains("/nonexistent/place") && error.contains("No such file"), "{error}");
-    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::NeverStarted);
+    assert_eq!(
+        run.supervisor.observe(&run.run_dir()).await.expect("observed"),
+        Observed::NeverStarted
+    );
     let never = run.supervisor.stop(&run.path("never"), SHORT_GRACE).await.expect("stopped");
     assert_eq!(never, Observed::NeverStarted);
 }
@@ -76,7 +85,8 @@ async fn a_run_of_which_nobody_wrote_down_who_runs_it_is_gone_and_not_started_ag
     let run = TestRun::of("echo up; sleep 1000");
     // In the way of the file that says it, as a power cut would be.
     std::fs::create_dir_all(run.run_dir().join("pid.json.tmp")).expect("made");
-    let error = run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
+    let error =
+        run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
     assert!(error.contains("pid.json"), "{error}");
     std::fs::remove_dir(run.run_dir().join("pid.json.tmp")).expect("removed");
     assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::Gone);
@@ -91,7 +101,8 @@ async fn a_run_is_started_once_however_often_it_is_asked_for() {
     let dir = run.run_dir();
     let starts = (0..8).map(|_| run.supervisor.start(&dir, &run.spec));
     let started = within("all starts", futures_util::future::join_all(starts)).await;
-    let pids: Vec<_> = started.into_iter().map(|started| started.expect("started").task.pid).collect();
+    let pids: Vec<_> =
+        started.into_iter().map(|started| started.expect("started").task.pid).collect();
     assert!(pids.iter().all(|pid| *pid == pids[0]), "{pids:?}");
     assert!(lives(pids[0]));
     within("the stop", run.supervisor.stop(&dir, LONG_GRACE)).await.expect("stopped");
@@ -107,18 +118,23 @@ async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
     let start = run.supervisor.start(dir.path(), &run.spec);
     assert!(tokio::time::timeout(Duration::from_millis(50), start).await.is_err());
     drop(stalled);
-    // Whoever waited for the lock would have it now. A process that another test is just starting shares it for a moment.
+    // Whoever waited for the lock would have it now. A process that another test is just starting
+    // shares it for a moment.
     let over = eventually("the lock", || dir.try_lock().expect("locked")).await;
     assert_eq!(dir.spec().expect("readable"), None);
     drop(over);
     assert_eq!(run.survivors(), Vec::<u32>::new());
-    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::NeverStarted);
+    assert_eq!(
+        run.supervisor.observe(&run.run_dir()).await.expect("observed"),
+        Observed::NeverStarted
+    );
 }
 
 #[test]
 fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
     // With one thread for all that blocks.
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build();
+    let runtime =
+        tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build();
     runtime.expect("a runtime").block_on(async {
         let run = TestRun::of("true");
         let dir = RunDir::create(&run.run_dir()).expect("dir");
@@ -139,8 +155,11 @@ fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
         };
         assert!(tokio::time::timeout(Duration::from_millis(200), waiting).await.is_err());
         let other = TestRun::of("exit 3");
-        within("another start", other.supervisor.start(&other.run_dir(), &other.spec)).await.expect("started");
-        let ended = within("its end", other.supervisor.wait(&other.run_dir())).await.expect("observed");
+        within("another start", other.supervisor.start(&other.run_dir(), &other.spec))
+            .await
+            .expect("started");
+        let ended =
+            within("its end", other.supervisor.wait(&other.run_dir())).await.expect("observed");
         assert_eq!(ended, Observed::Exited(ExitStatus::Code(3)));
         drop(hangs);
         within("the start", run.supervisor.start(path, &run.spec)).await.expect("started");
@@ -152,7 +171,9 @@ fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
 #[tokio::test]
 async fn starter() {
     let Some(dir) = std::env::var_os("STARTER_DIR").map(PathBuf::from) else { return };
-    let spec: RunSpec = serde_json::from_slice(&std::fs::read(dir.join("order.json")).expect("order")).expect("spec");
+    let spec: RunSpec =
+        serde_json::from_slice(&std::fs::read(dir.join("order.json")).expect("order"))
+            .expect("spec");
     // What a shell's `&` does to everything it starts.
     // SAFETY: ignoring a signal installs no handler.
     unsafe { nix::sys::signal::signal(Signal::SIGINT, SigHandler::SigIgn) }.expect("ignored");
@@ -161,17 +182,27 @@ async fn starter() {
     std::future::pending::<()>().await;
 }
 
-#[expect(clippy::disallowed_methods, reason = "the test needs a process it can kill in the place of the agent")]
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the test needs a process it can kill in the place of the agent"
+)]
 fn spawn_starter(dir: &Path) -> std::process::Child {
     let mut command = std::process::Command::new(std::env::current_exe().expect("own path"));
     command.args(["--exact", "supervise::starter"]).env("STARTER_DIR", dir).process_group(0);
-    command.stdout(std::process::Stdio::null()).stderr(std::process::Stdio::null()).spawn().expect("spawned")
+    command
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .expect("spawned")
 }
 
 #[tokio::test]
 async fn a_task_outlives_the_agent_and_is_adopted() {
-    let run = TestRun::of("trap 'echo asked; exit 4' INT; echo up; while :; do sleep 1000 & wait $!; done");
-    std::fs::write(run.path("order.json"), serde_json::to_vec(&run.spec).expect("json")).expect("order");
+    let run = TestRun::of(
+        "trap 'echo asked; exit 4' INT; echo up; while :; do sleep 1000 & wait $!; done",
+    );
+    std::fs::write(run.path("order.json"), serde_json::to_vec(&run.spec).expect("json"))
+        .expect("order");
     let mut starter = spawn_starter(&run.path("."));
     eventually("the start", || run.path("started").exists().then_some(())).await;
     run.wrote("up").await;
@@ -179,10 +210,15 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
     nix::sys::signal::killpg(group, Signal::SIGKILL).expect("killed");
     starter.wait().expect("collected");
 
-    let recorded = RunDir::create(&run.run_dir()).expect("dir").started().expect("read").expect("started");
+    let recorded =
+        RunDir::create(&run.run_dir()).expect("dir").started().expect("read").expect("started");
     let observed = run.supervisor.observe(&run.run_dir()).await.expect("observed");
-    assert!(matches!(observed, Observed::Running { pid, .. } if pid == recorded.task.pid), "{observed:?}");
-    // It was started by a process that ignored SIGINT; a trap on it works only where that was not inherited.
+    assert!(
+        matches!(observed, Observed::Running { pid, .. } if pid == recorded.task.pid),
+        "{observed:?}"
+    );
+    // It was started by a process that ignored SIGINT; a trap on it works only where that was not
+    // inherited.
     let (waited, stopped) = within(
         "the stop",
         futures_util::future::join(
@@ -196,7 +232,8 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
-/// Ignores what can be ignored, and has children in sessions of their own, one of them without its environment.
+/// Ignores what can be ignored, and has children in sessions of their own, one of them without its
+/// environment.
 const STUBBORN: &str = r#"
 trap '' INT TERM HUP
 stubborn='trap "" INT TERM HUP; echo $$ >> pids; while :; do sleep 1000; done'
@@ -209,7 +246,9 @@ while :; do sleep 1000; done
 
 async fn start_stubborn(script: &str) -> (TestRun, Started, Vec<u32>) {
     let run = TestRun::of(script);
-    let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
+    let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec))
+        .await
+        .expect("started");
     let pids = eventually("four stubborn processes", || {
         let text = std::fs::read_to_string(run.path("pids")).ok()?;
         let pids: Vec<u32> = text.lines().map(|line| line.parse().ok()).collect::<Option<_>>()?;
@@ -222,28 +261,39 @@ async fn start_stubborn(script: &str) -> (TestRun, Started, Vec<u32>) {
 #[tokio::test]
 async fn a_stubborn_task_and_its_daemons_are_ended() {
     let (run, _, pids) = start_stubborn(STUBBORN).await;
-    let stopped = within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    let stopped = within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
+        .await
+        .expect("stopped");
     assert_eq!(stopped, Observed::Exited(ExitStatus::Signal(9)));
     assert_eq!(run.survivors(), Vec::<u32>::new());
     assert_eq!(pids.into_iter().filter(|pid| lives(*pid)).collect::<Vec<_>>(), Vec::<u32>::new());
-    let again = within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    let again = within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
+        .await
+        .expect("stopped");
     assert_eq!(again, stopped);
 }
 
 #[tokio::test]
 async fn a_stop_that_is_dropped_can_be_asked_for_again() {
     let (run, _, _) = start_stubborn(STUBBORN).await;
-    let dropped =
-        tokio::time::timeout(Duration::from_millis(50), run.supervisor.stop(&run.run_dir(), LONG_GRACE)).await;
+    let dropped = tokio::time::timeout(
+        Duration::from_millis(50),
+        run.supervisor.stop(&run.run_dir(), LONG_GRACE),
+    )
+    .await;
     assert!(dropped.is_err());
-    within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped");
+    within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
+        .await
+        .expect("stopped");
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
 #[tokio::test]
 async fn a_task_that_ends_takes_its_daemons_with_it() {
-    let (run, ended) =
-        run_to_end("setsid sleep 1000 & setsid bash -c 'trap \"\" TERM; sleep 1000' & echo $!; exit 5").await;
+    let (run, ended) = run_to_end(
+        "setsid sleep 1000 & setsid bash -c 'trap \"\" TERM; sleep 1000' & echo $!; exit 5",
+    )
+    .await;
     assert_eq!(ended, Observed::Exited(ExitStatus::Code(5)));
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
@@ -254,11 +304,15 @@ async fn without_its_shim_a_task_is_ended_and_gone() {
     let (run, started, pids) = start_stubborn(&STUBBORN.replace("env -i PATH=\"$PATH\"", "")).await;
     let dir = run.run_dir();
     let kill = async { started.shim.signal(Signal::SIGKILL).expect("killed") };
-    let (observed, ()) = within("the notice", futures_util::future::join(run.supervisor.wait(&dir), kill)).await;
+    let (observed, ()) =
+        within("the notice", futures_util::future::join(run.supervisor.wait(&dir), kill)).await;
     assert_eq!(observed.expect("observed"), Observed::Gone);
     assert_eq!(pids.into_iter().filter(|pid| lives(*pid)).collect::<Vec<_>>(), Vec::<u32>::new());
     assert_eq!(run.survivors(), Vec::<u32>::new());
-    assert_eq!(run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"), Observed::Gone);
+    assert_eq!(
+        run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"),
+        Observed::Gone
+    );
 }
 
 #[tokio::test]
@@ -273,7 +327,10 @@ async fn a_pid_that_was_used_again_is_not_mistaken() {
     ] {
         dir.write_started(&Started { shim: imposter.clone(), task: imposter }).expect("pid file");
         // A stop would end this very process if it went by the pid.
-        assert_eq!(run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"), Observed::Gone);
+        assert_eq!(
+            run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"),
+            Observed::Gone
+        );
     }
 }
 
@@ -303,7 +360,9 @@ async fn output_and_errors_are_told_apart_and_a_prompt_is_not_held_back() {
     within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
     let log = std::fs::read_to_string(&run.spec.log.path).expect("log");
     let lines = log.lines().map(|line| line.split_once(' ').expect("a time").1);
-    let of = |letters: &str| lines.clone().filter(|line| line.starts_with(|c| letters.contains(c))).collect::<Vec<_>>();
+    let of = |letters: &str| {
+        lines.clone().filter(|line| line.starts_with(|c| letters.contains(c))).collect::<Vec<_>>()
+    };
     assert_eq!(of("Oo"), ["O one", "O name? ", "o Ada"]);
     assert_eq!((of("Ee"), of("T")), (vec!["E two"], vec!["T started"]));
     let end = task_agent::logs::last_lines(&run.spec.log.path, 4096);

@@ -1,5 +1,5 @@
-//! Hostile and honest archives against the unpacker. Whatever it is given, nothing changes outside the staging
-//! directory.
+//! Hostile and honest archives against the unpacker. Whatever it is given, nothing changes outside
+//! the staging directory.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -27,7 +27,12 @@ impl Site {
     }
 
     /// Unpacks; checks that nothing but the staging directory has changed.
-    fn unpack(&self, content: &[u8], facts: &ContentFacts, limits: &Limits) -> Result<(), UnpackError> {
+    fn unpack(
+        &self,
+        content: &[u8],
+        facts: &ContentFacts,
+        limits: &Limits,
+    ) -> Result<(), UnpackError> {
         let staging = self.dir.path().join("staging");
         let before = snapshot(self.dir.path(), &staging);
         let result = unpack(content, content.len() as u64, facts, limits, &staging);
@@ -60,7 +65,8 @@ fn snapshot(dir: &Path, except: &Path) -> BTreeMap<String, (u32, u64, Vec<u8>)> 
     found
 }
 
-/// Every link of the tree that leads somewhere leads into the tree; there are only files, directories and links.
+/// Every link of the tree that leads somewhere leads into the tree; there are only files,
+/// directories and links.
 fn assert_stays_inside(root: &Path) {
     let root = root.canonicalize().unwrap();
     let mut dirs = vec![root.clone()];
@@ -70,12 +76,21 @@ fn assert_stays_inside(root: &Path) {
             let metadata = path.symlink_metadata().unwrap();
             if metadata.is_symlink() {
                 if let Ok(target) = path.canonicalize() {
-                    assert!(target.starts_with(&root), "{} leads to {}", path.display(), target.display());
+                    assert!(
+                        target.starts_with(&root),
+                        "{} leads to {}",
+                        path.display(),
+                        target.display()
+                    );
                 }
                 continue;
             }
             let mode = metadata.mode() & 0o7777;
-            assert!(mode == 0o644 && metadata.is_file() || mode == 0o755, "{} has {mode:o}", path.display());
+            assert!(
+                mode == 0o644 && metadata.is_file() || mode == 0o755,
+                "{} has {mode:o}",
+                path.display()
+            );
             if metadata.is_dir() {
                 dirs.push(path);
             }
@@ -151,8 +166,14 @@ fn paths_that_leave_or_confuse_are_refused() {
         (named(b"a\nb"), "control character"),
         (named("a\u{9b}b".as_bytes()), "control character"),
         (tar().pax(&[("path", "a\0b")]).file("ok", b""), "control character"),
-        (tar().pax(&[("path", &"n".repeat(256))]).file("ok", b""), "a name is longer than 255 bytes"),
-        (tar().pax(&[("path", &"n/".repeat(600))]).file("ok", b""), "the path is longer than 1024 bytes"),
+        (
+            tar().pax(&[("path", &"n".repeat(256))]).file("ok", b""),
+            "a name is longer than 255 bytes",
+        ),
+        (
+            tar().pax(&[("path", &"n/".repeat(600))]).file("ok", b""),
+            "the path is longer than 1024 bytes",
+        ),
         (tar().typed(b'L', "l", &[b'n'; 5000]).file("ok", b""), "a name is longer than 1024 bytes"),
         (
             tar().pax(&[("path", &"d/".repeat(49))]).dir("ok"),
@@ -183,7 +204,10 @@ fn names_that_are_there_twice_are_refused() {
 fn links_that_leave_the_package_are_refused() {
     let tar = Tar::default;
     assert_refused([
-        (tar().symlink("a", "/etc"), r#"entry "a": the symbolic link to "/etc" leaves the package"#),
+        (
+            tar().symlink("a", "/etc"),
+            r#"entry "a": the symbolic link to "/etc" leaves the package"#,
+        ),
         (tar().symlink("a", ".."), "leaves the package"),
         (tar().symlink("d/a", "../../x"), "leaves the package"),
         (tar().symlink("d/a", "missing/../../../x"), "leaves the package"),
@@ -195,7 +219,10 @@ fn links_that_leave_the_package_are_refused() {
         (tar().typed(b'K', "l", b"/etc\0").symlink("a", "ok"), "leaves the package"),
         (tar().hard_link("a", "/etc/passwd"), "its link target: the path is absolute"),
         (tar().hard_link("a", "../neighbour/secret"), "its link target: the path has '..'"),
-        (tar().hard_link("a", "b").file("b", b""), "a hard link must name an earlier file of the archive"),
+        (
+            tar().hard_link("a", "b").file("b", b""),
+            "a hard link must name an earlier file of the archive",
+        ),
         (tar().dir("b").hard_link("a", "b"), "a hard link must name an earlier file"),
         (tar().symlink("b", "c").hard_link("a", "b"), "a hard link must name an earlier file"),
         (tar().hard_link("a", "a"), "a hard link must name an earlier file"),
@@ -234,7 +261,10 @@ fn headers_that_readers_would_disagree_about_are_refused() {
         (tar().typed(b'x', "x", b"99 path=x\n").file("a", b""), "a PAX record is malformed"),
         (tar().typed(b'x', "x", b"0 \n").file("a", b""), "a PAX record is malformed"),
         (tar().typed(b'x', "x", b"-1 a=b\n").file("a", b""), "a PAX record is malformed"),
-        (tar().typed(b'x', "x", &[b'9'; 20_000]).file("a", b""), "PAX records are longer than 16384 bytes"),
+        (
+            tar().typed(b'x', "x", &[b'9'; 20_000]).file("a", b""),
+            "PAX records are longer than 16384 bytes",
+        ),
         (tar().pax(&[("path", "a")]), "a long name belongs to no entry"),
     ]);
 }
@@ -258,7 +288,10 @@ fn what_is_no_archive_is_refused() {
         })
     };
     assert!(resized(b"77777777777").contains("longer than what is left"));
-    assert!(resized(b"\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff").contains("longer than what is left"));
+    assert!(
+        resized(b"\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff")
+            .contains("longer than what is left")
+    );
     assert!(resized(b"x").contains("an entry's size is no number"));
     let v7 = with(&|block| {
         block[257..265].fill(0);
@@ -290,10 +323,20 @@ fn the_task_manifest_is_held_to_the_byte() {
     let tar = Tar::default().file("a", b"1").file("b", b"2").end();
     let facts = tar.facts();
     let refused = |facts: ContentFacts| refusal_of(&tar.compressed(), &facts, &Limits::default());
-    assert!(refused(ContentFacts { entries: 1, ..facts }).contains("2, where the task manifest says 1"));
-    assert!(refused(ContentFacts { entries: 3, ..facts }).contains("2, where the task manifest says 3"));
-    assert!(refused(ContentFacts { tar_size: facts.tar_size + 512, ..facts }).contains("uncompressed bytes: 3072"));
-    assert!(refused(ContentFacts { tar_size: facts.tar_size - 512, ..facts }).contains("uncompressed bytes, so far"));
+    assert!(
+        refused(ContentFacts { entries: 1, ..facts }).contains("2, where the task manifest says 1")
+    );
+    assert!(
+        refused(ContentFacts { entries: 3, ..facts }).contains("2, where the task manifest says 3")
+    );
+    assert!(
+        refused(ContentFacts { tar_size: facts.tar_size + 512, ..facts })
+            .contains("uncompressed bytes: 3072")
+    );
+    assert!(
+        refused(ContentFacts { tar_size: facts.tar_size - 512, ..facts })
+            .contains("uncompressed bytes, so far")
+    );
 }
 
 #[test]
@@ -307,7 +350,9 @@ fn limits_hold_before_and_while_unpacking() {
     let refused = |limits: Limits| refusal_of(&content, &facts, &limits);
     let default = Limits::default();
     assert!(refused(Limits { entries: 19, ..default }).starts_with("entries in the archive: 20"));
-    assert!(refused(Limits { entries: 59, ..default }).starts_with("files, directories and links: 60"));
+    assert!(
+        refused(Limits { entries: 59, ..default }).starts_with("files, directories and links: 60")
+    );
     assert!(refused(Limits { depth: 2, ..default }).contains("at most 2 are allowed"));
     assert!(refused(Limits { bytes: 1000, ..default }).starts_with("uncompressed bytes: "));
 }
@@ -352,14 +397,32 @@ fn a_source_that_fails_is_not_blamed_on_the_archive() {
     let content = tar.compressed();
     let dir = tempfile::tempdir().unwrap();
     let source = content[..content.len() / 2].chain(Broken);
-    let result = unpack(source, content.len() as u64, &tar.facts(), &Limits::default(), &dir.path().join("s"));
+    let result = unpack(
+        source,
+        content.len() as u64,
+        &tar.facts(),
+        &Limits::default(),
+        &dir.path().join("s"),
+    );
     assert!(matches!(result, Err(UnpackError::Source(_))), "{result:?}");
 }
 
 /// Entries as an attacker combines them: few names, so that they meet.
 fn hostile_entry() -> impl Strategy<Value = (u8, String, String, u32)> {
-    let name = prop::sample::select(vec!["a", "b", "a/b", "a/c", "a/b/c", "../x", "/x", "./a", "b/../c", "c/", "."]);
-    let target = prop::sample::select(vec!["a", "b", "..", "../..", "a/..", "../neighbour/secret", "/etc", "b/c", ""]);
+    let name = prop::sample::select(vec![
+        "a", "b", "a/b", "a/c", "a/b/c", "../x", "/x", "./a", "b/../c", "c/", ".",
+    ]);
+    let target = prop::sample::select(vec![
+        "a",
+        "b",
+        "..",
+        "../..",
+        "a/..",
+        "../neighbour/secret",
+        "/etc",
+        "b/c",
+        "",
+    ]);
     let kind = prop::sample::select(b"0125".to_vec());
     let rare = prop::sample::select(b"3467SLKxg".to_vec());
     let kind = prop_oneof![12 => kind, 1 => rare];

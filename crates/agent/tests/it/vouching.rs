@@ -1,4 +1,5 @@
-//! Who vouches for a package, against a real HTTP server that has, or does not have, what publishers have signed.
+//! Who vouches for a package, against a real HTTP server that has, or does not have, what
+//! publishers have signed.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -21,7 +22,9 @@ use task_agent::task::observed::Vouched;
 use task_agent::telemetry::outputs::Registry;
 use task_agent::transfer::credential::Credential;
 use task_agent::transfer::parts::Listening;
-use task_proto::desired::{BlobRef, DesiredState, DesiredTask, Evidence, PackageRef, SignatureRef, Wanted};
+use task_proto::desired::{
+    BlobRef, DesiredState, DesiredTask, Evidence, PackageRef, SignatureRef, Wanted,
+};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::manifest::TaskManifest;
 use task_proto::publisher::{MAX_SIGNATURE_BYTES, PackageStatement, PublisherList, Role};
@@ -135,7 +138,8 @@ impl Robot {
         let shelf: Arc<Mutex<Shelf>> = Arc::default();
         let router = Router::new().route("/v2/{*path}", get(answer)).with_state(shelf.clone());
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
-        let server: reqwest::Url = format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
+        let server: reqwest::Url =
+            format!("http://{}/", listener.local_addr().unwrap()).parse().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         let dir = tempfile::tempdir().unwrap();
         let vouching = Self::vouching(&server, &dir);
@@ -146,15 +150,22 @@ impl Robot {
         let data = DataDir::new(dir.path()).unwrap();
         let _ = rustls::crypto::ring::default_provider().install_default();
         let client = reqwest::Client::builder().no_proxy().build().unwrap();
-        let settings = FetchSettings { stall_timeout: Duration::from_secs(20), ..FetchSettings::default() };
-        let fetcher = Fetcher::new(client, server.clone(), "token".to_owned(), data.clone(), settings);
-        let trusted = TrustSettings { publishers: role(&[1, 2, 3], 2), keepers: role(&[7], 1), requires_list: false };
+        let settings =
+            FetchSettings { stall_timeout: Duration::from_secs(20), ..FetchSettings::default() };
+        let fetcher =
+            Fetcher::new(client, server.clone(), "token".to_owned(), data.clone(), settings);
+        let trusted = TrustSettings {
+            publishers: role(&[1, 2, 3], 2),
+            keepers: role(&[7], 1),
+            requires_list: false,
+        };
         let trust = Trust::open(trusted, data.publishers());
         Arc::new(Vouching::new(trust, Arc::new(fetcher), data))
     }
 
     fn config(&self) -> Config {
-        let keys = [("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS".into(), key(1).public_key().to_string().into())];
+        let keys =
+            [("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS".into(), key(1).public_key().to_string().into())];
         Config::load(self.dir.path(), keys.into_iter()).unwrap()
     }
 
@@ -163,7 +174,13 @@ impl Robot {
         let data = DataDir::new(self.dir.path()).unwrap();
         let client = reqwest::Client::builder().no_proxy().build().unwrap();
         let (token, settings) = (Credential::from("token".to_owned()), FetchSettings::default());
-        let fetcher = Fetcher::new(client.clone(), self.server.clone(), token.clone(), data.clone(), settings);
+        let fetcher = Fetcher::new(
+            client.clone(),
+            self.server.clone(),
+            token.clone(),
+            data.clone(),
+            settings,
+        );
         let registry = Registry::new(client, self.server.clone(), token);
         let mac = "02:00:00:00:00:01".parse().unwrap();
         let parts = (fetcher, Listening::default());
@@ -210,7 +227,8 @@ impl Robot {
     }
 
     async fn vouch(&self, package: &PackageRef) -> Result<(), NotVouched> {
-        within("a judgement", self.vouching.vouch(package, Use::Begin, &CancellationToken::new())).await
+        within("a judgement", self.vouching.vouch(package, Use::Begin, &CancellationToken::new()))
+            .await
     }
 
     fn asked(&self) -> usize {
@@ -279,16 +297,22 @@ async fn a_new_list_is_followed_without_an_order_and_an_old_one_never() {
     robot.told(&talker, &[&first], &[&ada]);
     robot.vouch(&talker).await.unwrap();
     assert_eq!(robot.vouching.version(), 1);
-    assert_eq!(robot.vouching.facts().refused_list, None, "who follows and who waits have both had it");
+    assert_eq!(
+        robot.vouching.facts().refused_list,
+        None,
+        "who follows and who waits have both had it"
+    );
     let epoch = robot.vouching.facts().epoch;
     robot.told(&talker, &[&first, &second], &[&ada]);
-    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(())).await;
+    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(()))
+        .await;
     assert_ne!(robot.vouching.facts().epoch, epoch, "what was judged is judged anew");
     assert_eq!(robot.vouching.look(&talker), Vouched::No, "its publisher is revoked");
     // A server that was taken over, or put back from a copy, names the first again.
     robot.restart();
     robot.told(&talker, &[&first], &[&ada]);
-    let refused = eventually("the first to be refused", || robot.vouching.facts().refused_list).await;
+    let refused =
+        eventually("the first to be refused", || robot.vouching.facts().refused_list).await;
     assert!(refused.contains("its version 1 is not newer than 2"), "{refused}");
     assert!(robot.vouch(&talker).await.is_err());
     robot.told(&talker, &[&first, &second], &[&eve]);
@@ -309,8 +333,12 @@ async fn a_list_that_does_not_come_is_told_and_asked_for_until_it_does() {
     let said = eventually("it to be told", || robot.vouching.facts().refused_list).await;
     assert!(said.contains("can't be had"), "{said}");
     robot.shelve(&revoking);
-    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(())).await;
-    assert_eq!((robot.vouching.facts().refused_list, robot.vouching.look(&talker)), (None, Vouched::No));
+    eventually("the second list to be followed", || (robot.vouching.version() == 2).then_some(()))
+        .await;
+    assert_eq!(
+        (robot.vouching.facts().refused_list, robot.vouching.look(&talker)),
+        (None, Vouched::No)
+    );
     robot.told(&talker, &[&revoking], &[&bob]);
     robot.vouch(&talker).await.unwrap();
 }
@@ -321,10 +349,17 @@ async fn what_is_installed_gets_the_signature_of_a_new_key_without_an_order() {
     let [ada, eve] = [1, 9].map(|seed| signature(seed, &talker));
     robot.told(&talker, &[&list(1, &[1])], &[&ada]);
     robot.vouch(&talker).await.unwrap();
-    let src = DataDir::new(robot.dir.path()).unwrap().task(&talker.name).version(&talker.manifest.digest).src();
+    let src = DataDir::new(robot.dir.path())
+        .unwrap()
+        .task(&talker.name)
+        .version(&talker.manifest.digest)
+        .src();
     std::fs::create_dir_all(src).unwrap();
     robot.told(&talker, &[&list(1, &[1]), &list(2, &[9])], &[&ada, &eve]);
-    let vouched = || (robot.vouching.version() == 2 && robot.vouching.look(&talker) == Vouched::Yes).then_some(());
+    let vouched = || {
+        (robot.vouching.version() == 2 && robot.vouching.look(&talker) == Vouched::Yes)
+            .then_some(())
+    };
     eventually("the new signature to be there", vouched).await;
 }
 
@@ -356,7 +391,8 @@ async fn a_list_by_others_than_the_keepers_changes_nothing_and_is_told() {
 async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothing() {
     let (site, talker) = (Robot::new().await, package("talker"));
     let robot = site.body();
-    let (cancel, progress) = (CancellationToken::new(), watch::Sender::new(Progress { done: 0, total: 0 }));
+    let (cancel, progress) =
+        (CancellationToken::new(), watch::Sender::new(Progress { done: 0, total: 0 }));
     let asks = watch::Sender::default();
     let run = first_run(&talker);
     let outcomes = [
@@ -369,7 +405,12 @@ async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothi
     ];
     for (at, outcome) in outcomes.into_iter().enumerate() {
         let refused = outcome.unwrap_err();
-        assert_eq!(refused.failure.code, FailureCode::UNTRUSTED_PACKAGE, "{at}: {}", refused.failure);
+        assert_eq!(
+            refused.failure.code,
+            FailureCode::UNTRUSTED_PACKAGE,
+            "{at}: {}",
+            refused.failure
+        );
         // What was planned on another judgement is judged again; what decides is final.
         assert_eq!(refused.retry_after_ms.is_none(), matches!(at, 0 | 5), "{at}");
     }
@@ -397,7 +438,8 @@ async fn a_first_start_is_not_made_by_a_list_that_is_over_and_a_restart_is() {
     let (robot, first) = (site.body(), first_run(&talker));
     assert_eq!(robot.prepared(&talker).await.vouched, Vouched::Stale);
     assert!(robot.trust_facts().list_is_over, "which is looked at again and again");
-    let start = async |run: &ActiveRun| robot.start(&talker.name, run).await.unwrap_err().failure.code;
+    let start =
+        async |run: &ActiveRun| robot.start(&talker.name, run).await.unwrap_err().failure.code;
     assert_eq!(start(&first).await, FailureCode::PUBLISHERS_EXPIRED);
     // A restart comes as far as the manifest, which nobody has here.
     let again = ActiveRun { ever_started: true, ..first };

@@ -1,5 +1,6 @@
-//! A simulated robot's body: the agent's own effects for whatever concerns packages (fetch, verify, unpack, delete), and a
-//! body without processes, ROS and a ledger on the disk for the rest. What it starts lives at once and for ever.
+//! A simulated robot's body: the agent's own effects for whatever concerns packages (fetch, verify,
+//! unpack, delete), and a body without processes, ROS and a ledger on the disk for the rest. What
+//! it starts lives at once and for ever.
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -9,7 +10,9 @@ use task_agent::process::program::ExitStatus;
 use task_agent::reconcile::robot::Robot;
 use task_agent::system::clock;
 use task_agent::task::effects::{Effects, Now};
-use task_agent::task::ledger::{ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord};
+use task_agent::task::ledger::{
+    ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord,
+};
 use task_agent::task::observed::{Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts};
 use task_agent::task::plan::{Done, StepFailure};
 use task_agent::transfer::parts::Asks;
@@ -108,7 +111,11 @@ impl Effects for Body {
         self.robot.trust_facts()
     }
 
-    async fn check_signers(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn check_signers(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         self.robot.check_signers(package, cancel).await
     }
 
@@ -116,7 +123,11 @@ impl Effects for Body {
         self.robot.keep_parts(wanted);
     }
 
-    async fn pull_manifest(&self, package: &PackageRef, cancel: &CancellationToken) -> Result<Done, StepFailure> {
+    async fn pull_manifest(
+        &self,
+        package: &PackageRef,
+        cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
         self.robot.pull_manifest(package, cancel).await
     }
 

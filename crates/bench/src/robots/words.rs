@@ -1,5 +1,5 @@
-//! What a run and the process of its robots say to each other: one JSON document a line. Moments are nanoseconds of the
-//! machine's monotonic clock, which both read.
+//! What a run and the process of its robots say to each other: one JSON document a line. Moments
+//! are nanoseconds of the machine's monotonic clock, which both read.
 
 use std::net::Ipv4Addr;
 use std::path::PathBuf;
@@ -62,7 +62,8 @@ pub enum Word {
         /// When.
         at_ns: u64,
     },
-    /// The server has acknowledged, and so stored, a report that the ordered package is verified and unpacked.
+    /// The server has acknowledged, and so stored, a report that the ordered package is verified
+    /// and unpacked.
     Verified {
         /// Who.
         robot: usize,

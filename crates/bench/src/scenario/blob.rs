@@ -1,5 +1,6 @@
-//! `taskbench blob`: how fast blobs leave the server and what that costs it, beside nginx with the same files in the same
-//! run. Every connection is another robot's, with its own token and the right to just these blobs.
+//! `taskbench blob`: how fast blobs leave the server and what that costs it, beside nginx with the
+//! same files in the same run. Every connection is another robot's, with its own token and the
+//! right to just these blobs.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -72,7 +73,8 @@ struct Case<'a> {
 pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     let (began, seed) = (Instant::now(), flags.run.seed());
     let mut run = Run::begin("blob", seed).await;
-    let most = flags.clients.iter().copied().chain([flags.small_clients, flags.cold]).max().unwrap_or(0);
+    let most =
+        flags.clients.iter().copied().chain([flags.small_clients, flags.cold]).max().unwrap_or(0);
     allow_files(u64::from(most) + 200)?;
     let order = if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
     let taskd = Taskd::start(&flags.taskd, &order).await?;
@@ -95,7 +97,12 @@ pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
         flags.clients.iter().map(|&clients| large_case(large, clients.into(), &robots)).collect();
     if flags.small_clients > 0 {
         let clients = flags.small_clients.into();
-        cases.push(Case { blob: small, clients, until: Until::Elapsed(SMALL_TIME), robots: &robots });
+        cases.push(Case {
+            blob: small,
+            clients,
+            until: Until::Elapsed(SMALL_TIME),
+            robots: &robots,
+        });
     }
     measure_cases(&mut run, &flags, &taskd, nginx.as_ref(), &cases).await?;
     if flags.cold > 0 {
@@ -120,7 +127,8 @@ fn large_case(blob: BlobRef, clients: usize, robots: &[EnrollResponse]) -> Case<
     Case { blob, clients, until: Until::Fetches(fetches), robots }
 }
 
-/// Pushes a package of `size` random bytes and orders it for the robots meant by `selector`; gives its blob.
+/// Pushes a package of `size` random bytes and orders it for the robots meant by `selector`; gives
+/// its blob.
 pub(crate) async fn order_blob(
     server: &Server,
     name: &str,
@@ -131,8 +139,10 @@ pub(crate) async fn order_blob(
     let package = Package::random(name.parse()?, "1".parse()?, size, seed);
     let (name, content) = (package.name.clone(), package.content_blob());
     let manifest = server.push(package).await?;
-    let order =
-        CreateDeployment { delivery: DeliveryChoice::Poll, ..CreateDeployment::new(name, manifest, selector.parse()?) };
+    let order = CreateDeployment {
+        delivery: DeliveryChoice::Poll,
+        ..CreateDeployment::new(name, manifest, selector.parse()?)
+    };
     server.order(&order).await?;
     Ok(content)
 }
@@ -153,7 +163,10 @@ pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) 
 /// Where as many fetch it from nginx.
 pub(crate) fn at_nginx(nginx: &Peer, blob: BlobRef, count: usize) -> Vec<Target> {
     let path = format!("/{}", blob.digest.hex());
-    vec![Target { address: nginx.address, tls: tls(nginx.pin), path, token: None, size: blob.size }; count]
+    vec![
+        Target { address: nginx.address, tls: tls(nginx.pin), path, token: None, size: blob.size };
+        count
+    ]
 }
 
 fn tls(pin: Option<CaPin>) -> Option<Arc<ClientConfig>> {
@@ -180,19 +193,26 @@ async fn measure_cases(
         let mut figures = [Figures::default(), Figures::default()];
         for turn in 0..flags.runs {
             progress.says(&format!("{} bytes to {} clients", case.blob.size, case.clients));
-            // Who goes first changes, so that neither always finds the machine as the other left it.
+            // Who goes first changes, so that neither always finds the machine as the other left
+            // it.
             for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {
                 match (side, nginx, &others) {
-                    (0, ..) => figures[0].add(&own, case.until, || taskd.usage()).await.context("taskd")?,
+                    (0, ..) => {
+                        figures[0].add(&own, case.until, || taskd.usage()).await.context("taskd")?
+                    }
                     (_, Some(nginx), Some(others)) => {
-                        figures[1].add(others, case.until, || nginx.usage()).await.context("nginx")?;
+                        figures[1]
+                            .add(others, case.until, || nginx.usage())
+                            .await
+                            .context("nginx")?;
                     }
                     _ => {}
                 }
             }
             progress.step();
         }
-        let settings = || [("payload_bytes", case.blob.size as f64), ("clients", case.clients as f64)];
+        let settings =
+            || [("payload_bytes", case.blob.size as f64), ("clients", case.clients as f64)];
         let [own, others] = figures;
         if nginx.is_some() {
             run.points.push(own.ratio(&others, Point::new(RATIO, settings())));
@@ -212,7 +232,12 @@ struct Figures {
 }
 
 impl Figures {
-    async fn add(&mut self, targets: &[Target], until: Until, usage: impl Fn() -> Usage) -> anyhow::Result<()> {
+    async fn add(
+        &mut self,
+        targets: &[Target],
+        until: Until,
+        usage: impl Fn() -> Usage,
+    ) -> anyhow::Result<()> {
         let mut before = Usage::default();
         let Got { fetches, bytes, wall } = download(targets, until, || before = usage()).await?;
         let cpu_s = usage().cpu_s - before.cpu_s;
@@ -231,8 +256,9 @@ impl Figures {
     }
 
     fn ratio(&self, other: &Self, mut point: Point) -> Point {
-        let of =
-            |own: &[f64], others: &[f64]| own.iter().zip(others).map(|(own, other)| own / other).collect::<Vec<_>>();
+        let of = |own: &[f64], others: &[f64]| {
+            own.iter().zip(others).map(|(own, other)| own / other).collect::<Vec<_>>()
+        };
         point.measure("server_cpu", Unit::Number, of(&self.cpu_s_per_gb, &other.cpu_s_per_gb));
         point.measure("throughput", Unit::Number, of(&self.bytes_per_s, &other.bytes_per_s));
         point.measure("requests", Unit::Number, of(&self.requests_per_s, &other.requests_per_s));

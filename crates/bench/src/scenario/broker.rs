@@ -1,6 +1,7 @@
-//! `taskbench broker`: how soon a short message of its own reaches each of many connected robots, beside mosquitto in the
-//! same run. Both send with QoS 1 to clients of the same making. taskd's front rings from within; mosquitto is handed the
-//! messages by one publisher, all at once, which is the most it can be given.
+//! `taskbench broker`: how soon a short message of its own reaches each of many connected robots,
+//! beside mosquitto in the same run. Both send with QoS 1 to clients of the same making. taskd's
+//! front rings from within; mosquitto is handed the messages by one publisher, all at once, which
+//! is the most it can be given.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -89,7 +90,9 @@ pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
                     (Sender::Mosquitto(peer), address)
                 };
                 let name = sender.name();
-                measure(sender, address, clients as usize, &mut figures[side]).await.context(name)?;
+                measure(sender, address, clients as usize, &mut figures[side])
+                    .await
+                    .context(name)?;
             }
             progress.step();
         }
@@ -121,24 +124,40 @@ pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
     Ok(run)
 }
 
-async fn start_front(flags: &BrokerFlags, dir: &std::path::Path) -> anyhow::Result<(Sender, SocketAddr)> {
-    let program = Program::beside("examples/front", flags.front.as_deref())
-        .context("build it with cargo build --release -p taskd --example front, or give --front PATH")?;
+async fn start_front(
+    flags: &BrokerFlags,
+    dir: &std::path::Path,
+) -> anyhow::Result<(Sender, SocketAddr)> {
+    let program = Program::beside("examples/front", flags.front.as_deref()).context(
+        "build it with cargo build --release -p taskd --example front, or give --front PATH",
+    )?;
     let (process, input, output) = program.converse(&dir.join("front.log"))?;
     let mut line = String::new();
     let mut output = BufReader::new(output);
     let reading = output.read_line(&mut line);
-    tokio::time::timeout(ROUND_LIMIT, reading).await.context("the front does not say where it listens")??;
-    let address = line.trim().parse().with_context(|| format!("the front says {line:?} instead of its address"))?;
+    tokio::time::timeout(ROUND_LIMIT, reading)
+        .await
+        .context("the front does not say where it listens")??;
+    let address = line
+        .trim()
+        .parse()
+        .with_context(|| format!("the front says {line:?} instead of its address"))?;
     Ok((Sender::Front { process, input }, address))
 }
 
 /// Connects all clients, sends to each of them again and again, and ends the server.
-async fn measure(sender: Sender, address: SocketAddr, count: usize, figures: &mut Figures) -> anyhow::Result<()> {
+async fn measure(
+    sender: Sender,
+    address: SocketAddr,
+    count: usize,
+    figures: &mut Figures,
+) -> anyhow::Result<()> {
     let robots: Vec<RobotId> = (0..count).map(|_| RobotId::random()).collect();
     let topics: Vec<String> = robots
         .iter()
-        .map(|robot| TopicPrefix::default().format(&Topic::Robot(robot.clone(), RobotTopic::Desired)))
+        .map(|robot| {
+            TopicPrefix::default().format(&Topic::Robot(robot.clone(), RobotTopic::Desired))
+        })
         .collect();
     let begun = Instant::now();
     let clients = Clients::connect(address, &robots, &topics).await?;
@@ -160,7 +179,8 @@ async fn measure(sender: Sender, address: SocketAddr, count: usize, figures: &mu
     Ok(())
 }
 
-/// Connected and subscribed clients, each in a task that acknowledges and counts. Dropping them hangs up.
+/// Connected and subscribed clients, each in a task that acknowledges and counts. Dropping them
+/// hangs up.
 struct Clients {
     tasks: Vec<JoinHandle<()>>,
     shared: Arc<Shared>,
@@ -174,21 +194,33 @@ struct Shared {
 }
 
 impl Clients {
-    async fn connect(address: SocketAddr, robots: &[RobotId], topics: &[String]) -> anyhow::Result<Self> {
-        let connecting = robots.iter().zip(topics).enumerate().map(|(number, (robot, topic))| async move {
-            let credentials = Some((robot.as_str(), "any"));
-            let mut link = Link::connect(address, number, &Login { client_id: robot.as_str(), credentials }).await?;
-            link.subscribe(topic).await?;
-            anyhow::Ok(link)
-        });
-        let links: Vec<Link> = futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await?;
+    async fn connect(
+        address: SocketAddr,
+        robots: &[RobotId],
+        topics: &[String],
+    ) -> anyhow::Result<Self> {
+        let connecting =
+            robots.iter().zip(topics).enumerate().map(|(number, (robot, topic))| async move {
+                let credentials = Some((robot.as_str(), "any"));
+                let mut link = Link::connect(
+                    address,
+                    number,
+                    &Login { client_id: robot.as_str(), credentials },
+                )
+                .await?;
+                link.subscribe(topic).await?;
+                anyhow::Ok(link)
+            });
+        let links: Vec<Link> =
+            futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await?;
         let shared = Arc::new(Shared {
             clients: links.len(),
             received: AtomicUsize::new(0),
             all: Notify::new(),
             lost: AtomicU64::new(0),
         });
-        let tasks = links.into_iter().map(|link| tokio::spawn(listen(link, shared.clone()))).collect();
+        let tasks =
+            links.into_iter().map(|link| tokio::spawn(listen(link, shared.clone()))).collect();
         Ok(Self { tasks, shared })
     }
 
@@ -202,7 +234,11 @@ impl Clients {
         publisher.send().await?;
         let arrived = tokio::time::timeout(ROUND_LIMIT, all).await;
         let received = self.shared.received.load(Ordering::SeqCst);
-        ensure!(arrived.is_ok(), "{received} of {} messages came within {ROUND_LIMIT:?}", self.shared.clients);
+        ensure!(
+            arrived.is_ok(),
+            "{received} of {} messages came within {ROUND_LIMIT:?}",
+            self.shared.clients
+        );
         let lost = self.shared.lost.load(Ordering::SeqCst);
         ensure!(lost == 0, "{lost} clients lost their connection");
         Ok(begun.elapsed().as_secs_f64() * 1000.0)
@@ -221,7 +257,9 @@ async fn listen(link: Link, shared: Arc<Shared>) {
     let Link { mut reader, mut writer } = link;
     loop {
         let packet_id = match reader.next().await {
-            Ok(Heard::Message { packet_id, payload }) if payload.len() == PAYLOAD_BYTES => packet_id,
+            Ok(Heard::Message { packet_id, payload }) if payload.len() == PAYLOAD_BYTES => {
+                packet_id
+            }
             Ok(_) => continue,
             Err(_) => break,
         };
@@ -243,7 +281,11 @@ struct Publisher {
 }
 
 impl Publisher {
-    async fn connect(sender: Sender, address: SocketAddr, topics: &[String]) -> anyhow::Result<Self> {
+    async fn connect(
+        sender: Sender,
+        address: SocketAddr,
+        topics: &[String],
+    ) -> anyhow::Result<Self> {
         if let Sender::Front { .. } = sender {
             return Ok(Self { sender, link: None });
         }
@@ -309,8 +351,9 @@ impl Figures {
     }
 
     fn ratio(&self, other: &Self, mut point: Point) -> Point {
-        let of =
-            |own: &[f64], others: &[f64]| own.iter().zip(others).map(|(own, other)| own / other).collect::<Vec<_>>();
+        let of = |own: &[f64], others: &[f64]| {
+            own.iter().zip(others).map(|(own, other)| own / other).collect::<Vec<_>>()
+        };
         point.measure("time_to_last", Unit::Number, of(&self.warm_ms, &other.warm_ms));
         point.measure("first_time_to_last", Unit::Number, of(&self.first_ms, &other.first_ms));
         point.measure("all_subscribed", Unit::Number, of(&self.connected_s, &other.connected_s));

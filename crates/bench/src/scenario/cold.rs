@@ -1,5 +1,6 @@
-//! The part of `taskbench blob` that asks whether control stays alive: an API call is timed over and over while different
-//! large blobs come from the disk, served by taskd itself, and then by nginx on the same machine.
+//! The part of `taskbench blob` that asks whether control stays alive: an API call is timed over
+//! and over while different large blobs come from the disk, served by taskd itself, and then by
+//! nginx on the same machine.
 
 use std::time::{Duration, Instant};
 
@@ -54,7 +55,8 @@ pub async fn measure(
         progress.says("pulling from disk");
         let mut p99 = [None, None];
         for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {
-            // What is mapped can't be thrown out of the page cache; a server that has just started maps nothing.
+            // What is mapped can't be thrown out of the page cache; a server that has just started
+            // maps nothing.
             taskd = taskd.restart().await?;
             make_cold(&taskd, &blobs)?;
             let each = |(index, robot): (usize, &EnrollResponse)| match (side, nginx) {
@@ -75,9 +77,11 @@ pub async fn measure(
         progress.step();
     }
     let settings = || [("payload_bytes", plan.size as f64), ("cold_pulls", plan.pulls as f64)];
-    for (series, unit, samples) in
-        [("taskd", Unit::Milliseconds, own), ("nginx", Unit::Milliseconds, others), (RATIO, Unit::Number, ratios)]
-    {
+    for (series, unit, samples) in [
+        ("taskd", Unit::Milliseconds, own),
+        ("nginx", Unit::Milliseconds, others),
+        (RATIO, Unit::Number, ratios),
+    ] {
         let mut point = Point::new(series, settings());
         point.measure(if unit == Unit::Number { "api_p99" } else { "api" }, unit, samples);
         if !point.quantities.is_empty() {
@@ -88,7 +92,11 @@ pub async fn measure(
 }
 
 /// How long the API took for each answer while all of `targets` were fetched, in milliseconds.
-async fn probe_during(server: &Server, robot: &RobotId, targets: &[Target]) -> anyhow::Result<Vec<f64>> {
+async fn probe_during(
+    server: &Server,
+    robot: &RobotId,
+    targets: &[Target],
+) -> anyhow::Result<Vec<f64>> {
     let pulls = download(targets, Until::Fetches(1), || ());
     tokio::pin!(pulls);
     let mut tick = tokio::time::interval(PROBE_INTERVAL);
@@ -110,7 +118,8 @@ async fn probe_during(server: &Server, robot: &RobotId, targets: &[Target]) -> a
 }
 
 fn percentile_99(samples: &[f64]) -> Option<f64> {
-    crate::run::Quantity::of(Unit::Milliseconds, samples.iter().copied()).map(|quantity| quantity.p99)
+    crate::run::Quantity::of(Unit::Milliseconds, samples.iter().copied())
+        .map(|quantity| quantity.p99)
 }
 
 /// Throws what the page cache has of the blobs away, so that they have to be read from the disk.
@@ -118,7 +127,8 @@ fn make_cold(taskd: &Taskd, blobs: &[BlobRef]) -> anyhow::Result<()> {
     for blob in blobs {
         let path = taskd.blobs().join(blob.digest.hex());
         let file = std::fs::File::open(&path).with_context(|| path.display().to_string())?;
-        posix_fadvise(&file, 0, 0, PosixFadviseAdvice::POSIX_FADV_DONTNEED).context("the page cache")?;
+        posix_fadvise(&file, 0, 0, PosixFadviseAdvice::POSIX_FADV_DONTNEED)
+            .context("the page cache")?;
     }
     Ok(())
 }

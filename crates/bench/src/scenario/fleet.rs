@@ -1,4 +1,5 @@
-//! `taskbench fleet`: how one server bears a fleet: all connect at once, then one deployment goes to all.
+//! `taskbench fleet`: how one server bears a fleet: all connect at once, then one deployment goes
+//! to all.
 
 use std::time::{Duration, Instant};
 
@@ -72,7 +73,8 @@ impl Choice {
 pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
     let begun = Instant::now();
     let most = flags.robots.iter().map(|robots| *robots as usize).max().unwrap_or(1);
-    // The server has all sessions, and fewer HTTP connections at a time if there is no room for more.
+    // The server has all sessions, and fewer HTTP connections at a time if there is no room for
+    // more.
     let needed = most.min(ROBOTS_PER_PROCESS) * FILES_PER_ROBOT;
     allow_files((needed.max(most + most / 2) + OTHER_FILES) as u64)?;
     let seed = flags.run.seed();
@@ -88,9 +90,10 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
     let mut progress = RunProgress::new(flags.robots.len());
     for (number, robots) in flags.robots.iter().enumerate() {
         progress.says(&format!("{robots} robots"));
-        let (point, version) = measure(&flags, *robots as usize, seed.wrapping_mul(1 << 11) + number as u64)
-            .await
-            .with_context(|| format!("{robots} robots"))?;
+        let (point, version) =
+            measure(&flags, *robots as usize, seed.wrapping_mul(1 << 11) + number as u64)
+                .await
+                .with_context(|| format!("{robots} robots"))?;
         run.versions.insert("taskd".to_owned(), version);
         run.points.push(point);
         progress.step();
@@ -102,7 +105,8 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
 }
 
 async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result<(Point, String)> {
-    let mut order = if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
+    let mut order =
+        if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
     // All robots' sessions come from one address, which on the road they do not.
     order.settings.push(("TASKD_MAX_SILENT_PER_ADDRESS".to_owned(), MOST_ROBOTS.to_string()));
     let taskd = Taskd::start(&flags.taskd, &order).await?;
@@ -110,7 +114,11 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
     let limit = Duration::from_secs(flags.limit_s);
     let settings = [("robots", robots as f64), ("payload_bytes", flags.payload as f64)];
     let mut point = Point::new(&flags.delivery.ordered().to_string(), settings);
-    point.measure("enrolled", Unit::Milliseconds, fleet.enrolments.iter().map(|took| took.as_secs_f64() * 1000.0));
+    point.measure(
+        "enrolled",
+        Unit::Milliseconds,
+        fleet.enrolments.iter().map(|took| took.as_secs_f64() * 1000.0),
+    );
 
     let (memory, before) = (taskd.watch_memory(), (taskd.usage(), fleet.usage()));
     let connected = fleet.start(limit).await?;
@@ -122,11 +130,21 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
     connected.failures.into_iter().for_each(|why| point.fail(why));
 
     let memory = taskd.watch_memory();
-    let one = OneOrder { choice: flags.delivery.ordered(), payload_bytes: flags.payload, robots, seed, limit };
+    let one = OneOrder {
+        choice: flags.delivery.ordered(),
+        payload_bytes: flags.payload,
+        robots,
+        seed,
+        limit,
+    };
     let outcome = run_once(&taskd, &mut fleet, one).await?;
     let memory = memory.most().await;
     point.measure("delay", Unit::Milliseconds, outcome.arrivals.delays_ms());
-    point.measure("arrival", Unit::Percent, [100.0 * outcome.arrivals.arrived.len() as f64 / robots as f64]);
+    point.measure(
+        "arrival",
+        Unit::Percent,
+        [100.0 * outcome.arrivals.arrived.len() as f64 / robots as f64],
+    );
     point.measure("server_cpu", Unit::Seconds, [outcome.server_cpu_s]);
     point.measure("robots_cpu", Unit::Seconds, [outcome.robots_cpu_s]);
     point.measure("server_anonymous", Unit::Bytes, [memory.anonymous_bytes as f64]);
@@ -153,10 +171,30 @@ fn plots() -> Vec<Plot> {
         ..Plot::default()
     };
     vec![
-        plot("Connect storm: time until the last robot is connected", "connected", "time to last", Figure::Max),
-        plot("One deployment to all: time until the last robot has verified it", "delay", "time to last", Figure::Max),
-        plot("The same, half of the robots; the line reaches to the 99th percentile", "delay", "delay", Figure::Median),
-        plot("The server's own memory during the deployment", "server_anonymous", "RssAnon", Figure::Max),
+        plot(
+            "Connect storm: time until the last robot is connected",
+            "connected",
+            "time to last",
+            Figure::Max,
+        ),
+        plot(
+            "One deployment to all: time until the last robot has verified it",
+            "delay",
+            "time to last",
+            Figure::Max,
+        ),
+        plot(
+            "The same, half of the robots; the line reaches to the 99th percentile",
+            "delay",
+            "delay",
+            Figure::Median,
+        ),
+        plot(
+            "The server's own memory during the deployment",
+            "server_anonymous",
+            "RssAnon",
+            Figure::Max,
+        ),
         plot("Processor time of the server for the deployment", "server_cpu", "CPU", Figure::Max),
     ]
 }

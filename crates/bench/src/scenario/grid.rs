@@ -1,5 +1,5 @@
-//! Which runs the paper's experiment consists of: mechanisms × payloads × robots × repetitions, in a shuffled order that
-//! a seed repeats, and the plots that show them.
+//! Which runs the paper's experiment consists of: mechanisms × payloads × robots × repetitions, in
+//! a shuffled order that a seed repeats, and the plots that show them.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -11,7 +11,8 @@ use task_proto::api::DeliveryChoice;
 
 use crate::run::{Figure, Plot};
 
-/// The largest package that is sent inside the announcement: the server's setting is 32 KiB, the package's frame is within.
+/// The largest package that is sent inside the announcement: the server's setting is 32 KiB, the
+/// package's frame is within.
 const MOST_INLINE_BYTES: u64 = 30_000;
 /// The most robots, as in the paper.
 pub const MOST_ROBOTS: usize = 8;
@@ -104,7 +105,8 @@ pub enum Extent {
 /// All runs in the order in which they are made.
 pub fn runs(extent: Extent, repetitions: usize, seed: u64) -> Vec<Cell> {
     let cells = cells(extent);
-    let mut runs: Vec<Cell> = cells.iter().flat_map(|cell| std::iter::repeat_n(*cell, repetitions)).collect();
+    let mut runs: Vec<Cell> =
+        cells.iter().flat_map(|cell| std::iter::repeat_n(*cell, repetitions)).collect();
     runs.shuffle(&mut SmallRng::seed_from_u64(seed));
     runs
 }
@@ -216,9 +218,13 @@ mod tests {
         assert_eq!(grid, runs(Extent::Normal, 5, 7));
         assert_ne!(grid, runs(Extent::Normal, 5, 8));
         let inline = distinct.iter().filter(|cell| cell.mechanism == Mechanism::Inline);
-        assert!(inline.clone().count() > 0 && inline.clone().all(|cell| cell.payload_bytes <= MOST_INLINE_BYTES));
+        assert!(
+            inline.clone().count() > 0
+                && inline.clone().all(|cell| cell.payload_bytes <= MOST_INLINE_BYTES)
+        );
         for bytes in FIGURE_11_BYTES {
-            let of = |cell: &&Cell| cell.mechanism == Mechanism::PushPull && cell.payload_bytes == bytes;
+            let of =
+                |cell: &&Cell| cell.mechanism == Mechanism::PushPull && cell.payload_bytes == bytes;
             assert_eq!(distinct.iter().filter(of).count(), MOST_ROBOTS);
         }
         assert!(distinct.iter().all(|cell| (1..=MOST_ROBOTS).contains(&cell.robots)));

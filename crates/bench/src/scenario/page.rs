@@ -1,7 +1,9 @@
-//! `taskbench page`: the page in a real browser, in front of a fleet that reports all the time. How soon the first rows are
-//! there, how long the browser's main thread is busy at a time while somebody scrolls, and whether its memory grows.
+//! `taskbench page`: the page in a real browser, in front of a fleet that reports all the time. How
+//! soon the first rows are there, how long the browser's main thread is busy at a time while
+//! somebody scrolls, and whether its memory grows.
 //!
-//! The browser is driven by `page/look.mjs`, which node runs with what `scripts/need page` has installed.
+//! The browser is driven by `page/look.mjs`, which node runs with what `scripts/need page` has
+//! installed.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -18,7 +20,8 @@ use crate::progress::say;
 use crate::run::{Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
-/// What the browser does before and after it is watched: it starts, loads, and waits for its last words to be read.
+/// What the browser does before and after it is watched: it starts, loads, and waits for its last
+/// words to be read.
 const MARGIN_S: u64 = 90;
 
 /// What to measure.
@@ -89,7 +92,10 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     point.measure("events_taken_in", Unit::PerSecond, [events_per_s]);
     // Each report moves a robot on, so where fewer arrive, robots or the server did not keep up.
     if events_per_s < f64::from(flags.rate) * 0.95 {
-        point.fail(format!("of {} reports each second the page took in {events_per_s:.0}", flags.rate));
+        point.fail(format!(
+            "of {} reports each second the page took in {events_per_s:.0}",
+            flags.rate
+        ));
     }
     run.points.push(point);
     drop(robots);
@@ -101,7 +107,12 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
 }
 
 /// Lets the robots report until the browser has seen enough.
-async fn watch(taskd: &Taskd, robots: &mut [Reporter], flags: &PageFlags, point: &mut Point) -> anyhow::Result<Seen> {
+async fn watch(
+    taskd: &Taskd,
+    robots: &mut [Reporter],
+    flags: &PageFlags,
+    point: &mut Point,
+) -> anyhow::Result<Seen> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("page/look.mjs");
     let look = Program::named("node")
         .args([script.as_os_str(), flags.browser.as_os_str()])
@@ -129,5 +140,6 @@ async fn watch(taskd: &Taskd, robots: &mut [Reporter], flags: &PageFlags, point:
     drop(input);
     process.end().await;
     let log = || std::fs::read_to_string(taskd.dir().join("browser.log")).unwrap_or_default();
-    serde_json::from_str(&said).with_context(|| format!("the browser did not say what it saw: {}", log()))
+    serde_json::from_str(&said)
+        .with_context(|| format!("the browser did not say what it saw: {}", log()))
 }

@@ -42,7 +42,8 @@ pub struct PaperFlags {
     /// How often each point is measured [default: 5; 1 with --quick]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1000))]
     repetitions: Option<u16>,
-    /// Only these mechanisms, by the beginning of their names as the results have them: poll, direct-push, …
+    /// Only these mechanisms, by the beginning of their names as the results have them: poll,
+    /// direct-push, …
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     only: Vec<String>,
     /// Only packages up to this many bytes
@@ -72,7 +73,10 @@ enum Setting {
 impl Setting {
     fn of(mechanism: Mechanism) -> Self {
         match mechanism {
-            Mechanism::PushPull | Mechanism::Inline | Mechanism::Adaptive | Mechanism::DirectPush(1) => Self::AsItComes,
+            Mechanism::PushPull
+            | Mechanism::Inline
+            | Mechanism::Adaptive
+            | Mechanism::DirectPush(1) => Self::AsItComes,
             Mechanism::DirectPush(qos) => Self::Qos(qos),
             Mechanism::OneMessage => Self::OneMessage,
             Mechanism::Poll => Self::FastPoll,
@@ -100,7 +104,8 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     for setting in cells.iter().map(|cell| Setting::of(cell.mechanism)).collect::<BTreeSet<_>>() {
         stands.insert(setting, Stand::start(&flags, setting, link.as_ref()).await?);
     }
-    let version = stands.values().next().map(|stand| stand.taskd.version.clone()).unwrap_or_default();
+    let version =
+        stands.values().next().map(|stand| stand.taskd.version.clone()).unwrap_or_default();
     run.versions.insert("taskd".to_owned(), version);
     run.plots = plots();
     run.notes = notes(&flags);
@@ -108,8 +113,10 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     let mut results: BTreeMap<Cell, Vec<Outcome>> = BTreeMap::new();
     let mut progress = RunProgress::new(cells.len());
     for (number, cell) in cells.iter().enumerate() {
-        progress.says(&format!("{}, {} B, {} robots", cell.mechanism, cell.payload_bytes, cell.robots));
-        let stand = stands.get_mut(&Setting::of(cell.mechanism)).context("a stand for each mechanism")?;
+        progress
+            .says(&format!("{}, {} B, {} robots", cell.mechanism, cell.payload_bytes, cell.robots));
+        let stand =
+            stands.get_mut(&Setting::of(cell.mechanism)).context("a stand for each mechanism")?;
         let order = OneOrder {
             choice: cell.mechanism.choice(),
             payload_bytes: cell.payload_bytes,
@@ -120,7 +127,8 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
         };
         let outcome = match run_once(&stand.taskd, &mut stand.fleet, order).await {
             Ok(outcome) => outcome,
-            // It is this mechanism's failure; the others are measured with a server and robots that are well.
+            // It is this mechanism's failure; the others are measured with a server and robots that
+            // are well.
             Err(error) => {
                 let why = stand.taskd.ended().unwrap_or_else(|| format!("{error:#}"));
                 *stand = Stand::start(&flags, Setting::of(cell.mechanism), link.as_ref()).await?;
@@ -144,9 +152,14 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
 }
 
 impl Stand {
-    async fn start(flags: &PaperFlags, setting: Setting, link: Option<&Link>) -> anyhow::Result<Self> {
+    async fn start(
+        flags: &PaperFlags,
+        setting: Setting,
+        link: Option<&Link>,
+    ) -> anyhow::Result<Self> {
         let mut order = TaskdOrder::default();
-        let mut set = |name: &str, value: &str| order.settings.push((name.to_owned(), value.to_owned()));
+        let mut set =
+            |name: &str, value: &str| order.settings.push((name.to_owned(), value.to_owned()));
         set("TASKD_BLOB_GRACE", BLOB_GRACE);
         match setting {
             Setting::AsItComes | Setting::FastPoll => {}
@@ -158,10 +171,18 @@ impl Stand {
             order.listen = link.server();
         }
         let taskd = Taskd::start(&flags.taskd, &order).await?;
-        let poll = if setting == Setting::FastPoll { Duration::from_secs_f64(flags.poll_s) } else { SLOW_POLL };
+        let poll = if setting == Setting::FastPoll {
+            Duration::from_secs_f64(flags.poll_s)
+        } else {
+            SLOW_POLL
+        };
         let mut fleet = Fleet::assemble(&taskd, MOST_ROBOTS, poll, link).await?;
         let started = fleet.start(START_LIMIT).await?;
-        anyhow::ensure!(started.failures.is_empty(), "robots do not connect: {}", started.failures.join("; "));
+        anyhow::ensure!(
+            started.failures.is_empty(),
+            "robots do not connect: {}",
+            started.failures.join("; ")
+        );
         Ok(Self { taskd, fleet })
     }
 }
@@ -179,17 +200,27 @@ fn chosen(flags: &PaperFlags, seed: u64) -> anyhow::Result<Vec<Cell>> {
         let name = cell.mechanism.to_string();
         flags.only.is_empty() || flags.only.iter().any(|wanted| name.starts_with(wanted.as_str()))
     };
-    cells.retain(|cell| is_wanted(cell) && flags.max_payload.is_none_or(|most| cell.payload_bytes <= most));
-    let names = || Mechanism::ALL.map(|mechanism| format!("{:?}", mechanism.to_string())).join(", ");
-    anyhow::ensure!(!cells.is_empty(), "--only, --max-payload: nothing is left to measure; mechanisms are {}", names());
+    cells.retain(|cell| {
+        is_wanted(cell) && flags.max_payload.is_none_or(|most| cell.payload_bytes <= most)
+    });
+    let names =
+        || Mechanism::ALL.map(|mechanism| format!("{:?}", mechanism.to_string())).join(", ");
+    anyhow::ensure!(
+        !cells.is_empty(),
+        "--only, --max-payload: nothing is left to measure; mechanisms are {}",
+        names()
+    );
     Ok(cells)
 }
 
 /// How long a run may take: what it needs on a slow machine or on the link, twice.
 fn limit(flags: &PaperFlags, cell: &Cell) -> Duration {
-    let rate = flags.link.map_or(SLOW_MACHINE_BYTES_PER_S, |link| (link.bits_per_s / 8).min(SLOW_MACHINE_BYTES_PER_S));
+    let rate = flags.link.map_or(SLOW_MACHINE_BYTES_PER_S, |link| {
+        (link.bits_per_s / 8).min(SLOW_MACHINE_BYTES_PER_S)
+    });
     let bytes = cell.payload_bytes * cell.robots as u64;
-    ORDER_LIMIT + Duration::from_secs_f64(3.0 * flags.poll_s + 2.0 * bytes as f64 / rate.max(1) as f64)
+    ORDER_LIMIT
+        + Duration::from_secs_f64(3.0 * flags.poll_s + 2.0 * bytes as f64 / rate.max(1) as f64)
 }
 
 fn notes(flags: &PaperFlags) -> Vec<String> {
@@ -222,7 +253,8 @@ fn notes(flags: &PaperFlags) -> Vec<String> {
 /// What adaptive chose, by size.
 fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
     let mut chosen: BTreeMap<u64, BTreeSet<&str>> = BTreeMap::new();
-    for (cell, outcomes) in results.iter().filter(|(cell, _)| cell.mechanism == Mechanism::Adaptive) {
+    for (cell, outcomes) in results.iter().filter(|(cell, _)| cell.mechanism == Mechanism::Adaptive)
+    {
         let all = outcomes.iter().flat_map(|outcome| outcome.decisions.iter().map(String::as_str));
         chosen.entry(cell.payload_bytes).or_default().extend(all);
     }
@@ -231,7 +263,8 @@ fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
         format!("{size} by {}", decisions.into_iter().collect::<Vec<_>>().join(" or "))
     };
     let said: Vec<String> = chosen.into_iter().map(say).collect();
-    (!said.is_empty()).then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
+    (!said.is_empty())
+        .then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
 }
 
 /// At how many places adaptive is about as fast as the fastest of the others.
@@ -240,10 +273,13 @@ fn how_good_adaptive_is(points: &[Point]) -> Option<String> {
     let delay = |point: &Point| point.quantities.get("delay").map(|delay| delay.median);
     let (mut places, mut good) = (0, 0);
     for own in points.iter().filter(|point| point.series == adaptive) {
-        let others = points.iter().filter(|other| other.series != adaptive && other.settings == own.settings);
+        let others = points
+            .iter()
+            .filter(|other| other.series != adaptive && other.settings == own.settings);
         let Some(best) = others.filter_map(delay).min_by(f64::total_cmp) else { continue };
         places += 1;
-        good += usize::from(delay(own).is_some_and(|own| own <= (best * NEARLY).max(best + NEARLY_MS)));
+        good +=
+            usize::from(delay(own).is_some_and(|own| own <= (best * NEARLY).max(best + NEARLY_MS)));
     }
     (places > 0).then(|| {
         format!(
@@ -258,12 +294,17 @@ fn point(cell: &Cell, outcomes: &[Outcome]) -> Point {
     for failure in outcomes.iter().flat_map(|outcome| &outcome.arrivals.failures) {
         point.fail(failure);
     }
-    let arrival = |outcome: &Outcome| 100.0 * outcome.arrivals.arrived.len() as f64 / cell.robots as f64;
+    let arrival =
+        |outcome: &Outcome| 100.0 * outcome.arrivals.arrived.len() as f64 / cell.robots as f64;
     point.measure("arrival", Unit::Percent, outcomes.iter().map(arrival));
     // A run that lost a robot has no last answer.
     let whole: Vec<&Outcome> =
         outcomes.iter().filter(|outcome| outcome.arrivals.arrived.len() == cell.robots).collect();
-    point.measure("delay", Unit::Milliseconds, whole.iter().filter_map(|outcome| outcome.arrivals.last_ms()));
+    point.measure(
+        "delay",
+        Unit::Milliseconds,
+        whole.iter().filter_map(|outcome| outcome.arrivals.last_ms()),
+    );
     let each = outcomes.iter().flat_map(|outcome| outcome.arrivals.delays_ms());
     point.measure("robot_delay", Unit::Milliseconds, each);
     let load = |outcome: &Outcome| (outcome.mqtt_bytes + outcome.http_bytes) as f64;
@@ -272,7 +313,11 @@ fn point(cell: &Cell, outcomes: &[Outcome]) -> Point {
     point.measure("load_http", Unit::Bytes, whole.iter().map(|outcome| outcome.http_bytes as f64));
     let needed = (cell.payload_bytes * cell.robots as u64) as f64;
     point.measure("load_ratio", Unit::Number, whole.iter().map(|outcome| load(outcome) / needed));
-    point.measure("fell_behind", Unit::Number, outcomes.iter().map(|outcome| outcome.fell_behind as f64));
+    point.measure(
+        "fell_behind",
+        Unit::Number,
+        outcomes.iter().map(|outcome| outcome.fell_behind as f64),
+    );
     point
 }
 

@@ -1,5 +1,6 @@
-//! `taskbench pull`: one large package to several robots, from the order until all have verified and unpacked it, beside
-//! what a script would do: `curl`, then `openssl dgst`, then `tar`, against nginx, as many times side by side.
+//! `taskbench pull`: one large package to several robots, from the order until all have verified
+//! and unpacked it, beside what a script would do: `curl`, then `openssl dgst`, then `tar`, against
+//! nginx, as many times side by side.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -62,7 +63,9 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     let (bytes, robots) = (flags.megabytes * 1_000_000, usize::from(flags.robots));
     let taskd = Taskd::start(&flags.taskd, &TaskdOrder::default()).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
-    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), None).await?.context("nginx is needed, and not installed")?;
+    let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), None)
+        .await?
+        .context("nginx is needed, and not installed")?;
     run.versions.insert("nginx".to_owned(), nginx.version.clone());
     run.notes = vec![
         "Robots are the agent's own driver, link, fetch and verification; they and the scripts write to memory, the \
@@ -76,7 +79,8 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     let scripts = Scripts::prepare(&taskd, nginx, bytes, robots, seed).await?;
 
     let mut own = Figures { point: Point::new(OWN, settings(&flags)), ..Figures::default() };
-    let mut programs = Figures { point: Point::new(PROGRAMS, settings(&flags)), ..Figures::default() };
+    let mut programs =
+        Figures { point: Point::new(PROGRAMS, settings(&flags)), ..Figures::default() };
     let mut progress = RunProgress::new(flags.runs as usize);
     for turn in 0..flags.runs {
         progress.says(&format!("{} MB to {robots}", flags.megabytes));
@@ -103,7 +107,11 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     fleet.end().await?;
     scripts.nginx.end().await;
     taskd.end().await?;
-    run.points = vec![own.ratio(&programs, Point::new(RATIO, settings(&flags))), own.finish(), programs.finish()];
+    run.points = vec![
+        own.ratio(&programs, Point::new(RATIO, settings(&flags))),
+        own.finish(),
+        programs.finish(),
+    ];
     for path in run.write(&flags.run.out, begun)? {
         say(&format!("wrote {}", path.display()));
     }
@@ -124,23 +132,35 @@ struct Scripts {
 
 impl Scripts {
     /// Pushes a package of its own; nginx serves its content from the server's directory.
-    async fn prepare(taskd: &Taskd, nginx: Peer, bytes: u64, count: usize, seed: u64) -> anyhow::Result<Self> {
+    async fn prepare(
+        taskd: &Taskd,
+        nginx: Peer,
+        bytes: u64,
+        count: usize,
+        seed: u64,
+    ) -> anyhow::Result<Self> {
         let package = Package::random("scripts".parse()?, "1".parse()?, bytes, seed);
         let (blob, payload) = (package.content_blob(), package.payload);
         taskd.server.push(package).await.context("the package can't be pushed")?;
         Ok(Self { nginx, blob, payload, count })
     }
 
-    /// Runs all side by side; gives the time until the last has ended, and the processor seconds of them and of nginx.
+    /// Runs all side by side; gives the time until the last has ended, and the processor seconds of
+    /// them and of nginx.
     async fn run(&self) -> anyhow::Result<(Duration, f64)> {
-        let dirs =
-            (0..self.count).map(|_| memory_directory("taskbench-script-")).collect::<anyhow::Result<Vec<_>>>()?;
+        let dirs = (0..self.count)
+            .map(|_| memory_directory("taskbench-script-"))
+            .collect::<anyhow::Result<Vec<_>>>()?;
         let cpu_s = || anyhow::Ok(self.nginx.usage().cpu_s + ended_children_cpu_s()?);
         let (begun, before) = (Instant::now(), cpu_s()?);
         let said = try_join_all(dirs.iter().map(|dir| self.run_one(dir.path()))).await?;
         let (wall, after) = (begun.elapsed(), cpu_s()?);
         for (said, dir) in said.iter().zip(&dirs) {
-            ensure!(said.trim() == self.blob.digest.hex(), "a script has hashed the blob to {:?}", said.trim());
+            ensure!(
+                said.trim() == self.blob.digest.hex(),
+                "a script has hashed the blob to {:?}",
+                said.trim()
+            );
             self.check(dir)?;
         }
         Ok((wall, after - before))
@@ -153,8 +173,12 @@ impl Scripts {
     }
 
     fn check(&self, dir: &TempDir) -> anyhow::Result<()> {
-        let bytes = std::fs::read(dir.path().join(PAYLOAD_FILE)).context("what a script has unpacked")?;
-        ensure!(Digest::of(&bytes) == self.payload, "a script has unpacked other bytes than were pushed");
+        let bytes =
+            std::fs::read(dir.path().join(PAYLOAD_FILE)).context("what a script has unpacked")?;
+        ensure!(
+            Digest::of(&bytes) == self.payload,
+            "a script has unpacked other bytes than were pushed"
+        );
         Ok(())
     }
 }
@@ -172,14 +196,22 @@ impl Figures {
     }
 
     fn finish(mut self) -> Point {
-        self.point.measure("wall", Unit::Milliseconds, self.runs.iter().filter_map(|(wall_ms, _)| *wall_ms));
+        self.point.measure(
+            "wall",
+            Unit::Milliseconds,
+            self.runs.iter().filter_map(|(wall_ms, _)| *wall_ms),
+        );
         self.point.measure("cpu", Unit::Seconds, self.runs.iter().map(|(_, cpu_s)| *cpu_s));
         self.point
     }
 
     fn ratio(&self, other: &Self, mut point: Point) -> Point {
         let turns = || self.runs.iter().zip(&other.runs);
-        point.measure("wall", Unit::Number, turns().filter_map(|(own, other)| Some(own.0? / other.0?)));
+        point.measure(
+            "wall",
+            Unit::Number,
+            turns().filter_map(|(own, other)| Some(own.0? / other.0?)),
+        );
         point.measure("cpu", Unit::Number, turns().map(|(own, other)| own.1 / other.1));
         point
     }

@@ -1,5 +1,5 @@
-//! Robots that are connected over MQTT, have one order, and report on it when they are due: their reports are measured, or
-//! only keep a fleet lively.
+//! Robots that are connected over MQTT, have one order, and report on it when they are due: their
+//! reports are measured, or only keep a fleet lively.
 
 use std::time::{Duration, Instant};
 
@@ -18,7 +18,8 @@ use crate::taskd::Taskd;
 
 /// Connections opened at a time.
 const CONNECTS_AT_ONCE: usize = 64;
-/// One in so many reports says that the task is in another phase; the others, that it has come further in its own.
+/// One in so many reports says that the task is in another phase; the others, that it has come
+/// further in its own.
 const REPORTS_PER_PHASE: u64 = 10;
 /// How long the last acknowledgements may take.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -37,8 +38,10 @@ pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter
     let robots = enrol(&taskd.server, count).await?;
     let (package, version) = ("status".parse()?, "1".parse()?);
     let manifest = taskd.server.push_package(&package, &version).await?;
-    let order =
-        CreateDeployment { delivery: DeliveryChoice::Poll, ..CreateDeployment::new(package, manifest, "*".parse()?) };
+    let order = CreateDeployment {
+        delivery: DeliveryChoice::Poll,
+        ..CreateDeployment::new(package, manifest, "*".parse()?)
+    };
     let deployment = taskd.server.order(&order).await?.id;
     let connecting = robots.iter().enumerate().map(|(number, robot)| {
         let deployment = &deployment;
@@ -46,7 +49,8 @@ pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter
             let credentials = Some((robot.robot_id.as_str(), robot.token.as_str()));
             let login = Login { client_id: robot.robot_id.as_str(), credentials };
             let link = Link::connect(taskd.mqtt, number, &login).await?;
-            let topic = robot.mqtt.prefix.format(&Topic::Robot(robot.robot_id.clone(), RobotTopic::Report));
+            let topic =
+                robot.mqtt.prefix.format(&Topic::Robot(robot.robot_id.clone(), RobotTopic::Report));
             Ok(Reporter { link, topic, report: report(robot, deployment)? })
         }
     });
@@ -90,8 +94,9 @@ fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<R
     })
 }
 
-/// Lets all robots report `rate` times a second together, for so many seconds, each in its turn. Gives when that began, and
-/// for each robot how long after it was due each report was stored, in milliseconds.
+/// Lets all robots report `rate` times a second together, for so many seconds, each in its turn.
+/// Gives when that began, and for each robot how long after it was due each report was stored, in
+/// milliseconds.
 pub async fn report_at(
     robots: &mut [Reporter],
     rate: u32,
@@ -108,7 +113,8 @@ pub async fn report_at(
 }
 
 impl Reporter {
-    /// Reports whenever it is due, acknowledged or not; gives how long after that each report was stored, in milliseconds.
+    /// Reports whenever it is due, acknowledged or not; gives how long after that each report was
+    /// stored, in milliseconds.
     async fn keep_reporting(&mut self, due: Vec<Instant>) -> anyhow::Result<Vec<f64>> {
         let mut stored = Vec::with_capacity(due.len());
         let mut sent = 0;

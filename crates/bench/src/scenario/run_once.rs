@@ -1,10 +1,13 @@
-//! One order, from its making to its end: a package that nobody has seen, pushed beforehand; the time from the order to
-//! each robot's verified answer; the bytes at the server's sockets meanwhile; whether every robot has what was pushed.
+//! One order, from its making to its end: a package that nobody has seen, pushed beforehand; the
+//! time from the order to each robot's verified answer; the bytes at the server's sockets
+//! meanwhile; whether every robot has what was pushed.
 
 use std::time::Duration;
 
 use anyhow::{Context as _, ensure};
-use task_proto::api::{AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, ServerInfo};
+use task_proto::api::{
+    AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, ServerInfo,
+};
 use task_proto::{Digest, TaskName, Version};
 
 use crate::clock::monotonic_ns;
@@ -39,7 +42,8 @@ pub struct OneOrder {
 pub struct Outcome {
     /// Each robot's delay, and why others did not arrive.
     pub arrivals: Arrivals,
-    /// Bytes at the sockets both ways, from the order to the last answer, the order itself included.
+    /// Bytes at the sockets both ways, from the order to the last answer, the order itself
+    /// included.
     pub mqtt_bytes: u64,
     /// Likewise.
     pub http_bytes: u64,
@@ -53,15 +57,25 @@ pub struct Outcome {
     pub fell_behind: usize,
 }
 
-/// Makes the order and waits for its end. An error is one of the bench; what the system does wrong is in the outcome.
-pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyhow::Result<Outcome> {
-    let (name, version): (TaskName, Version) = (NAME.parse()?, format!("{:016x}", order.seed).parse()?);
+/// Makes the order and waits for its end. An error is one of the bench; what the system does wrong
+/// is in the outcome.
+pub async fn run_once(
+    taskd: &Taskd,
+    fleet: &mut Fleet,
+    order: OneOrder,
+) -> anyhow::Result<Outcome> {
+    let (name, version): (TaskName, Version) =
+        (NAME.parse()?, format!("{:016x}", order.seed).parse()?);
     let (of, bytes, seed) = (name.clone(), order.payload_bytes, order.seed);
-    let package = tokio::task::spawn_blocking(move || Package::random(of, version, bytes, seed)).await?;
+    let package =
+        tokio::task::spawn_blocking(move || Package::random(of, version, bytes, seed)).await?;
     let payload = package.payload;
     let manifest = taskd.server.push(package).await.context("the package can't be pushed")?;
     let selector = first(order.robots, fleet.robots).parse()?;
-    let create = CreateDeployment { delivery: order.choice, ..CreateDeployment::new(name.clone(), manifest, selector) };
+    let create = CreateDeployment {
+        delivery: order.choice,
+        ..CreateDeployment::new(name.clone(), manifest, selector)
+    };
     let (before, own) = own_bytes(taskd).await?;
     let (server, robots) = (taskd.usage(), fleet.usage());
     let ordered_ns = monotonic_ns();
@@ -69,12 +83,17 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
         Ok(deployment) => deployment,
         Err(error) => {
             let refused = format!("the order is refused: {:#}", anyhow::Error::new(error));
-            taskd.server.remove_package(&name, &manifest).await.context("the package can't be removed")?;
+            taskd
+                .server
+                .remove_package(&name, &manifest)
+                .await
+                .context("the package can't be removed")?;
             return Ok(Outcome::failed(refused, order.robots));
         }
     };
     let arrivals = fleet.verified(&deployment.id, order.robots, ordered_ns, order.limit).await?;
-    let (server_cpu_s, robots_cpu_s) = (taskd.usage().cpu_s - server.cpu_s, fleet.usage().cpu_s - robots.cpu_s);
+    let (server_cpu_s, robots_cpu_s) =
+        (taskd.usage().cpu_s - server.cpu_s, fleet.usage().cpu_s - robots.cpu_s);
     let after = taskd.server.info().await?;
     let view = taskd.server.deployment(&deployment.id).await?;
     let mut outcome = Outcome {
@@ -95,12 +114,16 @@ pub async fn run_once(taskd: &Taskd, fleet: &mut Fleet, order: OneOrder) -> anyh
 impl Outcome {
     /// An order by which none of so many robots got anything.
     pub fn failed(why: String, robots: usize) -> Self {
-        Self { arrivals: Arrivals { arrived: Vec::new(), failures: vec![why; robots] }, ..Self::default() }
+        Self {
+            arrivals: Arrivals { arrived: Vec::new(), failures: vec![why; robots] },
+            ..Self::default()
+        }
     }
 
     fn read_decisions(&mut self, view: &DeploymentView, choice: DeliveryChoice) {
         let mut other = Vec::new();
-        let assignments = || view.assignments.iter().flatten().filter(|one: &&AssignmentView| one.released);
+        let assignments =
+            || view.assignments.iter().flatten().filter(|one: &&AssignmentView| one.released);
         for decision in assignments().filter_map(|one| one.delivery.as_ref()) {
             self.decisions.push(format!("{} ({})", decision.mechanism, decision.rule));
             if decision.rule == FELL_BEHIND {
@@ -119,7 +142,8 @@ impl Outcome {
     }
 }
 
-/// What is on the robots, or a failure of each that has something else. Its agent has verified it: this checks the bench.
+/// What is on the robots, or a failure of each that has something else. Its agent has verified it:
+/// this checks the bench.
 fn check_payloads(
     fleet: &Fleet,
     arrivals: &mut Arrivals,
@@ -136,7 +160,9 @@ fn check_payloads(
         }
     }
     arrivals.arrived.retain(|(robot, _)| !wrong.contains(robot));
-    arrivals.failures.extend(wrong.iter().map(|_| "a robot has verified other bytes than were pushed".to_owned()));
+    arrivals.failures.extend(
+        wrong.iter().map(|_| "a robot has verified other bytes than were pushed".to_owned()),
+    );
     Ok(())
 }
 
@@ -144,7 +170,10 @@ fn check_payloads(
 async fn own_bytes(taskd: &Taskd) -> anyhow::Result<(ServerInfo, u64)> {
     let first = taskd.server.info().await?;
     let second = taskd.server.info().await?;
-    ensure!(http_bytes(&second) > http_bytes(&first), "the server does not count what goes over HTTP");
+    ensure!(
+        http_bytes(&second) > http_bytes(&first),
+        "the server does not count what goes over HTTP"
+    );
     let own = http_bytes(&second) - http_bytes(&first);
     Ok((second, own))
 }

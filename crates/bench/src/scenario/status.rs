@@ -1,6 +1,7 @@
-//! `taskbench status`: robots that report at a fixed rate over MQTT, and how long each report takes to be stored, which is
-//! when it is acknowledged. Beside it, in the same run and directory, what one fsync takes. A report is measured from when
-//! it was due, so that a server that falls behind shows.
+//! `taskbench status`: robots that report at a fixed rate over MQTT, and how long each report takes
+//! to be stored, which is when it is acknowledged. Beside it, in the same run and directory, what
+//! one fsync takes. A report is measured from when it was due, so that a server that falls behind
+//! shows.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -62,7 +63,10 @@ pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
         let mut robots = connect(&taskd, flags.robots.into()).await.context(name)?;
         for &rate in &flags.rate {
             progress.says(&format!("{name}: {rate} reports each second"));
-            let mut point = Point::new(name, [("reports_per_s", f64::from(rate)), ("robots", f64::from(flags.robots))]);
+            let mut point = Point::new(
+                name,
+                [("reports_per_s", f64::from(rate)), ("robots", f64::from(flags.robots))],
+            );
             measure(&taskd, &mut robots, rate, flags.seconds, &mut point).await.context(name)?;
             run.points.push(point);
             progress.step();
@@ -97,7 +101,11 @@ async fn measure(
         }
     }
     point.measure("stored_per_s", Unit::PerSecond, [stored.len() as f64 / wall.as_secs_f64()]);
-    point.measure("server_cpu_us_per_report", Unit::Number, [cpu_s * 1e6 / stored.len().max(1) as f64]);
+    point.measure(
+        "server_cpu_us_per_report",
+        Unit::Number,
+        [cpu_s * 1e6 / stored.len().max(1) as f64],
+    );
     point.measure("anonymous_memory", Unit::Bytes, [taskd.usage().anonymous_bytes as f64]);
     point.measure("stored_after", Unit::Milliseconds, stored);
     point.measure("fsync", Unit::Milliseconds, syncs);
@@ -110,7 +118,9 @@ fn sync_ms(dir: &Path) -> anyhow::Result<Vec<f64>> {
     let mut samples = Vec::with_capacity(SYNCS);
     for _ in 0..SYNCS {
         let begun = Instant::now();
-        file.write_all(&[0; 4096]).and_then(|()| file.sync_data()).context("a file can't be synced")?;
+        file.write_all(&[0; 4096])
+            .and_then(|()| file.sync_data())
+            .context("a file can't be synced")?;
         samples.push(begun.elapsed().as_secs_f64() * 1000.0);
     }
     Ok(samples)

@@ -1,5 +1,6 @@
-//! A robot enrols with a token that wants approval: its command waits, over a restart and without the token, and goes on by
-//! itself; an agent that was started too early does as well. One that is rejected is told so.
+//! A robot enrols with a token that wants approval: its command waits, over a restart and without
+//! the token, and goes on by itself; an agent that was started too early does as well. One that is
+//! rejected is told so.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;
@@ -27,7 +28,10 @@ fn enroll(data: &Path, more: &[&str], token: Option<&str>) -> tokio::process::Ch
 }
 
 async fn until_it_waits(data: &Path) {
-    eventually("the command to wait", async || printed(data).contains("waits to be approved").then_some(())).await;
+    eventually("the command to wait", async || {
+        printed(data).contains("waits to be approved").then_some(())
+    })
+    .await;
 }
 
 async fn ended(mut child: tokio::process::Child) -> ExitStatus {
@@ -57,7 +61,9 @@ async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
         log.contains("awaits_approval").then_some(())
     })
     .await;
-    let pending: Value = serde_json::from_str(&server.operate(["robot", "pending", "-o", "json"]).await).expect("json");
+    let pending: Value =
+        serde_json::from_str(&server.operate(["robot", "pending", "-o", "json"]).await)
+            .expect("json");
     assert_eq!(pending["robots"][0]["name"], "atlas", "{pending}");
     assert!(server.operate(["robot", "list"]).await.contains("offline awaits_approval"));
 
@@ -73,10 +79,16 @@ async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_robot_that_is_rejected_is_told_so_and_is_nobody_again() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let server = Server::start_with(&dir.path().join("server"), &[("TASKD_ENROLMENT_APPROVAL", "true")]).await;
+    let server =
+        Server::start_with(&dir.path().join("server"), &[("TASKD_ENROLMENT_APPROVAL", "true")])
+            .await;
     let (token, data) = (server.enrollment_token().await, dir.path().join("atlas"));
     let url = server.url("");
-    let child = enroll(&data, &["--server", &url, "--name", "atlas", "--mac", "02:00:00:00:00:01"], Some(&token));
+    let child = enroll(
+        &data,
+        &["--server", &url, "--name", "atlas", "--mac", "02:00:00:00:00:01"],
+        Some(&token),
+    );
     until_it_waits(&data).await;
     server.operate(["robot", "reject", "atlas"]).await;
     assert!(!ended(child).await.success());

@@ -1,4 +1,5 @@
-//! The whole system through a broker that is not its own: a real mosquitto, with the files that the server writes for it.
+//! The whole system through a broker that is not its own: a real mosquitto, with the files that the
+//! server writes for it.
 #![expect(clippy::disallowed_methods, reason = "the broker is a process")]
 
 use std::net::{SocketAddr, TcpListener};
@@ -45,7 +46,8 @@ impl Mosquitto {
     pub fn named(dir: &Path, name: &str) -> Self {
         let dir = dir.join(name);
         std::fs::create_dir(&dir).expect("directory");
-        // Nothing else is likely to take the port until mosquitto does: it can't be given one that is bound.
+        // Nothing else is likely to take the port until mosquitto does: it can't be given one that
+        // is bound.
         let free = TcpListener::bind("127.0.0.1:0").expect("port");
         let address = free.local_addr().expect("bound");
         let path = dir.display();
@@ -61,7 +63,8 @@ impl Mosquitto {
         Self { process: None, dir, address, scheme: "mqtt" }
     }
 
-    /// Has it encrypt from its next start on; gives the pin of the authority behind its certificate.
+    /// Has it encrypt from its next start on; gives the pin of the authority behind its
+    /// certificate.
     fn encrypt(&mut self) -> CaPin {
         let certificate = Certificate::new().expect("a certificate");
         let (chain, key) = (self.dir.join("chain.pem"), self.dir.join("key.pem"));
@@ -82,7 +85,8 @@ impl Mosquitto {
             .find(|path| Path::new(path).exists())
             .map_or_else(|| Command::new("mosquitto"), Command::new);
         self.process = Some(Process::spawn(command.arg("-c").arg(self.dir.join("conf"))));
-        eventually("mosquitto to listen", async || TcpStream::connect(self.address).await.ok()).await;
+        eventually("mosquitto to listen", async || TcpStream::connect(self.address).await.ok())
+            .await;
     }
 
     /// `kill -9`: all that it knew is gone.
@@ -95,14 +99,17 @@ impl Mosquitto {
         format!("{}://taskd:{PASSWORD}@{}", self.scheme, self.address)
     }
 
-    /// Its configuration from its next start on: that of `taskd broker conf`, with this directory and on loopback only.
+    /// Its configuration from its next start on: that of `taskd broker conf`, with this directory
+    /// and on loopback only.
     pub async fn configure(&self, server: &Server) {
         let conf = server.operate(["broker", "conf"]).await;
         let (port, path) = (self.address.port(), self.dir.display().to_string());
-        let conf = conf.replace(&format!("listener {port}\n"), &format!("listener {port} 127.0.0.1\n"));
+        let conf =
+            conf.replace(&format!("listener {port}\n"), &format!("listener {port} 127.0.0.1\n"));
         let conf = conf.replace("/etc/mosquitto/taskd.", &format!("{path}/"));
         let user = if nix::unistd::geteuid().is_root() { "user root\n" } else { "" };
-        std::fs::write(self.dir.join("conf"), format!("{conf}{user}log_dest file {path}/log\n")).expect("written");
+        std::fs::write(self.dir.join("conf"), format!("{conf}{user}log_dest file {path}/log\n"))
+            .expect("written");
     }
 
     /// What it has logged.
@@ -115,7 +122,8 @@ impl Mosquitto {
         let path = self.dir.join("passwd");
         let accounts = std::fs::read_to_string(&path).expect("written");
         let others = accounts.lines().filter(|line| !line.starts_with(&format!("{user}:")));
-        std::fs::write(path, others.map(|line| format!("{line}\n")).collect::<String>()).expect("written");
+        std::fs::write(path, others.map(|line| format!("{line}\n")).collect::<String>())
+            .expect("written");
     }
 
     /// What an operator does after robots were enrolled: new files, then SIGHUP.
@@ -138,8 +146,10 @@ async fn connected(server: &Server) -> Option<u64> {
 }
 
 pub async fn wait_connected(server: &Server, robots: u64) {
-    eventually(&format!("{robots} robots at the broker"), async || (connected(server).await? == robots).then_some(()))
-        .await;
+    eventually(&format!("{robots} robots at the broker"), async || {
+        (connected(server).await? == robots).then_some(())
+    })
+    .await;
 }
 
 pub async fn says(server: &Server, what: &str) {
@@ -180,7 +190,9 @@ fn server_log(server: &Server) -> String {
 async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessions() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::start(dir.path()).await;
-    let mut server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let mut server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())])
+            .await;
     says(&server, "does not accept the user taskd with the password in `broker`").await;
     mosquitto.learn(&server).await;
     server.wait_ready().await;
@@ -237,14 +249,19 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
 async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
     let dir = TempDir::new().expect("temp dir");
     let mosquitto = Mosquitto::start(dir.path()).await;
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())])
+            .await;
     let proxy = Proxy::start(server.http, u64::MAX).await;
     let url = format!("http://{}", proxy.address);
     let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &url, &[]).await;
     mosquitto.learn(&server).await;
     server.wait_ready().await;
     wait_connected(&server, 1).await;
-    let ways = [("inline", Delivery::Inline, 24_000), ("direct-push", Delivery::DirectPush, 4 * 1024 * 1024)];
+    let ways = [
+        ("inline", Delivery::Inline, 24_000),
+        ("direct-push", Delivery::DirectPush, 4 * 1024 * 1024),
+    ];
     for (number, (name, delivery, bytes)) in ways.into_iter().enumerate() {
         let version = format!("{}.0.0", number + 1);
         let package = worker(dir.path(), &version);
@@ -255,7 +272,8 @@ async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
         let pulled = proxy.bytes_to_clients() - before;
         assert!(pulled < bytes as u64 / 2, "{name}: {pulled} bytes came over HTTP");
         let view = server.deployment(ordered.id.as_str()).await.expect("known");
-        let chosen = view.assignments.expect("asked for")[0].delivery.clone().expect("its batch has begun");
+        let chosen =
+            view.assignments.expect("asked for")[0].delivery.clone().expect("its batch has begun");
         assert_eq!(chosen.mechanism, delivery, "{chosen:?}");
     }
 }
@@ -286,19 +304,25 @@ async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
 
 /// A client with a robot's own name and password at the broker.
 pub async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient, EventLoop) {
-    let identity: Value =
-        serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json");
-    let password = identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
+    let identity: Value = serde_json::from_slice(
+        &std::fs::read(robot.data().join("identity.json")).expect("identity"),
+    )
+    .expect("json");
+    let password =
+        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
     assert_ne!(identity["token"], password, "the token is not shown to the broker");
-    let mut options = MqttOptions::new(id, mosquitto.address.ip().to_string(), mosquitto.address.port());
+    let mut options =
+        MqttOptions::new(id, mosquitto.address.ip().to_string(), mosquitto.address.port());
     options.set_credentials(robot.id.as_str(), password);
     AsyncClient::new(options, 16)
 }
 
 pub async fn next(events: &mut EventLoop) -> Packet {
     loop {
-        if let Event::Incoming(packet) =
-            tokio::time::timeout(PATIENCE, events.poll()).await.expect("in time").expect("a session")
+        if let Event::Incoming(packet) = tokio::time::timeout(PATIENCE, events.poll())
+            .await
+            .expect("in time")
+            .expect("a session")
         {
             return packet;
         }
@@ -309,8 +333,17 @@ fn status(online: bool) -> String {
     format!(r#"{{"online":{online},"start":1000,"instance":"i00000000000000a1","connection":1}}"#)
 }
 
-async fn publish(client: &AsyncClient, events: &mut EventLoop, robot: &RobotId, topic: &str, text: String) {
-    client.publish(format!("taskd/v1/r/{robot}/{topic}"), QoS::AtLeastOnce, false, text).await.expect("queued");
+async fn publish(
+    client: &AsyncClient,
+    events: &mut EventLoop,
+    robot: &RobotId,
+    topic: &str,
+    text: String,
+) {
+    client
+        .publish(format!("taskd/v1/r/{robot}/{topic}"), QoS::AtLeastOnce, false, text)
+        .await
+        .expect("queued");
     while !matches!(next(events).await, Packet::PubAck(_)) {}
 }
 
@@ -318,7 +351,9 @@ async fn publish(client: &AsyncClient, events: &mut EventLoop, robot: &RobotId, 
 async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     let dir = TempDir::new().expect("temp dir");
     let mosquitto = Mosquitto::start(dir.path()).await;
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())])
+            .await;
     let mut robots = Vec::new();
     for number in 1..=2 {
         let mut robot = Robot::start(&server, dir.path(), &format!("robot-{number}"), number).await;
@@ -329,7 +364,9 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     server.wait_ready().await;
     let (own, other) = (&robots[0].id, &robots[1].id);
     let (client, mut events) = spy(&mosquitto, &robots[0], own.as_str()).await;
-    for filter in ["#", "taskd/v1/#", "taskd/v1/r/+/desired", "taskd/v1/r/+/status", "taskd/v1/server"] {
+    for filter in
+        ["#", "taskd/v1/#", "taskd/v1/r/+/desired", "taskd/v1/r/+/status", "taskd/v1/server"]
+    {
         // Mosquitto grants any filter, and passes on what the ACL allows.
         client.subscribe(filter, QoS::AtLeastOnce).await.expect("queued");
         while !matches!(next(&mut events).await, Packet::SubAck(_)) {}
@@ -365,17 +402,21 @@ async fn is_at(server: &Server, broker: &Mosquitto) -> bool {
 #[tokio::test(flavor = "multi_thread")]
 async fn robot_at_another_broker_than_the_server_comes_to_the_servers() {
     let dir = TempDir::new().expect("temp dir");
-    let mut brokers = [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
+    let mut brokers =
+        [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
     let list = format!("{}, {}", brokers[0].url(), brokers[1].url());
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
     let robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     // The second broker accepts the robot and refuses the server.
     brokers[1].learn(&server).await;
     brokers[1].forget("taskd");
     brokers[1].launch().await;
     let is_there = format!(" as {}-", robot.id);
-    eventually("the robot to be at the second broker", async || brokers[1].log().contains(&is_there).then_some(()))
-        .await;
+    eventually("the robot to be at the second broker", async || {
+        brokers[1].log().contains(&is_there).then_some(())
+    })
+    .await;
     brokers[0].learn(&server).await;
     brokers[0].launch().await;
     server.wait_ready().await;
@@ -390,9 +431,11 @@ async fn robot_at_another_broker_than_the_server_comes_to_the_servers() {
 #[tokio::test(flavor = "multi_thread")]
 async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     let dir = TempDir::new().expect("temp dir");
-    let mut brokers = [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
+    let mut brokers =
+        [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
     let list = format!("{}, {}", brokers[0].url(), brokers[1].url());
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &list)]).await;
     let robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     // Server and robot may find different brokers at first.
     for broker in &mut brokers {
@@ -407,7 +450,10 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     runs(&server, "robot-1", "1.0.0").await;
 
     brokers[at].kill();
-    eventually("the server to be at the other broker", async || is_at(&brokers[other]).await.then_some(())).await;
+    eventually("the server to be at the other broker", async || {
+        is_at(&brokers[other]).await.then_some(())
+    })
+    .await;
     server.wait_ready().await;
     wait_connected(&server, 1).await;
     server.push(&worker(dir.path(), "2.0.0"), "*").await;
@@ -416,8 +462,10 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     assert_eq!(view.from, LogsFrom::Robot, "asked over the second broker");
 
     // An agent that knows one address is told the broker at which the server is.
-    let token: Value =
-        serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json");
+    let token: Value = serde_json::from_slice(
+        &std::fs::read(robot.data().join("identity.json")).expect("identity"),
+    )
+    .expect("json");
     let url = server.url(&format!("/api/v1/robots/{}/mqtt", robot.id));
     let token = token["token"].as_str().expect("a token");
     let told = reqwest::Client::new().get(url).bearer_auth(token).send().await.expect("an answer");
@@ -433,8 +481,10 @@ async fn robots_follow_the_server_from_broker_to_broker_without_enrolling_again(
     let mut server = Server::start(&dir.path().join("server")).await;
     let refused = server.try_operate(["broker", "passwd"]).await;
     assert!(String::from_utf8_lossy(&refused.stderr).contains("no_external_broker"), "{refused:?}");
-    let often = [("TASK_AGENT_POLL_INTERVAL_S", "3"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "2")];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
+    let often =
+        [("TASK_AGENT_POLL_INTERVAL_S", "3"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "2")];
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
     wait_connected(&server, 1).await;
 
     // The broker is down: HTTP works, robots poll, and it heals by itself.

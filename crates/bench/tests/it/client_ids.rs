@@ -1,5 +1,6 @@
-//! Client ids at an external broker: nobody ends the session of the server or of a robot by connecting with its id, and
-//! `taskd doctor` finds a broker that would let them. With a real mosquitto and a real NATS server.
+//! Client ids at an external broker: nobody ends the session of the server or of a robot by
+//! connecting with its id, and `taskd doctor` finds a broker that would let them. With a real
+//! mosquitto and a real NATS server.
 #![expect(clippy::disallowed_methods, reason = "the broker is a process")]
 
 use std::net::{SocketAddr, TcpListener};
@@ -19,13 +20,19 @@ use crate::harness::{PATIENCE, Process, Robot, Server, eventually, required};
 
 /// What a robot has written down.
 fn identity(robot: &Robot) -> Value {
-    serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity")).expect("json")
+    serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity"))
+        .expect("json")
 }
 
 /// Connects with this robot's account and the given client id, and is let in.
-async fn connect_as(address: SocketAddr, robot: &Robot, client_id: &str) -> (AsyncClient, EventLoop) {
+async fn connect_as(
+    address: SocketAddr,
+    robot: &Robot,
+    client_id: &str,
+) -> (AsyncClient, EventLoop) {
     let identity = identity(robot);
-    let password = identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
+    let password =
+        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
     let mut options = MqttOptions::new(client_id, address.ip().to_string(), address.port());
     options.set_credentials(robot.id.as_str(), password);
     let (client, mut events) = AsyncClient::new(options, 16);
@@ -36,7 +43,11 @@ async fn connect_as(address: SocketAddr, robot: &Robot, client_id: &str) -> (Asy
 /// The client ids that the server and this robot had before they were secret.
 async fn known_ids(server: &Server, robot: &Robot) -> [String; 2] {
     let info = server.get("/api/v1/server").await.expect("it answers");
-    let key = info["key"].as_str().expect("a key").parse::<task_proto::envelope::PublicKey>().expect("a key");
+    let key = info["key"]
+        .as_str()
+        .expect("a key")
+        .parse::<task_proto::envelope::PublicKey>()
+        .expect("a key");
     [format!("taskd-{}", key.id()), robot.id.to_string()]
 }
 
@@ -62,7 +73,9 @@ async fn assert_undisturbed(server: &Server, robot: &str, robots: u64) {
 async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::start(dir.path()).await;
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &mosquitto.url())])
+            .await;
     let mut attacker = Robot::start(&server, dir.path(), "robot-1", 1).await;
     let victim = Robot::start(&server, dir.path(), "robot-2", 2).await;
     attacker.terminate();
@@ -73,9 +86,13 @@ async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
     runs(&server, "robot-2", "1.0.0").await;
 
-    // A mosquitto that tells clients apart by their ids: those that can be known are nobody's any more.
+    // A mosquitto that tells clients apart by their ids: those that can be known are nobody's any
+    // more.
     let (verdict, words) = doctor(&server).await;
-    assert!(verdict == "notice" && words.contains("use_username_as_clientid true"), "{verdict}: {words}");
+    assert!(
+        verdict == "notice" && words.contains("use_username_as_clientid true"),
+        "{verdict}: {words}"
+    );
     let before = mosquitto.log().matches("already connected, closing old connection").count();
     let mut held = Vec::new();
     for id in known_ids(&server, &victim).await {
@@ -88,7 +105,11 @@ async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     // Those that the sessions have, from the log: nobody but the broker's administrator sees it.
     let log = mosquitto.log();
     let ids_of = |user: &str| {
-        let line = log.lines().rev().find(|line| line.contains(&format!("u'{user}'"))).expect("a connection");
+        let line = log
+            .lines()
+            .rev()
+            .find(|line| line.contains(&format!("u'{user}'")))
+            .expect("a connection");
         line.split(" as ").nth(1).and_then(|rest| rest.split(' ').next()).expect("an id").to_owned()
     };
     let secret = [ids_of("taskd"), ids_of(victim.id.as_str())];
@@ -100,14 +121,17 @@ async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     assert_undisturbed(&server, "robot-2", 1).await;
     assert_eq!(doctor(&server).await.0, "good");
     let mut held = Vec::new();
-    for id in known_ids(&server, &victim).await.iter().chain(&secret).map(String::as_str).chain(["taskd"]) {
+    for id in
+        known_ids(&server, &victim).await.iter().chain(&secret).map(String::as_str).chain(["taskd"])
+    {
         // Each takes the place of the one before, which is the same user's.
         held.push(connect_as(mosquitto.address, &attacker, id).await);
     }
     assert_undisturbed(&server, "robot-2", 1).await;
     let log = mosquitto.log();
     let displaced = log.lines().filter(|line| line.contains("already connected"));
-    let others: Vec<_> = displaced.skip(after).filter(|line| !line.contains(attacker.id.as_str())).collect();
+    let others: Vec<_> =
+        displaced.skip(after).filter(|line| !line.contains(attacker.id.as_str())).collect();
     assert!(others.is_empty(), "{others:?}");
 }
 
@@ -123,7 +147,8 @@ impl Nats {
     fn new(dir: &Path) -> Self {
         let dir = dir.join("nats");
         std::fs::create_dir(&dir).expect("directory");
-        // Nothing else is likely to take the ports until the server does: it can't be given any that are bound.
+        // Nothing else is likely to take the ports until the server does: it can't be given any
+        // that are bound.
         let free = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").expect("port"));
         let [mqtt, client] = free.each_ref().map(|listener| listener.local_addr().expect("bound"));
         let path = dir.display();
@@ -157,7 +182,8 @@ impl Nats {
     async fn launch(&mut self) {
         let mut command = Command::new(required("TASKD_TEST_NATS"));
         self.process = Some(Process::spawn(command.arg("-c").arg(self.dir.join("nats.conf"))));
-        eventually("nats-server to listen", async || TcpStream::connect(self.mqtt).await.ok()).await;
+        eventually("nats-server to listen", async || TcpStream::connect(self.mqtt).await.ok())
+            .await;
     }
 }
 
@@ -165,7 +191,8 @@ impl Nats {
 async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     let dir = TempDir::new().expect("temp dir");
     let mut nats = Nats::new(dir.path());
-    let server = Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &nats.url())]).await;
+    let server =
+        Server::start_unready(&dir.path().join("server"), &[("TASKD_BROKER", &nats.url())]).await;
     nats.learn(&server).await;
     nats.launch().await;
     server.wait_ready().await;
@@ -179,7 +206,10 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
 
     // NATS ends a session for whoever knows its client id. Nobody does.
     let (verdict, words) = doctor(&server).await;
-    assert!(verdict == "notice" && words.contains("NATS has no such setting"), "{verdict}: {words}");
+    assert!(
+        verdict == "notice" && words.contains("NATS has no such setting"),
+        "{verdict}: {words}"
+    );
     let replaced = || nats.log().matches("Replacing old client").count();
     let before = replaced();
     assert!(before > 0, "the test's own session was replaced: {}", nats.log());
@@ -191,9 +221,21 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     assert_undisturbed(&server, "robot-2", 1).await;
 
     let (client, mut events) = connect_as(nats.mqtt, &attacker, "spy").await;
-    let (own, other) = (format!("taskd/v1/r/{}/desired", attacker.id), format!("taskd/v1/r/{}/desired", victim.id));
-    let refused =
-        ["#", "+/#", "taskd/v1/#", "taskd/v1/r/+/desired", &other, "$MQTT/#", "$MQTT/sub/+", "$JS/#", "$SYS/#"];
+    let (own, other) = (
+        format!("taskd/v1/r/{}/desired", attacker.id),
+        format!("taskd/v1/r/{}/desired", victim.id),
+    );
+    let refused = [
+        "#",
+        "+/#",
+        "taskd/v1/#",
+        "taskd/v1/r/+/desired",
+        &other,
+        "$MQTT/#",
+        "$MQTT/sub/+",
+        "$JS/#",
+        "$SYS/#",
+    ];
     for (filter, code) in refused
         .map(|filter| (filter, SubscribeReasonCode::Failure))
         .into_iter()
@@ -209,9 +251,14 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     }
     // With the same account over NATS' own protocol.
     let mut stream = TcpStream::connect(nats.client).await.expect("connected");
-    let password = identity(&attacker)["mqtt"]["external"]["password"].as_str().expect("a password").to_owned();
-    let hello =
-        format!("CONNECT {{\"verbose\":false,\"user\":\"{}\",\"pass\":\"{password}\"}}\r\nPING\r\n", attacker.id);
+    let password = identity(&attacker)["mqtt"]["external"]["password"]
+        .as_str()
+        .expect("a password")
+        .to_owned();
+    let hello = format!(
+        "CONNECT {{\"verbose\":false,\"user\":\"{}\",\"pass\":\"{password}\"}}\r\nPING\r\n",
+        attacker.id
+    );
     stream.write_all(hello.as_bytes()).await.expect("sent");
     let mut answer = String::new();
     let closing = tokio::time::timeout(PATIENCE, stream.read_to_string(&mut answer)).await;

@@ -33,7 +33,8 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     let job = fleet.package("curious", "1.0.0", "job", &script);
     fleet.server.push(&job, "*").await;
     fleet.server.wait_phase("robot-1", "curious", Phase::Succeeded).await;
-    let read = |name: &str| std::fs::read_to_string(found.join(name)).expect(name).trim().to_owned();
+    let read =
+        |name: &str| std::fs::read_to_string(found.join(name)).expect(name).trim().to_owned();
     assert_eq!(read("home"), own_home(&fleet.robots[0]));
     if nix::unistd::geteuid().is_root() {
         let user: u32 = read("user").parse().expect("a number");
@@ -45,7 +46,8 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     }
 }
 
-/// What a package would try on its neighbour, and on itself. Each line that it writes is something that it got.
+/// What a package would try on its neighbour, and on itself. Each line that it writes is something
+/// that it got.
 const BURGLAR: &str = r#"
 got() { if "$@" >/dev/null 2>&1; then echo "GOT $*" >> "$FOUND"; fi; }
 touch mine && echo "own directory: writable" >> "$FOUND"
@@ -108,7 +110,8 @@ async fn task_can_neither_change_nor_kill_nor_read_its_neighbour_nor_change_its_
     let found = std::fs::read_to_string(found.join("found")).expect("what it got");
     assert_eq!(found, "own directory: writable\ndone\n");
     assert_eq!(pid_of(&robot(&fleet.server).await, "victim"), Some(pid), "it was not killed");
-    let accounts = eventually("the robot's facts", async || robot(&fleet.server).await.host).await.accounts;
+    let accounts =
+        eventually("the robot's facts", async || robot(&fleet.server).await.host).await.accounts;
     assert_eq!(accounts, Some(TaskAccounts::PerTask));
 }
 
@@ -126,16 +129,21 @@ async fn package_that_was_changed_on_the_disk_is_not_started_and_comes_anew() {
     let pid = pid_of(&before, "steady").expect("a pid");
     let main = version_of(&fleet.robots[0], "steady").join("src/main.sh");
     std::fs::write(&main, script.replace("good", "evil")).expect("changed");
-    nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid.cast_signed()), nix::sys::signal::Signal::SIGKILL)
-        .expect("killed");
+    nix::sys::signal::kill(
+        nix::unistd::Pid::from_raw(pid.cast_signed()),
+        nix::sys::signal::Signal::SIGKILL,
+    )
+    .expect("killed");
     eventually("another process", async || {
         let now = pid_of(&robot(&fleet.server).await, "steady")?;
-        (now != pid && std::fs::read_to_string(found.join("started")).ok()?.lines().count() == 2).then_some(())
+        (now != pid && std::fs::read_to_string(found.join("started")).ok()?.lines().count() == 2)
+            .then_some(())
     })
     .await;
     assert_eq!(std::fs::read_to_string(found.join("started")).expect("written"), "good\ngood\n");
     assert_eq!(std::fs::read_to_string(&main).expect("there"), script);
-    let log = std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log")).expect("a log");
+    let log =
+        std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log")).expect("a log");
     assert!(log.contains("src is not what was unpacked"), "{log}");
 }
 
@@ -144,7 +152,9 @@ fn give_to_all_tasks(path: &Path) {
     let about = std::fs::symlink_metadata(path).expect("there");
     std::os::unix::fs::lchown(path, Some(65_534), Some(65_534)).expect("given");
     if about.is_dir() {
-        std::fs::read_dir(path).expect("a list").for_each(|entry| give_to_all_tasks(&entry.expect("an entry").path()));
+        std::fs::read_dir(path)
+            .expect("a list")
+            .for_each(|entry| give_to_all_tasks(&entry.expect("an entry").path()));
     }
 }
 
@@ -156,13 +166,19 @@ async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_i
     let mut fleet = Fleet::start(1).await;
     fleet
         .server
-        .push(&fleet.package("steady", "1.0.0", "service", "echo run >> written; exec sleep 1000\n"), "*")
+        .push(
+            &fleet.package("steady", "1.0.0", "service", "echo run >> written; exec sleep 1000\n"),
+            "*",
+        )
         .await;
     let before = fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
     let pid = pid_of(&before, "steady").expect("a pid");
     fleet.robots[0].terminate();
-    nix::sys::signal::kill(nix::unistd::Pid::from_raw(pid.cast_signed()), nix::sys::signal::Signal::SIGKILL)
-        .expect("killed");
+    nix::sys::signal::kill(
+        nix::unistd::Pid::from_raw(pid.cast_signed()),
+        nix::sys::signal::Signal::SIGKILL,
+    )
+    .expect("killed");
     let version = version_of(&fleet.robots[0], "steady");
     std::fs::remove_dir_all(version.join("work")).expect("removed");
     std::fs::remove_file(version.with_extension("seal")).expect("removed");
@@ -171,7 +187,8 @@ async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_i
         (std::fs::metadata(version.join("task.json")).expect("there"), version.join("src/written"));
     let since = (handed_over.ctime(), handed_over.ctime_nsec());
     // The clock of files does not tick at each write.
-    while std::fs::metadata(&old).map_or(true, |about| (about.mtime(), about.mtime_nsec()) <= since) {
+    while std::fs::metadata(&old).map_or(true, |about| (about.mtime(), about.mtime_nsec()) <= since)
+    {
         std::fs::write(&old, "old\n").expect("written");
     }
     give_to_all_tasks(&old);
@@ -182,7 +199,10 @@ async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_i
     .await;
     let owner = |name: &str| std::fs::metadata(version.join(name)).expect("there").uid();
     assert_eq!((owner(""), owner("src"), owner("src/main.sh")), (0, 0, 0));
-    assert!((70_000..80_000).contains(&owner("work/written")) && version.with_extension("seal").exists());
+    assert!(
+        (70_000..80_000).contains(&owner("work/written"))
+            && version.with_extension("seal").exists()
+    );
 }
 
 fn own_home(robot: &Robot) -> String {
@@ -198,7 +218,8 @@ async fn without_a_task_user_a_robot_says_what_to_do_and_runs_nothing() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let settings = [("TASK_AGENT_TASK_USER", "no-such-user")];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
     let package = dir.path().join("idle");
     write_package(&package, "idle", "1.0.0", "service", "exec sleep 1000\n");
     server.push(&package, "*").await;
@@ -206,7 +227,8 @@ async fn without_a_task_user_a_robot_says_what_to_do_and_runs_nothing() {
     assert_eq!(failure.code.as_str(), "no_task_user");
     assert!(failure.text.contains("\"no-such-user\""), "{failure}");
     let conditions = robot(&server).await.conditions;
-    let condition = conditions.iter().find(|condition| condition.code == "no_task_user").expect("a condition");
+    let condition =
+        conditions.iter().find(|condition| condition.code == "no_task_user").expect("a condition");
     assert_eq!(condition.text, failure.text);
     let run_dir = format!("TASKD_RUN_DIR={}", dir.path().display());
     assert_eq!(processes_with(run_dir.as_bytes()), Vec::<i32>::new());
@@ -218,14 +240,19 @@ async fn a_task_that_wants_eight_gigabytes_fails_alone_and_by_name() {
     let calm = fleet.package("calm", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&calm, "*").await;
     let before = fleet.server.wait_phase("robot-1", "calm", Phase::Running).await;
-    let greedy = fleet.package("greedy", "1.0.0", "job", "head -c 8G /dev/zero | tail -n 1 >/dev/null\n");
+    let greedy =
+        fleet.package("greedy", "1.0.0", "job", "head -c 8G /dev/zero | tail -n 1 >/dev/null\n");
     let toml = std::fs::read_to_string(greedy.join("task.toml")).expect("task.toml");
-    std::fs::write(greedy.join("task.toml"), toml + "[limits]\nmemory_mb = 200\npids = 32\ncpu_weight = 50\n")
-        .expect("limits");
+    std::fs::write(
+        greedy.join("task.toml"),
+        toml + "[limits]\nmemory_mb = 200\npids = 32\ncpu_weight = 50\n",
+    )
+    .expect("limits");
     fleet.server.push(&greedy, "*").await;
     let failure = failure_of(&fleet.server, "greedy", Phase::Failed).await;
     // What the robot says of itself is what it does.
-    match eventually("the robot's facts", async || robot(&fleet.server).await.host).await.isolation {
+    match eventually("the robot's facts", async || robot(&fleet.server).await.host).await.isolation
+    {
         Isolation::Cgroup => {
             assert_eq!(failure.code.as_str(), "out_of_memory");
             assert!(failure.text.contains("200 MiB"), "{failure}");

@@ -1,5 +1,6 @@
-//! The paper's experiment, its figures 7 and 8: a mapping package goes to a robot as a job, is built there, maps a
-//! corridor while the agent keeps its lifecycle node active, and the map comes back, as good as it is said to be.
+//! The paper's experiment, its figures 7 and 8: a mapping package goes to a robot as a job, is
+//! built there, maps a corridor while the agent keeps its lifecycle node active, and the map comes
+//! back, as good as it is said to be.
 
 use std::path::Path;
 
@@ -7,7 +8,8 @@ use serde_json::Value;
 
 use crate::ros::{Stage, copy};
 
-/// Shares that the issue of such a map turns on: cells that the lidar could see and knows, walls that are where they are.
+/// Shares that the issue of such a map turns on: cells that the lidar could see and knows, walls
+/// that are where they are.
 const KNOWN: f64 = 0.95;
 const WALLS_TRUE: f64 = 0.95;
 
@@ -16,7 +18,8 @@ async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
     let stage = Stage::bare().await;
     let package = stage.dir.path().join("corridor_mapping");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/corridor_mapping"), &package);
-    // As the example has it, but in less time: fewer particles, and a robot that drives twice as fast.
+    // As the example has it, but in less time: fewer particles, and a robot that drives twice as
+    // fast.
     let toml = std::fs::read_to_string(package.join("task.toml")).expect("task.toml");
     let quick = toml.replace("particles = 20", "particles = 8").replace("rate = 4.0", "rate = 8.0");
     assert_ne!(quick, toml);
@@ -34,8 +37,12 @@ async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
 
     let into = stage.dir.path().join("fetched");
     let into_text = into.to_str().expect("utf-8");
-    stage.server.operate(["output", "get", "robot-1", "corridor_mapping", "--into", into_text]).await;
-    let yaml = std::fs::read_to_string(into.join("maps/corridor.yaml")).expect("the map's description");
+    stage
+        .server
+        .operate(["output", "get", "robot-1", "corridor_mapping", "--into", into_text])
+        .await;
+    let yaml =
+        std::fs::read_to_string(into.join("maps/corridor.yaml")).expect("the map's description");
     assert!(yaml.contains("image: corridor.pgm") && yaml.contains("resolution: 0.05"), "{yaml}");
     let map = std::fs::read(into.join("maps/corridor.pgm")).expect("the map");
     assert!(map.starts_with(b"P5"), "a PGM");
@@ -45,11 +52,22 @@ async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
 
     let score = std::fs::read(into.join("maps/score.json")).expect("the score");
     let score: Value = serde_json::from_slice(&score).expect("json");
-    let share = |map: &str, what: &str| score[map][what].as_f64().unwrap_or_else(|| panic!("{map} {what}: {score}"));
+    let share = |map: &str, what: &str| {
+        score[map][what].as_f64().unwrap_or_else(|| panic!("{map} {what}: {score}"))
+    };
     for map in ["corridor", "odometry"] {
-        let [known, walls_true, walls_found] = ["known", "walls_true", "walls_found"].map(|what| share(map, what));
-        println!("{map}: known {known:.3}, walls true {walls_true:.3}, walls found {walls_found:.3}");
+        let [known, walls_true, walls_found] =
+            ["known", "walls_true", "walls_found"].map(|what| share(map, what));
+        println!(
+            "{map}: known {known:.3}, walls true {walls_true:.3}, walls found {walls_found:.3}"
+        );
     }
-    assert!(share("corridor", "known") >= KNOWN && share("corridor", "walls_true") >= WALLS_TRUE, "{score}");
-    assert!(share("corridor", "walls_true") > share("odometry", "walls_true") + 0.2, "clearly better: {score}");
+    assert!(
+        share("corridor", "known") >= KNOWN && share("corridor", "walls_true") >= WALLS_TRUE,
+        "{score}"
+    );
+    assert!(
+        share("corridor", "walls_true") > share("odometry", "walls_true") + 0.2,
+        "clearly better: {score}"
+    );
 }

@@ -1,4 +1,5 @@
-//! Power cuts: `kill -9` of agent and server at every kind of moment. Nothing is stuck, nothing is lost.
+//! Power cuts: `kill -9` of agent and server at every kind of moment. Nothing is stuck, nothing is
+//! lost.
 
 use std::io::Write as _;
 
@@ -39,10 +40,14 @@ async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
     let blobs = robot.data().join("blobs/sha256");
     let part_bytes = || -> Option<u64> {
         let entries = std::fs::read_dir(&blobs).ok()?.filter_map(Result::ok);
-        let parts = entries.filter(|entry| entry.path().extension().is_some_and(|extension| extension == "part"));
+        let parts = entries
+            .filter(|entry| entry.path().extension().is_some_and(|extension| extension == "part"));
         Some(parts.filter_map(|entry| Some(entry.metadata().ok()?.len())).sum())
     };
-    eventually("a third of the package to be kept", async || (part_bytes()? > total / 3).then_some(())).await;
+    eventually("a third of the package to be kept", async || {
+        (part_bytes()? > total / 3).then_some(())
+    })
+    .await;
     robot.kill();
     let part_bytes = part_bytes().expect("they stay");
     let before = proxy.bytes_to_clients();
@@ -51,7 +56,10 @@ async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
     server.wait_phase("robot-1", "heavy", Phase::Running).await;
     let after_restart = proxy.bytes_to_clients() - before;
     let left = total - part_bytes;
-    assert!(after_restart < left + 1_000_000, "{after_restart} bytes were fetched, {left} were left");
+    assert!(
+        after_restart < left + 1_000_000,
+        "{after_restart} bytes were fetched, {left} were left"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -138,10 +146,17 @@ async fn nothing_is_stuck_or_lost_after_a_hundred_power_cuts() {
         for assignment in deployment.assignments.expect("assignments") {
             let started = std::fs::read_dir(&starts)
                 .expect("directory")
-                .filter(|f| f.as_ref().expect("entry").file_name().to_string_lossy().starts_with(job.as_str()))
+                .filter(|f| {
+                    f.as_ref()
+                        .expect("entry")
+                        .file_name()
+                        .to_string_lossy()
+                        .starts_with(job.as_str())
+                })
                 .count();
             assert!(started <= 2, "{job} was started {started} times on two robots");
-            let interrupted = assignment.failure.as_ref().is_some_and(|f| f.code.as_str() == "interrupted");
+            let interrupted =
+                assignment.failure.as_ref().is_some_and(|f| f.code.as_str() == "interrupted");
             assert!(assignment.phase == Phase::Succeeded || interrupted, "{job}: {assignment:?}");
         }
     }

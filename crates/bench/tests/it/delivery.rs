@@ -22,7 +22,11 @@ async fn deliver(server: &Server, package: &std::path::Path, delivery: &str) -> 
     let view: DeploymentView = serde_json::from_str(&server.operate(order).await).expect("json");
     server.wait_phase("robot-1", "worker", Phase::Running).await;
     let view = server.deployment(view.id.as_str()).await.expect("known");
-    view.assignments.expect("assignments")[0].delivery.clone().expect("its batch has begun").mechanism
+    view.assignments.expect("assignments")[0]
+        .delivery
+        .clone()
+        .expect("its batch has begun")
+        .mechanism
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -31,7 +35,15 @@ async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let proxy = Proxy::start(server.http, u64::MAX).await;
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &format!("http://{}", proxy.address), &[]).await;
+    let _robot = Robot::start_with(
+        &server,
+        dir.path(),
+        "robot-1",
+        1,
+        &format!("http://{}", proxy.address),
+        &[],
+    )
+    .await;
     server.wait_online("robot-1").await;
     let package = package(dir.path(), BYTES);
     let before = proxy.bytes_to_clients();
@@ -45,11 +57,13 @@ async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let often = [("TASK_AGENT_POLL_INTERVAL_S", "1")];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
     let sent = async || Some(server.robot("robot-1").await?.mqtt?.traffic.messages_out);
     let package = package(dir.path(), 100);
     // A robot is sent its state when its agent names itself, which it does over MQTT and over HTTP.
-    eventually("the robot to be sent its state", async || sent().await.filter(|count| *count > 0)).await;
+    eventually("the robot to be sent its state", async || sent().await.filter(|count| *count > 0))
+        .await;
     let before = sent().await.expect("connected");
     assert_eq!(deliver(&server, &package, "poll").await, Delivery::Poll);
     assert_eq!(sent().await.expect("still connected"), before, "the order was announced");
@@ -60,7 +74,8 @@ async fn a_robot_without_mqtt_pulls_what_is_pushed() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let alone = [("TASK_AGENT_MQTT", "false"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "1")];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &alone).await;
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &alone).await;
     // On a slow machine the server may have told it so meanwhile.
     let mechanism = deliver(&server, &package(dir.path(), 100_000), "direct-push").await;
     assert!(matches!(mechanism, Delivery::DirectPush | Delivery::PushPull), "{mechanism}");

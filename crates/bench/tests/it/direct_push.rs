@@ -1,5 +1,5 @@
-//! Packages inside MQTT messages, with real agents: nothing is pulled but by those that can't keep up, and a power cut
-//! costs time only.
+//! Packages inside MQTT messages, with real agents: nothing is pulled but by those that can't keep
+//! up, and a power cut costs time only.
 
 use std::path::PathBuf;
 
@@ -37,7 +37,8 @@ impl Setting {
         let url = format!("http://{}", http.address);
         for number in 1..=robots {
             let name = format!("robot-{number}");
-            let robot = Robot::start_with(&fleet.server, fleet.dir.path(), &name, number, &url, &[]).await;
+            let robot =
+                Robot::start_with(&fleet.server, fleet.dir.path(), &name, number, &url, &[]).await;
             fleet.robots.push(robot);
         }
         for robot in &fleet.robots {
@@ -55,7 +56,10 @@ impl Setting {
 
     /// Waits until `bytes` have gone to robots over MQTT.
     async fn wait_for_parts(&self, bytes: usize) {
-        eventually("parts to travel", async || (self.mqtt.bytes_to_clients() > bytes as u64).then_some(())).await;
+        eventually("parts to travel", async || {
+            (self.mqtt.bytes_to_clients() > bytes as u64).then_some(())
+        })
+        .await;
     }
 
     async fn wait_running(&self, robot: &str) {

@@ -1,5 +1,5 @@
-//! `task-agent doctor` on a robot whose agent runs and whose server is there: what it says of the ways to the server, and that
-//! it disturbs neither.
+//! `task-agent doctor` on a robot whose agent runs and whose server is there: what it says of the
+//! ways to the server, and that it disturbs neither.
 
 use serde_json::Value;
 
@@ -9,7 +9,9 @@ async fn doctor(robot: &Robot) -> Value {
     #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
     let mut command = std::process::Command::new(program("task-agent"));
     command.args(["doctor", "-o", "json", "--data"]).arg(robot.data());
-    let output = tokio::task::spawn_blocking(move || command.output().expect("runs")).await.expect("no panic");
+    let output = tokio::task::spawn_blocking(move || command.output().expect("runs"))
+        .await
+        .expect("no panic");
     serde_json::from_slice(&output.stdout).expect("json")
 }
 
@@ -24,7 +26,18 @@ async fn a_robot_finds_its_server_by_both_ways() {
     let mut fleet = Fleet::start(1).await;
     fleet.server.wait_online("robot-1").await;
     let checkup = doctor(&fleet.robots[0]).await;
-    for check in ["settings", "data", "identity", "agent", "dns", "http", "clock", "token", "mqtt", "websocket"] {
+    for check in [
+        "settings",
+        "data",
+        "identity",
+        "agent",
+        "dns",
+        "http",
+        "clock",
+        "token",
+        "mqtt",
+        "websocket",
+    ] {
         assert_eq!(verdict(&checkup, check), "good", "{check}: {checkup}");
     }
     let before = fleet.server.robot("robot-1").await.expect("known");

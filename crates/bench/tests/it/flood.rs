@@ -1,5 +1,6 @@
-//! One robot's credentials in the hands of something that floods the server by both ways: another robot's order arrives and is
-//! carried out all the same, the flood is shown, and its robot comes back once it behaves.
+//! One robot's credentials in the hands of something that floods the server by both ways: another
+//! robot's order arrives and is carried out all the same, the flood is shown, and its robot comes
+//! back once it behaves.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -27,7 +28,9 @@ async fn flood_mqtt(options: MqttOptions, topic: String) {
     loop {
         tick.tick().await;
         let (client, mut events) = AsyncClient::new(options.clone(), 100);
-        let publish = async { while client.publish(&topic, QoS::AtMostOnce, false, vec![b'x'; 4096]).await.is_ok() {} };
+        let publish = async {
+            while client.publish(&topic, QoS::AtMostOnce, false, vec![b'x'; 4096]).await.is_ok() {}
+        };
         let poll = async { while events.poll().await.is_ok() {} };
         tokio::select! { () = publish => {}, () = poll => {} }
     }
@@ -46,8 +49,11 @@ async fn flood_http(client: reqwest::Client, url: String, token: String, refused
 #[tokio::test(flavor = "multi_thread")]
 async fn a_flood_by_one_robot_keeps_nothing_from_another() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let settings =
-        [("TASKD_ROBOTS_PATIENCE", "1s"), ("TASKD_ROBOTS_BACKOFF", "500ms"), ("TASKD_ROBOTS_FORGIVE_AFTER", "2s")];
+    let settings = [
+        ("TASKD_ROBOTS_PATIENCE", "1s"),
+        ("TASKD_ROBOTS_BACKOFF", "500ms"),
+        ("TASKD_ROBOTS_FORGIVE_AFTER", "2s"),
+    ];
     let server = Server::start_with(&dir.path().join("server"), &settings).await;
     let mut bad = Robot::start(&server, dir.path(), "bad", 1).await;
     let _good = Robot::start(&server, dir.path(), "good", 2).await;
@@ -66,10 +72,19 @@ async fn a_flood_by_one_robot_keeps_nothing_from_another() {
     }
     let trouble = async || {
         let view = server.robot("bad").await?;
-        view.conditions.into_iter().find(|condition| condition.code == "misbehaves").map(|condition| condition.text)
+        view.conditions
+            .into_iter()
+            .find(|condition| condition.code == "misbehaves")
+            .map(|condition| condition.text)
     };
-    eventually("the flood to be cut off", async || trouble().await.filter(|text| text.contains("cut off"))).await;
-    eventually("reports to be refused", async || (refused.load(Ordering::SeqCst) > 0).then_some(())).await;
+    eventually("the flood to be cut off", async || {
+        trouble().await.filter(|text| text.contains("cut off"))
+    })
+    .await;
+    eventually("reports to be refused", async || {
+        (refused.load(Ordering::SeqCst) > 0).then_some(())
+    })
+    .await;
 
     // The flood goes on, and the other robot is ordered something, does it, and says so.
     let package = dir.path().join("steady");

@@ -1,5 +1,6 @@
-//! What strangers on the ROS network can do to a robot: a real agent with a task that promises nodes, under the packets that
-//! once took a gigabyte each, and with the process killed that takes part in the graph.
+//! What strangers on the ROS network can do to a robot: a real agent with a task that promises
+//! nodes, under the packets that once took a gigabyte each, and with the process killed that takes
+//! part in the graph.
 
 use std::net::UdpSocket;
 
@@ -11,7 +12,8 @@ use crate::harness::{eventually, within};
 use crate::ros::{Stage, pid_of};
 use crate::rtps;
 
-const READY: &str = "restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\nnodes = ['/watched']\n";
+const READY: &str =
+    "restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\nnodes = ['/watched']\n";
 /// What a process may grow by under the attack.
 const GROWTH_BYTES: u64 = 64 << 20;
 
@@ -27,7 +29,9 @@ fn agent_and_graph(stage: &Stage) -> Option<(u32, u32)> {
         .expect("/proc")
         .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
         .collect();
-    let agent = *pids.iter().find(|pid| words_of(**pid, "cmdline").contains(&format!("run --data {data}")))?;
+    let agent = *pids
+        .iter()
+        .find(|pid| words_of(**pid, "cmdline").contains(&format!("run --data {data}")))?;
     let is_graph = |pid: &&u32| {
         words_of(**pid, "cmdline").starts_with("task-agent graph")
             && words_of(**pid, "status").contains(&format!("PPid:\t{agent}\n"))
@@ -56,13 +60,22 @@ async fn packets_that_state_gigabytes_cost_a_robot_no_memory() {
         prefix[10..].copy_from_slice(&u16::try_from(number % 100).expect("short").to_le_bytes());
         let stated = if number % 2 == 0 { 1 << 30 } else { u32::MAX };
         let endpoints = [rtps::PARTICIPANTS, rtps::PUBLICATIONS];
-        rtps::send(&socket, domain, endpoints.map(|endpoints| rtps::data_frag(prefix, endpoints, number, stated)));
+        rtps::send(
+            &socket,
+            domain,
+            endpoints.map(|endpoints| rtps::data_frag(prefix, endpoints, number, stated)),
+        );
     }
     eventually("an answer under attack", async || is_answered(&stage).await.then_some(())).await;
     let memory_after = memory();
-    println!("resident and whole memory of agent and graph: {memory_before:?}, then {memory_after:?}");
+    println!(
+        "resident and whole memory of agent and graph: {memory_before:?}, then {memory_after:?}"
+    );
     for (before, after) in memory_before.iter().zip(memory_after) {
-        assert!(after.0 < before.0 + GROWTH_BYTES && after.1 < before.1 + GROWTH_BYTES, "{before:?} became {after:?}");
+        assert!(
+            after.0 < before.0 + GROWTH_BYTES && after.1 < before.1 + GROWTH_BYTES,
+            "{before:?} became {after:?}"
+        );
     }
     assert_eq!(agent_and_graph(&stage), Some((agent, graph)), "none was started again");
     assert_eq!(pid_of(&stage.runs("watched").await), pid_of(&before));

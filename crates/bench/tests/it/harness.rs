@@ -1,5 +1,6 @@
-//! Starts the real programs with data directories of their own, on ports of their own, and ends them.
-//! It asks them only through their public faces: commands, the HTTP API, files an operator may read.
+//! Starts the real programs with data directories of their own, on ports of their own, and ends
+//! them. It asks them only through their public faces: commands, the HTTP API, files an operator
+//! may read.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
 use std::ffi::OsStr;
@@ -27,7 +28,8 @@ pub const PATIENCE: Duration = Duration::from_secs(90);
 /// Lines that are shown of a log when a test fails.
 const MAX_SHOWN: usize = 100;
 
-/// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody who owns anything.
+/// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody
+/// who owns anything.
 const TASK_USER: &str = "65534";
 
 /// The path of one of the workspace's programs.
@@ -35,13 +37,18 @@ pub fn program(name: &str) -> PathBuf {
     let test = std::env::current_exe().expect("own path");
     let dir = test.parent().and_then(Path::parent).expect("target/debug");
     let path = dir.join(name);
-    assert!(path.exists(), "{} is missing: run `cargo build --bins`, or ./scripts/test", path.display());
+    assert!(
+        path.exists(),
+        "{} is missing: run `cargo build --bins`, or ./scripts/test",
+        path.display()
+    );
     path
 }
 
 /// A variable that `./scripts/test` sets.
 pub fn required(variable: &str) -> String {
-    std::env::var(variable).unwrap_or_else(|_| panic!("{variable} is not set: run the tests with ./scripts/test"))
+    std::env::var(variable)
+        .unwrap_or_else(|_| panic!("{variable} is not set: run the tests with ./scripts/test"))
 }
 
 /// Asks again until there is an answer; fails with `what` when patience ends.
@@ -50,8 +57,14 @@ pub async fn eventually<T>(what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T
 }
 
 /// The same, for what takes longer than most.
-pub async fn eventually_within<T>(patience: Duration, what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T {
-    within(patience, ask).await.unwrap_or_else(|| panic!("after {patience:?} still waiting for {what}"))
+pub async fn eventually_within<T>(
+    patience: Duration,
+    what: &str,
+    ask: impl AsyncFnMut() -> Option<T>,
+) -> T {
+    within(patience, ask)
+        .await
+        .unwrap_or_else(|| panic!("after {patience:?} still waiting for {what}"))
 }
 
 /// Asks again until there is an answer or patience ends.
@@ -69,10 +82,12 @@ pub async fn within<T>(patience: Duration, mut ask: impl AsyncFnMut() -> Option<
 
 /// A client that trusts the authority with this pin, where there is one.
 fn client(pin: Option<CaPin>) -> reqwest::Client {
-    // For clients that a test makes itself. A second install is refused because the first is in place.
+    // For clients that a test makes itself. A second install is refused because the first is in
+    // place.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let tls = Trust::by(pin).client_config(task_agent::system::clock::for_certificates());
-    let client = reqwest::Client::builder().timeout(Duration::from_secs(20)).tls_backend_preconfigured(tls);
+    let client =
+        reqwest::Client::builder().timeout(Duration::from_secs(20)).tls_backend_preconfigured(tls);
     client.build().expect("client")
 }
 
@@ -135,7 +150,12 @@ impl Server {
     }
 
     /// Starts one at these addresses, which another has left.
-    pub async fn start_at(data: &Path, settings: &[(&str, &str)], http: SocketAddr, mqtt: SocketAddr) -> Self {
+    pub async fn start_at(
+        data: &Path,
+        settings: &[(&str, &str)],
+        http: SocketAddr,
+        mqtt: SocketAddr,
+    ) -> Self {
         let mut server = Self::new(data, settings);
         (server.http, server.mqtt) = (http, mqtt);
         server.restart().await;
@@ -176,19 +196,27 @@ impl Server {
             serde_json::from_slice(&std::fs::read(&addresses).ok()?).ok()
         })
         .await;
-        let address = |key: &str| found[key].as_str().and_then(|a| a.parse().ok()).unwrap_or_else(|| panic!("{found}"));
+        let address = |key: &str| {
+            found[key].as_str().and_then(|a| a.parse().ok()).unwrap_or_else(|| panic!("{found}"))
+        };
         (self.http, self.mqtt) = (address("http"), address("mqtt"));
         self.pin = found["ca_pin"].as_str().map(|pin| pin.parse().expect("a pin"));
         self.client = client(self.pin);
     }
 
     pub async fn wait_ready(&self) {
-        eventually("taskd to be ready", async || (self.readiness().await?["status"] == "ready").then_some(())).await;
+        eventually("taskd to be ready", async || {
+            (self.readiness().await?["status"] == "ready").then_some(())
+        })
+        .await;
     }
 
     /// Until this robot's session has come about.
     pub async fn wait_online(&self, robot: &str) {
-        eventually("the robot to be online", async || self.robot(robot).await?.online.then_some(())).await;
+        eventually("the robot to be online", async || {
+            self.robot(robot).await?.online.then_some(())
+        })
+        .await;
     }
 
     /// What `/readyz` says.
@@ -196,7 +224,8 @@ impl Server {
         self.client.get(self.url("/readyz")).send().await.ok()?.json().await.ok()
     }
 
-    /// Ends it and starts it again with another setting, `None`: without it. It listens for MQTT elsewhere then.
+    /// Ends it and starts it again with another setting, `None`: without it. It listens for MQTT
+    /// elsewhere then.
     pub async fn restart_with(&mut self, name: &str, value: Option<&str>) {
         self.terminate();
         self.set(name, value);
@@ -238,12 +267,16 @@ impl Server {
     }
 
     pub fn operator_token(&self) -> String {
-        std::fs::read_to_string(self.data.join("operator.token")).expect("operator.token").trim().to_owned()
+        std::fs::read_to_string(self.data.join("operator.token"))
+            .expect("operator.token")
+            .trim()
+            .to_owned()
     }
 
     /// `GET` as the operator; `None` while the server is away.
     pub async fn get(&self, path: &str) -> Option<Value> {
-        let answer = self.client.get(self.url(path)).bearer_auth(self.operator_token()).send().await.ok()?;
+        let answer =
+            self.client.get(self.url(path)).bearer_auth(self.operator_token()).send().await.ok()?;
         answer.status().is_success().then_some(())?;
         answer.json().await.ok()
     }
@@ -278,7 +311,8 @@ impl Server {
     /// Runs an operator's command that must end with status 0.
     pub async fn operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> String {
         let output = self.try_operate(args).await;
-        let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        let (out, err) =
+            (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
         assert!(output.status.success(), "{}\nstdout: {out}\nstderr: {err}", output.status);
         out.into_owned()
     }
@@ -286,7 +320,9 @@ impl Server {
     /// Runs an operator's command, whatever its status.
     pub async fn try_operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> Output {
         let mut command = self.command(args);
-        tokio::task::spawn_blocking(move || command.output().expect("taskd runs")).await.expect("no panic")
+        tokio::task::spawn_blocking(move || command.output().expect("taskd runs"))
+            .await
+            .expect("no panic")
     }
 
     /// Uploads `package` and orders it for `selector`; gives the deployment.
@@ -295,7 +331,12 @@ impl Server {
     }
 
     /// The same with further options.
-    pub async fn push_with(&self, package: &Path, selector: &str, options: &[&str]) -> DeploymentView {
+    pub async fn push_with(
+        &self,
+        package: &Path,
+        selector: &str,
+        options: &[&str],
+    ) -> DeploymentView {
         let package = package.to_str().expect("utf-8 path");
         let args = [&["push", package, "--to", selector, "--yes", "-o", "json"], options].concat();
         let out = self.operate(args).await;
@@ -340,8 +381,10 @@ impl Robot {
     ) -> Self {
         let data = dir.join(name);
         let token = server.enrollment_token().await;
-        let environment: Vec<_> = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
-        enroll(&data, number, &environment, &["--server", url, "--token", &token, "--name", name]).await;
+        let environment: Vec<_> =
+            environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        enroll(&data, number, &environment, &["--server", url, "--token", &token, "--name", name])
+            .await;
         let id = server.robot(name).await.expect("an enrolled robot").id;
         let mut robot = Self { process: None, data, environment, name: name.to_owned(), id };
         robot.restart();
@@ -369,7 +412,8 @@ impl Robot {
     /// A whole copy of this robot's data, as it is now. Its agent does not run yet.
     pub fn copied(&self, dir: &Path, name: &str) -> Self {
         let data = dir.join(name);
-        let copied = Command::new("cp").arg("-a").arg(&self.data).arg(&data).status().expect("cp runs");
+        let copied =
+            Command::new("cp").arg("-a").arg(&self.data).arg(&data).status().expect("cp runs");
         assert!(copied.success(), "the data directory is copied");
         let (environment, id) = (self.environment.clone(), self.id.clone());
         Self { process: None, data, environment, name: self.name.clone(), id }
@@ -377,7 +421,8 @@ impl Robot {
 
     /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
     pub fn enrolled(dir: &Path, name: &str, id: RobotId, environment: &[(&str, &str)]) -> Self {
-        let environment = environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
+        let environment =
+            environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
         Self { process: None, data: dir.join(name), environment, name: name.to_owned(), id }
     }
 
@@ -388,9 +433,14 @@ impl Robot {
         let mut command = Command::new(program("task-agent"));
         command.arg("run").arg("--data").arg(&self.data);
         if nix::unistd::geteuid().is_root() {
-            let ros =
-                self.environment.iter().any(|(name, _)| name.starts_with("ROS_") || name == "TASK_AGENT_UNDERLAYS");
-            command.env("TASK_AGENT_TASK_USER", if ros && !ros_is_for_all() { "root" } else { TASK_USER });
+            let ros = self
+                .environment
+                .iter()
+                .any(|(name, _)| name.starts_with("ROS_") || name == "TASK_AGENT_UNDERLAYS");
+            command.env(
+                "TASK_AGENT_TASK_USER",
+                if ros && !ros_is_for_all() { "root" } else { TASK_USER },
+            );
         }
         command.envs(self.environment.iter().map(|(k, v)| (k, v)));
         command.stdout(log.try_clone().expect("log")).stderr(log);
@@ -433,13 +483,19 @@ impl Drop for Robot {
 async fn enroll(data: &Path, number: u8, environment: &[(String, String)], options: &[&str]) {
     let mut enroll = Command::new(program("task-agent"));
     enroll.arg("enroll").args(options).args(["--mac", &format!("02:00:00:00:00:{number:02x}")]);
-    enroll.arg("--data").arg(data).envs(environment.iter().map(|(k, v)| (k, v))).stdin(Stdio::null());
-    let output =
-        tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs")).await.expect("no panic");
+    enroll
+        .arg("--data")
+        .arg(data)
+        .envs(environment.iter().map(|(k, v)| (k, v)))
+        .stdin(Stdio::null());
+    let output = tokio::task::spawn_blocking(move || enroll.output().expect("task-agent runs"))
+        .await
+        .expect("no panic");
     assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that goes with the test.
+/// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that goes with
+/// the test.
 pub struct Fleet {
     // Robots end before the server, and both before their directory is removed.
     pub robots: Vec<Robot>,
@@ -453,7 +509,9 @@ impl Fleet {
         let server = Server::start(&dir.path().join("server")).await;
         let mut fleet = Self { robots: Vec::new(), server, dir };
         for number in 1..=robots {
-            let robot = Robot::start(&fleet.server, fleet.dir.path(), &format!("robot-{number}"), number).await;
+            let robot =
+                Robot::start(&fleet.server, fleet.dir.path(), &format!("robot-{number}"), number)
+                    .await;
             fleet.robots.push(robot);
         }
         fleet
@@ -484,10 +542,12 @@ pub fn add_ballast(package: &Path, bytes: usize) {
     std::fs::write(package.join("ballast.bin"), ballast).expect("ballast");
 }
 
-/// Whether any user may run the Python of the ROS that the tests use; a Python in root's home is for root only.
+/// Whether any user may run the Python of the ROS that the tests use; a Python in root's home is
+/// for root only.
 fn ros_is_for_all() -> bool {
     let python = Path::new(&required("TASKD_TEST_ROS")).join("bin/python3");
-    let open = |path: &Path| path.metadata().is_ok_and(|data| data.permissions().mode() & 0o001 != 0);
+    let open =
+        |path: &Path| path.metadata().is_ok_and(|data| data.permissions().mode() & 0o001 != 0);
     [python.canonicalize().expect("python3"), python].iter().all(|path| path.ancestors().all(open))
 }
 
@@ -497,7 +557,8 @@ pub fn open_directory(path: &Path) {
     std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o1777)).expect("open to all");
 }
 
-/// Where a test has failed, what a program said last is all there is to learn from: its directory goes with the test.
+/// Where a test has failed, what a program said last is all there is to learn from: its directory
+/// goes with the test.
 #[expect(clippy::print_stderr, reason = "the test runner shows what a failed test printed")]
 fn show_log_of_failed(path: &Path) {
     if std::thread::panicking() {
@@ -512,9 +573,16 @@ fn log_file(path: &Path) -> File {
     File::options().create(true).append(true).open(path).expect("log file")
 }
 
-/// A request in the name of a robot, as its agent makes it after a restart in the data directory `data`.
-pub fn from_restarted_agent(request: reqwest::RequestBuilder, data: &Path) -> reqwest::RequestBuilder {
-    let place =
-        std::fs::File::open(data.join("lock")).and_then(|lock| task_agent::system::place::of(&lock)).expect("a place");
-    request.header(INSTANCE_HEADER, InstanceId::random().as_str()).header(PLACE_HEADER, place.to_string())
+/// A request in the name of a robot, as its agent makes it after a restart in the data directory
+/// `data`.
+pub fn from_restarted_agent(
+    request: reqwest::RequestBuilder,
+    data: &Path,
+) -> reqwest::RequestBuilder {
+    let place = std::fs::File::open(data.join("lock"))
+        .and_then(|lock| task_agent::system::place::of(&lock))
+        .expect("a place");
+    request
+        .header(INSTANCE_HEADER, InstanceId::random().as_str())
+        .header(PLACE_HEADER, place.to_string())
 }

@@ -1,9 +1,13 @@
-//! What someone with an operator's or one robot's credentials may try: hostile archives, other robots' topics.
+//! What someone with an operator's or one robot's credentials may try: hostile archives, other
+//! robots' topics.
 
 use std::path::Path;
 use std::time::Duration;
 
-use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
+use rumqttc::{
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Packet, QoS,
+    SubscribeReasonCode,
+};
 use serde_json::json;
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
@@ -41,7 +45,8 @@ fn archive(entries: &[Vec<u8>]) -> Vec<u8> {
     tar
 }
 
-/// Uploads a package whose content is `tar`, past `taskd push` and its checks, as any OCI client could; gives the answer.
+/// Uploads a package whose content is `tar`, past `taskd push` and its checks, as any OCI client
+/// could; gives the answer.
 async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> (u16, String) {
     let content = zstd::encode_all(tar, 3).expect("compressed");
     let config = json!({
@@ -50,12 +55,18 @@ async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> (u16
     });
     let config = serde_json::to_vec(&config).expect("json");
     let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
-    let manifest = serde_json::to_vec(&ImageManifest::package(blob(&config), blob(&content))).expect("json");
+    let manifest =
+        serde_json::to_vec(&ImageManifest::package(blob(&config), blob(&content))).expect("json");
     let client = reqwest::Client::new();
     for bytes in [&config, &content] {
         let url = server.url(&format!("/v2/{name}/blobs/uploads/?digest={}", Digest::of(bytes)));
-        let answer =
-            client.post(url).bearer_auth(server.operator_token()).body(bytes.clone()).send().await.expect("sent");
+        let answer = client
+            .post(url)
+            .bearer_auth(server.operator_token())
+            .body(bytes.clone())
+            .send()
+            .await
+            .expect("sent");
         assert_eq!(answer.status(), 201);
     }
     let answer = client
@@ -70,7 +81,8 @@ async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> (u16
 }
 
 fn tree(dir: &Path) -> Vec<std::path::PathBuf> {
-    let mut found: Vec<_> = std::fs::read_dir(dir).expect("readable").map(|e| e.expect("entry").path()).collect();
+    let mut found: Vec<_> =
+        std::fs::read_dir(dir).expect("readable").map(|e| e.expect("entry").path()).collect();
     found.sort();
     found
 }
@@ -89,11 +101,18 @@ async fn hostile_archive_is_refused_at_push_with_its_reason() {
         ("device", vec![entry("null", b'3', "", b"")], "device"),
         ("fifo", vec![entry("pipe", b'6', "", b"")], "fifo"),
         ("duplicate", vec![file("twice"), file("./twice")], "twice"),
-        ("bomb", vec![entry("zeros", b'0', "", &vec![0; 300_000_000])], "uncompressed bytes for so few"),
+        (
+            "bomb",
+            vec![entry("zeros", b'0', "", &vec![0; 300_000_000])],
+            "uncompressed bytes for so few",
+        ),
     ];
     for (name, entries, reason) in cases {
         let (status, answer) = upload(&server, name, &archive(&entries), entries.len()).await;
-        assert!(status == 400 && answer.contains("robots would refuse"), "{name}: {status} {answer}");
+        assert!(
+            status == 400 && answer.contains("robots would refuse"),
+            "{name}: {status} {answer}"
+        );
         assert!(answer.to_lowercase().contains(reason), "{name}: {answer}");
     }
     assert_eq!(server.get("/api/v1/packages").await.expect("a list")["packages"], json!([]));
@@ -119,7 +138,11 @@ async fn mqtt_5_client_is_refused_and_named_in_the_servers_log() {
     let peer = peer.expect("connected").to_string();
     let line = eventually("a line in the log", async || {
         let log = std::fs::read_to_string(server.data().with_extension("server.log")).ok()?;
-        let mut lines = log.lines().filter(|line| line.contains("MQTT 5")).map(str::to_owned).collect::<Vec<_>>();
+        let mut lines = log
+            .lines()
+            .filter(|line| line.contains("MQTT 5"))
+            .map(str::to_owned)
+            .collect::<Vec<_>>();
         (lines.len() == 1).then(|| lines.remove(0))
     })
     .await;
@@ -129,7 +152,9 @@ async fn mqtt_5_client_is_refused_and_named_in_the_servers_log() {
 async fn next_packet(events: &mut rumqttc::EventLoop) -> Result<Packet, ConnectionError> {
     loop {
         if let Event::Incoming(packet) =
-            tokio::time::timeout(Duration::from_secs(20), events.poll()).await.expect("an answer")?
+            tokio::time::timeout(Duration::from_secs(20), events.poll())
+                .await
+                .expect("an answer")?
         {
             return Ok(packet);
         }
@@ -139,13 +164,15 @@ async fn next_packet(events: &mut rumqttc::EventLoop) -> Result<Packet, Connecti
 #[tokio::test(flavor = "multi_thread")]
 async fn one_robots_credentials_reach_no_other_robot() {
     let mut fleet = Fleet::start(2).await;
-    let identity: serde_json::Value =
-        serde_json::from_slice(&std::fs::read(fleet.robots[0].data().join("identity.json")).expect("identity"))
-            .expect("json");
+    let identity: serde_json::Value = serde_json::from_slice(
+        &std::fs::read(fleet.robots[0].data().join("identity.json")).expect("identity"),
+    )
+    .expect("json");
     fleet.robots[0].terminate();
     let (own, other) = (fleet.robots[0].id.to_string(), fleet.robots[1].id.to_string());
     let options = |password: &str| {
-        let mut options = MqttOptions::new(&own, fleet.server.mqtt.ip().to_string(), fleet.server.mqtt.port());
+        let mut options =
+            MqttOptions::new(&own, fleet.server.mqtt.ip().to_string(), fleet.server.mqtt.port());
         options.set_credentials(&own, password);
         options
     };
@@ -158,7 +185,8 @@ async fn one_robots_credentials_reach_no_other_robot() {
     let token = identity["token"].as_str().expect("token");
     let (client, mut events) = AsyncClient::new(options(token), 10);
     assert!(matches!(next_packet(&mut events).await, Ok(Packet::ConnAck(_))));
-    for filter in ["#", "taskd/v1/#", "+/+/+/+/+", &format!("taskd/v1/r/{other}/desired"), "$SYS/#"] {
+    for filter in ["#", "taskd/v1/#", "+/+/+/+/+", &format!("taskd/v1/r/{other}/desired"), "$SYS/#"]
+    {
         client.subscribe(filter, QoS::AtMostOnce).await.expect("queued");
         loop {
             match next_packet(&mut events).await {
@@ -171,7 +199,10 @@ async fn one_robots_credentials_reach_no_other_robot() {
             }
         }
     }
-    client.publish(format!("taskd/v1/r/{other}/report"), QoS::AtLeastOnce, false, "{}").await.expect("queued");
+    client
+        .publish(format!("taskd/v1/r/{other}/report"), QoS::AtLeastOnce, false, "{}")
+        .await
+        .expect("queued");
     let refused = async {
         loop {
             match next_packet(&mut events).await {

@@ -20,16 +20,22 @@ pub fn end(data: &Path) {
     groups.iter().for_each(|group| remove_cgroup(group));
 }
 
-/// The control groups of a robot's runs, and of what else it has started: those that none but its killed agent removes.
+/// The control groups of a robot's runs, and of what else it has started: those that none but its
+/// killed agent removes.
 fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
-    let entries = |dir: PathBuf| std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path());
+    let entries = |dir: PathBuf| {
+        std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path())
+    };
     let runs = entries(data.join("tasks")).flat_map(|task| entries(task.join("run")));
     let written = runs.filter_map(|run| {
-        let spec: Value = serde_json::from_slice(&std::fs::read(run.join("spec.json")).ok()?).ok()?;
+        let spec: Value =
+            serde_json::from_slice(&std::fs::read(run.join("spec.json")).ok()?).ok()?;
         Some(PathBuf::from(spec["cgroup"].as_str()?))
     });
     let mounts = std::fs::read_to_string("/proc/mounts").expect("mounts");
-    let mount = mounts.lines().find_map(|line| line.contains(" cgroup2 ").then(|| line.split(' ').nth(1)).flatten());
+    let mount = mounts
+        .lines()
+        .find_map(|line| line.contains(" cgroup2 ").then(|| line.split(' ').nth(1)).flatten());
     let carry = processes_with(data.to_str().expect("utf-8 path").as_bytes());
     let joined = carry.into_iter().filter_map(|pid| {
         let groups = std::fs::read_to_string(format!("/proc/{pid}/cgroup")).ok()?;
@@ -39,7 +45,8 @@ fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
     written.chain(joined).collect()
 }
 
-/// Ends what is left in the group and removes it, and what it lay in if no other test has groups there.
+/// Ends what is left in the group and removes it, and what it lay in if no other test has groups
+/// there.
 fn remove_cgroup(group: &Path) {
     let start = Instant::now();
     while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < PATIENCE {

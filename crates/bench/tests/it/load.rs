@@ -16,7 +16,8 @@ async fn a_load_run_measures_every_phase_and_leaves_no_robots() {
         .kill_on_drop(true)
         .output();
     let output = run.await.expect("taskbench runs");
-    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    let (out, err) =
+        (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
     assert!(output.status.success(), "{}\n{out}\n{err}", output.status);
 
     let result: Value = serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"));
@@ -27,10 +28,22 @@ async fn a_load_run_measures_every_phase_and_leaves_no_robots() {
         .iter()
         .map(|phase| {
             assert!(phase["p50_ms"].as_f64() <= phase["max_ms"].as_f64(), "{phase}");
-            (phase["phase"].as_str().expect("name"), phase["count"].as_u64(), phase["failed"].as_u64())
+            (
+                phase["phase"].as_str().expect("name"),
+                phase["count"].as_u64(),
+                phase["failed"].as_u64(),
+            )
         })
         .collect();
-    let names = ["enrol", "connect", "first report", "order", "order to running", "steady reports", "reconnect storm"];
+    let names = [
+        "enrol",
+        "connect",
+        "first report",
+        "order",
+        "order to running",
+        "steady reports",
+        "reconnect storm",
+    ];
     let expected: Vec<_> = names
         .into_iter()
         .chain(["remove"])

@@ -1,4 +1,5 @@
-//! What a task says reaches the operator: asked for, followed over breaks, and within bounds when it is a flood.
+//! What a task says reaches the operator: asked for, followed over breaks, and within bounds when
+//! it is a flood.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read, Write as _};
@@ -26,9 +27,11 @@ impl Bench {
         open_directory(&open);
         let orders = open.join("orders");
         let path = orders.display();
-        // Held open both ways, so that no order falls between the end of one and the beginning of the next.
-        let script =
-            format!("mkfifo {path}\nexec 3<>{path}\n{first}\nwhile read -r order <&3; do eval \"$order\"; done\n");
+        // Held open both ways, so that no order falls between the end of one and the beginning of
+        // the next.
+        let script = format!(
+            "mkfifo {path}\nexec 3<>{path}\n{first}\nwhile read -r order <&3; do eval \"$order\"; done\n"
+        );
         fleet.server.push(&fleet.package("speaker", "1.0.0", "service", &script), "*").await;
         fleet.server.wait_phase("robot-1", "speaker", Phase::Running).await;
         Self { fleet, orders }
@@ -38,21 +41,31 @@ impl Bench {
     async fn order(&self, line: String) {
         let orders = self.orders.clone();
         // The task may not have made it yet.
-        let mut made =
-            eventually("the task to take orders", async || File::options().write(true).open(&orders).ok()).await;
+        let mut made = eventually("the task to take orders", async || {
+            File::options().write(true).open(&orders).ok()
+        })
+        .await;
         // It waits for the task to read, should that be behind.
         let written = tokio::task::spawn_blocking(move || made.write_all(line.as_bytes()));
         written.await.expect("no panic").expect("ordered");
     }
 
     async fn logs(&self, arguments: &[&str]) -> LogsView {
-        let out = self.fleet.server.operate([&["logs", "robot-1", "-o", "json"], arguments].concat()).await;
+        let out = self
+            .fleet
+            .server
+            .operate([&["logs", "robot-1", "-o", "json"], arguments].concat())
+            .await;
         serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
     }
 
     fn follow(&self, arguments: &[&str]) -> Follower {
-        let mut command = self.fleet.server.command([&["logs", "-f", "robot-1", "-o", "json"], arguments].concat());
-        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("taskd runs");
+        let mut command = self
+            .fleet
+            .server
+            .command([&["logs", "-f", "robot-1", "-o", "json"], arguments].concat());
+        let mut child =
+            command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("taskd runs");
         let (lines, remarks) = (lines_of(child.stdout.take()), lines_of(child.stderr.take()));
         Follower { child, lines, remarks }
     }
@@ -61,7 +74,9 @@ impl Bench {
 fn lines_of(stream: Option<impl Read + Send + 'static>) -> Receiver<String> {
     let (sender, receiver) = channel();
     let stream = BufReader::new(stream.expect("piped"));
-    std::thread::spawn(move || stream.lines().map_while(Result::ok).try_for_each(|line| sender.send(line)));
+    std::thread::spawn(move || {
+        stream.lines().map_while(Result::ok).try_for_each(|line| sender.send(line))
+    });
     receiver
 }
 
@@ -80,7 +95,10 @@ impl Follower {
 
     fn remark(&self, text: &str) -> String {
         loop {
-            let remark = self.remarks.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("nothing says {text:?}"));
+            let remark = self
+                .remarks
+                .recv_timeout(PATIENCE)
+                .unwrap_or_else(|_| panic!("nothing says {text:?}"));
             if remark.contains(text) {
                 return remark;
             }
@@ -110,10 +128,16 @@ async fn lines_are_fetched_with_their_levels_and_remembered_when_the_robot_is_aw
     .await;
     assert_eq!((view.from, view.age_ms), (LogsFrom::Robot, 0));
     let shown: Vec<_> = view.lines.iter().map(|line| (line.level, line.text.as_str())).collect();
-    for expected in [(LogLevel::Info, "hello"), (LogLevel::Warn, "oops"), (LogLevel::Error, "broken")] {
+    for expected in
+        [(LogLevel::Info, "hello"), (LogLevel::Warn, "oops"), (LogLevel::Error, "broken")]
+    {
         assert!(shown.contains(&expected), "{shown:?}");
     }
-    assert!(view.lines.iter().any(|line| line.node.as_ref().is_some_and(|node| node.as_str() == "/arm/driver")));
+    assert!(
+        view.lines
+            .iter()
+            .any(|line| line.node.as_ref().is_some_and(|node| node.as_str() == "/arm/driver"))
+    );
     assert_eq!(texts(&bench.logs(&["--level", "error"]).await), ["broken"]);
     let none = bench.fleet.server.try_operate(["logs", "robot-1", "nothing"]).await;
     assert_eq!(none.status.code(), Some(1));
@@ -138,7 +162,10 @@ async fn lines_are_fetched_with_their_levels_and_remembered_when_the_robot_is_aw
 #[tokio::test(flavor = "multi_thread")]
 async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
     let mut bench = Bench::start("echo before").await;
-    eventually("the past", async || texts(&bench.logs(&[]).await).contains(&"before").then_some(())).await;
+    eventually("the past", async || {
+        texts(&bench.logs(&[]).await).contains(&"before").then_some(())
+    })
+    .await;
     // What is asked for of the past is no bound for what a break leaves out.
     let follower = bench.follow(&["-n", "1", "speaker"]);
     while follower.next().text != "before" {}
@@ -152,7 +179,8 @@ async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
         }
     }
     // What was said in the moment before the stream began may come by it.
-    let said = std::iter::repeat_with(|| follower.next().text).filter(|text| text.starts_with("line "));
+    let said =
+        std::iter::repeat_with(|| follower.next().text).filter(|text| text.starts_with("line "));
     let seen: Vec<String> = said.take(30).collect();
     let expected: Vec<String> = (0..30).map(|number| format!("line {number}")).collect();
     assert_eq!(seen, expected);
@@ -171,7 +199,10 @@ async fn a_flood_is_counted_and_stays_within_its_bounds() {
         texts(&view).last().is_some_and(|last| *last == "25000").then_some(view)
     })
     .await;
-    assert_eq!(texts(&view), (24_991..=25_000).map(|number| number.to_string()).collect::<Vec<_>>());
+    assert_eq!(
+        texts(&view),
+        (24_991..=25_000).map(|number| number.to_string()).collect::<Vec<_>>()
+    );
     let published = follower.lines.try_iter().count();
     assert!(published < 10_000, "{published} lines were published");
     bench.order("echo after >&2\n".to_owned()).await;

@@ -11,7 +11,8 @@ use crate::proxy::Proxy;
 #[tokio::test(flavor = "multi_thread")]
 async fn two_operators_end_with_one_winner_everywhere() {
     let fleet = Fleet::start(3).await;
-    let versions = ["1.0.0", "2.0.0"].map(|v| fleet.package("worker", v, "service", "exec sleep 1000\n"));
+    let versions =
+        ["1.0.0", "2.0.0"].map(|v| fleet.package("worker", v, "service", "exec sleep 1000\n"));
     for package in &versions {
         fleet.server.operate(["push", package.to_str().expect("utf-8")]).await;
     }
@@ -21,8 +22,10 @@ async fn two_operators_end_with_one_winner_everywhere() {
         let order = async |operator: usize| {
             let key = format!("round-{round}-operator-{operator}");
             let package = versions[operator].to_str().expect("utf-8");
-            let args = ["push", package, "--to", "*", "--yes", "-o", "json", "--idempotency-key", &key];
-            let (first, again) = tokio::join!(fleet.server.operate(args), fleet.server.operate(args));
+            let args =
+                ["push", package, "--to", "*", "--yes", "-o", "json", "--idempotency-key", &key];
+            let (first, again) =
+                tokio::join!(fleet.server.operate(args), fleet.server.operate(args));
             let id = |text: &str| {
                 let view: serde_json::Value = serde_json::from_str(text).expect("json");
                 view["id"].as_str().expect("id").to_owned()

@@ -8,7 +8,9 @@ use crate::harness::{Robot, Server, eventually, write_package};
 #[tokio::test(flavor = "multi_thread")]
 async fn what_the_server_would_not_keep_does_not_travel_and_says_why() {
     let dir = TempDir::new().expect("temp dir");
-    let server = Server::start_with(&dir.path().join("server"), &[("TASKD_ROBOTS_OUTPUT_BYTES", "64MB")]).await;
+    let server =
+        Server::start_with(&dir.path().join("server"), &[("TASKD_ROBOTS_OUTPUT_BYTES", "64MB")])
+            .await;
     let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     let push = async |name: &str, script: &str| {
         let package = dir.path().join(name);
@@ -25,7 +27,8 @@ async fn what_the_server_would_not_keep_does_not_travel_and_says_why() {
     })
     .await;
     let blobs = std::fs::read_dir(server.data().join("blobs/sha256")).expect("a directory");
-    let largest = blobs.map(|blob| blob.and_then(|blob| blob.metadata()).expect("a blob").len()).max();
+    let largest =
+        blobs.map(|blob| blob.and_then(|blob| blob.metadata()).expect("a blob").len()).max();
     assert!(largest.is_some_and(|bytes| bytes < 1_000_000), "{largest:?}");
 
     push("small", "head -c 1000 /dev/zero > small.bin").await;

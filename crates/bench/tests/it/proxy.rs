@@ -1,5 +1,5 @@
-//! A TCP proxy that counts what passes and can slow it down: bad Wi-Fi, and a witness of what was transferred.
-//! It never looks into the bytes.
+//! A TCP proxy that counts what passes and can slow it down: bad Wi-Fi, and a witness of what was
+//! transferred. It never looks into the bytes.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -17,7 +17,8 @@ pub struct Proxy {
 }
 
 impl Proxy {
-    /// Listens on a port of its own and forwards to `target`, downstream at most `bytes_per_s` per connection.
+    /// Listens on a port of its own and forwards to `target`, downstream at most `bytes_per_s` per
+    /// connection.
     pub async fn start(target: SocketAddr, bytes_per_s: u64) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("port");
         let proxy = Self {
@@ -44,7 +45,12 @@ impl Proxy {
     }
 }
 
-async fn forward(client: TcpStream, target: SocketAddr, counter: Arc<AtomicU64>, rate: Arc<AtomicU64>) {
+async fn forward(
+    client: TcpStream,
+    target: SocketAddr,
+    counter: Arc<AtomicU64>,
+    rate: Arc<AtomicU64>,
+) {
     let Ok(server) = TcpStream::connect(target).await else { return };
     let (mut from_client, mut to_client) = client.into_split();
     let (mut from_server, mut to_server) = server.into_split();
@@ -56,7 +62,8 @@ async fn forward(client: TcpStream, target: SocketAddr, counter: Arc<AtomicU64>,
         while let Ok(count @ 1..) = from_server.read(&mut buffer).await {
             let pause = Duration::from_secs_f64(count as f64 / rate.load(Ordering::SeqCst) as f64);
             // A timer, not a guess: this is what makes the link slow.
-            let (written, ()) = tokio::join!(to_client.write_all(&buffer[..count]), tokio::time::sleep(pause));
+            let (written, ()) =
+                tokio::join!(to_client.write_all(&buffer[..count]), tokio::time::sleep(pause));
             if written.is_err() {
                 return;
             }

@@ -1,5 +1,5 @@
-//! What an operator sees of a robot's ROS graph and does to its nodes, through the whole system: real nodes, the real
-//! commands, and the health of the task that follows.
+//! What an operator sees of a robot's ROS graph and does to its nodes, through the whole system:
+//! real nodes, the real commands, and the health of the task that follows.
 
 use std::collections::BTreeSet;
 
@@ -46,32 +46,48 @@ async fn an_operator_looks_at_nodes_and_changes_them() {
     assert_eq!(named(&info["nodes"][0]["services"], "/say")["type"], "std_srvs/srv/Trigger");
     assert_eq!(named(&info["nodes"][0]["publishers"], "/ticks")["type"], "std_msgs/msg/String");
     let topics = stage.asked(&["topic", "list", ROBOT]).await;
-    assert_eq!(named(&topics["topics"], "/ticks")["publishers"], serde_json::json!(["/asked"]), "{topics}");
+    assert_eq!(
+        named(&topics["topics"], "/ticks")["publishers"],
+        serde_json::json!(["/asked"]),
+        "{topics}"
+    );
 
     let set = stage.asked(&["param", "set", ROBOT, "/asked", "resolution", "2"]).await;
     assert_eq!(set["parameter"]["value"], 2.0, "a whole number becomes the node's double: {set}");
     assert_eq!(stage.say("/say").await, "2.0", "as an independent client hears");
-    // What the node said about it is kept with its task, once, though it stands on its standard error as well.
+    // What the node said about it is kept with its task, once, though it stands on its standard
+    // error as well.
     let said = eventually("the node's words", async || {
         let logs = stage.asked(&["logs", ROBOT, "asked", "--level", "warn"]).await;
         let lines = logs["lines"].as_array().expect("lines").clone();
-        let said: Vec<Value> = lines.into_iter().filter(|line| line["text"] == "I was asked").collect();
+        let said: Vec<Value> =
+            lines.into_iter().filter(|line| line["text"] == "I was asked").collect();
         (!said.is_empty()).then_some(said)
     })
     .await;
     let moments: BTreeSet<_> = said.iter().map(|line| line["at_ms"].as_u64()).collect();
     assert_eq!(said.len(), moments.len(), "{said:?}");
-    assert_eq!((&said[0]["node"], &said[0]["level"]), (&"/asked".into(), &"warn".into()), "{said:?}");
+    assert_eq!(
+        (&said[0]["node"], &said[0]["level"]),
+        (&"/asked".into(), &"warn".into()),
+        "{said:?}"
+    );
     let all = stage.asked(&["param", "list", ROBOT, "/asked"]).await;
     assert_eq!(named(&all["parameters"], "resolution")["value"], 2.0);
     let rejected = stage.refused(&["param", "set", ROBOT, "/asked", "resolution", "-1"]).await;
-    assert!(rejected.contains("/asked does not accept resolution = -1: must be positive"), "{rejected}");
+    assert!(
+        rejected.contains("/asked does not accept resolution = -1: must be positive"),
+        "{rejected}"
+    );
     let kept = stage.asked(&["param", "get", ROBOT, "/asked", "resolution"]).await;
     assert_eq!(named(&kept["parameters"], "resolution")["value"], 2.0);
     let unknown = stage.refused(&["param", "get", ROBOT, "/asked", "colour"]).await;
     assert!(unknown.contains("/asked has no parameter colour"), "{unknown}");
     let nobody = stage.refused(&["node", "info", ROBOT, "/nobody"]).await;
-    assert!(nobody.contains("there is no node /nobody; on the graph: ") && nobody.contains("/asked"), "{nobody}");
+    assert!(
+        nobody.contains("there is no node /nobody; on the graph: ") && nobody.contains("/asked"),
+        "{nobody}"
+    );
 
     let state = stage.asked(&["lifecycle", ROBOT, "/asked", "deactivate"]).await;
     assert_eq!(state["state"], "inactive", "{state}");

@@ -1,4 +1,5 @@
-//! Independent OCI clients: the `oci-client` crate and `crane` push to the package store and pull from it.
+//! Independent OCI clients: the `oci-client` crate and `crane` push to the package store and pull
+//! from it.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;
@@ -14,24 +15,32 @@ use crate::harness::{Server, required, write_package};
 async fn the_oci_client_crate_pushes_and_pulls() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
-    let client = Client::new(ClientConfig { protocol: ClientProtocol::Http, ..ClientConfig::default() });
+    let client =
+        Client::new(ClientConfig { protocol: ClientProtocol::Http, ..ClientConfig::default() });
     let auth = RegistryAuth::Basic("anyone".to_owned(), server.operator_token());
-    let image: Reference = format!("{}/foreign/artifact:1", server.http).parse().expect("reference");
+    let image: Reference =
+        format!("{}/foreign/artifact:1", server.http).parse().expect("reference");
     let bytes: Vec<u8> = (0..3_000_000).map(|_| rand::random()).collect();
     let layer = ImageLayer::new(bytes.clone(), "application/octet-stream".to_owned(), None);
-    let config = Config::new(b"{}".to_vec(), "application/vnd.example.config.v1+json".to_owned(), None);
+    let config =
+        Config::new(b"{}".to_vec(), "application/vnd.example.config.v1+json".to_owned(), None);
     let manifest = OciImageManifest::build(std::slice::from_ref(&layer), &config, None);
     client.push(&image, &[layer], config, &auth, Some(manifest)).await.expect("pushed");
 
-    let pulled = client.pull(&image, &auth, vec!["application/octet-stream"]).await.expect("pulled");
+    let pulled =
+        client.pull(&image, &auth, vec!["application/octet-stream"]).await.expect("pulled");
     assert_eq!(pulled.layers[0].data, bytes);
     let stranger = RegistryAuth::Basic("anyone".to_owned(), "wrong".to_owned());
-    let fresh = Client::new(ClientConfig { protocol: ClientProtocol::Http, ..ClientConfig::default() });
+    let fresh =
+        Client::new(ClientConfig { protocol: ClientProtocol::Http, ..ClientConfig::default() });
     assert!(fresh.pull(&image, &stranger, vec!["application/octet-stream"]).await.is_err());
 }
 
 async fn crane(home: &Path, args: &[&str]) -> String {
-    let output = tokio::process::Command::new(required("TASKD_TEST_CRANE")).args(args).env("HOME", home).output();
+    let output = tokio::process::Command::new(required("TASKD_TEST_CRANE"))
+        .args(args)
+        .env("HOME", home)
+        .output();
     let output = output.await.expect("crane runs");
     assert!(output.status.success(), "crane {args:?}: {}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).expect("utf-8")
@@ -52,8 +61,12 @@ async fn crane_logs_in_pushes_and_pulls() {
         .expect("appended");
     archive.finish().expect("archive");
     let image = format!("{host}/some/thing:v1");
-    crane(home, &["append", "--insecure", "-f", content.to_str().expect("utf-8"), "-t", &image]).await;
-    assert_eq!(crane(home, &["ls", "--insecure", &format!("{host}/some/thing")]).await.trim(), "v1");
+    crane(home, &["append", "--insecure", "-f", content.to_str().expect("utf-8"), "-t", &image])
+        .await;
+    assert_eq!(
+        crane(home, &["ls", "--insecure", &format!("{host}/some/thing")]).await.trim(),
+        "v1"
+    );
     let digest = crane(home, &["digest", "--insecure", &image]).await;
     let copy = format!("{host}/other/thing:v1");
     crane(home, &["copy", "--insecure", &image, &copy]).await;
@@ -61,8 +74,11 @@ async fn crane_logs_in_pushes_and_pulls() {
     let exported = dir.path().join("exported.tar");
     crane(home, &["export", "--insecure", &copy, exported.to_str().expect("utf-8")]).await;
     let mut archive = tar::Archive::new(std::fs::File::open(&exported).expect("exported"));
-    let names: Vec<_> =
-        archive.entries().expect("entries").map(|e| e.expect("entry").path().expect("path").into_owned()).collect();
+    let names: Vec<_> = archive
+        .entries()
+        .expect("entries")
+        .map(|e| e.expect("entry").path().expect("path").into_owned())
+        .collect();
     assert_eq!(names, [Path::new("registry.rs")]);
 
     // taskd's own packages are ordinary artifacts to crane.
@@ -86,7 +102,8 @@ async fn crane_copies_a_package_under_another_name() {
     let host = server.http.to_string();
     let token = server.operator_token();
     crane(dir.path(), &["auth", "login", &host, "-u", "anyone", "-p", &token]).await;
-    let (own, mirror) = (format!("{host}/talker:1.0.0"), format!("{host}/mirror/team/talker:1.0.0"));
+    let (own, mirror) =
+        (format!("{host}/talker:1.0.0"), format!("{host}/mirror/team/talker:1.0.0"));
     crane(dir.path(), &["copy", "--insecure", &own, &mirror]).await;
     let digest = crane(dir.path(), &["digest", "--insecure", &own]).await;
     assert_eq!(crane(dir.path(), &["digest", "--insecure", &mirror]).await, digest);

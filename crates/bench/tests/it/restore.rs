@@ -1,4 +1,5 @@
-//! A database put back to an older copy: the robots know more than the server, and nothing that runs is harmed.
+//! A database put back to an older copy: the robots know more than the server, and nothing that
+//! runs is harmed.
 
 use std::path::Path;
 

@@ -1,5 +1,6 @@
-//! A robot is revoked while everything is under way: its session, a download, a request that is being sent, and a token it was
-//! about to go over to. All of it ends at once; what runs on the robot goes on, and the robot says why it is out.
+//! A robot is revoked while everything is under way: its session, a download, a request that is
+//! being sent, and a token it was about to go over to. All of it ends at once; what runs on the
+//! robot goes on, and the robot says why it is out.
 
 use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, MqttOptions};
 use serde_json::Value;
@@ -7,7 +8,9 @@ use task_proto::report::Phase;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
-use crate::harness::{Fleet, PATIENCE, Robot, Server, add_ballast, eventually, from_restarted_agent, program};
+use crate::harness::{
+    Fleet, PATIENCE, Robot, Server, add_ballast, eventually, from_restarted_agent, program,
+};
 
 /// More than all buffers between the server and a client that reads nothing.
 const HEAVY_BYTES: usize = 64 << 20;
@@ -23,14 +26,17 @@ async fn status(robot: &Robot) -> Value {
     #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
     let mut command = std::process::Command::new(program("task-agent"));
     command.args(["status", "-o", "json", "--data"]).arg(robot.data());
-    let output = tokio::task::spawn_blocking(move || command.output().expect("runs")).await.expect("no panic");
+    let output = tokio::task::spawn_blocking(move || command.output().expect("runs"))
+        .await
+        .expect("no panic");
     serde_json::from_slice(&output.stdout).expect("json")
 }
 
 /// The status and the code that a robot's token gets over HTTP.
 async fn refused(server: &Server, robot: &str, token: &str) -> (u16, String) {
     let url = server.url(&format!("/api/v1/robots/{robot}/desired"));
-    let answer = reqwest::Client::new().get(url).bearer_auth(token).send().await.expect("an answer");
+    let answer =
+        reqwest::Client::new().get(url).bearer_auth(token).send().await.expect("an answer");
     let status = answer.status().as_u16();
     let body: Value = answer.json().await.expect("json");
     (status, body["error"]["code"].as_str().unwrap_or_default().to_owned())
@@ -72,7 +78,8 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let heavy = fleet.package("heavy", "1.0.0", "service", "exec sleep 1000\n");
     add_ballast(&heavy, HEAVY_BYTES);
     fleet.server.operate(["push", heavy.to_str().expect("utf-8")]).await;
-    // The robot itself is not to fetch what is fetched below in its name. Its session lasts half a minute.
+    // The robot itself is not to fetch what is fetched below in its name. Its session lasts half a
+    // minute.
     fleet.robots[0].freeze();
     let blob = fleet.server.push(&heavy, "*").await.package.content;
     let (server, robot) = (&fleet.server, &fleet.robots[0]);
@@ -103,9 +110,17 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     });
     assert!(cut.await.expect("an end") && got < blob.size, "{got} of {} bytes came", blob.size);
     let mut rest = Vec::new();
-    let ended = tokio::time::timeout(PATIENCE, report.read_to_end(&mut rest)).await.expect("an end");
-    assert!(ended.is_err() || rest.is_empty(), "the report was answered: {}", String::from_utf8_lossy(&rest));
-    eventually("the session to be gone", async || server.robot("robot-1").await?.mqtt.is_none().then_some(())).await;
+    let ended =
+        tokio::time::timeout(PATIENCE, report.read_to_end(&mut rest)).await.expect("an end");
+    assert!(
+        ended.is_err() || rest.is_empty(),
+        "the report was answered: {}",
+        String::from_utf8_lossy(&rest)
+    );
+    eventually("the session to be gone", async || {
+        server.robot("robot-1").await?.mqtt.is_none().then_some(())
+    })
+    .await;
     for token in [&token, &next] {
         assert_eq!(refused(server, &id, token).await, (401, "robot_revoked".to_owned()));
         assert_eq!(refused_over_mqtt(server, &id, token).await, ConnectReturnCode::NotAuthorized);
@@ -119,7 +134,12 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     });
     let told = told.await;
     assert!(told["removed_because"].as_str().expect("a text").contains("revoked"), "{told}");
-    let steady = told["tasks"].as_array().expect("tasks").iter().find(|task| task["task"] == "steady").expect("there");
+    let steady = told["tasks"]
+        .as_array()
+        .expect("tasks")
+        .iter()
+        .find(|task| task["task"] == "steady")
+        .expect("there");
     assert_eq!(steady["phase"], "running", "{told}");
     let pid = steady["pid"].as_u64().expect("a pid");
     assert!(std::path::Path::new(&format!("/proc/{pid}")).exists(), "it runs on");
@@ -127,18 +147,41 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     assert!(out.contains("offline revoked"), "{out}");
 
     // It comes back, and to what was ordered meanwhile, once it is registered anew.
-    let out = fleet.server.operate(["enroll-token", "create", "--robot", "robot-1", "--uses", "1"]).await;
+    let out =
+        fleet.server.operate(["enroll-token", "create", "--robot", "robot-1", "--uses", "1"]).await;
     fleet.robots[0].terminate();
     let data = fleet.robots[0].data().to_owned();
     #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
     let mut enroll = std::process::Command::new(program("task-agent"));
-    enroll.args(["enroll", "--force", "--mac", "02:00:00:00:00:01", "--server", &fleet.server.url(""), "--data"]);
+    enroll.args([
+        "enroll",
+        "--force",
+        "--mac",
+        "02:00:00:00:00:01",
+        "--server",
+        &fleet.server.url(""),
+        "--data",
+    ]);
     enroll.arg(&data).env("TASK_AGENT_ENROLL_TOKEN", out.trim());
-    let enrolled = tokio::task::spawn_blocking(move || enroll.output().expect("runs")).await.expect("no panic");
+    let enrolled = tokio::task::spawn_blocking(move || enroll.output().expect("runs"))
+        .await
+        .expect("no panic");
     assert!(enrolled.status.success(), "{}", String::from_utf8_lossy(&enrolled.stderr));
     fleet.robots[0].restart();
     let view = fleet.server.wait_phase("robot-1", "heavy", Phase::Running).await;
-    assert!(view.conditions.iter().all(|condition| condition.code != "revoked"), "{:?}", view.conditions);
-    let same = view.tasks.iter().find(|task| task.task.as_str() == "steady").and_then(|task| task.active.as_ref());
-    assert_eq!(same.map(|active| u64::from(active.pid)), Some(pid), "what ran is not started again");
+    assert!(
+        view.conditions.iter().all(|condition| condition.code != "revoked"),
+        "{:?}",
+        view.conditions
+    );
+    let same = view
+        .tasks
+        .iter()
+        .find(|task| task.task.as_str() == "steady")
+        .and_then(|task| task.active.as_ref());
+    assert_eq!(
+        same.map(|active| u64::from(active.pid)),
+        Some(pid),
+        "what ran is not started again"
+    );
 }

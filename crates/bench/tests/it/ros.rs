@@ -1,5 +1,6 @@
-//! "Running" as ROS says it: real rclpy nodes, built by real colcon and pushed through the whole system, keep or break what
-//! their packages promise. Each test has a server, a robot and a ROS domain of its own; its tasks go side by side.
+//! "Running" as ROS says it: real rclpy nodes, built by real colcon and pushed through the whole
+//! system, keep or break what their packages promise. Each test has a server, a robot and a ROS
+//! domain of its own; its tasks go side by side.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::net::UdpSocket;
@@ -13,7 +14,9 @@ use task_proto::api::RobotTask;
 use task_proto::report::{Failure, Phase};
 use tempfile::TempDir;
 
-use crate::harness::{PATIENCE, Process, Robot, Server, eventually, eventually_within, required, within};
+use crate::harness::{
+    PATIENCE, Process, Robot, Server, eventually, eventually_within, required, within,
+};
 use crate::leftovers::processes_with;
 use crate::talker::trigger;
 
@@ -22,7 +25,8 @@ const PROBE: &str = "tests/it/graph_probe";
 /// How long a job may take on a busy machine.
 const JOB_PATIENCE: Duration = Duration::from_secs(600);
 
-/// A ROS domain that nobody else on this machine has while this lives: a port that no participant of it uses is the lock.
+/// A ROS domain that nobody else on this machine has while this lives: a port that no participant
+/// of it uses is the lock.
 pub struct Domain {
     pub id: String,
     _lock: UdpSocket,
@@ -30,7 +34,8 @@ pub struct Domain {
 
 impl Domain {
     fn free() -> Self {
-        // Domains whose ports lie below those the system gives out; port 7400 + 250 n + 249 would be the 120th participant's.
+        // Domains whose ports lie below those the system gives out; port 7400 + 250 n + 249 would
+        // be the 120th participant's.
         let free = |id: u16| {
             let lock = UdpSocket::bind(("127.0.0.1", 7400 + 250 * id + 249)).ok()?;
             Some(Self { id: id.to_string(), _lock: lock })
@@ -57,8 +62,13 @@ impl Stage {
 
     /// A stage without anything built.
     pub async fn bare() -> Self {
-        Self::with(|domain| vec![("TASK_AGENT_UNDERLAYS", activate()), ("TASK_AGENT_ROS_DOMAIN_ID", domain.to_owned())])
-            .await
+        Self::with(|domain| {
+            vec![
+                ("TASK_AGENT_UNDERLAYS", activate()),
+                ("TASK_AGENT_ROS_DOMAIN_ID", domain.to_owned()),
+            ]
+        })
+        .await
     }
 
     /// A stage whose robot has settings of its own for this domain, and nothing is built.
@@ -67,9 +77,11 @@ impl Stage {
         let dir = TempDir::new().expect("temp dir");
         let server = Server::start(&dir.path().join("server")).await;
         let own = own(&domain.id);
-        let mut settings: Vec<_> = own.iter().map(|(name, value)| (*name, value.as_str())).collect();
+        let mut settings: Vec<_> =
+            own.iter().map(|(name, value)| (*name, value.as_str())).collect();
         settings.push(("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"));
-        let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
+        let robot =
+            Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &settings).await;
         Self { robot, server, domain, dir }
     }
 
@@ -78,7 +90,8 @@ impl Stage {
         build(&activate(), &self.dir.path().join("built")).await;
     }
 
-    /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]` table. It is built already.
+    /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]`
+    /// table. It is built already.
     pub fn package(&self, name: &str, version: &str, arguments: &str, rest: &str) -> PathBuf {
         let dir = self.dir.path().join(format!("{name}-{version}"));
         copy(&self.dir.path().join("built/install"), &dir.join("install"));
@@ -91,7 +104,12 @@ impl Stage {
     }
 
     pub async fn task(&self, name: &str) -> Option<RobotTask> {
-        self.server.robot("robot-1").await?.tasks.into_iter().find(|task| task.task.as_str() == name)
+        self.server
+            .robot("robot-1")
+            .await?
+            .tasks
+            .into_iter()
+            .find(|task| task.task.as_str() == name)
     }
 
     /// Waits until the task, which is built on the robot, runs.
@@ -128,14 +146,21 @@ impl Stage {
         self.is(name, Phase::Running, |task| task.degraded).await
     }
 
-    pub async fn is<T>(&self, name: &str, phase: Phase, which: impl Fn(RobotTask) -> Option<T>) -> T {
+    pub async fn is<T>(
+        &self,
+        name: &str,
+        phase: Phase,
+        which: impl Fn(RobotTask) -> Option<T>,
+    ) -> T {
         let mut seen = None;
         let answer = within(PATIENCE, async || {
             seen = self.task(name).await;
             which(seen.clone().filter(|task| task.phase == phase)?)
         })
         .await;
-        answer.unwrap_or_else(|| panic!("{name} was to be {phase}, and is {seen:#?}\n{}", self.log(name)))
+        answer.unwrap_or_else(|| {
+            panic!("{name} was to be {phase}, and is {seen:#?}\n{}", self.log(name))
+        })
     }
 
     /// The process of the task's node, which is the one that has these words in its command line.
@@ -165,7 +190,8 @@ impl Stage {
     }
 
     pub fn log(&self, name: &str) -> String {
-        std::fs::read_to_string(self.robot.data().join(format!("tasks/{name}/logs/task.log"))).unwrap_or_default()
+        std::fs::read_to_string(self.robot.data().join(format!("tasks/{name}/logs/task.log")))
+            .unwrap_or_default()
     }
 }
 
@@ -175,9 +201,12 @@ pub fn activate() -> String {
 }
 
 fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str) {
-    let words = ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
+    let words =
+        ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
     let words: Vec<&str> = words.collect();
-    let toml = format!("name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 30\n{rest}");
+    let toml = format!(
+        "name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 30\n{rest}"
+    );
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
 }
 
@@ -185,7 +214,9 @@ fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str
 async fn build(activate: &str, dir: &Path) {
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join(PROBE), &dir.join("src"));
     let mut colcon = tokio::process::Command::new("bash");
-    colcon.args(["-c", ". \"$0\" && exec colcon build --base-paths src", activate]).current_dir(dir);
+    colcon
+        .args(["-c", ". \"$0\" && exec colcon build --base-paths src", activate])
+        .current_dir(dir);
     let output = colcon.output().await.expect("bash runs");
     assert!(output.status.success(), "colcon: {}", String::from_utf8_lossy(&output.stderr));
 }
@@ -218,23 +249,35 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
     let parameters = "services = ['/say']\n[parameters.'/by_service']\nresolution = 2";
     stage.push("by-service", "--node by_service --service /say", &ready(parameters)).await;
     stage
-        .push("by-topic", "--node by_topic --topic /ticks --hz 20", &ready("topics = { '/ticks' = { min_hz = 10 } }"))
+        .push(
+            "by-topic",
+            "--node by_topic --topic /ticks --hz 20",
+            &ready("topics = { '/ticks' = { min_hz = 10 } }"),
+        )
         .await;
-    let late =
-        "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
-    stage.push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late)).await;
+    let late = "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
+    stage
+        .push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late))
+        .await;
     stage.builds("by-node").await;
     for name in ["by-node", "by-service", "by-topic", "by-lifecycle"] {
         stage.runs(name).await;
     }
     // An independent client: the parameters have arrived, a whole number as the node's double.
-    assert_eq!((stage.say("/say").await, stage.say("/ask").await), ("2.0".to_owned(), "0.5".to_owned()));
+    assert_eq!(
+        (stage.say("/say").await, stage.say("/ask").await),
+        ("2.0".to_owned(), "0.5".to_owned())
+    );
 
     let asked = Instant::now();
     stage.server.operate(["stop", "by-lifecycle", "--on", "*", "--yes"]).await;
     stage.server.wait_phase("robot-1", "by-lifecycle", Phase::Stopped).await;
     println!("stopped a lifecycle node in {:?}", asked.elapsed());
-    assert!(stage.log("by-lifecycle").contains("shut down in good order"), "{}", stage.log("by-lifecycle"));
+    assert!(
+        stage.log("by-lifecycle").contains("shut down in good order"),
+        "{}",
+        stage.log("by-lifecycle")
+    );
     let asked = Instant::now();
     stage.server.operate(["stop", "by-node", "--on", "*", "--yes"]).await;
     stage.server.wait_phase("robot-1", "by-node", Phase::Stopped).await;
@@ -250,10 +293,22 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
     // What is missing must be known by then, what is refused is so whenever it is seen.
     let (short, long) = (|what: &str| by(30, what), |what: &str| by(80, what));
     stage.push("absent", "--node lidar", &short("nodes = ['/mapper']")).await;
-    stage.push("slow", "--node slow --topic /slow --hz 2", &short("topics = { '/slow' = { min_hz = 10 } }")).await;
+    stage
+        .push(
+            "slow",
+            "--node slow --topic /slow --hz 2",
+            &short("topics = { '/slow' = { min_hz = 10 } }"),
+        )
+        .await;
     let negative = long("[parameters.'/picky']\nresolution = -1\nunheard_of = true");
     stage.push("picky", "--node picky", &negative).await;
-    stage.push("stubborn", "--node stubborn --lifecycle --breaks configure", &long("lifecycle = ['/stubborn']")).await;
+    stage
+        .push(
+            "stubborn",
+            "--node stubborn --lifecycle --breaks configure",
+            &long("lifecycle = ['/stubborn']"),
+        )
+        .await;
 
     let mut stranger = Command::new(format!("{}/bin/python3", required("TASKD_TEST_ROS")));
     stranger
@@ -287,13 +342,22 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
     let stage = Stage::start().await;
-    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
+    let ready =
+        |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
     stage.push("crashing", "--node crashing --breaks crash", &ready("nodes = ['/crashing']")).await;
     stage.push("killed", "--node killed --below", &ready("nodes = ['/killed']")).await;
     let topic = ready("topics = { '/ticks' = { min_hz = 5 } }");
     stage.push("silent", "--node silent --topic /ticks --breaks silence", &topic).await;
-    stage.push("inactive", "--node inactive --lifecycle --breaks inactive", &ready("lifecycle = ['/inactive']")).await;
-    stage.push("deaf", "--node deaf --service /say --breaks service", &ready("services = ['/say']")).await;
+    stage
+        .push(
+            "inactive",
+            "--node inactive --lifecycle --breaks inactive",
+            &ready("lifecycle = ['/inactive']"),
+        )
+        .await;
+    stage
+        .push("deaf", "--node deaf --service /say --breaks service", &ready("services = ['/say']"))
+        .await;
     let back = "--node back --lifecycle --below --respawn";
     stage.push("back", back, &ready("lifecycle = ['/back']\n[parameters.'/back']\nlate = 2")).await;
     for name in ["crashing", "killed", "silent", "inactive", "deaf", "back"] {
@@ -308,7 +372,9 @@ async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
     let failure = stage.degrades("killed").await;
     println!("a killed node was noticed after {:?}", killed.elapsed());
     assert_eq!(failure.to_string(), "node_vanished: `/killed` left the graph; its process is gone");
-    for (name, code) in [("silent", "topic_silent"), ("inactive", "node_inactive"), ("deaf", "service_lost")] {
+    for (name, code) in
+        [("silent", "topic_silent"), ("inactive", "node_inactive"), ("deaf", "service_lost")]
+    {
         let failure = stage.degrades(name).await;
         assert_eq!(failure.code.as_str(), code, "{name}: {failure}");
     }
@@ -327,7 +393,8 @@ async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
     let mut stage = Stage::start().await;
-    let ready = |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
+    let ready =
+        |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
     let kept = ready("lifecycle = ['/kept']\n[parameters.'/kept']\nlate = 2");
     stage.push("kept", "--node kept --lifecycle", &kept).await;
     stage.push("lost", "--node lost --below", &ready("nodes = ['/lost']")).await;
@@ -339,17 +406,24 @@ async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
     assert_eq!(stage.degrades("lost").await.code.as_str(), "node_vanished");
     let after = stage.runs("kept").await;
     assert_eq!((pid_of(&after), after.restarts), (pid_of(&before), before.restarts));
-    assert_eq!(stage.log("kept").matches("activated with late = 2").count(), 1, "{}", stage.log("kept"));
+    assert_eq!(
+        stage.log("kept").matches("activated with late = 2").count(),
+        1,
+        "{}",
+        stage.log("kept")
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_version_that_does_not_get_ready_gives_way_to_the_one_before() {
     let stage = Stage::start().await;
-    let ready =
-        |node: &str, timeout_s: u32| format!("[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\nlifecycle = ['/{node}']\n");
+    let ready = |node: &str, timeout_s: u32| {
+        format!("[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\nlifecycle = ['/{node}']\n")
+    };
     stage.push("mapper", "--node mapper --lifecycle", &ready("mapper", 60)).await;
     let before = stage.runs("mapper").await;
-    let second = stage.package("mapper", "2.0.0", "--node mapper --lifecycle", &ready("better_mapper", 10));
+    let second =
+        stage.package("mapper", "2.0.0", "--node mapper --lifecycle", &ready("better_mapper", 10));
     stage.server.push(&second, "*").await;
     let failure = stage.is("mapper", Phase::RolledBack, |task| task.failure).await;
     assert!(failure.text.contains("`/better_mapper` did not appear within 10 s"), "{failure}");

@@ -19,7 +19,11 @@ async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
         .kill_on_drop(true)
         .output();
     let output = run.await.expect("taskbench runs");
-    assert_eq!(std::fs::read_dir(&data).expect("readable").count(), 0, "a server's directory is left");
+    assert_eq!(
+        std::fs::read_dir(&data).expect("readable").count(),
+        0,
+        "a server's directory is left"
+    );
     let needle = data.to_str().expect("utf-8").as_bytes().to_owned();
     assert_eq!(processes_with(&needle), Vec::<i32>::new(), "a process is left");
     output
@@ -28,7 +32,8 @@ async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
 /// The points of the result, all of which must have arrived whole.
 fn arrived(dir: &Path, scenario: &str, output: &Output) -> Vec<Value> {
     let said = String::from_utf8_lossy(&output.stderr);
-    let file = |extension: &str| std::fs::read(dir.join("out").join(format!("{scenario}.{extension}")));
+    let file =
+        |extension: &str| std::fs::read(dir.join("out").join(format!("{scenario}.{extension}")));
     let json = file("json").unwrap_or_else(|error| panic!("{error}: {said}"));
     let run: Value = serde_json::from_slice(&json).expect("json");
     let points = run["points"].as_array().expect("points").clone();
@@ -38,7 +43,10 @@ fn arrived(dir: &Path, scenario: &str, output: &Output) -> Vec<Value> {
     }
     assert!(output.status.success(), "{said}");
     assert_eq!(run["seed"], 7);
-    assert!(run["versions"]["taskd"].is_string() && run["machine"]["cores"].as_u64() > Some(0), "{run:#}");
+    assert!(
+        run["versions"]["taskd"].is_string() && run["machine"]["cores"].as_u64() > Some(0),
+        "{run:#}"
+    );
     let html = String::from_utf8(file("html").expect("a page")).expect("utf-8");
     assert!(html.contains("<svg") && html.contains("Nothing failed."));
     assert!(file("csv").expect("a table").len() > 100);
@@ -79,10 +87,12 @@ async fn every_robot_gets_the_very_bytes_by_every_mechanism_of_the_paper() {
 async fn a_fleet_connects_and_each_robot_of_it_gets_the_package() {
     for encrypted in [None, Some("--tls")] {
         let dir = tempfile::tempdir().expect("temp dir");
-        let arguments = ["fleet", "--robots", "3,20", "--payload", "5000"].into_iter().chain(encrypted);
+        let arguments =
+            ["fleet", "--robots", "3,20", "--payload", "5000"].into_iter().chain(encrypted);
         let output = taskbench(dir.path(), &arguments.collect::<Vec<_>>()).await;
         let points = arrived(dir.path(), "fleet", &output);
-        let counts: Vec<_> = points.iter().map(|point| point["quantities"]["connected"]["count"].as_u64()).collect();
+        let counts: Vec<_> =
+            points.iter().map(|point| point["quantities"]["connected"]["count"].as_u64()).collect();
         assert_eq!(counts, [Some(3), Some(20)]);
     }
 }
@@ -90,7 +100,8 @@ async fn a_fleet_connects_and_each_robot_of_it_gets_the_package() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_link_is_made_of_namespaces_that_go_with_the_run_or_refused_in_words() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let arguments = ["paper", "--quick", "--only", "push-pull", "--max-payload", "1000", "--link", "50mbit"];
+    let arguments =
+        ["paper", "--quick", "--only", "push-pull", "--max-payload", "1000", "--link", "50mbit"];
     let output = taskbench(dir.path(), &arguments).await;
     if nix::unistd::geteuid().is_root() {
         assert_eq!(arrived(dir.path(), "paper", &output).len(), 2);
@@ -99,8 +110,14 @@ async fn a_link_is_made_of_namespaces_that_go_with_the_run_or_refused_in_words()
         assert!(!output.status.success() && said.contains("--link needs root"), "{said}");
     }
     // A namespace is named for the run's process, which is no more.
-    let left = std::fs::read_dir("/run/netns").into_iter().flatten().flatten().map(|entry| entry.file_name());
-    let left = left.filter_map(|name| name.to_str()?.strip_prefix("taskbench-")?.parse::<u32>().ok());
-    let left: Vec<u32> = left.filter(|pid| !Path::new("/proc").join(pid.to_string()).exists()).collect();
+    let left = std::fs::read_dir("/run/netns")
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.file_name());
+    let left =
+        left.filter_map(|name| name.to_str()?.strip_prefix("taskbench-")?.parse::<u32>().ok());
+    let left: Vec<u32> =
+        left.filter(|pid| !Path::new("/proc").join(pid.to_string()).exists()).collect();
     assert_eq!(left, Vec::<u32>::new());
 }

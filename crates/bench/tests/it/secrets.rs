@@ -1,5 +1,6 @@
-//! Known secrets go through the real programs, which log all they can, and through what people do wrong: none turns up in a log,
-//! a command line, a URL, an answer or an error, and the few files that hold one are their owner's alone.
+//! Known secrets go through the real programs, which log all they can, and through what people do
+//! wrong: none turns up in a log, a command line, a URL, an answer or an error, and the few files
+//! that hold one are their owner's alone.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::collections::BTreeSet;
@@ -36,7 +37,8 @@ impl Secrets {
     }
 
     fn found_in(&self, bytes: &[u8]) -> Vec<&'static str> {
-        let holds = |secret: &String| bytes.windows(secret.len()).any(|window| window == secret.as_bytes());
+        let holds =
+            |secret: &String| bytes.windows(secret.len()).any(|window| window == secret.as_bytes());
         self.0.iter().filter(|(_, secret)| holds(secret)).map(|(what, _)| *what).collect()
     }
 
@@ -62,7 +64,10 @@ impl Witness {
             while ended.recv_timeout(Duration::from_millis(10)).is_err() {
                 let processes = std::fs::read_dir("/proc").expect("/proc").flatten();
                 let processes = processes.filter(|process| *process.file_name() != *own);
-                seen.extend(processes.filter_map(|process| std::fs::read(process.path().join("cmdline")).ok()));
+                seen.extend(
+                    processes
+                        .filter_map(|process| std::fs::read(process.path().join("cmdline")).ok()),
+                );
             }
             seen
         });
@@ -78,7 +83,8 @@ impl Witness {
 /// Stands before the server and keeps what it is sent.
 async fn listen_in(target: SocketAddr) -> (SocketAddr, Arc<Mutex<Vec<u8>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("port");
-    let (address, heard) = (listener.local_addr().expect("bound"), Arc::new(Mutex::new(Vec::new())));
+    let (address, heard) =
+        (listener.local_addr().expect("bound"), Arc::new(Mutex::new(Vec::new())));
     let kept = heard.clone();
     tokio::spawn(async move {
         while let Ok((client, _)) = listener.accept().await {
@@ -109,8 +115,12 @@ async fn forward(client: TcpStream, target: SocketAddr, heard: Arc<Mutex<Vec<u8>
 async fn run(mut command: Command, input: &str) -> Output {
     let input = input.to_owned();
     let run = move || {
-        let mut child =
-            command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("runs");
+        let mut child = command
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("runs");
         // A command that needs no input may have ended.
         let _ = child.stdin.take().expect("piped").write_all(input.as_bytes());
         child.wait_with_output().expect("ends")
@@ -118,14 +128,19 @@ async fn run(mut command: Command, input: &str) -> Output {
     tokio::task::spawn_blocking(run).await.expect("no panic")
 }
 
-/// Runs it until it has said `words` on its standard error, then kills it. Gives all that it said there.
+/// Runs it until it has said `words` on its standard error, then kills it. Gives all that it said
+/// there.
 async fn run_until(mut command: Command, words: &'static str) -> Vec<u8> {
     let run = move || {
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("runs");
         let mut said = Vec::new();
         let mut errors = BufReader::new(child.stderr.take().expect("piped"));
         while !String::from_utf8_lossy(&said).contains(words) {
-            assert_ne!(errors.read_until(b'\n', &mut said).expect("readable"), 0, "it ended without {words:?}");
+            assert_ne!(
+                errors.read_until(b'\n', &mut said).expect("readable"),
+                0,
+                "it ended without {words:?}"
+            );
         }
         child.kill().expect("killed");
         child.wait().expect("ended");
@@ -150,10 +165,17 @@ fn mangled(token: &str) -> String {
 }
 
 /// What people do wrong with secrets at the command line; each must fail.
-async fn do_wrong(server: &Server, dir: &Path, secrets: &Secrets, tokens: &[String], password: &str) {
+async fn do_wrong(
+    server: &Server,
+    dir: &Path,
+    secrets: &Secrets,
+    tokens: &[String],
+    password: &str,
+) {
     let url = format!("postgres://u:{password}@127.0.0.1:1/db");
     let file = dir.join("wrong.toml");
-    std::fs::write(&file, format!("broker = \"mqtt://u:{password}@host\nhttp = 1")).expect("written");
+    std::fs::write(&file, format!("broker = \"mqtt://u:{password}@host\nhttp = 1"))
+        .expect("written");
     let serve = |variables: &[(&str, &str)], arguments: &[&str]| {
         let mut command = Command::new(program("taskd"));
         command.args(["serve", "--data"]).arg(dir.join("none")).args([
@@ -189,10 +211,12 @@ async fn do_wrong(server: &Server, dir: &Path, secrets: &Secrets, tokens: &[Stri
         secrets.assert_absent(&shown, &[output.stdout, output.stderr].concat());
     }
     // A password is not even taken from where others could read it.
-    for (flag, value) in
-        [("--broker", format!("mqtt://u:{password}-seen@127.0.0.1:1")), ("--database", format!("{url}-seen"))]
-    {
-        let output = serve(&[], &[flag, &value.replace(password, "unknown")]).output().expect("runs");
+    for (flag, value) in [
+        ("--broker", format!("mqtt://u:{password}-seen@127.0.0.1:1")),
+        ("--database", format!("{url}-seen")),
+    ] {
+        let output =
+            serve(&[], &[flag, &value.replace(password, "unknown")]).output().expect("runs");
         assert_eq!(output.status.code(), Some(2), "{flag}");
         assert!(!String::from_utf8_lossy(&output.stderr).contains("unknown"), "{flag}");
     }
@@ -201,7 +225,9 @@ async fn do_wrong(server: &Server, dir: &Path, secrets: &Secrets, tokens: &[Stri
 /// The same over HTTP: gives all answers.
 async fn ask_wrongly(server: &Server, tokens: &[String], password: &str) -> Vec<u8> {
     let client = reqwest::Client::new();
-    let post = |path: &str, body: Value| client.post(server.url(path)).header("origin", server.url("")).json(&body);
+    let post = |path: &str, body: Value| {
+        client.post(server.url(path)).header("origin", server.url("")).json(&body)
+    };
     let mut requests = vec![
         post("/api/v1/login", json!({ "user": "bob", "password": password })),
         post("/api/v1/login", json!({ "user": "alice", "password": [password] })),
@@ -223,8 +249,15 @@ async fn ask_wrongly(server: &Server, tokens: &[String], password: &str) -> Vec<
     answers
 }
 
-/// Someone with a password signs in, by the command line and at the page. Gives the token of the command line.
-async fn person(server: &Server, dir: &Path, proxy: SocketAddr, password: &str, secrets: &mut Secrets) -> String {
+/// Someone with a password signs in, by the command line and at the page. Gives the token of the
+/// command line.
+async fn person(
+    server: &Server,
+    dir: &Path,
+    proxy: SocketAddr,
+    password: &str,
+    secrets: &mut Secrets,
+) -> String {
     let with_password = |arguments: &[&str]| {
         let mut command = server.command(arguments);
         command.env("XDG_CONFIG_HOME", dir).env("TASKD_SERVER", format!("http://{proxy}"));
@@ -237,11 +270,14 @@ async fn person(server: &Server, dir: &Path, proxy: SocketAddr, password: &str, 
     let output = run(login, password).await;
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     secrets.assert_absent("taskd login", &[output.stdout, output.stderr].concat());
-    let credentials = std::fs::read_to_string(dir.join("taskd/credentials.json")).expect("credentials");
-    let signed_in = credentials.split('"').find(|text| text.starts_with("tsko_")).expect("a token").to_owned();
+    let credentials =
+        std::fs::read_to_string(dir.join("taskd/credentials.json")).expect("credentials");
+    let signed_in =
+        credentials.split('"').find(|text| text.starts_with("tsko_")).expect("a token").to_owned();
     secrets.token("a person's token", &signed_in);
     let origin = format!("http://{proxy}");
-    let sign_in = reqwest::Client::new().post(format!("{origin}/api/v1/session")).header("origin", &origin);
+    let sign_in =
+        reqwest::Client::new().post(format!("{origin}/api/v1/session")).header("origin", &origin);
     let sign_in = sign_in.json(&json!({ "user": "alice", "password": password }));
     let answer = sign_in.send().await.expect("an answer");
     let cookie = answer.headers()["set-cookie"].to_str().expect("text");
@@ -250,14 +286,32 @@ async fn person(server: &Server, dir: &Path, proxy: SocketAddr, password: &str, 
     signed_in
 }
 
-/// A robot enrols, runs a task that says all it was given, and is made a next token. Gives it and the tokens it had.
-async fn robot(server: &Server, dir: &Path, proxy: SocketAddr, secrets: &mut Secrets) -> (Robot, [String; 2]) {
+/// A robot enrols, runs a task that says all it was given, and is made a next token. Gives it and
+/// the tokens it had.
+async fn robot(
+    server: &Server,
+    dir: &Path,
+    proxy: SocketAddr,
+    secrets: &mut Secrets,
+) -> (Robot, [String; 2]) {
     let enrolment = server.enrollment_token().await;
     secrets.token("the enrolment token", &enrolment);
     let data = dir.join("atlas");
     let mut enroll = Command::new(program("task-agent"));
-    enroll.args(["enroll", "--name", "atlas", "--mac", "02:00:00:00:00:01", "--server", &format!("http://{proxy}")]);
-    enroll.arg("--data").arg(&data).env("TASK_AGENT_ENROLL_TOKEN", &enrolment).env("TASK_AGENT_LOG", "trace");
+    enroll.args([
+        "enroll",
+        "--name",
+        "atlas",
+        "--mac",
+        "02:00:00:00:00:01",
+        "--server",
+        &format!("http://{proxy}"),
+    ]);
+    enroll
+        .arg("--data")
+        .arg(&data)
+        .env("TASK_AGENT_ENROLL_TOKEN", &enrolment)
+        .env("TASK_AGENT_LOG", "trace");
     let output = run(enroll, "").await;
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let identity = std::fs::read(data.join("identity.json")).expect("read");
@@ -266,14 +320,23 @@ async fn robot(server: &Server, dir: &Path, proxy: SocketAddr, secrets: &mut Sec
     secrets.token("the robot's token", &token);
     secrets.assert_absent("task-agent enroll", &[output.stdout, output.stderr].concat());
     let id = server.robot("atlas").await.expect("listed").id;
-    let environment = [("TASK_AGENT_LOG", "trace"), ("TASK_AGENT_ENROLL_TOKEN", enrolment.as_str())];
+    let environment =
+        [("TASK_AGENT_LOG", "trace"), ("TASK_AGENT_ENROLL_TOKEN", enrolment.as_str())];
     let mut robot = Robot::enrolled(dir, "atlas", id.clone(), &environment);
     robot.restart();
     let package = dir.join("teller");
-    write_package(&package, "teller", "1.0.0", "service", "env\ncat /proc/self/cmdline\nset\nexec sleep 1000\n");
+    write_package(
+        &package,
+        "teller",
+        "1.0.0",
+        "service",
+        "env\ncat /proc/self/cmdline\nset\nexec sleep 1000\n",
+    );
     server.push(&package, "atlas").await;
     server.wait_phase("atlas", "teller", Phase::Running).await;
-    let next = reqwest::Client::new().post(format!("http://{proxy}/api/v1/robots/{id}/token")).bearer_auth(&token);
+    let next = reqwest::Client::new()
+        .post(format!("http://{proxy}/api/v1/robots/{id}/token"))
+        .bearer_auth(&token);
     let next = from_restarted_agent(next, robot.data());
     let next: Value = next.send().await.expect("sent").json().await.expect("json");
     secrets.token("the robot's next token", next["token"].as_str().expect("a token"));
@@ -282,9 +345,19 @@ async fn robot(server: &Server, dir: &Path, proxy: SocketAddr, secrets: &mut Sec
 
 /// What an administrator can read.
 async fn read_all(server: &Server, secrets: &Secrets) {
-    let paths = ["server", "me", "users", "tokens?all=true", "audit", "enrollment-tokens", "robots", "robots/atlas"];
+    let paths = [
+        "server",
+        "me",
+        "users",
+        "tokens?all=true",
+        "audit",
+        "enrollment-tokens",
+        "robots",
+        "robots/atlas",
+    ];
     for path in paths {
-        let answer = server.get(&format!("/api/v1/{path}")).await.unwrap_or_else(|| panic!("{path}"));
+        let answer =
+            server.get(&format!("/api/v1/{path}")).await.unwrap_or_else(|| panic!("{path}"));
         secrets.assert_absent(path, answer.to_string().as_bytes());
     }
     let out = server.operate(["audit", "--export"]).await;
@@ -313,9 +386,11 @@ fn look_through(dir: &Path, secrets: &Secrets) {
 async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     let dir = tempfile::tempdir().expect("temp dir");
     let witness = Witness::begin();
-    let mut server = Server::start_with(&dir.path().join("server"), &[("TASKD_LOG", "trace")]).await;
+    let mut server =
+        Server::start_with(&dir.path().join("server"), &[("TASKD_LOG", "trace")]).await;
     let (proxy, heard) = listen_in(server.http).await;
-    let (password, mut secrets) = (format!("hush-{:032x}", rand::random::<u128>()), Secrets::default());
+    let (password, mut secrets) =
+        (format!("hush-{:032x}", rand::random::<u128>()), Secrets::default());
     secrets.0.push(("the password", password.clone()));
     secrets.token("the first token", &server.operator_token());
     let signed_in = person(&server, dir.path(), proxy, &password, &mut secrets).await;
@@ -330,7 +405,11 @@ async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     server.terminate();
     let lines = witness.end();
     let is_shim = |line: &&Vec<u8>| line.windows(4).any(|word| word == b"shim");
-    assert!(lines.iter().any(|line| is_shim(&line)), "no shim is among {} command lines", lines.len());
+    assert!(
+        lines.iter().any(|line| is_shim(&line)),
+        "no shim is among {} command lines",
+        lines.len()
+    );
     lines.iter().for_each(|line| secrets.assert_absent("a command line", line));
     let heard = heard.lock().expect("no panic").clone();
     let shown = secrets.found_in(&heard);
@@ -341,7 +420,8 @@ async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     );
     // A body may stand before the next request on its line.
     let lines = heard.split(|&byte| byte == b'\n').filter(|line| line.ends_with(b" HTTP/1.1\r"));
-    let urls: Vec<&[u8]> = lines.filter_map(|line| line.rsplit(|&byte| byte == b' ').nth(1)).collect();
+    let urls: Vec<&[u8]> =
+        lines.filter_map(|line| line.rsplit(|&byte| byte == b' ').nth(1)).collect();
     assert!(urls.len() > 5, "{}", urls.len());
     urls.iter().for_each(|url| secrets.assert_absent("a URL", url));
     look_through(dir.path(), &secrets);

@@ -1,4 +1,5 @@
-//! What an administrator sets for a robot at the server holds on the robot, without a restart, and later without a server.
+//! What an administrator sets for a robot at the server holds on the robot, without a restart, and
+//! later without a server.
 
 use nix::sys::signal::Signal;
 use task_proto::report::Phase;
@@ -12,21 +13,28 @@ const READY: &str = "[ready]\nhold_s = 0\ntimeout_s = 60\nservices = ['/say']\n"
 async fn a_robot_has_its_ros_from_the_server() {
     let mut stage = Stage::with(|_| vec![("TASK_AGENT_VITALS_INTERVAL_S", "1".to_owned())]).await;
     stage.build().await;
-    let (underlays, domain) = (format!("underlays={}", activate()), format!("ros_domain_id={}", stage.domain.id));
+    let (underlays, domain) =
+        (format!("underlays={}", activate()), format!("ros_domain_id={}", stage.domain.id));
     stage.server.operate(["robot", "edit", "robot-1", "--set", &underlays, "--set", &domain]).await;
     stage.push("talker", "--node talker --service /say", READY).await;
     let before = pid_of(&stage.runs("talker").await);
     assert_eq!(stage.say("/say").await, "0.05", "as a client in that domain hears");
-    let effective = stage.server.robot("robot-1").await.expect("a robot").effective_settings.expect("said");
-    assert_eq!(effective.values.ros_domain_id.map(|id| id.to_string()).as_ref(), Some(&stage.domain.id));
+    let effective =
+        stage.server.robot("robot-1").await.expect("a robot").effective_settings.expect("said");
+    assert_eq!(
+        effective.values.ros_domain_id.map(|id| id.to_string()).as_ref(),
+        Some(&stage.domain.id)
+    );
     assert!(effective.own.is_empty() && effective.refused.is_empty(), "{effective:?}");
     eventually("how its machine does", async || {
         let vitals = stage.server.robot("robot-1").await?.vitals?;
-        (vitals.memory_total_bytes? > vitals.memory_used_bytes? && vitals.cpu_percent? <= 100.0).then_some(())
+        (vitals.memory_total_bytes? > vitals.memory_used_bytes? && vitals.cpu_percent? <= 100.0)
+            .then_some(())
     })
     .await;
 
-    // All of them die, and there is no server when the agent is back: what was set is known, and the task runs by it.
+    // All of them die, and there is no server when the agent is back: what was set is known, and
+    // the task runs by it.
     stage.server.kill();
     stage.robot.kill();
     stage.signal("talker", Signal::SIGKILL);

@@ -1,4 +1,5 @@
-//! Publishers' signatures through the real programs: what enough have signed runs, whatever way it takes, and nothing else.
+//! Publishers' signatures through the real programs: what enough have signed runs, whatever way it
+//! takes, and nothing else.
 
 use std::path::{Path, PathBuf};
 
@@ -18,7 +19,9 @@ pub struct Site {
 /// Makes a key and gives its private file and the public text.
 pub async fn new_key(server: &Server, dir: &Path, name: &str) -> (String, String) {
     let file = dir.join(name).to_str().expect("utf-8").to_owned();
-    let made: Value = serde_json::from_str(&server.operate(["key", "new", &file, "-o", "json"]).await).expect("json");
+    let made: Value =
+        serde_json::from_str(&server.operate(["key", "new", &file, "-o", "json"]).await)
+            .expect("json");
     (file, made["key"].as_str().expect("a key").to_owned())
 }
 
@@ -38,7 +41,8 @@ impl Site {
             ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "1".to_owned()),
             ("TASK_AGENT_POLL_INTERVAL_S", "1".to_owned()),
         ];
-        let settings: Vec<(&str, &str)> = settings.iter().map(|(name, value)| (*name, value.as_str())).collect();
+        let settings: Vec<(&str, &str)> =
+            settings.iter().map(|(name, value)| (*name, value.as_str())).collect();
         let url = server.url("");
         let robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &url, &settings).await;
         (Self { server, robot, dir }, made)
@@ -60,7 +64,10 @@ impl Site {
     pub async fn wait(&self, deployment: &str, phase: Phase) -> RobotView {
         eventually(&format!("{deployment} to be {phase}"), async || {
             let view = self.server.robot("robot-1").await?;
-            view.tasks.iter().any(|task| task.deployment.as_str() == deployment && task.phase == phase).then_some(view)
+            view.tasks
+                .iter()
+                .any(|task| task.deployment.as_str() == deployment && task.phase == phase)
+                .then_some(view)
         })
         .await
     }
@@ -84,8 +91,11 @@ async fn what_enough_publishers_have_signed_runs_whatever_way_it_takes_and_nothi
     let (site, keys) = Site::start(2, &["ada.key", "bob.key"]).await;
     let [ada, bob] = [0, 1].map(|at: usize| keys[at].0.as_str());
     let (eve, _) = new_key(&site.server, site.dir.path(), "eve.key").await;
-    for (version, delivery) in [("1.0", "push-pull"), ("2.0", "inline"), ("3.0", "direct-push"), ("4.0", "poll")] {
-        let order = site.push(version, &["--sign", ada, "--sign", bob, "--delivery", delivery]).await;
+    for (version, delivery) in
+        [("1.0", "push-pull"), ("2.0", "inline"), ("3.0", "direct-push"), ("4.0", "poll")]
+    {
+        let order =
+            site.push(version, &["--sign", ada, "--sign", bob, "--delivery", delivery]).await;
         site.wait(&order, Phase::Running).await;
     }
     let keys: [&[&str]; 3] = [&[], &["--sign", ada], &["--sign", ada, "--sign", &eve]];
@@ -97,9 +107,14 @@ async fn what_enough_publishers_have_signed_runs_whatever_way_it_takes_and_nothi
         let text = format!("{count} of the 2 trusted publishers that it takes have signed it");
         assert!(failure.text.contains(&text), "{failure}");
         assert!(!site.has_fetched(&order).await);
-        assert_eq!(view.tasks[0].active.as_ref().map(|active| active.version.as_str()), Some("4.0"), "it goes on");
+        assert_eq!(
+            view.tasks[0].active.as_ref().map(|active| active.version.as_str()),
+            Some("4.0"),
+            "it goes on"
+        );
     }
-    // The operator sees why, and the second publisher's word is enough, from the same directory on any machine.
+    // The operator sees why, and the second publisher's word is enough, from the same directory on
+    // any machine.
     let shown = site.server.operate(["robot", "info", "robot-1"]).await;
     assert!(shown.contains("untrusted_package"), "{shown}");
     assert!(shown.contains("those of its own settings"), "{shown}");
@@ -118,7 +133,9 @@ async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_with
 
     let draft = site.dir.path().join("list").to_str().expect("utf-8").to_owned();
     let server = &site.server;
-    server.operate(["key", "draft", &draft, "--publisher", &bob_public, "--keeper", &keeper_public]).await;
+    server
+        .operate(["key", "draft", &draft, "--publisher", &bob_public, "--keeper", &keeper_public])
+        .await;
     let unsigned = server.try_operate(["key", "publish", &draft]).await;
     assert!(!unsigned.status.success());
     // By the keeper before, which is the publisher of the robot's settings, and by the new one.
@@ -126,11 +143,18 @@ async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_with
         server.operate(["key", "sign", &draft, "--key", key]).await;
     }
     server.operate(["key", "publish", &draft]).await;
-    let listed: Value = serde_json::from_str(&server.operate(["key", "list", "-o", "json"]).await).expect("json");
-    assert_eq!((&listed["version"], &listed["publishers"]["keys"]), (&json!(1), &json!([bob_public])));
+    let listed: Value =
+        serde_json::from_str(&server.operate(["key", "list", "-o", "json"]).await).expect("json");
+    assert_eq!(
+        (&listed["version"], &listed["publishers"]["keys"]),
+        (&json!(1), &json!([bob_public]))
+    );
     let revoked = eventually("the robot to go by the list", async || {
         let view = server.robot("robot-1").await?;
-        let degraded = view.tasks[0].degraded.as_ref().is_some_and(|why| why.code == FailureCode::UNTRUSTED_PACKAGE);
+        let degraded = view.tasks[0]
+            .degraded
+            .as_ref()
+            .is_some_and(|why| why.code == FailureCode::UNTRUSTED_PACKAGE);
         (view.host.as_ref()?.publishers == Some(1) && degraded).then_some(view)
     })
     .await;
@@ -151,13 +175,15 @@ async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_with
     let order = site.push("1.0", &["--sign", &bob]).await;
     site.wait(&order, Phase::Running).await;
     // The next list is the new keeper's alone, and takes a package back.
-    let manifest = site.server.deployment(&order).await.expect("known").package.manifest.digest.to_string();
+    let manifest =
+        site.server.deployment(&order).await.expect("known").package.manifest.digest.to_string();
     site.server.operate(["key", "draft", &draft, "--withdraw", &manifest]).await;
     site.server.operate(["key", "sign", &draft, "--key", &keeper]).await;
     site.server.operate(["key", "publish", &draft]).await;
     eventually("the robot to go by the next list", async || {
         let view = site.server.robot("robot-1").await?;
-        (view.host.as_ref()?.publishers == Some(2) && view.tasks[0].degraded.is_some()).then_some(())
+        (view.host.as_ref()?.publishers == Some(2) && view.tasks[0].degraded.is_some())
+            .then_some(())
     })
     .await;
     let order = site.push("1.0", &["--sign", &bob, "--restart"]).await;

@@ -1,4 +1,5 @@
-//! The foundation's promise: a real ROS 2 package travels from a directory to two robots, is built there, runs and reports.
+//! The foundation's promise: a real ROS 2 package travels from a directory to two robots, is built
+//! there, runs and reports.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;
@@ -32,14 +33,20 @@ async fn the_talker_runs_on_two_robots_and_answers() {
     let server = Server::start(&dir.path().join("server")).await;
     let mut robots = Vec::new();
     for (number, domain) in [(1, "71"), (2, "72")] {
-        let settings =
-            [("TASK_AGENT_UNDERLAYS", activate.to_str().expect("utf-8")), ("TASK_AGENT_ROS_DOMAIN_ID", domain)];
+        let settings = [
+            ("TASK_AGENT_UNDERLAYS", activate.to_str().expect("utf-8")),
+            ("TASK_AGENT_ROS_DOMAIN_ID", domain),
+        ];
         let name = format!("robot-{number}");
-        robots.push(Robot::start_with(&server, dir.path(), &name, number, &server.url(""), &settings).await);
+        robots.push(
+            Robot::start_with(&server, dir.path(), &name, number, &server.url(""), &settings).await,
+        );
     }
     let talker = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/talker");
     let talker = talker.to_str().expect("utf-8");
-    let out = server.operate(["push", talker, "--to", "*", "--wait", "--timeout", "10m", "-o", "json"]).await;
+    let out = server
+        .operate(["push", talker, "--to", "*", "--wait", "--timeout", "10m", "-o", "json"])
+        .await;
     assert!(out.contains("\"running\""), "{out}");
 
     for domain in ["71", "72"] {
@@ -49,8 +56,10 @@ async fn the_talker_runs_on_two_robots_and_answers() {
 
     // The same tree again: the same digest, and not a blob travels.
     let again = server.try_operate(["push", talker, "--to", "*", "--yes", "-o", "json"]).await;
-    let manifest =
-        |text: &[u8]| serde_json::from_slice::<serde_json::Value>(text).expect("json")["package"]["manifest"].clone();
+    let manifest = |text: &[u8]| {
+        serde_json::from_slice::<serde_json::Value>(text).expect("json")["package"]["manifest"]
+            .clone()
+    };
     assert_eq!(manifest(&again.stdout), manifest(out.as_bytes()));
     let progress = String::from_utf8_lossy(&again.stderr);
     assert!(progress.contains("nothing to upload"), "{progress}");

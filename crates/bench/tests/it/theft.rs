@@ -1,5 +1,5 @@
-//! What somebody gets who has a token and no key, and a thief who has the server's key, a state that it signed once, or a
-//! robot's identity.
+//! What somebody gets who has a token and no key, and a thief who has the server's key, a state
+//! that it signed once, or a robot's identity.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -23,7 +23,8 @@ use tokio::task::JoinHandle;
 use crate::harness::{Server, eventually, from_restarted_agent, open_directory, write_package};
 use crate::signing::{Site, new_key};
 
-/// Somebody in the server's place, with a state for the robot and blobs, who listens to what the robot says.
+/// Somebody in the server's place, with a state for the robot and blobs, who listens to what the
+/// robot says.
 #[derive(Clone, Default)]
 struct Thief(Arc<Mutex<Loot>>);
 
@@ -95,12 +96,14 @@ async fn signed_state(site: &Site) -> Envelope {
 
 /// The server's own key, which signs desired states.
 fn stolen_key(server: &Server) -> SigningKey {
-    let seed = std::fs::read_to_string(server.data().join("signing.key")).expect("the server's key");
+    let seed =
+        std::fs::read_to_string(server.data().join("signing.key")).expect("the server's key");
     SigningKey::from_bytes(unhex(seed.trim()).expect("64 hex digits"))
 }
 
 async fn stolen_blob(server: &Server, blob: BlobRef) -> Vec<u8> {
-    let request = reqwest::Client::new().get(server.url(&format!("/v2/worker/blobs/{}", blob.digest)));
+    let request =
+        reqwest::Client::new().get(server.url(&format!("/v2/worker/blobs/{}", blob.digest)));
     let answer = request.bearer_auth(server.operator_token()).send().await.expect("an answer");
     let bytes = answer.bytes().await.expect("a blob").to_vec();
     assert_eq!(BlobRef::of(&bytes), blob);
@@ -112,23 +115,40 @@ async fn a_publishers_token_without_a_trusted_key_runs_nothing_whatever_is_pushe
     let (site, keys) = Site::start(1, &["ada.key"]).await;
     let order = site.push("1.0", &["--sign", &keys[0].0]).await;
     let running = site.wait(&order, Phase::Running).await.tasks.remove(0).active;
-    site.server.operate(["user", "add", "eve", "--role", "operator,publisher", "--no-password"]).await;
+    site.server
+        .operate(["user", "add", "eve", "--role", "operator,publisher", "--no-password"])
+        .await;
     let made = site.server.operate(["token", "create", "--user", "eve", "-o", "json"]).await;
     let made: Value = serde_json::from_str(&made).expect("json");
     let as_eve = async |args: &[&str]| {
         let mut command = site.server.command(args);
         command.env("TASKD_TOKEN", made["token"].as_str().expect("a token"));
-        tokio::task::spawn_blocking(move || command.output().expect("taskd runs")).await.expect("no panic")
+        tokio::task::spawn_blocking(move || command.output().expect("taskd runs"))
+            .await
+            .expect("no panic")
     };
     let (key, public) = new_key(&site.server, site.dir.path(), "eve.key").await;
     let package = site.package("6.6");
-    let push = ["push", package.to_str().expect("utf-8"), "--to", "robot-1", "--yes", "--sign", &key, "-o", "json"];
+    let push = [
+        "push",
+        package.to_str().expect("utf-8"),
+        "--to",
+        "robot-1",
+        "--yes",
+        "--sign",
+        &key,
+        "-o",
+        "json",
+    ];
     let is_refused = async || {
         let output = as_eve(&push).await;
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         let order: DeploymentView = serde_json::from_slice(&output.stdout).expect("a deployment");
         let view = site.wait(order.id.as_str(), Phase::Failed).await;
-        assert_eq!(view.tasks[0].failure.as_ref().expect("why").code, FailureCode::UNTRUSTED_PACKAGE);
+        assert_eq!(
+            view.tasks[0].failure.as_ref().expect("why").code,
+            FailureCode::UNTRUSTED_PACKAGE
+        );
         assert_eq!(view.tasks[0].active, running, "what was signed goes on");
         view
     };
@@ -162,10 +182,14 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
     let script = format!("touch {}/was-here\nexec sleep 1000\n", marker.display());
     write_package(&evil, "worker", "1.0", "service", &script);
     let args = ["push", evil.to_str().expect("utf-8"), "--force", "-o", "json"];
-    let evil: PackageRef = serde_json::from_str(&site.server.operate(args).await).expect("a package");
+    let evil: PackageRef =
+        serde_json::from_str(&site.server.operate(args).await).expect("a package");
 
     let key = stolen_key(&site.server);
-    let payload = signed_state(&site).await.open(DESIRED_STATE_TYPE, &key.public_key()).expect("by the server's key");
+    let payload = signed_state(&site)
+        .await
+        .open(DESIRED_STATE_TYPE, &key.public_key())
+        .expect("by the server's key");
     let good: DesiredState = serde_json::from_slice(&payload).expect("a state");
     let thief = Thief::default();
     for blob in [evil.config, evil.content].into_iter().chain(good.evidence.blobs()) {
@@ -175,7 +199,8 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
     site.server.kill();
     let serving = thief.serve(site.server.http).await;
 
-    // All of the evil package; and the signed one's name, version and manifest, with the evil one's bytes.
+    // All of the evil package; and the signed one's name, version and manifest, with the evil one's
+    // bytes.
     let signed = good.tasks[0].package.clone();
     let mixed = PackageRef { config: evil.config, content: evil.content, ..signed };
     for (package, generation) in [evil, mixed].into_iter().zip(good.generation.0 + 1..) {
@@ -184,8 +209,9 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
         (forged.tasks[0].package, forged.tasks[0].deployment) = (package, DeploymentId::random());
         let payload = serde_json::to_vec(&forged).expect("json");
         thief.loot().state = Some(Envelope::seal(DESIRED_STATE_TYPE, &payload, &key));
-        let is_refused =
-            |task: &&TaskReport| task.deployment == forged.tasks[0].deployment && task.phase == Phase::Failed;
+        let is_refused = |task: &&TaskReport| {
+            task.deployment == forged.tasks[0].deployment && task.phase == Phase::Failed
+        };
         let refused = |report: &Report| report.tasks.iter().find(is_refused).cloned();
         let refused = thief.hears("the robot to refuse it", refused).await;
         assert_eq!(refused.failure.expect("why").code, FailureCode::UNTRUSTED_PACKAGE);
@@ -211,7 +237,8 @@ async fn a_replayed_old_state_is_refused_also_after_a_restart_of_the_agent() {
     let serving = thief.serve(site.server.http).await;
     for _ in 0..2 {
         let refused = |report: &Report| {
-            let condition = report.conditions.iter().find(|condition| condition.code == "state_refused")?;
+            let condition =
+                report.conditions.iter().find(|condition| condition.code == "state_refused")?;
             Some((condition.text.clone(), report.tasks.clone()))
         };
         let (why, tasks) = thief.hears("the robot to refuse it", refused).await;
@@ -229,13 +256,15 @@ async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_th
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let sign = ["--sign", keys[0].0.as_str()];
     let thief = site.robot.stolen(site.dir.path(), "thief");
-    let is_shown = async || site.server.robot("robot-1").await.filter(|view| has(view, "duplicate_identity"));
+    let is_shown =
+        async || site.server.robot("robot-1").await.filter(|view| has(view, "duplicate_identity"));
     eventually("the server to see two of them", is_shown).await;
     let shown = site.server.operate(["robot", "info", "robot-1"]).await;
     assert!(shown.contains("duplicate_identity"), "{shown}");
     let order = site.push("1.0", &sign).await;
 
-    let made = site.server.operate(["enroll-token", "create", "--robot", "robot-1", "-o", "json"]).await;
+    let made =
+        site.server.operate(["enroll-token", "create", "--robot", "robot-1", "-o", "json"]).await;
     let made: Value = serde_json::from_str(&made).expect("json");
     site.robot.terminate();
     site.robot.enroll_anew(1, made["token"].as_str().expect("a token")).await;
@@ -250,14 +279,20 @@ async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_th
 async fn with_a_known_robot() -> (Site, Vec<(String, String)>) {
     let (site, keys) = Site::start(1, &["ada.key"]).await;
     let is_known = |view: &RobotView| view.online && view.host.is_some();
-    eventually("the robot to be known", async || site.server.robot("robot-1").await.filter(is_known)).await;
+    eventually("the robot to be known", async || {
+        site.server.robot("robot-1").await.filter(is_known)
+    })
+    .await;
     (site, keys)
 }
 
 /// Waits until the server shows that another agent has come with the robot's identity.
 async fn is_noticed(site: &Site) {
     let noticed = |view: &RobotView| has(view, "instance_waits") || has(view, "duplicate_identity");
-    eventually("the copy to be noticed", async || site.server.robot("robot-1").await.filter(noticed)).await;
+    eventually("the copy to be noticed", async || {
+        site.server.robot("robot-1").await.filter(noticed)
+    })
+    .await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,5 +1,5 @@
-//! Encryption through the real programs: one token is all a robot needs, a proxy's one port is enough, and a server that is
-//! not the one it was enrolled at gets nothing.
+//! Encryption through the real programs: one token is all a robot needs, a proxy's one port is
+//! enough, and a server that is not the one it was enrolled at gets nothing.
 #![expect(clippy::disallowed_methods, reason = "a test starts a proxy")]
 
 use std::net::SocketAddr;
@@ -20,7 +20,18 @@ async fn run_something(server: &Server, dir: &Path, version: &str) {
     let package = dir.join(format!("worker-{version}"));
     write_package(&package, "worker", version, "service", "exec sleep 1000\n");
     let package = package.to_str().expect("utf-8 path");
-    let order = ["push", package, "--to", "robot-1", "--yes", "--delivery", "push-pull", "--wait", "--timeout", "80s"];
+    let order = [
+        "push",
+        package,
+        "--to",
+        "robot-1",
+        "--yes",
+        "--delivery",
+        "push-pull",
+        "--wait",
+        "--timeout",
+        "80s",
+    ];
     server.operate(order).await;
     server.wait_phase("robot-1", "worker", Phase::Running).await;
 }
@@ -36,7 +47,8 @@ async fn one_token_is_all_a_robot_needs_and_another_server_gets_nothing() {
     let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     connected(&server).await;
     run_something(&server, dir.path(), "1.0.0").await;
-    // At the same addresses there is now somebody else, who knows as much of the robot as a copy of the database tells.
+    // At the same addresses there is now somebody else, who knows as much of the robot as a copy of
+    // the database tells.
     server.terminate();
     let copy = dir.path().join("impostor");
     std::fs::create_dir(&copy).expect("made");
@@ -65,18 +77,33 @@ async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
     let (token, plain) = (server.enrollment_token().await, format!("http://{}", server.http));
     let agent = async |arguments: &[&str]| {
         let mut command = Command::new(program("task-agent"));
-        command.args(arguments).arg("--data").arg(dir.path().join("robot-1")).env("TASK_AGENT_SERVER", &plain);
-        tokio::task::spawn_blocking(move || command.output().expect("task-agent runs")).await.expect("no panic")
+        command
+            .args(arguments)
+            .arg("--data")
+            .arg(dir.path().join("robot-1"))
+            .env("TASK_AGENT_SERVER", &plain);
+        tokio::task::spawn_blocking(move || command.output().expect("task-agent runs"))
+            .await
+            .expect("no panic")
     };
-    let enroll = |server| ["enroll", "--token", &token, "--mac", "02:00:00:00:00:01", "--server", server];
+    let enroll =
+        |server| ["enroll", "--token", &token, "--mac", "02:00:00:00:00:01", "--server", server];
     let refused = agent(&enroll(&plain)).await;
     let said = String::from_utf8_lossy(&refused.stderr);
-    assert!(!refused.status.success() && said.contains("--server: the token is for a server that encrypts"), "{said}");
+    assert!(
+        !refused.status.success()
+            && said.contains("--server: the token is for a server that encrypts"),
+        "{said}"
+    );
     // Nor is the robot's own, whatever its settings say.
     assert!(agent(&enroll(&server.url(""))).await.status.success());
     let refused = agent(&["run"]).await;
     let said = String::from_utf8_lossy(&refused.stderr);
-    assert!(!refused.status.success() && said.contains("server: the token is for a server that encrypts"), "{said}");
+    assert!(
+        !refused.status.success()
+            && said.contains("server: the token is for a server that encrypts"),
+        "{said}"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -96,18 +123,24 @@ async fn an_own_certificate_is_taken_from_its_files_without_a_restart() {
     ];
     let server = Server::start_with(&dir.path().join("server"), &files).await;
     let roots = [("SSL_CERT_FILE", authority.root.to_str().expect("utf-8"))];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &roots).await;
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &roots).await;
     connected(&server).await;
-    let since = server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("connected").since_ms;
+    let since =
+        server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("connected").since_ms;
     put_in_place();
     server.signal(Signal::SIGHUP);
     let log = dir.path().join("server.server.log");
     eventually("the server to take the new certificate", async || {
-        std::fs::read_to_string(&log).ok()?.contains("new connections are shown the certificate").then_some(())
+        std::fs::read_to_string(&log)
+            .ok()?
+            .contains("new connections are shown the certificate")
+            .then_some(())
     })
     .await;
     run_something(&server, dir.path(), "1.0.0").await;
-    let session = server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("still connected");
+    let session =
+        server.robot("robot-1").await.and_then(|robot| robot.mqtt).expect("still connected");
     assert_eq!(session.since_ms, since, "the session went on");
 }
 
@@ -117,7 +150,9 @@ async fn a_proxys_one_port_is_enough() {
     let authority = Authority::new(&dir.path().join("root.pem"));
     // What robots are told of MQTT is a port that nobody listens on, as behind a firewall.
     let closed = free_address().port().to_string();
-    let server = Server::start_with(&dir.path().join("server"), &[("TASKD_PUBLIC_MQTT_PORT", &closed)]).await;
+    let server =
+        Server::start_with(&dir.path().join("server"), &[("TASKD_PUBLIC_MQTT_PORT", &closed)])
+            .await;
     let proxy = Proxy::start(&server, &authority, dir.path()).await;
     let roots = [("SSL_CERT_FILE", authority.root.to_str().expect("utf-8"))];
     let url = format!("https://{}", proxy.address);
@@ -133,10 +168,14 @@ async fn a_proxys_one_port_is_enough() {
 async fn a_setting_takes_mqtt_over_the_servers_own_http_port() {
     let dir = tempfile::tempdir().expect("temp dir");
     let closed = free_address().port().to_string();
-    let server =
-        Server::start_with(&dir.path().join("server"), &[ENCRYPTED, KEYED, ("TASKD_PUBLIC_MQTT_PORT", &closed)]).await;
+    let server = Server::start_with(
+        &dir.path().join("server"),
+        &[ENCRYPTED, KEYED, ("TASKD_PUBLIC_MQTT_PORT", &closed)],
+    )
+    .await;
     let only_http = [("TASK_AGENT_MQTT_TRANSPORT", "websocket")];
-    let _robot = Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &only_http).await;
+    let _robot =
+        Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &only_http).await;
     connected(&server).await;
     run_something(&server, dir.path(), "1.0.0").await;
 }
@@ -165,7 +204,9 @@ impl Authority {
 }
 
 fn free_address() -> SocketAddr {
-    std::net::TcpListener::bind("127.0.0.1:0").and_then(|listener| listener.local_addr()).expect("a port")
+    std::net::TcpListener::bind("127.0.0.1:0")
+        .and_then(|listener| listener.local_addr())
+        .expect("a port")
 }
 
 /// nginx, as docs/tls.md has it.
@@ -206,7 +247,8 @@ impl Proxy {
         let mut command = Command::new("nginx");
         command.env("PATH", path).args(["-e", "error.log", "-c", "nginx.conf", "-p"]).arg(&prefix);
         let proxy = Self { _process: Process::spawn(&mut command), address };
-        eventually("nginx to listen", async || tokio::net::TcpStream::connect(address).await.ok()).await;
+        eventually("nginx to listen", async || tokio::net::TcpStream::connect(address).await.ok())
+            .await;
         proxy
     }
 }

@@ -11,7 +11,8 @@ use task_hostile::{Mutation, TARGETS, Target};
 
 /// What the changes begin with.
 const SEED: u64 = 5;
-/// Panics of the threads that serve: one in a session's task ends that session, and nobody hears of it.
+/// Panics of the threads that serve: one in a session's task ends that session, and nobody hears of
+/// it.
 static PANICS: AtomicUsize = AtomicUsize::new(0);
 
 pub fn directory() -> PathBuf {
@@ -21,11 +22,15 @@ pub fn directory() -> PathBuf {
 /// The inputs kept for `target`, by name.
 pub fn kept(target: &str) -> Vec<(String, Vec<u8>)> {
     let directory = directory().join(target);
-    let entries = fs::read_dir(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
+    let entries =
+        fs::read_dir(&directory).unwrap_or_else(|error| panic!("{}: {error}", directory.display()));
     let mut kept: Vec<_> = entries
         .map(|entry| {
             let entry = entry.expect("an entry");
-            (entry.file_name().to_string_lossy().into_owned(), fs::read(entry.path()).expect("readable"))
+            (
+                entry.file_name().to_string_lossy().into_owned(),
+                fs::read(entry.path()).expect("readable"),
+            )
         })
         .collect();
     kept.sort();
@@ -62,5 +67,9 @@ fn check(target: &Target, bytes: &[u8], what: &str) {
     let ended = catch_unwind(AssertUnwindSafe(|| (target.run)(bytes)));
     let name = target.name;
     let harmless = ended.is_ok() && PANICS.load(Ordering::SeqCst) == before;
-    assert!(harmless, "{name} does not bear {what}; keep it in fuzz/corpus/{name}: \"{}\"", bytes.escape_ascii());
+    assert!(
+        harmless,
+        "{name} does not bear {what}; keep it in fuzz/corpus/{name}: \"{}\"",
+        bytes.escape_ascii()
+    );
 }

@@ -96,7 +96,10 @@ fn no_websocket_frame_does_harm() {
 fn however_deep_it_is_nothing_does_harm() {
     const DEPTH: usize = 200_000;
     let nested = |before: &str, open: &str, close: &str| {
-        [before.to_owned() + &open.repeat(DEPTH), before.to_owned() + &open.repeat(DEPTH) + &close.repeat(DEPTH)]
+        [
+            before.to_owned() + &open.repeat(DEPTH),
+            before.to_owned() + &open.repeat(DEPTH) + &close.repeat(DEPTH),
+        ]
     };
     let inputs = [
         nested("", "[", "]"),
@@ -125,18 +128,26 @@ fn every_target_is_run_here_and_by_the_fuzzer() {
     let fuzz = directory().join("..");
     let listed = fs::read_to_string(fuzz.join("Cargo.toml")).expect("fuzz/Cargo.toml");
     for name in TARGETS.map(|target| target.name) {
-        assert!(include_str!("targets.rs").contains(&format!("    run(\"{name}\");")), "no test for {name}");
+        assert!(
+            include_str!("targets.rs").contains(&format!("    run(\"{name}\");")),
+            "no test for {name}"
+        );
         assert!(
             listed.contains(&format!("name = \"{name}\"\npath = \"fuzz_targets/{name}.rs\"")),
             "{name} is not listed"
         );
-        let program = fs::read_to_string(fuzz.join(format!("fuzz_targets/{name}.rs"))).expect("its program");
-        assert!(program.contains(&format!("task_hostile::{name}(bytes)")), "{name} runs something else");
+        let program =
+            fs::read_to_string(fuzz.join(format!("fuzz_targets/{name}.rs"))).expect("its program");
+        assert!(
+            program.contains(&format!("task_hostile::{name}(bytes)")),
+            "{name} runs something else"
+        );
     }
 }
 
 #[test]
 fn what_is_kept_stays_small() {
-    let size: usize = TARGETS.iter().flat_map(|target| kept(target.name)).map(|(_, bytes)| bytes.len()).sum();
+    let size: usize =
+        TARGETS.iter().flat_map(|target| kept(target.name)).map(|(_, bytes)| bytes.len()).sum();
     assert!(size <= 300 * 1024, "fuzz/corpus has {size} bytes: minimise it");
 }

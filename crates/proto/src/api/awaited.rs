@@ -22,7 +22,8 @@ impl DeploymentView {
     /// The robots on which it has not settled; none where the view has no assignments.
     pub fn awaited(&self) -> Awaited<'_> {
         let mut awaited = Awaited::default();
-        for one in self.assignments.iter().flatten().filter(|one| !one.phase.is_settled(self.kind)) {
+        for one in self.assignments.iter().flatten().filter(|one| !one.phase.is_settled(self.kind))
+        {
             match (one.online, one.released) {
                 (false, _) => awaited.offline.push(one),
                 (true, true) => awaited.busy.push(one),
@@ -45,7 +46,11 @@ impl fmt::Display for Awaited<'_> {
             .filter(|(_, robots)| !robots.is_empty())
             .map(|(title, robots)| format!("{title}{}", names(robots, MAX_NAMES)))
             .collect();
-        if parts.is_empty() { f.write_str("it has settled on every robot") } else { f.write_str(&parts.join("; ")) }
+        if parts.is_empty() {
+            f.write_str("it has settled on every robot")
+        } else {
+            f.write_str(&parts.join("; "))
+        }
     }
 }
 

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 use crate::id::{LabelKey, Labels};
 use crate::selector::Selector;
 
-/// `POST /bulk/labels` (maintain): what is neither set nor removed stays. The answer is [`super::MatchedRobots`].
+/// `POST /bulk/labels` (maintain): what is neither set nor removed stays. The answer is
+/// [`super::MatchedRobots`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BulkLabels {
@@ -23,7 +24,8 @@ pub struct BulkLabels {
     pub dry_run: bool,
 }
 
-/// `POST /bulk/remove` (maintain): like `DELETE /robots/{robot}` for each. The answer is [`super::MatchedRobots`].
+/// `POST /bulk/remove` (maintain): like `DELETE /robots/{robot}` for each. The answer is
+/// [`super::MatchedRobots`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BulkRemove {

@@ -30,7 +30,8 @@ pub enum DeliveryChoice {
 pub struct DeliveryDecision {
     /// How the bytes travel.
     pub mechanism: Delivery,
-    /// The rule's name; `ordered` where the operator chose, `fell behind` where a robot was told to pull instead.
+    /// The rule's name; `ordered` where the operator chose, `fell behind` where a robot was told to
+    /// pull instead.
     pub rule: String,
     /// For people: what decided, with its values: `size 9.7 MB > 256 KB`.
     pub because: String,

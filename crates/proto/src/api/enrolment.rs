@@ -26,7 +26,8 @@ pub struct EnrollmentTokenView {
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Enrolments left; absent: any number. With none left it is only good for one whose answer was lost.
+    /// Enrolments left; absent: any number. With none left it is only good for one whose answer was
+    /// lost.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub uses_left: Option<u64>,
     /// Whether a robot that comes by it waits to be approved.
@@ -49,7 +50,8 @@ pub struct PendingRobotList {
     pub robots: Vec<PendingRobot>,
 }
 
-/// A robot that waits to be approved. Name, MAC and labels are what it says of itself, but for the token's labels.
+/// A robot that waits to be approved. Name, MAC and labels are what it says of itself, but for the
+/// token's labels.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PendingRobot {
@@ -79,7 +81,8 @@ pub struct CreateEnrollmentToken {
     /// Only for this robot, by id or name, which may register again with it.
     #[serde(default)]
     pub robot: Option<String>,
-    /// How many enrolments it is good for; absent: as many as the server's setting `enrolment.uses` says.
+    /// How many enrolments it is good for; absent: as many as the server's setting `enrolment.uses`
+    /// says.
     #[serde(default)]
     pub uses: Option<u64>,
     /// Whether it is good for any number of them; not with `uses`.
@@ -92,7 +95,8 @@ pub struct CreateEnrollmentToken {
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Whether a robot that comes by it waits to be approved, also where the server does not ask that of all.
+    /// Whether a robot that comes by it waits to be approved, also where the server does not ask
+    /// that of all.
     #[serde(default)]
     pub approval: bool,
 }

@@ -1,5 +1,5 @@
-//! Bodies of the feed: the last things in the fleet that are worth a look. It is in memory and starts empty with the
-//! server; what must not be lost is in the audit.
+//! Bodies of the feed: the last things in the fleet that are worth a look. It is in memory and
+//! starts empty with the server; what must not be lost is in the audit.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,7 +9,8 @@ use crate::{DeploymentId, RobotId, RobotName};
 /// The most entries the server keeps, and the most that are answered at once.
 pub const MAX_FEED_ENTRIES: usize = 2000;
 
-/// `GET /feed` (read), optionally `?after=<number>` and `?limit=` (absent: 100): the newest of those that the person may see.
+/// `GET /feed` (read), optionally `?after=<number>` and `?limit=` (absent: 100): the newest of
+/// those that the person may see.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct FeedPage {

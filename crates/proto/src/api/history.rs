@@ -25,8 +25,8 @@ pub struct TimelineEntry {
     pub attempt: u32,
 }
 
-/// `GET /robots/{robot}/tasks` (read), optionally `?limit=` (1 to 200, absent: 50), `?before=<deployment>` and `?task=`:
-/// everything that was ordered for a robot.
+/// `GET /robots/{robot}/tasks` (read), optionally `?limit=` (1 to 200, absent: 50),
+/// `?before=<deployment>` and `?task=`: everything that was ordered for a robot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TaskHistory {
@@ -50,7 +50,8 @@ pub struct PastAssignment {
     pub kind: TaskKind,
     /// Whether its batch has begun.
     pub released: bool,
-    /// Whether it is what the robot should have now, running or stopped; absent: no more, or not yet.
+    /// Whether it is what the robot should have now, running or stopped; absent: no more, or not
+    /// yet.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub wanted: Option<Wanted>,
     /// Where it stands.
@@ -77,7 +78,8 @@ pub struct PastAssignment {
     pub superseded_by: Option<DeploymentId>,
 }
 
-/// `GET /robots/{robot}/vitals` (read): the last hour, about one a minute; gone when the server restarts.
+/// `GET /robots/{robot}/vitals` (read): the last hour, about one a minute; gone when the server
+/// restarts.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct VitalsView {

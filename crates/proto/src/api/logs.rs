@@ -24,7 +24,8 @@ pub struct LogsQuery {
     /// At most so many; absent: 500.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_lines: Option<u64>,
-    /// Whether to stream [`LogEvent`]s from now on instead; then `since_s` and `max_lines` have no meaning.
+    /// Whether to stream [`LogEvent`]s from now on instead; then `since_s` and `max_lines` have no
+    /// meaning.
     #[serde(default)]
     pub follow: bool,
 }
@@ -58,13 +59,14 @@ pub enum LogsFrom {
     Server,
 }
 
-/// What `GET /robots/{robot}/logs?follow=true` streams: each is the `data` of a server-sent event whose `event` is the
-/// tag's value.
+/// What `GET /robots/{robot}/logs?follow=true` streams: each is the `data` of a server-sent event
+/// whose `event` is the tag's value.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum LogEvent {
-    /// The robot publishes its lines from now on. Comes again after a gap: what was said in it is to be had by asking.
+    /// The robot publishes its lines from now on. Comes again after a gap: what was said in it is
+    /// to be had by asking.
     Following,
     /// The robot can't be reached, and is asked again and again.
     Away {
@@ -75,7 +77,8 @@ pub enum LogEvent {
     Lines {
         /// The lines.
         lines: Vec<LogLine>,
-        /// Lines that were left out since the ones before because they were too many; the robot keeps them.
+        /// Lines that were left out since the ones before because they were too many; the robot
+        /// keeps them.
         suppressed: u64,
     },
 }

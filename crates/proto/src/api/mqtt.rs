@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::pin::CaPin;
 use crate::topic::TopicPrefix;
 
-/// Where a robot's MQTT session goes: part of the answer to an enrolment, and `GET /robots/{robot}/mqtt` (that robot).
+/// Where a robot's MQTT session goes: part of the answer to an enrolment, and
+/// `GET /robots/{robot}/mqtt` (that robot).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MqttEndpoint {
@@ -21,11 +22,12 @@ pub struct MqttEndpoint {
     /// Whether the port speaks TLS.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tls: bool,
-    /// The broker there is not the server's own. Absent: it is, and the password is the robot's token.
+    /// The broker there is not the server's own. Absent: it is, and the password is the robot's
+    /// token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub external: Option<ExternalBroker>,
-    /// Other external brokers with the same accounts, in the order in which a robot tries them when the first one does not
-    /// answer. Agents that don't know this field ask the server again.
+    /// Other external brokers with the same accounts, in the order in which a robot tries them when
+    /// the first one does not answer. Agents that don't know this field ask the server again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alternatives: Vec<MqttPlace>,
 }
@@ -44,18 +46,19 @@ pub struct MqttPlace {
     pub tls: bool,
 }
 
-/// What is otherwise with a broker that is not the server's own. Its PUBACK says that the broker took a message, and
-/// nothing of the server: reports go over HTTP, whose answer means stored.
+/// What is otherwise with a broker that is not the server's own. Its PUBACK says that the broker
+/// took a message, and nothing of the server: reports go over HTTP, whose answer means stored.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ExternalBroker {
     /// The robot's password there, in the place of its token, which such a broker is never shown.
     pub password: String,
-    /// The robot's MQTT client id there. No other client knows it, so that none can end this robot's session by connecting
-    /// with the same id. Absent: the robot id.
+    /// The robot's MQTT client id there. No other client knows it, so that none can end this
+    /// robot's session by connecting with the same id. Absent: the robot id.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub client_id: Option<String>,
-    /// The authority behind the broker's certificate, if that is to be it alone and no root of the robot's system.
+    /// The authority behind the broker's certificate, if that is to be it alone and no root of the
+    /// robot's system.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
 }
@@ -101,7 +104,8 @@ pub struct BrokerChecks {
 pub struct BrokerCheck {
     /// Host and port.
     pub address: String,
-    /// Whether one account ends the session of another by connecting with its client id. Absent: the test did not get so far.
+    /// Whether one account ends the session of another by connecting with its client id. Absent:
+    /// the test did not get so far.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub displaces: Option<bool>,
     /// Why it did not.

@@ -1,4 +1,5 @@
-//! Bodies of orders that follow from earlier ones: the same once more where it failed, and back to what was there before.
+//! Bodies of orders that follow from earlier ones: the same once more where it failed, and back to
+//! what was there before.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,9 +7,10 @@ use super::{DeploymentView, MatchedRobot};
 use crate::report::FailureCode;
 use crate::selector::Selector;
 
-/// `POST /deployments/{deployment}/retry` (operate), with an `Idempotency-Key` header: a new deployment of the same package in
-/// the same way, for the robots on which this one has ended badly and that nothing else was ordered of since. The answer is a
-/// [`DeploymentView`], to a dry run [`super::MatchedRobots`].
+/// `POST /deployments/{deployment}/retry` (operate), with an `Idempotency-Key` header: a new
+/// deployment of the same package in the same way, for the robots on which this one has ended badly
+/// and that nothing else was ordered of since. The answer is a [`DeploymentView`], to a dry run
+/// [`super::MatchedRobots`].
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RetryDeployment {

@@ -34,8 +34,8 @@ pub struct PackageVersions {
     pub name: TaskName,
     /// Those with a tag first, each the newest first.
     pub versions: Vec<PackageView>,
-    /// Which of them robots should have now, and how many of the robots that the person may see. A manifest may be here that
-    /// is not among the versions: robots go on with what was deleted.
+    /// Which of them robots should have now, and how many of the robots that the person may see. A
+    /// manifest may be here that is not among the versions: robots go on with what was deleted.
     pub running: Vec<PackageUse>,
 }
 
@@ -49,7 +49,8 @@ pub struct PackageUse {
     pub robots: u64,
 }
 
-/// `GET /packages/{package}/{version}/files` (read), where the version is a version or a manifest's digest.
+/// `GET /packages/{package}/{version}/files` (read), where the version is a version or a manifest's
+/// digest.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageFiles {
@@ -90,7 +91,8 @@ pub enum PackageFileKind {
     Link,
 }
 
-/// `GET /packages/{package}/diff?from=&to=` (read): what differs between two of its versions. All are sorted by path.
+/// `GET /packages/{package}/diff?from=&to=` (read): what differs between two of its versions. All
+/// are sorted by path.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageDiff {

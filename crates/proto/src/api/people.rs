@@ -1,4 +1,5 @@
-//! The part of the HTTP API that is about people: who they are, how they sign in, their tokens, and what they did.
+//! The part of the HTTP API that is about people: who they are, how they sign in, their tokens, and
+//! what they did.
 
 use serde::{Deserialize, Serialize};
 
@@ -199,7 +200,8 @@ pub struct TokenView {
     pub revoked_at_ms: Option<u64>,
 }
 
-/// `POST /tokens` (any user who signed in with a password): a token of one's own that may do as much or less.
+/// `POST /tokens` (any user who signed in with a password): a token of one's own that may do as
+/// much or less.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateToken {

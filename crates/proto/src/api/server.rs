@@ -47,8 +47,8 @@ pub struct HttpTraffic {
     pub bytes_out: u64,
 }
 
-/// What went over MQTT, all connections together, the server's own watchdog excepted. With an external broker only the
-/// server's own connection to it is known.
+/// What went over MQTT, all connections together, the server's own watchdog excepted. With an
+/// external broker only the server's own connection to it is known.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]

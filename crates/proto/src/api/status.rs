@@ -108,7 +108,8 @@ pub struct DatabaseStatus {
     pub size_bytes: Option<u64>,
     /// Of a question asked now.
     pub latency_ms: f64,
-    /// For people: why orders and reports are refused; absent where nothing is known against the database.
+    /// For people: why orders and reports are refused; absent where nothing is known against the
+    /// database.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
     /// When the server last checked all of it since its start and found nothing wrong. SQLite only.
@@ -155,8 +156,8 @@ pub struct ListenerView {
     pub tls: bool,
 }
 
-/// `GET /server/sessions` (read), optionally `?limit=` (1 to 1,000, absent: 100) and `?after=<name>`: the robots that are
-/// connected over MQTT and that the person may see.
+/// `GET /server/sessions` (read), optionally `?limit=` (1 to 1,000, absent: 100) and
+/// `?after=<name>`: the robots that are connected over MQTT and that the person may see.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SessionList {
@@ -169,7 +170,8 @@ pub struct SessionList {
     pub next: Option<RobotName>,
 }
 
-/// A robot's MQTT connection and what it listens to. With an external broker only whom it has announced is known.
+/// A robot's MQTT connection and what it listens to. With an external broker only whom it has
+/// announced is known.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotSession {

@@ -10,8 +10,9 @@ const MAX_CONDITION_CHARS: usize = 500;
 const MAX_FACT_CHARS: usize = 200;
 
 impl Report {
-    /// The same as far as it is kept: texts without control characters and no longer than they may be, lists with their first
-    /// entries. What it says of a robot is shown to everybody who may see that one, each time something changes.
+    /// The same as far as it is kept: texts without control characters and no longer than they may
+    /// be, lists with their first entries. What it says of a robot is shown to everybody who may
+    /// see that one, each time something changes.
     #[must_use]
     pub fn tidied(mut self) -> Self {
         self.boot_id = fact(&self.boot_id);
@@ -57,7 +58,10 @@ fn fact(text: &str) -> String {
 
 /// So much of a text; control characters, which a package could smuggle in, become spaces.
 pub(super) fn clean(text: &str, max_chars: usize) -> String {
-    text.chars().map(|c| if c.is_control() && c != '\n' { ' ' } else { c }).take(max_chars).collect()
+    text.chars()
+        .map(|c| if c.is_control() && c != '\n' { ' ' } else { c })
+        .take(max_chars)
+        .collect()
 }
 
 #[cfg(test)]
@@ -71,9 +75,12 @@ mod tests {
             serde_json::from_str(include_str!("../../tests/golden/report.json")).expect("a report");
         let text = "a\u{1b}[31mb\n".repeat(MAX_FAILURE_CHARS);
         let said = Failure { code: FailureCode::BUILD_FAILED, text };
-        (report.tasks[0].failure, report.tasks[0].degraded) = (Some(said.clone()), Some(said.clone()));
+        (report.tasks[0].failure, report.tasks[0].degraded) =
+            (Some(said.clone()), Some(said.clone()));
         let kept = Failure::new(said.code, said.text);
-        assert!(kept.text.starts_with("a [31mb\n") && kept.text.chars().count() == MAX_FAILURE_CHARS);
+        assert!(
+            kept.text.starts_with("a [31mb\n") && kept.text.chars().count() == MAX_FAILURE_CHARS
+        );
         let task = report.tidied().tasks.swap_remove(0);
         assert_eq!((task.failure, task.degraded), (Some(kept.clone()), Some(kept)));
     }

@@ -2,10 +2,11 @@
 
 use serde_json::json;
 use task_proto::api::{
-    AssignmentView, BrokerStatus, DatabaseStatus, DeliveryDecision, DiskStatus, EditRobot, Event, FeedEntry, FeedKind,
-    FeedPage, HttpTraffic, LimitView, ListenerView, MqttTraffic, PastAssignment, ReportStatus, RobotCounts,
-    RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus, Subscription, TaskHistory,
-    TimelineEntry, Traffic, TransferStatus, VitalsView,
+    AssignmentView, BrokerStatus, DatabaseStatus, DeliveryDecision, DiskStatus, EditRobot, Event,
+    FeedEntry, FeedKind, FeedPage, HttpTraffic, LimitView, ListenerView, MqttTraffic,
+    PastAssignment, ReportStatus, RobotCounts, RobotSession, RuleView, ServerRules, ServerStatus,
+    SessionList, SiteStatus, Subscription, TaskHistory, TimelineEntry, Traffic, TransferStatus,
+    VitalsView,
 };
 use task_proto::desired::{Delivery, DesiredState, Wanted};
 use task_proto::log::LogLevel;
@@ -66,7 +67,10 @@ fn what_is_set_for_a_robot() {
     let edit = |json| serde_json::from_value::<EditRobot>(json).expect("parses").settings;
     assert_eq!(edit(json!({})), None);
     assert_eq!(edit(json!({"settings": null})), Some(None));
-    assert_eq!(edit(json!({"settings": {"workspace": "/ws"}})).flatten().and_then(|s| s.workspace), parsed_path("/ws"));
+    assert_eq!(
+        edit(json!({"settings": {"workspace": "/ws"}})).flatten().and_then(|s| s.workspace),
+        parsed_path("/ws")
+    );
 }
 
 fn parsed_path(text: &str) -> Option<task_proto::AbsolutePath> {
@@ -75,7 +79,8 @@ fn parsed_path(text: &str) -> Option<task_proto::AbsolutePath> {
 
 #[test]
 fn settings_that_can_not_be_read_leave_the_rest_readable() {
-    let mut value: serde_json::Value = serde_json::from_str(&golden("desired_state.json")).expect("json");
+    let mut value: serde_json::Value =
+        serde_json::from_str(&golden("desired_state.json")).expect("json");
     value["settings"]["workspace"] = json!("ws");
     value["settings"]["limits"]["log_bytes"] = json!("many");
     let read: DesiredState = serde_json::from_value(value.clone()).expect("tolerated");
@@ -121,7 +126,10 @@ fn what_became_of_tasks() {
         updated_at_ms: 1_800_000_003_400,
         superseded_by: None,
     };
-    check("task_history.json", &TaskHistory { assignments: vec![past], next: Some(parsed("d00000000000000b1")) });
+    check(
+        "task_history.json",
+        &TaskHistory { assignments: vec![past], next: Some(parsed("d00000000000000b1")) },
+    );
     check_tolerance::<TaskHistory>("task_history.json");
     let view = AssignmentView {
         robot: robot(),
@@ -159,7 +167,11 @@ fn how_the_server_does() {
         http: HttpTraffic::default(),
         transfers: TransferStatus { active: 2, waiting: 7, bytes_per_s: 12_000_000 },
         sites: vec![site(Some("lab"), Some(31)), site(None, None)],
-        reports: ReportStatus { per_s: 120.5, latency_ms_p50: Some(1.5), latency_ms_p99: Some(12.0) },
+        reports: ReportStatus {
+            per_s: 120.5,
+            latency_ms_p50: Some(1.5),
+            latency_ms_p99: Some(12.0),
+        },
         database: DatabaseStatus {
             kind: "sqlite".to_owned(),
             size_bytes: Some(4_194_304),
@@ -169,8 +181,16 @@ fn how_the_server_does() {
             guard: None,
         },
         disk: DiskStatus { free_bytes: 9, total_bytes: 10, packages_bytes: 1 },
-        broker: BrokerStatus { kind: "embedded".to_owned(), healthy: true, detail: "in this server".to_owned() },
-        listeners: vec![ListenerView { kind: "http".to_owned(), address: "127.0.0.1:8080".to_owned(), tls: false }],
+        broker: BrokerStatus {
+            kind: "embedded".to_owned(),
+            healthy: true,
+            detail: "in this server".to_owned(),
+        },
+        listeners: vec![ListenerView {
+            kind: "http".to_owned(),
+            address: "127.0.0.1:8080".to_owned(),
+            tls: false,
+        }],
     };
     check("server_status.json", &status);
     check_tolerance::<ServerStatus>("server_status.json");
@@ -179,10 +199,16 @@ fn how_the_server_does() {
         name: parsed("atlas"),
         since_ms: 1_800_000_000_000,
         address: Some("192.0.2.7:51234".to_owned()),
-        subscriptions: vec![Subscription { topic_filter: "taskd/v1/r/r00000000000000a1/desired".to_owned(), qos: 1 }],
+        subscriptions: vec![Subscription {
+            topic_filter: "taskd/v1/r/r00000000000000a1/desired".to_owned(),
+            qos: 1,
+        }],
         traffic: Traffic::default(),
     };
-    check("session_list.json", &SessionList { sessions: vec![session], total: 2, next: Some(parsed("atlas")) });
+    check(
+        "session_list.json",
+        &SessionList { sessions: vec![session], total: 2, next: Some(parsed("atlas")) },
+    );
     check_tolerance::<SessionList>("session_list.json");
     let rule = RuleView {
         order: 1,
@@ -206,7 +232,8 @@ fn what_is_worth_a_look() {
         robot: Some(robot()),
         robot_name: Some(parsed("atlas")),
         deployment: Some(parsed("d00000000000000b2")),
-        text: "talker 1.2.0 failed on atlas: build_failed: colcon build ended with status 1".to_owned(),
+        text: "talker 1.2.0 failed on atlas: build_failed: colcon build ended with status 1"
+            .to_owned(),
     };
     check("feed_page.json", &FeedPage { entries: vec![entry.clone()] });
     check_tolerance::<FeedPage>("feed_page.json");

@@ -1,5 +1,6 @@
-//! Compares what is written with `tests/golden/`, and reads it as a newer and an older version of the other side would.
-//! After a wanted change: `UPDATE_GOLDEN=1 cargo test -p task-proto`, and change docs/protocol.md with it.
+//! Compares what is written with `tests/golden/`, and reads it as a newer and an older version of
+//! the other side would. After a wanted change: `UPDATE_GOLDEN=1 cargo test -p task-proto`, and
+//! change docs/protocol.md with it.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -9,28 +10,32 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    ConductTotals, CreateDeployment, DeliveryChoice, EnrollRequest, EnrollResponse, ErrorBody, Event, ExternalBroker,
-    HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint, MqttPlace, MqttTraffic, OutputList,
-    OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
+    ConductTotals, CreateDeployment, DeliveryChoice, EnrollRequest, EnrollResponse, ErrorBody,
+    Event, ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint,
+    MqttPlace, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
 };
 use task_proto::desired::{
-    BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef, SignatureRef, Wanted,
+    BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef,
+    SignatureRef, Wanted,
 };
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
 use task_proto::manifest::{
-    Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind, TaskManifest,
+    Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind,
+    TaskManifest,
 };
 use task_proto::oci::ImageManifest;
 use task_proto::output::{OutputFile, OutputSet};
 use task_proto::part::{Part, PartRange};
 use task_proto::publisher::{PackageStatement, PublisherList, Role, SIGNATURE_ARTIFACT};
 use task_proto::report::{
-    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase, Progress, Report, RosFacts,
-    Status, TaskAccounts, TaskReport,
+    ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase,
+    Progress, Report, RosFacts, Status, TaskAccounts, TaskReport,
 };
 use task_proto::request::{Action, Answer, Ask, Outcome, Refusal, Reply, Request};
-use task_proto::ros::{Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition};
+use task_proto::ros::{
+    Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition,
+};
 use task_proto::topic::TopicPrefix;
 use task_proto::{Digest, Generation, RobotId};
 
@@ -73,7 +78,10 @@ fn desired_state() -> DesiredState {
         }],
         evidence: Evidence {
             lists: vec![blob("list")],
-            signatures: vec![SignatureRef { manifest: package().manifest.digest, envelope: blob("signature") }],
+            signatures: vec![SignatureRef {
+                manifest: package().manifest.digest,
+                envelope: blob("signature"),
+            }],
         },
         settings: crate::fleet::settings(),
     }
@@ -108,8 +116,16 @@ fn report() -> Report {
             publishers: Some(3),
             settings: Some(crate::fleet::effective_settings()),
         },
-        conditions: vec![Condition { code: "held".to_owned(), text: "held at the robot".to_owned() }],
-        link: Some(LinkFacts { throughput_bytes_per_s: Some(2_400_000), rtt_ms: Some(31), reconnects: 1, losses: 2 }),
+        conditions: vec![Condition {
+            code: "held".to_owned(),
+            text: "held at the robot".to_owned(),
+        }],
+        link: Some(LinkFacts {
+            throughput_bytes_per_s: Some(2_400_000),
+            rtt_ms: Some(31),
+            reconnects: 1,
+            losses: 2,
+        }),
         tasks: vec![
             TaskReport {
                 task: parsed("mapper"),
@@ -121,7 +137,10 @@ fn report() -> Report {
                 phase: Phase::Fetching,
                 phase_ms: 1_500,
                 progress: Some(Progress { done: 1, total: 7 }),
-                missing_parts: Some(vec![PartRange { from: 0, to: 0 }, PartRange { from: 3, to: 5 }]),
+                missing_parts: Some(vec![
+                    PartRange { from: 0, to: 0 },
+                    PartRange { from: 3, to: 5 },
+                ]),
                 attempts: 1,
                 restarts: 0,
                 failure: None,
@@ -141,7 +160,10 @@ fn report() -> Report {
                 missing_parts: None,
                 attempts: 3,
                 restarts: 1,
-                failure: Some(Failure::new(FailureCode::BUILD_FAILED, "colcon build ended with status 1")),
+                failure: Some(Failure::new(
+                    FailureCode::BUILD_FAILED,
+                    "colcon build ended with status 1",
+                )),
                 degraded: Some(Failure::new(FailureCode::TOPIC_SILENT, "/scan has no publisher")),
                 active: Some(ActiveVersion {
                     deployment: parsed("d00000000000000b0"),
@@ -174,9 +196,15 @@ pub fn manifest() -> TaskManifest {
             ]),
             ..Ready::default()
         },
-        parameters: BTreeMap::from([("/talker".to_owned(), BTreeMap::from([("period_s".to_owned(), json!(0.5))]))]),
+        parameters: BTreeMap::from([(
+            "/talker".to_owned(),
+            BTreeMap::from([("period_s".to_owned(), json!(0.5))]),
+        )]),
         outputs: Outputs { paths: vec!["maps/*.pgm".to_owned()] },
-        requires: Requires { ros_distro: vec!["jazzy".to_owned(), "kilted".to_owned()], ..Requires::default() },
+        requires: Requires {
+            ros_distro: vec!["jazzy".to_owned(), "kilted".to_owned()],
+            ..Requires::default()
+        },
         limits: Limits { memory_mb: Some(512), cpu_weight: None, pids: Some(64) },
         exec_depends: vec!["rclpy".to_owned()],
         content: ContentFacts { tar_digest: Digest::of(b"tar"), tar_size: 10_240, entries: 9 },
@@ -200,7 +228,11 @@ fn from_the_future(value: &Value) -> Value {
 pub fn check<T: Serialize + DeserializeOwned + PartialEq + Debug>(name: &str, value: &T) {
     check_text::<T>(name, value);
     let text = golden(name);
-    assert_eq!(&serde_json::from_str::<T>(&text).expect("golden file parses"), value, "{name} reads back");
+    assert_eq!(
+        &serde_json::from_str::<T>(&text).expect("golden file parses"),
+        value,
+        "{name} reads back"
+    );
 }
 
 pub fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
@@ -210,11 +242,16 @@ pub fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
     serde_json::from_str::<T>(&written).expect("reads what it wrote");
 }
 
-/// A reader of this version must not mind what a later version adds. Only where maps hold no free keys.
+/// A reader of this version must not mind what a later version adds. Only where maps hold no free
+/// keys.
 pub fn check_tolerance<T: DeserializeOwned + PartialEq + Debug>(name: &str) {
     let value: Value = serde_json::from_str(&golden(name)).expect("json");
     let now: T = serde_json::from_value(value.clone()).expect("reads its own");
-    assert_eq!(serde_json::from_value::<T>(from_the_future(&value)).expect("reads the future"), now, "{name}");
+    assert_eq!(
+        serde_json::from_value::<T>(from_the_future(&value)).expect("reads the future"),
+        now,
+        "{name}"
+    );
 }
 
 fn update_golden(name: &str, written: &str) {
@@ -234,8 +271,12 @@ fn documents_between_server_and_robot() {
     let key = SigningKey::from_bytes([7; 32]);
     let state = desired_state();
     check("desired_state.json", &state);
-    let envelope = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&state).expect("json"), &key);
-    check("doorbell_state.json", &Doorbell::State { envelope: envelope.clone(), inline: Inline::default() });
+    let envelope =
+        Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&state).expect("json"), &key);
+    check(
+        "doorbell_state.json",
+        &Doorbell::State { envelope: envelope.clone(), inline: Inline::default() },
+    );
     let mut inline = Inline::default();
     inline.insert(blob("config").digest, b"config".to_vec());
     inline.insert(blob("content").digest, b"content".to_vec());
@@ -244,7 +285,13 @@ fn documents_between_server_and_robot() {
     check("report.json", &report());
     check(
         "status.json",
-        &Status { online: true, start: 3, instance: parsed("i00000000000000c3"), connection: 2, place: None },
+        &Status {
+            online: true,
+            start: 3,
+            instance: parsed("i00000000000000c3"),
+            connection: 2,
+            place: None,
+        },
     );
     let reply = ReportReply {
         generation: Generation(7),
@@ -273,11 +320,21 @@ fn questions_and_answers() {
         Ask::Parameter { node: parsed("/talker"), name: "period_s".to_owned() },
         Ask::SetParameter { node: parsed("/talker"), parameter: parameter() },
         Ask::Lifecycle { node: parsed("/talker"), transition: Transition::Activate },
-        Ask::Logs { task: Some(parsed("talker")), level: LogLevel::Warn, since_ms: Some(600_000), max_lines: 100 },
+        Ask::Logs {
+            task: Some(parsed("talker")),
+            level: LogLevel::Warn,
+            since_ms: Some(600_000),
+            max_lines: 100,
+        },
         Ask::Follow { level: LogLevel::Info, lease_ms: 30_000 },
         Ask::Vitals,
     ];
-    let requests = asks.map(|ask| Request { id: parsed("q00000000000000d4"), ttl_ms: 10_000, ask, signed: None });
+    let requests = asks.map(|ask| Request {
+        id: parsed("q00000000000000d4"),
+        ttl_ms: 10_000,
+        ask,
+        signed: None,
+    });
     let action = Action {
         robot_id: parsed("r00000000000000a1"),
         instance: parsed("i00000000000000c3"),
@@ -288,12 +345,17 @@ fn questions_and_answers() {
     check_tolerance::<Action>("action.json");
     check("requests.json", &requests.to_vec());
     check_tolerance::<Vec<Request>>("requests.json");
-    let newer = json!({"id": "q00000000000000d4", "ttl_ms": 1, "ask": {"type": "levitate", "height_m": 2}});
+    let newer =
+        json!({"id": "q00000000000000d4", "ttl_ms": 1, "ask": {"type": "levitate", "height_m": 2}});
     assert_eq!(serde_json::from_value::<Request>(newer).expect("tolerated").ask, Ask::Unknown);
 
-    let summary =
-        NodeSummary { name: parsed("/talker"), task: Some(parsed("talker")), lifecycle: Some(LifecycleState::Active) };
-    let endpoint = |name: &str, kind: &str| vec![Endpoint { name: parsed(name), kind: kind.to_owned() }];
+    let summary = NodeSummary {
+        name: parsed("/talker"),
+        task: Some(parsed("talker")),
+        lifecycle: Some(LifecycleState::Active),
+    };
+    let endpoint =
+        |name: &str, kind: &str| vec![Endpoint { name: parsed(name), kind: kind.to_owned() }];
     let detail = NodeDetail {
         node: summary.clone(),
         publishers: endpoint("/chatter", "std_msgs/msg/String"),
@@ -318,7 +380,10 @@ fn questions_and_answers() {
         Answer::Following,
         Answer::Vitals(crate::fleet::vitals()),
     ];
-    let refusal = Refusal { code: "no_such_node".to_owned(), text: "no node /talker on the graph".to_owned() };
+    let refusal = Refusal {
+        code: "no_such_node".to_owned(),
+        text: "no node /talker on the graph".to_owned(),
+    };
     let outcomes = answers.map(Outcome::Answer).into_iter().chain([Outcome::Refusal(refusal)]);
     let reply = |outcome| Reply { robot_id: robot(), id: parsed("q00000000000000d4"), outcome };
     check("replies.json", &outcomes.map(reply).collect::<Vec<_>>());
@@ -369,7 +434,11 @@ fn documents_that_publishers_sign() {
     };
     check("publisher_list.json", &list);
     check_tolerance::<PublisherList>("publisher_list.json");
-    let manifest = ImageManifest::signed_document(SIGNATURE_ARTIFACT, blob("envelope"), Some(blob("manifest")));
+    let manifest = ImageManifest::signed_document(
+        SIGNATURE_ARTIFACT,
+        blob("envelope"),
+        Some(blob("manifest")),
+    );
     check("signature_manifest.json", &manifest);
     assert_eq!(manifest.lone_envelope(), Some(blob("envelope")));
     assert_eq!(ImageManifest::package(blob("config"), blob("content")).lone_envelope(), None);
@@ -379,8 +448,10 @@ fn documents_that_publishers_sign() {
 fn documents_of_the_api() {
     check(
         "error.json",
-        &serde_json::from_value::<ErrorBody>(json!({"error": {"code": "not_found", "message": "no robot \"x\""}}))
-            .expect("json"),
+        &serde_json::from_value::<ErrorBody>(
+            json!({"error": {"code": "not_found", "message": "no robot \"x\""}}),
+        )
+        .expect("json"),
     );
     check("event_removed.json", &Event::RobotRemoved { id: robot() });
     check_text(
@@ -422,7 +493,11 @@ fn documents_of_the_api() {
             prefix: TopicPrefix::default(),
             tls: true,
             external,
-            alternatives: vec![MqttPlace { host: Some("broker2.lab".to_owned()), port: 8883, tls: true }],
+            alternatives: vec![MqttPlace {
+                host: Some("broker2.lab".to_owned()),
+                port: 8883,
+                tls: true,
+            }],
         },
     );
     check_text("robot_token.json", &RobotToken { token: "tskr_…".to_owned() });

@@ -2,8 +2,9 @@
 
 use task_proto::Digest;
 use task_proto::api::{
-    BulkLabels, BulkRemove, ChangedFile, DeploymentList, MatchedRobot, PackageDiff, PackageFile, PackageFileKind,
-    PackageFiles, PackageUse, PackageVersions, PackageView, RetryDeployment, RobotList, RolledBack,
+    BulkLabels, BulkRemove, ChangedFile, DeploymentList, MatchedRobot, PackageDiff, PackageFile,
+    PackageFileKind, PackageFiles, PackageUse, PackageVersions, PackageView, RetryDeployment,
+    RobotList, RolledBack,
 };
 use task_proto::report::FailureCode;
 
@@ -22,9 +23,13 @@ fn file(text: &str, mode: u32) -> PackageFile {
 
 #[test]
 fn what_is_in_packages() {
-    let view = PackageView { package: package(), pushed_at_ms: 1_800_000_000_000, manifest: manifest() };
+    let view =
+        PackageView { package: package(), pushed_at_ms: 1_800_000_000_000, manifest: manifest() };
     let running = vec![PackageUse { manifest: package().manifest.digest, robots: 12 }];
-    check("package_versions.json", &PackageVersions { name: parsed("talker"), versions: vec![view], running });
+    check(
+        "package_versions.json",
+        &PackageVersions { name: parsed("talker"), versions: vec![view], running },
+    );
     let directory = PackageFile {
         path: "src".to_owned(),
         kind: PackageFileKind::Directory,
@@ -38,10 +43,22 @@ fn what_is_in_packages() {
         target: Some("talker.py".to_owned()),
         ..directory.clone()
     };
-    check("package_files.json", &PackageFiles { files: vec![directory, link.clone(), file("old", 0o644)] });
+    check(
+        "package_files.json",
+        &PackageFiles { files: vec![directory, link.clone(), file("old", 0o644)] },
+    );
     check_tolerance::<PackageFiles>("package_files.json");
-    let changed = ChangedFile { path: "src/talker.py".to_owned(), from: file("old", 0o644), to: file("newer", 0o755) };
-    let diff = PackageDiff { added: vec![link], removed: vec![], changed: vec![changed], manifest_changed: true };
+    let changed = ChangedFile {
+        path: "src/talker.py".to_owned(),
+        from: file("old", 0o644),
+        to: file("newer", 0o755),
+    };
+    let diff = PackageDiff {
+        added: vec![link],
+        removed: vec![],
+        changed: vec![changed],
+        manifest_changed: true,
+    };
     check("package_diff.json", &diff);
     check_tolerance::<PackageDiff>("package_diff.json");
 }
@@ -50,7 +67,10 @@ fn what_is_in_packages() {
 fn what_is_done_to_many_robots() {
     let set = [(parsed("site"), parsed("lab"))].into();
     let selector = parsed("site=field,!arm");
-    check("bulk_labels.json", &BulkLabels { selector, set, remove: vec![parsed("room")], dry_run: false });
+    check(
+        "bulk_labels.json",
+        &BulkLabels { selector, set, remove: vec![parsed("room")], dry_run: false },
+    );
     check("bulk_remove.json", &BulkRemove { selector: parsed("!site=lab"), dry_run: true });
     let code = Some(FailureCode::DISK_FULL);
     check("retry_deployment.json", &RetryDeployment { selector: None, code, dry_run: false });
@@ -63,7 +83,10 @@ fn what_is_done_to_many_robots() {
 #[test]
 fn a_page_of_a_list() {
     let next = Some(parsed("atlas"));
-    check_text("robot_list.json", &RobotList { robots: vec![], unknown: vec![], next, total: Some(1_204) });
+    check_text(
+        "robot_list.json",
+        &RobotList { robots: vec![], unknown: vec![], next, total: Some(1_204) },
+    );
     let next = Some(parsed("d00000000000000b2"));
     check_text("deployment_list.json", &DeploymentList { deployments: vec![], next });
 }

@@ -2,7 +2,9 @@
 
 use std::fmt::Debug;
 
-use task_proto::api::{AccessToken, Me, ProviderView, SessionView, TokenOrigin, TokenView, UserView};
+use task_proto::api::{
+    AccessToken, Me, ProviderView, SessionView, TokenOrigin, TokenView, UserView,
+};
 use task_proto::audit::{AuditEntry, AuditRecord, Link};
 use task_proto::person::Permission;
 
@@ -25,11 +27,17 @@ fn people_and_their_tokens() {
     check("user_view.json", &user);
     let subject = Some("https://id.example.org 248289761001".to_owned());
     check("user_view_of_provider.json", &UserView { has_password: false, subject, ..user });
-    let provider =
-        ProviderView { title: "the lab".to_owned(), url: "https://fleet.example.org/api/v1/oidc".to_owned() };
+    let provider = ProviderView {
+        title: "the lab".to_owned(),
+        url: "https://fleet.example.org/api/v1/oidc".to_owned(),
+    };
     check(
         "session_view.json",
-        &SessionView { expires_at_ms: Some(1_800_000_000_000), provider: Some(provider), ended_by_restart: false },
+        &SessionView {
+            expires_at_ms: Some(1_800_000_000_000),
+            provider: Some(provider),
+            ended_by_restart: false,
+        },
     );
     check_tolerance::<SessionView>("session_view.json");
     let token = TokenView {
@@ -64,7 +72,8 @@ fn people_and_their_tokens() {
     check_tolerance::<Me>("me.json");
 }
 
-/// An entry's bytes and how they are chained may never change: what was written down once has to hold for ever.
+/// An entry's bytes and how they are chained may never change: what was written down once has to
+/// hold for ever.
 #[test]
 fn entries_of_the_audit() {
     let entry = AuditEntry {

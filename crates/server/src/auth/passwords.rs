@@ -1,6 +1,6 @@
-//! Passwords: which are good enough, how they are hashed and checked. Hashing is meant to be slow, so it happens off the
-//! async threads, few at a time, with a rest as long as the work, and a flood of sign-ins is turned away instead of waiting.
-//! It never sees who the password belongs to.
+//! Passwords: which are good enough, how they are hashed and checked. Hashing is meant to be slow,
+//! so it happens off the async threads, few at a time, with a rest as long as the work, and a flood
+//! of sign-ins is turned away instead of waiting. It never sees who the password belongs to.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -17,7 +17,8 @@ const MOST_WAITING: usize = 32;
 const SHORTEST: usize = 12;
 /// The longest, in bytes.
 const LONGEST: usize = 1024;
-/// The hash of a password that nobody knows, at the costs of new ones: what is checked for a user who has none.
+/// The hash of a password that nobody knows, at the costs of new ones: what is checked for a user
+/// who has none.
 const DECOY: &str = "$argon2id$v=19$m=19456,t=2,p=1$oiWDNzbpRSZLLWAsLdq6YA$fFQXZmPfKzsmg/2F1msjXUWT4U8aycI1kUvh4FTMccY";
 
 /// What is kept of a password: an argon2id hash in PHC form, with its own salt and costs.
@@ -83,24 +84,34 @@ impl Default for Passwords {
 
 impl Passwords {
     /// The hash of a new password of `user`.
-    pub async fn hash(&self, user: &UserName, password: &str) -> Result<PasswordHash, PasswordError> {
+    pub async fn hash(
+        &self,
+        user: &UserName,
+        password: &str,
+    ) -> Result<PasswordHash, PasswordError> {
         check(user, password)?;
         let password = password.to_owned();
         self.work(move || hashed(&password)).await?
     }
 
     /// Whether `password` is the one that was hashed. Without a hash it takes as long, and is not.
-    pub async fn verify(&self, password: &str, hash: Option<&PasswordHash>) -> Result<bool, PasswordError> {
+    pub async fn verify(
+        &self,
+        password: &str,
+        hash: Option<&PasswordHash>,
+    ) -> Result<bool, PasswordError> {
         if password.len() > LONGEST {
             return Ok(false);
         }
         let (password, is_there) = (password.to_owned(), hash.is_some());
         let hash = hash.unwrap_or(&self.decoy).clone();
         let begun = Instant::now();
-        let checked = self.work(move || match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
-            Ok(()) => Ok(is_there),
-            Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
-            Err(_) => Err(PasswordError::Failed),
+        let checked = self.work(move || {
+            match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
+                Ok(()) => Ok(is_there),
+                Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
+                Err(_) => Err(PasswordError::Failed),
+            }
         });
         let checked = checked.await?;
         let took_us = u64::try_from(begun.elapsed().as_micros()).unwrap_or(u64::MAX);
@@ -113,7 +124,10 @@ impl Passwords {
         tokio::time::sleep(Duration::from_micros(self.took_us.load(Ordering::Relaxed))).await;
     }
 
-    async fn work<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Result<T, PasswordError> {
+    async fn work<T: Send + 'static>(
+        &self,
+        work: impl FnOnce() -> T + Send + 'static,
+    ) -> Result<T, PasswordError> {
         let place = self.places.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
         let turn = self.turns.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
         let begun = Instant::now();
@@ -139,10 +153,12 @@ async fn rest(begun: Instant, turn: OwnedSemaphorePermit, place: OwnedSemaphoreP
 fn hashed(password: &str) -> Result<PasswordHash, PasswordError> {
     let salt: [u8; 16] = rand::random();
     let hash = Argon2::default().hash_password_with_salt(password.as_bytes(), &salt);
-    hash.map(|hash: argon2::PasswordHash| PasswordHash(hash.to_string())).map_err(|_| PasswordError::Failed)
+    hash.map(|hash: argon2::PasswordHash| PasswordHash(hash.to_string()))
+        .map_err(|_| PasswordError::Failed)
 }
 
-/// Long is all that a password has to be, as NIST SP 800-63B has it, and not what anyone would try first.
+/// Long is all that a password has to be, as NIST SP 800-63B has it, and not what anyone would try
+/// first.
 fn check(user: &UserName, password: &str) -> Result<(), PasswordError> {
     let unfit = |reason: &str| Err(PasswordError::Unfit(reason.to_owned()));
     if password.chars().count() < SHORTEST {
@@ -179,12 +195,17 @@ mod tests {
         assert!(hash.as_str().starts_with("$argon2id$v=19$m=19456,t=2,p=1$"), "{}", hash.as_str());
         assert!(!format!("{hash:?}").contains("argon2"));
         assert!(passwords.verify("correct horse battery", Some(&hash)).await.expect("checked"));
-        for wrong in ["correct horse batterz", "", "Correct horse battery", &"x".repeat(LONGEST + 1)] {
+        for wrong in
+            ["correct horse batterz", "", "Correct horse battery", &"x".repeat(LONGEST + 1)]
+        {
             assert!(!passwords.verify(wrong, Some(&hash)).await.expect("checked"), "{wrong:?}");
         }
         assert!(!passwords.verify("correct horse battery", None).await.expect("checked"));
         let nonsense = PasswordHash::stored("nonsense".to_owned());
-        assert!(matches!(passwords.verify("correct horse battery", Some(&nonsense)).await, Err(PasswordError::Failed)));
+        assert!(matches!(
+            passwords.verify("correct horse battery", Some(&nonsense)).await,
+            Err(PasswordError::Failed)
+        ));
         let again = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
         assert_ne!(again, hash, "each has its own salt");
     }
@@ -192,23 +213,40 @@ mod tests {
     #[tokio::test]
     async fn who_has_no_password_costs_as_much_as_who_has_one() {
         let passwords = Passwords::default();
-        let (hash, costs) =
-            (passwords.hash(&alice(), "correct horse battery").await.expect("hashed"), "$m=19456,t=2,p=1$");
+        let (hash, costs) = (
+            passwords.hash(&alice(), "correct horse battery").await.expect("hashed"),
+            "$m=19456,t=2,p=1$",
+        );
         assert!(hash.as_str().contains(costs) && passwords.decoy.as_str().contains(costs));
         assert_eq!(hash.as_str().len(), passwords.decoy.as_str().len());
         // It is really looked at: one that can't be is noticed, and one that fits opens nothing.
-        let unreadable = Passwords { decoy: PasswordHash::stored("nonsense".to_owned()), ..Passwords::default() };
-        assert!(matches!(unreadable.verify("correct horse battery", None).await, Err(PasswordError::Failed)));
+        let unreadable = Passwords {
+            decoy: PasswordHash::stored("nonsense".to_owned()),
+            ..Passwords::default()
+        };
+        assert!(matches!(
+            unreadable.verify("correct horse battery", None).await,
+            Err(PasswordError::Failed)
+        ));
         let fitting = Passwords { decoy: hash, ..Passwords::default() };
         assert!(!fitting.verify("correct horse battery", None).await.expect("checked"));
     }
 
     #[test]
     fn what_anyone_would_try_is_refused() {
-        for bad in ["short", "elevenchars", "aliceAlice12", "aaaaaaaaaaaaaaa", "abababababab", &"x1y2z3".repeat(200)] {
+        for bad in [
+            "short",
+            "elevenchars",
+            "aliceAlice12",
+            "aaaaaaaaaaaaaaa",
+            "abababababab",
+            &"x1y2z3".repeat(200),
+        ] {
             assert!(matches!(check(&alice(), bad), Err(PasswordError::Unfit(_))), "{bad:?}");
         }
-        for good in ["correct horse battery", "twelve chars", "pässwörter sind", "alice in chains live"] {
+        for good in
+            ["correct horse battery", "twelve chars", "pässwörter sind", "alice in chains live"]
+        {
             assert!(check(&alice(), good).is_ok(), "{good:?}");
         }
     }
@@ -216,8 +254,12 @@ mod tests {
     #[tokio::test]
     async fn a_flood_is_turned_away_and_the_rest_gets_its_turn() {
         let passwords = Passwords::default();
-        let (places, held) = (passwords.places.available_permits(), passwords.turns.available_permits());
-        assert!((1..=4).contains(&held) && places == held + MOST_WAITING, "{held} at once, {places} in all");
+        let (places, held) =
+            (passwords.places.available_permits(), passwords.turns.available_permits());
+        assert!(
+            (1..=4).contains(&held) && places == held + MOST_WAITING,
+            "{held} at once, {places} in all"
+        );
         let mut flood = tokio::task::JoinSet::new();
         // What is being checked is not let go before all have come.
         let gate = Arc::new(std::sync::Barrier::new(2));

@@ -1,7 +1,8 @@
-//! How often signing in with a password may fail: for an account, and from an address. An address from which an account was
-//! signed in to lately has a count of its own for that account, and no other counts there: neither strangers elsewhere nor
-//! neighbours behind the same address lock its owner out. Every attempt counts as failed until it has succeeded, so many at
-//! once count as many. Memory is bounded. It never sees a password.
+//! How often signing in with a password may fail: for an account, and from an address. An address
+//! from which an account was signed in to lately has a count of its own for that account, and no
+//! other counts there: neither strangers elsewhere nor neighbours behind the same address lock its
+//! owner out. Every attempt counts as failed until it has succeeded, so many at once count as many.
+//! Memory is bounded. It never sees a password.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -31,7 +32,8 @@ struct Counts {
     /// Names that nobody has: answered like others, but they must not take room from those.
     nobody: Windows<UserName>,
     addresses: Windows<IpAddr>,
-    /// Those of which only the address is known. Wrong passwords don't count here, or the other way round.
+    /// Those of which only the address is known. Wrong passwords don't count here, or the other way
+    /// round.
     unnamed: Windows<IpAddr>,
     pairs: Windows<(UserName, IpAddr)>,
     familiar: HashMap<(UserName, IpAddr), u64>,
@@ -48,7 +50,13 @@ pub struct Blocked {
 
 impl SignIns {
     /// An attempt is about to be made. `is_known` says whether there is such an account.
-    pub fn begin(&self, user: &UserName, is_known: bool, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
+    pub fn begin(
+        &self,
+        user: &UserName,
+        is_known: bool,
+        address: IpAddr,
+        now_ms: u64,
+    ) -> Result<(), Blocked> {
         let address = network(address);
         let mut counts = self.lock();
         let pair = (user.clone(), address);
@@ -70,19 +78,24 @@ impl SignIns {
         self.lock().unnamed.take_back(&network(address));
     }
 
-    /// Until when names that are not known at the address are refused there. A wrong password for one that is known there is
-    /// told the same, so that nobody learns which names are.
+    /// Until when names that are not known at the address are refused there. A wrong password for
+    /// one that is known there is told the same, so that nobody learns which names are.
     pub fn blocked_at(&self, address: IpAddr, now_ms: u64) -> Option<Blocked> {
         self.lock().addresses.exceeded(&network(address), MOST_FROM_ADDRESS, now_ms)
     }
 
-    /// The attempt that was begun has succeeded: it counts no longer, and the address is known for the account.
+    /// The attempt that was begun has succeeded: it counts no longer, and the address is known for
+    /// the account.
     pub fn succeeded(&self, user: &UserName, address: IpAddr, now_ms: u64) {
         let pair = (user.clone(), network(address));
         let mut counts = self.lock();
         counts.take_back(&pair, true);
         if counts.familiar.len() >= MOST_FAMILIAR && !counts.familiar.contains_key(&pair) {
-            let oldest = counts.familiar.iter().min_by_key(|(_, since_ms)| **since_ms).map(|(pair, _)| pair.clone());
+            let oldest = counts
+                .familiar
+                .iter()
+                .min_by_key(|(_, since_ms)| **since_ms)
+                .map(|(pair, _)| pair.clone());
             oldest.map(|oldest| counts.familiar.remove(&oldest));
         }
         counts.familiar.insert(pair, now_ms);
@@ -134,7 +147,8 @@ impl<K: Eq + Hash> Windows<K> {
         let is_over = |window: &Window| now_ms.saturating_sub(window.began_ms) >= WINDOW_MS;
         if self.counts.len() >= MOST_COUNTS && !self.counts.contains_key(&key) {
             self.counts.retain(|_, window| !is_over(window));
-            // Whoever fills it with names or addresses gains as many tries as a fresh start of the server gives.
+            // Whoever fills it with names or addresses gains as many tries as a fresh start of the
+            // server gives.
             if self.counts.len() >= MOST_COUNTS {
                 self.counts.clear();
             }
@@ -153,7 +167,10 @@ impl<K: Eq + Hash> Windows<K> {
     /// Until when no more is let through; `None`: more is.
     fn exceeded(&self, key: &K, most: u32, now_ms: u64) -> Option<Blocked> {
         let until_ms = |window: &Window| window.began_ms + WINDOW_MS;
-        let window = self.counts.get(key).filter(|window| window.count > most && now_ms < until_ms(window))?;
+        let window = self
+            .counts
+            .get(key)
+            .filter(|window| window.count > most && now_ms < until_ms(window))?;
         Some(Blocked { until_ms: until_ms(window), is_news: false })
     }
 
@@ -167,7 +184,9 @@ impl<K: Eq + Hash> Windows<K> {
 /// Whoever has one IPv6 address has 2^64 of them.
 fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
-        IpAddr::V6(address) => IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX))),
+        IpAddr::V6(address) => {
+            IpAddr::V6(Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)))
+        }
         address => address,
     }
 }
@@ -201,7 +220,9 @@ mod tests {
         assert_eq!(sign_ins.begin(&alice, true, address(98), NOW_MS + 1), blocked(false));
         assert_eq!(sign_ins.begin(&user("bob"), true, address(99), NOW_MS), Ok(()));
         for _ in 0..MOST_FOR_ACCOUNT {
-            sign_ins.begin(&alice, true, address(1), NOW_MS + 2).expect("the owner's address has its own count");
+            sign_ins
+                .begin(&alice, true, address(1), NOW_MS + 2)
+                .expect("the owner's address has its own count");
         }
         assert!(sign_ins.begin(&alice, true, address(1), NOW_MS + 2).is_err());
         assert_eq!(sign_ins.begin(&alice, true, address(99), until_ms), Ok(()));
@@ -211,7 +232,9 @@ mod tests {
     fn an_address_is_blocked_whatever_names_it_tries() {
         let sign_ins = SignIns::default();
         for n in 0..MOST_FROM_ADDRESS {
-            sign_ins.begin(&user(&format!("user{n}")), n % 2 == 0, address(1), NOW_MS).expect("allowed");
+            sign_ins
+                .begin(&user(&format!("user{n}")), n % 2 == 0, address(1), NOW_MS)
+                .expect("allowed");
         }
         assert!(sign_ins.begin(&user("alice"), true, address(1), NOW_MS).is_err());
         assert_eq!(sign_ins.begin(&user("alice"), true, address(2), NOW_MS), Ok(()));
@@ -236,9 +259,15 @@ mod tests {
         for _ in 0..MOST_FOR_ACCOUNT {
             sign_ins.begin(&alice, true, address(1), NOW_MS).expect("she is known there");
         }
-        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS), Some(blocked), "her failures are told like theirs");
+        assert_eq!(
+            sign_ins.blocked_at(address(1), NOW_MS),
+            Some(blocked),
+            "her failures are told like theirs"
+        );
         assert_eq!(sign_ins.blocked_at(address(1), NOW_MS + WINDOW_MS), None);
-        sign_ins.begin_unnamed(address(1), NOW_MS).expect("the provider's sign-ins are counted apart");
+        sign_ins
+            .begin_unnamed(address(1), NOW_MS)
+            .expect("the provider's sign-ins are counted apart");
     }
 
     #[test]
@@ -272,7 +301,12 @@ mod tests {
             sign_ins.succeeded(&name, from, NOW_MS + u64::from(n));
         }
         let counts = sign_ins.lock();
-        assert!(counts.addresses.counts.len() <= MOST_COUNTS && counts.accounts.counts.len() <= MOST_COUNTS);
-        assert!(counts.nobody.counts.len() <= MOST_COUNTS && counts.familiar.len() <= MOST_FAMILIAR);
+        assert!(
+            counts.addresses.counts.len() <= MOST_COUNTS
+                && counts.accounts.counts.len() <= MOST_COUNTS
+        );
+        assert!(
+            counts.nobody.counts.len() <= MOST_COUNTS && counts.familiar.len() <= MOST_FAMILIAR
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! A blob to read, and the check of its file after a read has failed. A mapped page that cannot be read raises SIGBUS in
-//! the process that touches it, so mapped bytes go to sockets only, where the kernel reads them and a failure ends one write.
+//! A blob to read, and the check of its file after a read has failed. A mapped page that cannot be
+//! read raises SIGBUS in the process that touches it, so mapped bytes go to sockets only, where the
+//! kernel reads them and a failure ends one write.
 
 use std::fs::{self, File};
 use std::io::{self, IoSliceMut};
@@ -55,9 +56,10 @@ impl Blob {
         let mapped = match store.settings.reading {
             // An empty file can't be mapped.
             BlobRead::Mmap if size > 0 => {
-                // SAFETY: nothing writes to a file after it was renamed into the store, and deleting it leaves the
-                // mapping intact. Should the disk or a person take bytes away, this process never touches them: the
-                // mapping is given to sockets alone, where the kernel gets an error in place of a signal.
+                // SAFETY: nothing writes to a file after it was renamed into the store, and
+                // deleting it leaves the mapping intact. Should the disk or a person take bytes
+                // away, this process never touches them: the mapping is given to sockets alone,
+                // where the kernel gets an error in place of a signal.
                 let mapping = unsafe { memmap2::Mmap::map(&file) }?;
                 Some(Bytes::from_owner(mapping))
             }
@@ -113,8 +115,8 @@ impl Blob {
         read.await.map_err(unreadable)
     }
 
-    /// Copies `length` bytes at `offset`, or gives `None` where that would wait for the disk or fail: then the next step
-    /// reads on a blocking thread and meets the error again.
+    /// Copies `length` bytes at `offset`, or gives `None` where that would wait for the disk or
+    /// fail: then the next step reads on a blocking thread and meets the error again.
     pub(super) fn read_cached(&self, offset: u64, length: usize) -> Option<Bytes> {
         let mut bytes = vec![0; length];
         let mut read = 0;
@@ -137,8 +139,8 @@ impl Blob {
         Ok(bytes.into())
     }
 
-    /// Has the kernel read these bytes into the page cache. Not through the mapping: all threads share its lock, and would
-    /// wait for the disk with this one.
+    /// Has the kernel read these bytes into the page cache. Not through the mapping: all threads
+    /// share its lock, and would wait for the disk with this one.
     pub(super) fn read_ahead(&self, offset: u64, length: usize) -> io::Result<()> {
         let mut scrap = vec![0; SCRAP_BYTES.min(length)];
         let end = offset + length as u64;
@@ -149,7 +151,8 @@ impl Blob {
         Ok(())
     }
 
-    /// Reads from the disk on a blocking thread, a few readers at a time. After a failure the blob's file is checked.
+    /// Reads from the disk on a blocking thread, a few readers at a time. After a failure the
+    /// blob's file is checked.
     pub(super) async fn with_disk_permit<T, F>(self, read: F) -> io::Result<T>
     where
         T: Send + 'static,
@@ -195,8 +198,8 @@ impl Blob {
     }
 }
 
-/// Renames a file that does not hold the blob, so that the blob counts as absent and can be pushed again. True if it was
-/// renamed; false if it holds the blob or is gone.
+/// Renames a file that does not hold the blob, so that the blob counts as absent and can be pushed
+/// again. True if it was renamed; false if it holds the blob or is gone.
 fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> {
     let failed = |action| BlobError::disk(action, path);
     let before = match fs::metadata(path) {
@@ -268,7 +271,10 @@ mod tests {
             fs::write(&path, b"cOntent").expect("written");
             assert!(put_aside_if_damaged(digest, &path).expect("checked"));
             let aside = data.path().join(format!("{}.damaged", digest.hex()));
-            assert_eq!((path.exists(), fs::read(aside).expect("kept")), (false, b"cOntent".to_vec()));
+            assert_eq!(
+                (path.exists(), fs::read(aside).expect("kept")),
+                (false, b"cOntent".to_vec())
+            );
         }
     }
 }

@@ -1,5 +1,6 @@
-//! A blob's bytes as the body of an HTTP answer: slices of bounded size, and a length known from the start. Reads that
-//! would wait for the disk are done on a blocking thread, so that one cold blob never stalls the other connections.
+//! A blob's bytes as the body of an HTTP answer: slices of bounded size, and a length known from
+//! the start. Reads that would wait for the disk are done on a blocking thread, so that one cold
+//! blob never stalls the other connections.
 
 use std::io;
 use std::ops::Range;
@@ -15,9 +16,9 @@ use super::{Blob, BytesFor};
 
 /// The most bytes handed out at once.
 const SLICE_BYTES: u64 = 128 * 1024;
-/// The most bytes that are looked at ahead for whether they are in memory, in one system call, and that are read ahead if
-/// they are not. They may be thrown out again before they are sent; then a page is read where it should not be, which costs
-/// other connections a moment.
+/// The most bytes that are looked at ahead for whether they are in memory, in one system call, and
+/// that are read ahead if they are not. They may be thrown out again before they are sent; then a
+/// page is read where it should not be, which costs other connections a moment.
 const LOOK_AHEAD_BYTES: usize = 1024 * 1024;
 /// No page of memory is smaller.
 const PAGE_BYTES: usize = 4096;
@@ -30,8 +31,8 @@ pub struct BlobBody {
     left: Range<u64>,
     /// The end of the mapped bytes that were in memory at the last look.
     in_memory_until: u64,
-    /// Whether others are to have theirs first. A client that is as fast as memory would otherwise keep a thread until it
-    /// has all.
+    /// Whether others are to have theirs first. A client that is as fast as memory would otherwise
+    /// keep a thread until it has all.
     is_turn_over: bool,
     /// The next slice, while it is being fetched from the disk.
     pending: Option<BoxFuture<'static, io::Result<Bytes>>>,
@@ -48,8 +49,10 @@ impl BlobBody {
     /// The next slice if it is in memory; else starts to fetch it.
     fn next_slice(&mut self) -> io::Result<Option<Bytes>> {
         let start = self.left.start;
-        let length = usize::try_from(SLICE_BYTES.min(self.left.end - start)).map_err(io::Error::other)?;
-        let ahead = usize::try_from(self.left.end - start).unwrap_or(usize::MAX).min(LOOK_AHEAD_BYTES);
+        let length =
+            usize::try_from(SLICE_BYTES.min(self.left.end - start)).map_err(io::Error::other)?;
+        let ahead =
+            usize::try_from(self.left.end - start).unwrap_or(usize::MAX).min(LOOK_AHEAD_BYTES);
         let slice = match &self.mapped {
             None => match self.blob.read_cached(start, length) {
                 Some(slice) => return Ok(Some(slice)),
@@ -83,7 +86,10 @@ impl Body for BlobBody {
     type Data = Bytes;
     type Error = io::Error;
 
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<io::Result<Frame<Bytes>>>> {
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<io::Result<Frame<Bytes>>>> {
         if self.left.is_empty() {
             return Poll::Ready(None);
         }
@@ -115,17 +121,21 @@ impl Body for BlobBody {
     }
 }
 
-/// How many of these mapped bytes, counted from the first, can be read without waiting for the disk. Too few cost only a
-/// detour.
+/// How many of these mapped bytes, counted from the first, can be read without waiting for the
+/// disk. Too few cost only a detour.
 fn bytes_in_memory(slice: &[u8]) -> usize {
     // SAFETY: `sysconf` only reads its argument.
-    let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).unwrap_or(PAGE_BYTES).max(PAGE_BYTES);
+    let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) })
+        .unwrap_or(PAGE_BYTES)
+        .max(PAGE_BYTES);
     let before = slice.as_ptr().addr() % page;
     let mut resident = [0_u8; LOOK_AHEAD_BYTES / PAGE_BYTES + 1];
     let length = (before + slice.len()).min(resident.len() * page);
-    // SAFETY: the range lies in one mapping, since a mapping begins on a page and the slice is part of it; there is a byte
-    // for each of its pages.
-    let status = unsafe { libc::mincore(slice.as_ptr().sub(before).cast_mut().cast(), length, resident.as_mut_ptr()) };
+    // SAFETY: the range lies in one mapping, since a mapping begins on a page and the slice is part
+    // of it; there is a byte for each of its pages.
+    let status = unsafe {
+        libc::mincore(slice.as_ptr().sub(before).cast_mut().cast(), length, resident.as_mut_ptr())
+    };
     if status != 0 {
         return 0;
     }

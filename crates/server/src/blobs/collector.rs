@@ -1,7 +1,7 @@
-//! Collects what nobody needs any more: uploads that were given up, blobs that nothing refers to. Blobs of a package that
-//! a robot should have, or may get back, are kept whatever happened to their manifest. A blob is left alone for a grace
-//! time after a pusher last asked for it, so that a push in progress finds what it found before; for a shorter one if robots
-//! have dropped it.
+//! Collects what nobody needs any more: uploads that were given up, blobs that nothing refers to.
+//! Blobs of a package that a robot should have, or may get back, are kept whatever happened to
+//! their manifest. A blob is left alone for a grace time after a pusher last asked for it, so that
+//! a push in progress finds what it found before; for a shorter one if robots have dropped it.
 
 use std::time::Duration;
 
@@ -17,7 +17,8 @@ const MAX_AT_ONCE: usize = 256;
 /// The shortest and longest time between two collections.
 const INTERVAL: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(600)];
 
-/// How long what a robot has dropped is left alone, if the grace is not shorter: it brings back more.
+/// How long what a robot has dropped is left alone, if the grace is not shorter: it brings back
+/// more.
 const DROPPED_GRACE: Duration = Duration::from_secs(3600);
 
 /// What one collection removed.
@@ -41,7 +42,13 @@ pub enum CollectError {
 }
 
 /// Collects now and then, until it is told to stop.
-pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop: CancellationToken) {
+pub async fn run(
+    store: Store,
+    blobs: Blobs,
+    clock: Clock,
+    grace: Duration,
+    stop: CancellationToken,
+) {
     let [shortest, longest] = INTERVAL;
     let mut interval = tokio::time::interval((grace / 4).clamp(shortest, longest));
     interval.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -53,20 +60,32 @@ pub async fn run(store: Store, blobs: Blobs, clock: Clock, grace: Duration, stop
         }
         match collect(&store, &blobs, clock.now_ms(), grace).await {
             Ok(Collected { uploads: 0, blobs: 0 }) => {}
-            Ok(Collected { uploads, blobs }) => tracing::info!(uploads, blobs, "collected what nobody needs"),
+            Ok(Collected { uploads, blobs }) => {
+                tracing::info!(uploads, blobs, "collected what nobody needs")
+            }
             Err(CollectError::Store(error)) => error.log("collecting failed"),
-            Err(error) => tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed"),
+            Err(error) => {
+                tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed")
+            }
         }
     }
 }
 
 /// Removes what has not been needed for `grace`.
-pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration) -> Result<Collected, CollectError> {
-    let before = |grace: Duration| now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX));
+pub async fn collect(
+    store: &Store,
+    blobs: &Blobs,
+    now_ms: u64,
+    grace: Duration,
+) -> Result<Collected, CollectError> {
+    let before = |grace: Duration| {
+        now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX))
+    };
     let uploads = blobs.drop_idle_uploads(before(grace)).await?;
     let mut old = blobs.untouched_since(before(grace)).await?;
     let mut dropped = store.blobs_dropped_by_robots().await?;
-    // Most are needed, and that is found out while nobody waits. The rest is looked at once more below.
+    // Most are needed, and that is found out while nobody waits. The rest is looked at once more
+    // below.
     let needed = store.needed_blobs().await?;
     old.retain(|digest| !needed.contains(digest));
     dropped.retain(|digest| !needed.contains(digest));
@@ -75,8 +94,14 @@ pub async fn collect(store: &Store, blobs: &Blobs, now_ms: u64, grace: Duration)
     Ok(Collected { uploads, blobs: removed })
 }
 
-/// Removes those of `candidates` that nobody needs, or has asked for since `before_ms`; says how many.
-async fn remove(store: &Store, blobs: &Blobs, candidates: &[Digest], before_ms: u64) -> Result<usize, CollectError> {
+/// Removes those of `candidates` that nobody needs, or has asked for since `before_ms`; says how
+/// many.
+async fn remove(
+    store: &Store,
+    blobs: &Blobs,
+    candidates: &[Digest],
+    before_ms: u64,
+) -> Result<usize, CollectError> {
     let mut removed = 0;
     for candidates in candidates.chunks(MAX_AT_ONCE) {
         let collection = blobs.begin_collection().await;

@@ -31,8 +31,8 @@ pub use upload::{InvalidUploadId, UploadId};
 use crate::config::BlobRead;
 use crate::domain::delivery::shown_bytes;
 
-/// Reads from the disk for answers at the same time. More would not be faster, and would keep the processor from those who
-/// wait for something else.
+/// Reads from the disk for answers at the same time. More would not be faster, and would keep the
+/// processor from those who wait for something else.
 const DISK_READS: usize = 2;
 
 /// The blob store's limits and choices.
@@ -46,9 +46,11 @@ pub struct BlobSettings {
     pub max_uploads: usize,
     /// The most blobs kept open for the next reader.
     pub max_open_blobs: usize,
-    /// The most bytes kept of what one robot brings back. While older ones go, it may have twice as many on the disk.
+    /// The most bytes kept of what one robot brings back. While older ones go, it may have twice as
+    /// many on the disk.
     pub max_robot_bytes: u64,
-    /// What people leave free on the disk, in bytes, for the database and all else. Robots leave twice as much.
+    /// What people leave free on the disk, in bytes, for the database and all else. Robots leave
+    /// twice as much.
     pub reserve_bytes: u64,
 }
 
@@ -142,7 +144,13 @@ pub enum BlobError {
 impl BlobError {
     /// Whether the bytes are more than there is room for.
     fn is_want_of_room(&self) -> bool {
-        matches!(self, Self::DiskFull | Self::DiskReserved { .. } | Self::TooMuchOfRobot { .. } | Self::TooLarge { .. })
+        matches!(
+            self,
+            Self::DiskFull
+                | Self::DiskReserved { .. }
+                | Self::TooMuchOfRobot { .. }
+                | Self::TooLarge { .. }
+        )
     }
 
     fn disk(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
@@ -164,7 +172,8 @@ struct Shared {
     directory: PathBuf,
     settings: BlobSettings,
     uploads: Uploads,
-    /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's bytes.
+    /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's
+    /// bytes.
     open: Mutex<VecDeque<Blob>>,
     /// Blobs whose files are checked because a read failed.
     checked: Mutex<HashSet<Digest>>,
@@ -193,8 +202,15 @@ impl Blobs {
         let uploads = Uploads::open(data.join("uploads"), settings)?;
         let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
         let disk = Arc::new(Semaphore::new(DISK_READS));
-        let shared =
-            Shared { directory, settings, uploads, open, checked: Mutex::default(), disk, collection: Arc::default() };
+        let shared = Shared {
+            directory,
+            settings,
+            uploads,
+            open,
+            checked: Mutex::default(),
+            disk,
+            collection: Arc::default(),
+        };
         Ok(Self { shared: Arc::new(shared) })
     }
 
@@ -237,8 +253,9 @@ impl Blobs {
                 file.write_all(&bytes)?;
                 file.sync_all()
             };
-            let stored =
-                write().map_err(BlobError::disk("write", &partial)).and_then(|()| move_into_place(&partial, &target));
+            let stored = write()
+                .map_err(BlobError::disk("write", &partial))
+                .and_then(|()| move_into_place(&partial, &target));
             if stored.is_err() {
                 // Best effort: what stays is removed at the next start.
                 let _ = fs::remove_file(&partial);
@@ -272,7 +289,8 @@ impl Blobs {
                 for entry in fs::read_dir(directory.join(algorithm.as_str()))? {
                     let entry = entry?;
                     let name = entry.file_name();
-                    let named = name.to_str().map(|hex| format!("{}:{hex}", algorithm.as_str()).parse());
+                    let named =
+                        name.to_str().map(|hex| format!("{}:{hex}", algorithm.as_str()).parse());
                     let Some(Ok(digest)) = named else { continue };
                     if modified_ms(&entry.metadata()?)? < before_ms {
                         found.push(digest);
@@ -280,7 +298,10 @@ impl Blobs {
                 }
                 Ok(())
             };
-            Algorithm::ALL.into_iter().try_for_each(&mut list).map_err(BlobError::disk("list", &directory))?;
+            Algorithm::ALL
+                .into_iter()
+                .try_for_each(&mut list)
+                .map_err(BlobError::disk("list", &directory))?;
             Ok(found)
         })
         .await
@@ -293,15 +314,26 @@ impl Blobs {
             let sum = |algorithm: Algorithm| {
                 // One that is deleted meanwhile takes no room.
                 let entries = fs::read_dir(directory.join(algorithm.as_str()))?.flatten();
-                Ok(entries.filter_map(|entry| entry.metadata().ok()).map(|metadata| metadata.len()).sum::<u64>())
+                Ok(entries
+                    .filter_map(|entry| entry.metadata().ok())
+                    .map(|metadata| metadata.len())
+                    .sum::<u64>())
             };
-            Algorithm::ALL.into_iter().map(sum).sum::<io::Result<u64>>().map_err(BlobError::disk("list", &directory))
+            Algorithm::ALL
+                .into_iter()
+                .map(sum)
+                .sum::<io::Result<u64>>()
+                .map_err(BlobError::disk("list", &directory))
         })
         .await
     }
 
     /// Whether the blob is here and was last touched before `before_ms`.
-    pub async fn is_untouched_since(&self, digest: Digest, before_ms: u64) -> Result<bool, BlobError> {
+    pub async fn is_untouched_since(
+        &self,
+        digest: Digest,
+        before_ms: u64,
+    ) -> Result<bool, BlobError> {
         let path = self.path(digest);
         on_disk(move || match fs::metadata(&path).and_then(|metadata| modified_ms(&metadata)) {
             Ok(modified) => Ok(modified < before_ms),
@@ -316,7 +348,9 @@ impl Blobs {
         self.shared.close(digest);
         let path = self.path(digest);
         on_disk(move || match fs::remove_file(&path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(BlobError::disk("delete", &path)(error)),
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                Err(BlobError::disk("delete", &path)(error))
+            }
             _ => Ok(()),
         })
         .await?;
@@ -344,8 +378,8 @@ impl Shared {
         Some(blob)
     }
 
-    /// Keeps `blob` open, unless somebody else has opened it meanwhile: then theirs is used, so that many first readers
-    /// at once end with one mapping.
+    /// Keeps `blob` open, unless somebody else has opened it meanwhile: then theirs is used, so
+    /// that many first readers at once end with one mapping.
     fn keep_open(&self, blob: Blob) -> Blob {
         let mut open = self.open_blobs();
         if let Some(earlier) = open.iter().find(|other| other.digest == blob.digest) {
@@ -381,7 +415,9 @@ where
 fn move_into_place(partial: &Path, target: &Path) -> Result<(), BlobError> {
     fs::rename(partial, target).map_err(BlobError::disk("rename", partial))?;
     let directory = target.parent().unwrap_or(target);
-    File::open(directory).and_then(|file| file.sync_all()).map_err(BlobError::disk("sync", directory))
+    File::open(directory)
+        .and_then(|file| file.sync_all())
+        .map_err(BlobError::disk("sync", directory))
 }
 
 fn modified_ms(metadata: &fs::Metadata) -> io::Result<u64> {
@@ -401,7 +437,8 @@ mod tests {
     async fn readers_share_one_mapping() {
         let data = tempfile::tempdir().expect("a directory");
         let blobs = Blobs::open(data.path(), BlobSettings::default()).expect("opened");
-        let digest = blobs.put(Algorithm::Sha256, Bytes::from_static(b"content")).await.expect("stored");
+        let digest =
+            blobs.put(Algorithm::Sha256, Bytes::from_static(b"content")).await.expect("stored");
         let readers: Vec<_> = (0..64)
             .map(|_| {
                 tokio::spawn({

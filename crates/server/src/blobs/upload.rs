@@ -1,7 +1,7 @@
-//! Unfinished uploads: `uploads/<id>.<repository>` holds the bytes that came, memory holds their running hash by SHA-256. After a
-//! restart they go on at the end of their file, and are hashed once they are whole.
-//! It never lets bytes become a blob before they hash to what was announced, nor robots take more than is theirs, nor uploads
-//! that somebody left keep others from pushing.
+//! Unfinished uploads: `uploads/<id>.<repository>` holds the bytes that came, memory holds their
+//! running hash by SHA-256. After a restart they go on at the end of their file, and are hashed
+//! once they are whole. It never lets bytes become a blob before they hash to what was announced,
+//! nor robots take more than is theirs, nor uploads that somebody left keep others from pushing.
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
@@ -29,7 +29,8 @@ use crate::system::data_directory::room;
 const GATHERED_BYTES: usize = 1024 * 1024;
 /// How long a sender may be silent in the middle of a body.
 const SILENCE: Duration = Duration::from_secs(60);
-/// Uploads that one robot may leave unfinished: it sends one file after another, and forgets some on the way.
+/// Uploads that one robot may leave unfinished: it sends one file after another, and forgets some
+/// on the way.
 const MAX_OF_ROBOT: usize = 8;
 const ID_DIGITS: usize = 32;
 /// What file systems take as one name.
@@ -108,8 +109,8 @@ impl Upload {
         Ok(Self { path, file, offset: 0, bytes, hasher, written_at, ended: false })
     }
 
-    /// Takes up what an earlier process left. Its bytes came in order, so all that are there count: whether they are the right
-    /// ones is seen when they are hashed.
+    /// Takes up what an earlier process left. Its bytes came in order, so all that are there count:
+    /// whether they are the right ones is seen when they are hashed.
     fn resume(path: PathBuf) -> io::Result<Self> {
         let file = File::options().write(true).open(&path)?;
         let offset = file.metadata()?.len();
@@ -117,7 +118,8 @@ impl Upload {
         Ok(Self { path, file, offset, bytes, hasher: None, written_at, ended: false })
     }
 
-    /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by the next try.
+    /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by
+    /// the next try.
     fn write(&mut self, chunks: &[Bytes]) -> Result<(), BlobError> {
         let mut offset = self.offset;
         for chunk in chunks {
@@ -133,8 +135,8 @@ impl Upload {
         Ok(())
     }
 
-    /// Orders those that nobody writes to by which gives way first: what was left for a while, the empty before the rest,
-    /// and then what was written to the longest ago.
+    /// Orders those that nobody writes to by which gives way first: what was left for a while, the
+    /// empty before the rest, and then what was written to the longest ago.
     fn gives_way(&self) -> (bool, bool, Instant) {
         let is_left = self.written_at.elapsed() >= SILENCE;
         (!is_left, is_left && self.offset > 0, self.written_at)
@@ -151,12 +153,21 @@ impl Upload {
         self.file.set_len(self.offset).map_err(BlobError::disk("cut", &self.path))?;
         let unreadable = BlobError::disk("read", &self.path);
         let actual = match (expected.algorithm(), &self.hasher) {
-            (Algorithm::Sha256, Some(hasher)) => Digest::from_sha256(hasher.clone().finalize().into()),
-            (Algorithm::Sha256, None) => Digest::from_sha256(hash::<Sha256>(&self.path).map_err(unreadable)?.into()),
-            (Algorithm::Sha512, _) => Digest::from_sha512(hash::<Sha512>(&self.path).map_err(unreadable)?.into()),
+            (Algorithm::Sha256, Some(hasher)) => {
+                Digest::from_sha256(hasher.clone().finalize().into())
+            }
+            (Algorithm::Sha256, None) => {
+                Digest::from_sha256(hash::<Sha256>(&self.path).map_err(unreadable)?.into())
+            }
+            (Algorithm::Sha512, _) => {
+                Digest::from_sha512(hash::<Sha512>(&self.path).map_err(unreadable)?.into())
+            }
         };
         if actual != expected {
-            return Err(BlobError::WrongDigest { expected: expected.into(), actual: actual.into() });
+            return Err(BlobError::WrongDigest {
+                expected: expected.into(),
+                actual: actual.into(),
+            });
         }
         self.file.sync_all().map_err(BlobError::disk("sync", &self.path))?;
         move_into_place(&self.path, target)?;
@@ -164,7 +175,8 @@ impl Upload {
     }
 }
 
-/// The hash of a file. SHA-512 is computed so, which few ask for, and that of an upload which was taken up.
+/// The hash of a file. SHA-512 is computed so, which few ask for, and that of an upload which was
+/// taken up.
 pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
     let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; GATHERED_BYTES]);
     loop {
@@ -175,8 +187,8 @@ pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Out
     }
 }
 
-/// The name of an upload's file. That of a repository whose name leaves no room for the id is the id alone, which no restart
-/// goes on with.
+/// The name of an upload's file. That of a repository whose name leaves no room for the id is the
+/// id alone, which no restart goes on with.
 fn file_name(id: &UploadId, repository: &RepositoryName) -> String {
     let name = format!("{}.{}", id.as_str(), repository.as_str().replace('/', "+"));
     if name.len() <= MAX_NAME_BYTES { name } else { id.as_str().to_owned() }
@@ -189,8 +201,8 @@ fn named_by(file_name: &OsStr) -> Option<(UploadId, RepositoryName)> {
 }
 
 impl Uploads {
-    /// Opens the directory, takes up the uploads that an earlier process left unfinished, as many as there may be, the newest
-    /// first, and removes whatever else is in it.
+    /// Opens the directory, takes up the uploads that an earlier process left unfinished, as many
+    /// as there may be, the newest first, and removes whatever else is in it.
     pub(super) fn open(directory: PathBuf, settings: BlobSettings) -> Result<Self, BlobError> {
         let resume = || {
             fs::create_dir_all(&directory)?;
@@ -198,7 +210,9 @@ impl Uploads {
             for entry in fs::read_dir(&directory)? {
                 let entry = entry?;
                 match named_by(&entry.file_name()) {
-                    Some(upload) => left.push((entry.metadata()?.modified()?, entry.path(), upload)),
+                    Some(upload) => {
+                        left.push((entry.metadata()?.modified()?, entry.path(), upload))
+                    }
                     None => fs::remove_file(entry.path())?,
                 }
             }
@@ -206,9 +220,9 @@ impl Uploads {
             for (_, path, _) in left.drain(settings.max_uploads.min(left.len())..) {
                 fs::remove_file(path)?;
             }
-            let resumed = left
-                .into_iter()
-                .map(|(_, path, (id, repository))| Ok((id, Active::new(repository, Upload::resume(path)?))));
+            let resumed = left.into_iter().map(|(_, path, (id, repository))| {
+                Ok((id, Active::new(repository, Upload::resume(path)?)))
+            });
             resumed.collect::<io::Result<HashMap<_, _>>>()
         };
         let active = resume().map_err(BlobError::disk("clean", &directory))?;
@@ -224,15 +238,20 @@ impl Uploads {
         self.active.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes an upload in. Where every place is taken it gets one of a person's that nobody writes to: that is returned, and
-    /// the caller cancels it.
-    fn insert(&self, id: UploadId, active: Active) -> Result<Option<OwnedMutexGuard<Upload>>, BlobError> {
+    /// Takes an upload in. Where every place is taken it gets one of a person's that nobody writes
+    /// to: that is returned, and the caller cancels it.
+    fn insert(
+        &self,
+        id: UploadId,
+        active: Active,
+    ) -> Result<Option<OwnedMutexGuard<Upload>>, BlobError> {
         let max = self.settings.max_uploads;
         let mut all = self.active();
         if let Some((robot, _)) = owner(&active.repository) {
             // However many robots there are, a quarter stays free for operators.
             let max_of_robots = max - max / 4;
-            let robots: Vec<_> = all.values().filter_map(|other| owner(&other.repository)).collect();
+            let robots: Vec<_> =
+                all.values().filter_map(|other| owner(&other.repository)).collect();
             if robots.len() >= max_of_robots {
                 return Err(BlobError::TooManyUploads { max: max_of_robots });
             }
@@ -252,9 +271,12 @@ impl Uploads {
 
     /// Whether there is room for so many bytes more of a robot of which `kept` are kept already.
     fn check_room_of(&self, robot: &RobotId, bytes: u64, kept: u64) -> Result<(), BlobError> {
-        let is_robots = |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
-        let unfinished: u64 = self.active().values().filter(is_robots).map(|a| a.bytes.load(Ordering::Relaxed)).sum();
-        let (max, kept) = (self.settings.max_robot_bytes.saturating_mul(2), kept.saturating_add(unfinished));
+        let is_robots =
+            |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
+        let unfinished: u64 =
+            self.active().values().filter(is_robots).map(|a| a.bytes.load(Ordering::Relaxed)).sum();
+        let (max, kept) =
+            (self.settings.max_robot_bytes.saturating_mul(2), kept.saturating_add(unfinished));
         if kept.saturating_add(bytes) > max {
             return Err(BlobError::TooMuchOfRobot { max, kept });
         }
@@ -276,7 +298,8 @@ impl Uploads {
 /// Of people's uploads that nobody writes to, the one that gives way first.
 fn left_by_people(all: &HashMap<UploadId, Active>) -> Option<(UploadId, OwnedMutexGuard<Upload>)> {
     let of_people = all.iter().filter(|(_, active)| owner(&active.repository).is_none());
-    let left = of_people.filter_map(|(id, active)| Some((id, active.upload.clone().try_lock_owned().ok()?)));
+    let left = of_people
+        .filter_map(|(id, active)| Some((id, active.upload.clone().try_lock_owned().ok()?)));
     let (id, upload) = left.min_by_key(|(_, upload)| upload.gives_way())?;
     Some((id.clone(), upload))
 }
@@ -288,7 +311,8 @@ impl Blobs {
         let path = self.shared.uploads.directory.join(file_name(&id, repository));
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
         let active = Active::new(repository.clone(), created);
-        // Best effort, both: what stays is an upload that nobody goes on with, which the collector gives up.
+        // Best effort, both: what stays is an upload that nobody goes on with, which the collector
+        // gives up.
         match self.shared.uploads.insert(id.clone(), active) {
             Ok(None) => {}
             Ok(Some(mut left)) => drop(on_disk(move || left.cancel()).await),
@@ -301,12 +325,22 @@ impl Blobs {
     }
 
     /// How many bytes of an upload are here.
-    pub async fn upload_offset(&self, repository: &RepositoryName, id: &UploadId) -> Result<u64, BlobError> {
+    pub async fn upload_offset(
+        &self,
+        repository: &RepositoryName,
+        id: &UploadId,
+    ) -> Result<u64, BlobError> {
         Ok(self.lock_upload(repository, id)?.offset)
     }
 
-    /// Whether so many bytes more would be taken. `kept` is what is kept of the robot whose repository this is.
-    pub fn check_room(&self, repository: &RepositoryName, bytes: u64, kept: u64) -> Result<(), BlobError> {
+    /// Whether so many bytes more would be taken. `kept` is what is kept of the robot whose
+    /// repository this is.
+    pub fn check_room(
+        &self,
+        repository: &RepositoryName,
+        bytes: u64,
+        kept: u64,
+    ) -> Result<(), BlobError> {
         let max = self.max_bytes_in(repository);
         if bytes > max {
             return Err(BlobError::TooLarge { max });
@@ -321,18 +355,24 @@ impl Blobs {
     /// How many bytes more people may bring, as far as the disk goes.
     pub fn room_for_people(&self) -> u64 {
         let uploads = &self.shared.uploads;
-        room(&uploads.directory).map_or(u64::MAX, |(free, _)| free.saturating_sub(uploads.settings.reserve_bytes))
+        room(&uploads.directory)
+            .map_or(u64::MAX, |(free, _)| free.saturating_sub(uploads.settings.reserve_bytes))
     }
 
     /// The largest blob that a repository takes.
     fn max_bytes_in(&self, repository: &RepositoryName) -> u64 {
         let BlobSettings { max_blob_bytes, max_robot_bytes, .. } = self.shared.settings;
-        if owner(repository).is_some() { max_blob_bytes.min(max_robot_bytes) } else { max_blob_bytes }
+        if owner(repository).is_some() {
+            max_blob_bytes.min(max_robot_bytes)
+        } else {
+            max_blob_bytes
+        }
     }
 
-    /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What came before an error or
-    /// before the caller gave up is kept, and the next chunk begins there; only where there is no room for it the upload
-    /// ends. `kept` is as in [`Self::check_room`]. Returns the new offset.
+    /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What
+    /// came before an error or before the caller gave up is kept, and the next chunk begins there;
+    /// only where there is no room for it the upload ends. `kept` is as in [`Self::check_room`].
+    /// Returns the new offset.
     pub async fn append<S, E>(
         &self,
         repository: &RepositoryName,
@@ -362,11 +402,13 @@ impl Blobs {
                 } else {
                     self.check_room(repository, length as u64, kept)
                 };
-                // The lock travels with the work: if the caller is dropped here, the bytes still count as one piece.
+                // The lock travels with the work: if the caller is dropped here, the bytes still
+                // count as one piece.
                 let written = on_disk(move || {
                     let written = room.and_then(|()| upload.write(&chunks));
                     if written.as_ref().is_err_and(BlobError::is_want_of_room) {
-                        // What is here already would keep the disk full, for the database as well. Best effort.
+                        // What is here already would keep the disk full, for the database as well.
+                        // Best effort.
                         let _ = upload.cancel();
                     }
                     written.map(|()| upload)
@@ -385,7 +427,8 @@ impl Blobs {
         }
     }
 
-    /// Makes the upload a blob, if it hashes to `expected`; else it is given up. Returns the blob's size.
+    /// Makes the upload a blob, if it hashes to `expected`; else it is given up. Returns the blob's
+    /// size.
     pub async fn finish_upload(
         &self,
         repository: &RepositoryName,
@@ -408,7 +451,11 @@ impl Blobs {
     }
 
     /// Gives an upload up.
-    pub async fn cancel_upload(&self, repository: &RepositoryName, id: &UploadId) -> Result<(), BlobError> {
+    pub async fn cancel_upload(
+        &self,
+        repository: &RepositoryName,
+        id: &UploadId,
+    ) -> Result<(), BlobError> {
         let mut upload = self.lock_upload(repository, id)?;
         self.shared.uploads.active().remove(id);
         on_disk(move || upload.cancel()).await
@@ -416,7 +463,8 @@ impl Blobs {
 
     /// Gives up the uploads that got no byte since `before_ms`, and says how many.
     pub async fn drop_idle_uploads(&self, before_ms: u64) -> Result<usize, BlobError> {
-        let all: Vec<_> = self.shared.uploads.active().iter().map(|(id, a)| (id.clone(), a.clone())).collect();
+        let all: Vec<_> =
+            self.shared.uploads.active().iter().map(|(id, a)| (id.clone(), a.clone())).collect();
         let mut dropped = 0;
         for (id, active) in all {
             // Someone writes to it this moment: not idle, whatever the file's time says.
@@ -426,8 +474,10 @@ impl Blobs {
                 if upload.ended {
                     return Ok(true);
                 }
-                let metadata = upload.file.metadata().map_err(BlobError::disk("look at", &upload.path))?;
-                let modified_ms = modified_ms(&metadata).map_err(BlobError::disk("look at", &upload.path))?;
+                let metadata =
+                    upload.file.metadata().map_err(BlobError::disk("look at", &upload.path))?;
+                let modified_ms =
+                    modified_ms(&metadata).map_err(BlobError::disk("look at", &upload.path))?;
                 if modified_ms >= before_ms { Ok(false) } else { upload.cancel().map(|()| true) }
             });
             if is_dropped.await? {
@@ -438,19 +488,29 @@ impl Blobs {
         Ok(dropped)
     }
 
-    /// The only writer's right to an upload. A second writer is refused rather than queued: its chunk would be out of
-    /// order anyway.
-    fn lock_upload(&self, repository: &RepositoryName, id: &UploadId) -> Result<OwnedMutexGuard<Upload>, BlobError> {
+    /// The only writer's right to an upload. A second writer is refused rather than queued: its
+    /// chunk would be out of order anyway.
+    fn lock_upload(
+        &self,
+        repository: &RepositoryName,
+        id: &UploadId,
+    ) -> Result<OwnedMutexGuard<Upload>, BlobError> {
         // Held until the end: who looks for one to give way takes each for a moment.
         let all = self.shared.uploads.active();
-        let active = all.get(id).filter(|active| active.repository == *repository).ok_or(BlobError::UploadUnknown)?;
+        let active = all
+            .get(id)
+            .filter(|active| active.repository == *repository)
+            .ok_or(BlobError::UploadUnknown)?;
         let upload = active.upload.clone().try_lock_owned().map_err(|_| BlobError::UploadBusy)?;
         if upload.ended { Err(BlobError::UploadUnknown) } else { Ok(upload) }
     }
 }
 
-/// Takes chunks from a body until there are enough for one write, and says if and how the body ended.
-async fn gather<S, E>(body: &mut std::pin::Pin<&mut S>) -> (Vec<Bytes>, Option<Result<(), BlobError>>)
+/// Takes chunks from a body until there are enough for one write, and says if and how the body
+/// ended.
+async fn gather<S, E>(
+    body: &mut std::pin::Pin<&mut S>,
+) -> (Vec<Bytes>, Option<Result<(), BlobError>>)
 where
     S: Stream<Item = Result<Bytes, E>> + Send,
     E: Into<Box<dyn std::error::Error + Send + Sync>>,
@@ -463,7 +523,9 @@ where
                 length += chunk.len();
                 chunks.push(chunk);
             }
-            Ok(Some(Err(error))) => return (chunks, Some(Err(BlobError::Interrupted(error.into())))),
+            Ok(Some(Err(error))) => {
+                return (chunks, Some(Err(BlobError::Interrupted(error.into()))));
+            }
             Ok(None) => return (chunks, Some(Ok(()))),
             Err(elapsed) => return (chunks, Some(Err(BlobError::Interrupted(elapsed.into())))),
         }
@@ -482,7 +544,9 @@ mod tests {
         let settings = BlobSettings { reading: BlobRead::Pread, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
         let repository: RepositoryName = "talker".parse().expect("a name");
-        let body = |bytes: &'static [u8]| futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))]);
+        let body = |bytes: &'static [u8]| {
+            futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))])
+        };
         let id = blobs.begin_upload(&repository).await.expect("begins");
         blobs.append(&repository, &id, None, body(b"some"), 0).await.expect("there is room");
         let full = File::options().write(true).open("/dev/full").expect("Linux has it");
@@ -498,7 +562,9 @@ mod tests {
     async fn unfinished_uploads_go_on_after_a_restart_within_their_bounds() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 3, ..BlobSettings::default() };
-        let body = |bytes: &'static [u8]| futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))]);
+        let body = |bytes: &'static [u8]| {
+            futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(bytes))])
+        };
         let (repository, other): (RepositoryName, RepositoryName) =
             ("lab/talker".parse().expect("a name"), "lab/other".parse().expect("a name"));
         let long: RepositoryName = ["a"; 128].join("/").parse().expect("a name");
@@ -507,7 +573,8 @@ mod tests {
         let forgotten = blobs.begin_upload(&long).await.expect("begins");
         blobs.append(&repository, &id, None, body(b"some"), 0).await.expect("there is room");
         let uploads = directory.path().join("uploads");
-        fs::write(uploads.join("0123456789abcdef0123456789abcdef"), "left by a write").expect("written");
+        fs::write(uploads.join("0123456789abcdef0123456789abcdef"), "left by a write")
+            .expect("written");
         drop(blobs);
 
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -517,7 +584,10 @@ mod tests {
             assert!(matches!(unknown, Err(BlobError::UploadUnknown)), "{unknown:?}");
         }
         assert_eq!(blobs.upload_offset(&repository, &id).await.expect("there"), 4);
-        assert_eq!(blobs.append(&repository, &id, Some(4), body(b"more"), 0).await.expect("goes on"), 8);
+        assert_eq!(
+            blobs.append(&repository, &id, Some(4), body(b"more"), 0).await.expect("goes on"),
+            8
+        );
         let (right, wrong) = (Digest::of(b"somemore"), Digest::of(b"something"));
         assert_eq!(blobs.finish_upload(&repository, &id, right).await.expect("it is whole"), 8);
         assert!(blobs.get(right).await.expect("read").is_some());
@@ -530,7 +600,10 @@ mod tests {
         }
         drop(blobs);
         let few = BlobSettings { max_uploads: 2, ..settings };
-        assert_eq!(Blobs::open(directory.path(), few).expect("opens").shared.uploads.active().len(), 2);
+        assert_eq!(
+            Blobs::open(directory.path(), few).expect("opens").shared.uploads.active().len(),
+            2
+        );
         assert_eq!(fs::read_dir(&uploads).expect("there").count(), 2);
         for entry in fs::read_dir(&uploads).expect("there") {
             fs::remove_file(entry.expect("an entry").path()).expect("removed");
@@ -550,7 +623,8 @@ mod tests {
         let push = async |repository: &str| {
             let repository: RepositoryName = repository.parse().expect("a name");
             let id = blobs.begin_upload(&repository).await.expect("begins");
-            let body = futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
+            let body =
+                futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
             blobs.append(&repository, &id, None, body, 0).await
         };
         let refused = push("outputs/r00000000000000a1/mapping").await;
@@ -569,7 +643,11 @@ mod tests {
         let refused = blobs.append(&repository, &id, None, body, 0).await.expect_err("refused");
         assert!(refused.to_string().contains("(disk_reserve)"), "{refused}");
         assert_eq!(blobs.room_for_people(), 0);
-        assert_eq!(fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(), 0, "the upload ends");
+        assert_eq!(
+            fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(),
+            0,
+            "the upload ends"
+        );
     }
 
     #[tokio::test]
@@ -577,7 +655,8 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 2 * MAX_OF_ROBOT, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
-        let [first, second] = ["outputs/r00000000000000a1/mapping", "outputs/r00000000000000a2/mapping"];
+        let [first, second] =
+            ["outputs/r00000000000000a1/mapping", "outputs/r00000000000000a2/mapping"];
         let begun = async |repository: &str, count: usize| {
             let repository: RepositoryName = repository.parse().expect("a name");
             let mut begun = 0;
@@ -588,9 +667,16 @@ mod tests {
         };
         assert_eq!(begun(first, MAX_OF_ROBOT + 1).await, MAX_OF_ROBOT);
         assert_eq!(begun(second, MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2, "a quarter is nobody's");
-        assert_eq!(begun("talker", MAX_OF_ROBOT).await, MAX_OF_ROBOT, "people's give way to people's");
+        assert_eq!(
+            begun("talker", MAX_OF_ROBOT).await,
+            MAX_OF_ROBOT,
+            "people's give way to people's"
+        );
         let is_peoples = |active: &&Active| owner(&active.repository).is_none();
-        assert_eq!(blobs.shared.uploads.active().values().filter(is_peoples).count(), MAX_OF_ROBOT / 2);
+        assert_eq!(
+            blobs.shared.uploads.active().values().filter(is_peoples).count(),
+            MAX_OF_ROBOT / 2
+        );
     }
 
     #[tokio::test]
@@ -598,7 +684,8 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 4, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
-        let begin = async |repository: &str| blobs.begin_upload(&repository.parse().expect("a name")).await;
+        let begin =
+            async |repository: &str| blobs.begin_upload(&repository.parse().expect("a name")).await;
         for _ in 0..4 {
             begin("talker").await.expect("begins");
         }
@@ -623,14 +710,17 @@ mod tests {
         for id in &ids {
             blobs.lock_upload(&repository, id).expect("there").written_at -= SILENCE;
         }
-        // The empty one gives way, then the one with bytes, and only then what was begun a moment ago.
+        // The empty one gives way, then the one with bytes, and only then what was begun a moment
+        // ago.
         for gone in [None, Some(1), Some(0), Some(2)] {
             ids.push(begin().await.expect("begins"));
-            let there: Vec<bool> = ids.iter().map(|id| blobs.lock_upload(&repository, id).is_ok()).collect();
+            let there: Vec<bool> =
+                ids.iter().map(|id| blobs.lock_upload(&repository, id).is_ok()).collect();
             assert!(gone.is_none_or(|gone: usize| !there[gone]), "{there:?}");
             assert_eq!(there.iter().filter(|there| **there).count(), 3, "{there:?}");
         }
-        let writing: Vec<_> = ids[3..].iter().map(|id| blobs.lock_upload(&repository, id).expect("there")).collect();
+        let writing: Vec<_> =
+            ids[3..].iter().map(|id| blobs.lock_upload(&repository, id).expect("there")).collect();
         let refused = begin().await;
         assert!(matches!(refused, Err(BlobError::TooManyUploads { max: 3 })), "{refused:?}");
         drop(writing);

@@ -1,6 +1,7 @@
-//! Sending a package's parts to many robots at once, on `p/<digest>`: to those it was granted to, as fast as the slowest of
-//! them listens, and no longer than the [`FanOut`] lives. A part is held once, and so long as somebody has not taken it.
-//! Nothing is retained: who subscribes late, or falls out, gets the rest in another way.
+//! Sending a package's parts to many robots at once, on `p/<digest>`: to those it was granted to,
+//! as fast as the slowest of them listens, and no longer than the [`FanOut`] lives. A part is held
+//! once, and so long as somebody has not taken it. Nothing is retained: who subscribes late, or
+//! falls out, gets the rest in another way.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -77,7 +78,8 @@ pub enum FanOutError {
     BrokerAway,
 }
 
-/// A package on its way to many. Dropped, it ends: robots hear no further part and can't subscribe any more.
+/// A package on its way to many. Dropped, it ends: robots hear no further part and can't subscribe
+/// any more.
 pub struct FanOut(Way);
 
 enum Way {
@@ -125,7 +127,8 @@ impl FanOut {
         }
     }
 
-    /// A report says whether the robot listens. Our own front knows by itself, an external broker does not tell.
+    /// A report says whether the robot listens. Our own front knows by itself, an external broker
+    /// does not tell.
     pub fn told(&self, robot: &RobotId, is_listening: bool) {
         if let Way::External(crowd) = &self.0 {
             crowd.told(robot, is_listening);
@@ -148,8 +151,8 @@ impl FanOut {
         }
     }
 
-    /// Waits until somebody has begun to listen since this was waited for last. Through an external broker only
-    /// [`Self::told`] says so.
+    /// Waits until somebody has begun to listen since this was waited for last. Through an external
+    /// broker only [`Self::told`] says so.
     pub async fn joined(&self) {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.joined().await,
@@ -183,8 +186,9 @@ impl FanOut {
         }
     }
 
-    /// Sends the next part to all who listen. Waits while the slowest of them is too far behind; whoever holds up the
-    /// others for long is put out. Once this returns the part is on its way, not there: what arrived, robots report.
+    /// Sends the next part to all who listen. Waits while the slowest of them is too far behind;
+    /// whoever holds up the others for long is put out. Once this returns the part is on its way,
+    /// not there: what arrived, robots report.
     pub async fn publish(&mut self, part: Part) -> Result<(), FanOutError> {
         if part.len() > MAX_PART_BYTES {
             return Err(FanOutError::TooLarge(part.len()));
@@ -196,8 +200,8 @@ impl FanOut {
         Ok(())
     }
 
-    /// Waits until every listener, or the external broker, has acknowledged all that was sent, or was put out, or `patience`
-    /// is over.
+    /// Waits until every listener, or the external broker, has acknowledged all that was sent, or
+    /// was put out, or `patience` is over.
     pub async fn settle(&mut self, patience: Duration) {
         match &self.0 {
             Way::Embedded(granted) => granted.settle(patience).await,

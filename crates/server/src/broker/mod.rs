@@ -95,7 +95,8 @@ pub trait Gatekeeper: Send + Sync + 'static {
 /// A message from a robot on its `report`, `status`, `reply` or `log` topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotMessage {
-    /// Who sent it: proven by the connection, or as far as an external broker's access control list does.
+    /// Who sent it: proven by the connection, or as far as an external broker's access control list
+    /// does.
     pub robot: RobotId,
     /// Which of these topics.
     pub topic: RobotTopic,
@@ -105,8 +106,8 @@ pub struct RobotMessage {
     pub peer: Option<SocketAddr>,
     /// The connection it came by, as in [`Inbox::connected`].
     pub connection: u64,
-    /// The token the connection was let in by, as in [`Principal::Robot`]. An external broker is shown no token, so what
-    /// comes from there can't speak for one, and no report does.
+    /// The token the connection was let in by, as in [`Principal::Robot`]. An external broker is
+    /// shown no token, so what comes from there can't speak for one, and no report does.
     pub token_number: Option<u64>,
 }
 
@@ -117,21 +118,23 @@ pub struct NotStored;
 
 /// Receives what robots send.
 pub trait Inbox: Send + Sync + 'static {
-    /// A message arrived. The robot gets its acknowledgement once this resolves to `Ok`; on `Err`, or after
-    /// [`Limits::inbox_timeout`], its connection is closed instead, so that it sends again. A message whose content is
-    /// nonsense must resolve to `Ok`, or the robot would send it for ever. May be dropped half-way.
+    /// A message arrived. The robot gets its acknowledgement once this resolves to `Ok`; on `Err`,
+    /// or after [`Limits::inbox_timeout`], its connection is closed instead, so that it sends
+    /// again. A message whose content is nonsense must resolve to `Ok`, or the robot would send it
+    /// for ever. May be dropped half-way.
     fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>>;
 
-    /// A robot's session is live: [`Broker::ring`] reaches it from now on, so this is the moment to send its state.
-    /// `connection` grows with every connection of this process. Any earlier session of this robot has fully ended.
-    /// An external broker does not tell the peer.
+    /// A robot's session is live: [`Broker::ring`] reaches it from now on, so this is the moment to
+    /// send its state. `connection` grows with every connection of this process. Any earlier
+    /// session of this robot has fully ended. An external broker does not tell the peer.
     fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64);
 
-    /// The robot's session with this number has ended. Comes exactly once for each `connected`, after it.
+    /// The robot's session with this number has ended. Comes exactly once for each `connected`,
+    /// after it.
     fn disconnected(&self, robot: &RobotId, connection: u64);
 
-    /// The external broker is back, and any robot may be at it already: [`Broker::ring`] each, so that those who are there
-    /// have their state and say so.
+    /// The external broker is back, and any robot may be at it already: [`Broker::ring`] each, so
+    /// that those who are there have their state and say so.
     fn everyone_may_be_there(&self);
 }
 
@@ -155,7 +158,8 @@ pub struct BrokerConfig {
 pub struct Limits {
     /// Connections at a time, those not yet admitted included.
     pub max_connections: usize,
-    /// Those of one address that have not sent CONNECT yet; a further one takes the place of the oldest.
+    /// Those of one address that have not sent CONNECT yet; a further one takes the place of the
+    /// oldest.
     pub max_silent_per_address: usize,
     /// Operators among them.
     pub max_operators: usize,
@@ -275,15 +279,16 @@ impl Broker {
         Ok(Self { kind: Kind::Embedded(front), health })
     }
 
-    /// Becomes a client of another broker, now or as soon as that can be reached. Its health is never
+    /// Becomes a client of another broker, now or as soon as that can be reached. Its health is
+    /// never
     /// [`Health::Failed`]: it mends by itself.
     pub fn connect(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> Self {
         let (external, health) = External::start(config, inbox);
         Self { kind: Kind::External(external), health }
     }
 
-    /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits: one undelivered payload is held for a robot, and
-    /// a newer one takes its place, also before the robot has subscribed.
+    /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits: one undelivered payload
+    /// is held for a robot, and a newer one takes its place, also before the robot has subscribed.
     pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
         match &self.kind {
             Kind::Embedded(front) => front.ring(robot, payload),
@@ -291,7 +296,8 @@ impl Broker {
         }
     }
 
-    /// Whether [`Broker::ring`] may reach the robot. An external broker does not say who listens: all of them may.
+    /// Whether [`Broker::ring`] may reach the robot. An external broker does not say who listens:
+    /// all of them may.
     pub fn may_reach(&self, robot: &RobotId) -> bool {
         match &self.kind {
             Kind::Embedded(front) => front.has_session(robot),
@@ -313,8 +319,8 @@ impl Broker {
         }
     }
 
-    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions that have not gone out when the
-    /// session ends are lost.
+    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions that have not
+    /// gone out when the session ends are lost.
     pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
         match &self.kind {
             Kind::Embedded(front) => front.ask(robot, payload),
@@ -322,8 +328,9 @@ impl Broker {
         }
     }
 
-    /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on, until the [`FanOut`]
-    /// is dropped. Few packages at a time. At an external broker every robot may subscribe at any time.
+    /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on,
+    /// until the [`FanOut`] is dropped. Few packages at a time. At an external broker every robot
+    /// may subscribe at any time.
     pub fn fan_out(
         &self,
         digest: Digest,
@@ -332,12 +339,14 @@ impl Broker {
     ) -> Result<FanOut, FanOutError> {
         match &self.kind {
             Kind::Embedded(front) => FanOut::begin(front.clone(), digest, settings, robots),
-            Kind::External(external) => Ok(FanOut::at(Crowd::new(external.clone(), digest, settings.qos))),
+            Kind::External(external) => {
+                Ok(FanOut::at(Crowd::new(external.clone(), digest, settings.qos)))
+            }
         }
     }
 
-    /// The bytes of packages' parts that are held for listeners: the front's backlog. Those on their way to an external
-    /// broker are as few as its window.
+    /// The bytes of packages' parts that are held for listeners: the front's backlog. Those on
+    /// their way to an external broker are as few as its window.
     pub fn queued_part_bytes(&self) -> usize {
         match &self.kind {
             Kind::Embedded(front) => front.grants().queued_bytes(),
@@ -345,8 +354,8 @@ impl Broker {
         }
     }
 
-    /// Ends the robot's session, if it has one: its token was revoked or it was removed. At an external broker nobody can
-    /// be put out; the robot just counts as gone.
+    /// Ends the robot's session, if it has one: its token was revoked or it was removed. At an
+    /// external broker nobody can be put out; the robot just counts as gone.
     pub fn disconnect(&self, robot: &RobotId) {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect(robot),
@@ -354,8 +363,8 @@ impl Broker {
         }
     }
 
-    /// Serves a client whose connection somebody else has accepted, once `handshake` ends. False: the broker is another
-    /// one, or has no room.
+    /// Serves a client whose connection somebody else has accepted, once `handshake` ends. False:
+    /// the broker is another one, or has no room.
     pub fn take_in<S>(
         &self,
         peer: SocketAddr,
@@ -419,7 +428,8 @@ impl Broker {
         }
     }
 
-    /// Where the broker is, `host:port`; of several external ones that which the server was connected to last.
+    /// Where the broker is, `host:port`; of several external ones that which the server was
+    /// connected to last.
     pub fn address(&self) -> String {
         match &self.kind {
             Kind::Embedded(front) => front.local_addr().to_string(),
@@ -432,7 +442,8 @@ impl Broker {
         self.health.clone()
     }
 
-    /// Stops accepting, ends every session of ours and waits until all have ended, at most for `patience`.
+    /// Stops accepting, ends every session of ours and waits until all have ended, at most for
+    /// `patience`.
     pub async fn shutdown(&self, patience: Duration) {
         match &self.kind {
             Kind::Embedded(front) => front.shutdown(patience).await,

@@ -1,6 +1,7 @@
-//! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a client's bytes, topics
-//! or filters unchecked, because its thread dies of some of them; and since the router keeps a log for each filter and a
-//! record for each link name for ever, it gets two filters and a fixed set of names. Listeners pick out what they want.
+//! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a
+//! client's bytes, topics or filters unchecked, because its thread dies of some of them; and since
+//! the router keeps a log for each filter and a record for each link name for ever, it gets two
+//! filters and a fixed set of names. Listeners pick out what they want.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -16,9 +17,11 @@ use tokio_util::sync::CancellationToken;
 
 /// What the watchdog's canary travels on. No prefix can contain a space, so it meets nobody else.
 pub(super) const CANARY_TOPIC: &str = "router canary";
-/// What the publishing link may have waiting; the router being this far behind, messages to listeners are dropped.
+/// What the publishing link may have waiting; the router being this far behind, messages to
+/// listeners are dropped.
 const MAX_BACKLOG: usize = 1000;
-/// The router's log for each of the two filters: so much may a listener fall behind before it misses messages.
+/// The router's log for each of the two filters: so much may a listener fall behind before it
+/// misses messages.
 const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
 const SEGMENTS: usize = 4;
 /// Messages the router hands a listener at a time.
@@ -48,7 +51,8 @@ struct Running {
     replaced: CancellationToken,
 }
 
-/// Builds a link by name, if the thread lives. It blocks. (The router's sender has a type that can't be named, so it lives in a closure.)
+/// Builds a link by name, if the thread lives. It blocks. (The router's sender has a type that
+/// can't be named, so it lives in a closure.)
 type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 
 /// What a listener asks for.
@@ -81,7 +85,10 @@ pub(super) enum RouterError {
 
 impl Router {
     /// Starts the router's thread.
-    pub(super) async fn start(prefix: &TopicPrefix, max_listeners: usize) -> Result<Arc<Self>, RouterError> {
+    pub(super) async fn start(
+        prefix: &TopicPrefix,
+        max_listeners: usize,
+    ) -> Result<Arc<Self>, RouterError> {
         let everything = format!("{prefix}/#");
         let max_links = max_listeners + OTHER_LINKS;
         let running = Running::start(&everything, max_links).await?;
@@ -104,8 +111,8 @@ impl Router {
         Ok(())
     }
 
-    /// Publishes to whoever listens now. It never waits; what a router in trouble can't take is dropped, and the
-    /// watchdog told.
+    /// Publishes to whoever listens now. It never waits; what a router in trouble can't take is
+    /// dropped, and the watchdog told.
     pub(super) fn publish(&self, topic: &str, qos: QoS, payload: Bytes) {
         if topic != CANARY_TOPIC && self.listeners.load(Ordering::Relaxed) == 0 {
             return;
@@ -121,12 +128,17 @@ impl Router {
         let mut publisher = lock(&running.publisher);
         let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
         if !is_behind {
-            // Inside the router all is QoS 0, so the real one travels as one more level of the topic.
-            let message = Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
+            // Inside the router all is QoS 0, so the real one travels as one more level of the
+            // topic.
+            let message =
+                Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
             publisher.buffer().push_back(Packet::Publish(message, None));
         }
-        // Says that there is something in the buffer; a full channel has many such notes in it already.
-        if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) = publisher.try_unsubscribe(NOTHING) {
+        // Says that there is something in the buffer; a full channel has many such notes in it
+        // already.
+        if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) =
+            publisher.try_unsubscribe(NOTHING)
+        {
             self.trouble.notify_one();
         }
         if is_behind {
@@ -142,7 +154,10 @@ impl Router {
     }
 
     /// A new listener, which hears what is published from now on.
-    pub(super) async fn listen(self: &Arc<Self>, listening: Listening) -> Result<Listener, RouterError> {
+    pub(super) async fn listen(
+        self: &Arc<Self>,
+        listening: Listening,
+    ) -> Result<Listener, RouterError> {
         let running = lock(&self.current).clone();
         let (filter, name, place) = match listening {
             Listening::Everything => {
@@ -184,8 +199,9 @@ impl Running {
             ..RouterConfig::default()
         };
         let sender = rumqttd::Router::new(0, config).spawn();
-        let connect: Connect =
-            Arc::new(move |name| LinkBuilder::new(name, sender.clone()).build().ok().map(|(tx, rx, _)| (tx, rx)));
+        let connect: Connect = Arc::new(move |name| {
+            LinkBuilder::new(name, sender.clone()).build().ok().map(|(tx, rx, _)| (tx, rx))
+        });
         let mut link = Link::open(&connect, "publisher".to_owned(), None).await?;
         let publisher = link.tx.take().ok_or(RouterError::Gone)?;
         Ok(Self { connect, publisher: Mutex::new(publisher), replaced: CancellationToken::new() })
@@ -201,10 +217,15 @@ struct Link {
 }
 
 impl Link {
-    async fn open(connect: &Connect, name: String, place: Option<Place>) -> Result<Self, RouterError> {
+    async fn open(
+        connect: &Connect,
+        name: String,
+        place: Option<Place>,
+    ) -> Result<Self, RouterError> {
         let (reply, answer) = oneshot::channel();
         let connect = connect.clone();
-        // A thread of its own: if the router dies just now this waits for ever, and the runtime would wait with it.
+        // A thread of its own: if the router dies just now this waits for ever, and the runtime
+        // would wait with it.
         std::thread::spawn(move || {
             let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _place: place });
             // If nobody waits any more, the link is dropped, and so closed, right here.
@@ -307,6 +328,7 @@ fn heard(publish: Publish) -> Option<Heard> {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+    // half-done.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

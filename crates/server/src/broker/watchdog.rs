@@ -1,5 +1,6 @@
-//! Watches the router: every few seconds a canary logs in through the real listener, publishes and must hear itself.
-//! A router that is dead or stuck is started anew; what that does not cure is given up on, and the server told.
+//! Watches the router: every few seconds a canary logs in through the real listener, publishes and
+//! must hear itself. A router that is dead or stuck is started anew; what that does not cure is
+//! given up on, and the server told.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -7,8 +8,8 @@ use std::sync::Arc;
 
 use bytes::BytesMut;
 use rumqttd::protocol::{
-    Connect, ConnectReturnCode, Error, Filter, Login, Packet, Protocol, Publish, QoS, RetainForwardRule, Subscribe,
-    v4::V4,
+    Connect, ConnectReturnCode, Error, Filter, Login, Packet, Protocol, Publish, QoS,
+    RetainForwardRule, Subscribe, v4::V4,
 };
 use task_transport::{DialError, Duplex, Route, dial};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -26,7 +27,11 @@ const MAX_REMEDIES: u32 = 3;
 const MAX_PACKET_BYTES: usize = 1024;
 
 /// Starts watching; the receiver always has the latest finding.
-pub(super) fn start(front: &Front, router: Arc<Router>, limits: &Limits) -> watch::Receiver<Health> {
+pub(super) fn start(
+    front: &Front,
+    router: Arc<Router>,
+    limits: &Limits,
+) -> watch::Receiver<Health> {
     let (sender, receiver) = watch::channel(Health::Serving);
     let watchdog = Watchdog {
         route: route(front),
@@ -56,8 +61,8 @@ enum Lost {
     /// Nothing helps, if it lasts.
     #[error("the MQTT listener does not accept connections")]
     Listener(#[source] DialError),
-    /// Time helps: the watchdog has no connection of its own, as when too many files are open. That says nothing of the
-    /// listener.
+    /// Time helps: the watchdog has no connection of its own, as when too many files are open. That
+    /// says nothing of the listener.
     #[error("the watchdog can't open a connection to the MQTT listener")]
     Dial(#[source] DialError),
     /// Time helps: too many connections, too much to do. A new router would only make it worse.
@@ -72,7 +77,8 @@ impl Lost {
     /// What a failed attempt to connect says.
     fn by(error: DialError) -> Self {
         let refused = io::ErrorKind::ConnectionRefused;
-        let is_refused = matches!(&error, DialError::Connect { source, .. } if source.kind() == refused);
+        let is_refused =
+            matches!(&error, DialError::Connect { source, .. } if source.kind() == refused);
         match error {
             error if is_refused => Self::Listener(error),
             // As when the front closes a connection that it has no place for.
@@ -105,7 +111,10 @@ impl Watchdog {
                 failures += 1;
             }
             if failures > MAX_REMEDIES {
-                tracing::error!("the MQTT broker is beyond repair: {:#}", anyhow::Error::from(lost));
+                tracing::error!(
+                    "the MQTT broker is beyond repair: {:#}",
+                    anyhow::Error::from(lost)
+                );
                 self.say(Health::Failed(seen));
                 return;
             }
@@ -122,7 +131,8 @@ impl Watchdog {
     }
 
     fn say(&self, finding: Health) {
-        self.health.send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
+        self.health
+            .send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
     }
 
     /// One canary, there and back.
@@ -146,13 +156,16 @@ impl Bird {
     async fn enter(route: &Route, password: String) -> Result<Self, Lost> {
         let stream = dial(route).await.map_err(Lost::by)?;
         let mut bird = Self { stream, input: BytesMut::new() };
-        let connect = Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
+        let connect =
+            Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
         let login = Login { username: CANARY_ID.to_owned(), password };
         match bird.ask(Packet::Connect(connect, None, None, None, Some(login))).await {
             Some(Packet::ConnAck(ack, _)) => match ack.code {
                 ConnectReturnCode::Success => Ok(bird),
                 // The one thing the front needs for a canary is a link to the router.
-                ConnectReturnCode::ServiceUnavailable => Err(Lost::Router("it answers no new link")),
+                ConnectReturnCode::ServiceUnavailable => {
+                    Err(Lost::Router("it answers no new link"))
+                }
                 _ => Err(Lost::Front("it refused the password")),
             },
             _ => Err(Lost::Front("the connection broke")),
@@ -168,7 +181,9 @@ impl Bird {
             retain_forward_rule: RetainForwardRule::Never,
         };
         let broke = Lost::Router("the watchdog's connection broke");
-        let Some(_) = self.ask(Packet::Subscribe(Subscribe { pkid: 1, filters: vec![filter] }, None)).await else {
+        let Some(_) =
+            self.ask(Packet::Subscribe(Subscribe { pkid: 1, filters: vec![filter] }, None)).await
+        else {
             return Err(broke);
         };
         let publish = Publish::new(CANARY_TOPIC.to_owned(), song.clone(), false);
@@ -222,7 +237,9 @@ mod tests {
     use task_proto::topic::TopicPrefix;
     use tokio::net::TcpStream;
 
-    use super::super::{BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage};
+    use super::super::{
+        BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage,
+    };
     use super::*;
     use crate::limits::conduct::{Conduct, ConductLimits};
 
@@ -245,40 +262,56 @@ mod tests {
         fn everyone_may_be_there(&self) {}
     }
 
-    async fn watched(change: impl FnOnce(&mut Limits)) -> (Arc<Front>, Arc<Router>, watch::Receiver<Health>) {
+    async fn watched(
+        change: impl FnOnce(&mut Limits),
+    ) -> (Arc<Front>, Arc<Router>, watch::Receiver<Health>) {
         let mut limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
         change(&mut limits);
         let listen = "127.0.0.1:0".parse().expect("an address");
         let conduct = Conduct::new(ConductLimits::default());
-        let config =
-            BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits: limits.clone(), conduct };
+        let config = BrokerConfig {
+            listen,
+            tls: None,
+            prefix: TopicPrefix::default(),
+            limits: limits.clone(),
+            conduct,
+        };
         let router = Router::start(&config.prefix, 4).await.expect("a router");
-        let front =
-            Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone()).await.expect("a free port");
+        let front = Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone())
+            .await
+            .expect("a free port");
         let health = start(&front, router.clone(), &limits);
         (front, router, health)
     }
 
     async fn until(health: &mut watch::Receiver<Health>, wanted: impl FnMut(&Health) -> bool) {
-        timeout(PATIENCE, health.wait_for(wanted)).await.expect("in time").expect("the watchdog lives");
+        timeout(PATIENCE, health.wait_for(wanted))
+            .await
+            .expect("in time")
+            .expect("the watchdog lives");
     }
 
     #[tokio::test]
     async fn a_killed_router_is_started_anew() {
         let (front, router, mut health) = watched(|_| {}).await;
         for _ in 0..3 {
-            let mut listener = router.listen(super::super::router::Listening::Everything).await.expect("a link");
+            let mut listener =
+                router.listen(super::super::router::Listening::Everything).await.expect("a link");
             router.kill();
             until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
             until(&mut health, |health| *health == Health::Serving).await;
-            assert!(timeout(PATIENCE, listener.next()).await.expect("in time").is_err(), "old listeners learn of it");
+            assert!(
+                timeout(PATIENCE, listener.next()).await.expect("in time").is_err(),
+                "old listeners learn of it"
+            );
         }
         front.shutdown(PATIENCE).await;
     }
 
     #[tokio::test]
     async fn a_dead_router_is_noticed_by_whoever_publishes() {
-        let (_front, router, mut health) = watched(|limits| limits.canary_interval = Duration::from_secs(3600)).await;
+        let (_front, router, mut health) =
+            watched(|limits| limits.canary_interval = Duration::from_secs(3600)).await;
         router.kill();
         let noticed = async {
             while !health.has_changed().expect("the watchdog lives") {
@@ -288,7 +321,10 @@ mod tests {
         };
         timeout(PATIENCE, noticed).await.expect("in time");
         until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
-        router.listen(super::super::router::Listening::Everything).await.expect("it was started anew");
+        router
+            .listen(super::super::router::Listening::Everything)
+            .await
+            .expect("it was started anew");
     }
 
     #[tokio::test]
@@ -323,8 +359,16 @@ mod tests {
         let (sender, mut health) = watch::channel(Health::Serving);
         let limits = Limits { canary_interval: Duration::from_millis(1), ..Limits::default() };
         let router = Router::start(&TopicPrefix::default(), 1).await.expect("a router");
-        let route = Route { host: dead.ip().to_string(), port: dead.port(), tls: None, websocket: None };
-        let watchdog = Watchdog { route, pass: front.canary_pass(), router, limits, health: sender, flights: 0 };
+        let route =
+            Route { host: dead.ip().to_string(), port: dead.port(), tls: None, websocket: None };
+        let watchdog = Watchdog {
+            route,
+            pass: front.canary_pass(),
+            router,
+            limits,
+            health: sender,
+            flights: 0,
+        };
         watchdog.run().await;
         until(&mut health, |health| matches!(health, Health::Failed(_))).await;
     }

@@ -1,4 +1,5 @@
-//! The command line of `taskd` as a whole: what `main` parses, what shells complete and what the man pages are made of.
+//! The command line of `taskd` as a whole: what `main` parses, what shells complete and what the
+//! man pages are made of.
 
 use std::ffi::OsString;
 
@@ -36,10 +37,13 @@ pub enum Command {
 
 impl CommandLine {
     /// What was typed, and what the environment adds.
-    pub fn read(words: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> Result<Self, clap::Error> {
+    pub fn read(
+        words: impl IntoIterator<Item = impl Into<OsString> + Clone>,
+    ) -> Result<Self, clap::Error> {
         let matches = Self::command().try_get_matches_from(words)?;
         let mut read = Self::from_arg_matches(&matches)?;
-        let is_typed = |option: &str| matches.value_source(option) == Some(ValueSource::CommandLine);
+        let is_typed =
+            |option: &str| matches.value_source(option) == Some(ValueSource::CommandLine);
         read.connection.prefer_what_is_typed(is_typed);
         Ok(read)
     }
@@ -62,7 +66,8 @@ mod tests {
     #[test]
     fn the_data_directory_may_be_named_before_the_command_or_after_it() {
         for line in [["taskd", "--data", "/d", "serve"], ["taskd", "serve", "--data", "/d"]] {
-            let Command::Serve(flags) = CommandLine::try_parse_from(line).expect("parses").command else {
+            let Command::Serve(flags) = CommandLine::try_parse_from(line).expect("parses").command
+            else {
                 panic!("{line:?}")
             };
             assert_eq!(flags.settings, [("data", "/d".to_owned())]);

@@ -1,5 +1,5 @@
-//! `taskd completions` and `taskd man`: what a packager installs beside the program. Both are made of the command line
-//! itself, so they can't tell of anything that is not there.
+//! `taskd completions` and `taskd man`: what a packager installs beside the program. Both are made
+//! of the command line itself, so they can't tell of anything that is not there.
 
 use std::path::PathBuf;
 
@@ -44,7 +44,9 @@ pub(super) fn completions(order: &CompletionsOrder) -> Result<Outcome, CommandEr
     };
     let failed = |source| CommandError::Io { what: "can't write the script".to_owned(), source };
     let shells = Shells::builtins();
-    let shell = shells.completer(name).ok_or_else(|| CommandError::Usage(format!("{name}: no such shell")))?;
+    let shell = shells
+        .completer(name)
+        .ok_or_else(|| CommandError::Usage(format!("{name}: no such shell")))?;
     let mut script = Vec::new();
     shell.write_registration(VARIABLE, "taskd", "taskd", "taskd", &mut script).map_err(failed)?;
     stream_text(&String::from_utf8_lossy(&script))?;
@@ -54,7 +56,10 @@ pub(super) fn completions(order: &CompletionsOrder) -> Result<Outcome, CommandEr
 /// Writes a page for each command.
 pub(super) fn man(order: &ManOrder, command_line: clap::Command) -> Result<Outcome, CommandError> {
     let directory = &order.directory;
-    let failed = |source| CommandError::Io { what: format!("can't write to {}", directory.display()), source };
+    let failed = |source| CommandError::Io {
+        what: format!("can't write to {}", directory.display()),
+        source,
+    };
     std::fs::create_dir_all(directory).map_err(failed)?;
     clap_mangen::generate_to(command_line, directory).map_err(failed)?;
     say(&format!("read them with: man {}", directory.join("taskd.1").display()));

@@ -160,13 +160,16 @@ pub enum Command {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Asking the server")]
 pub struct Connection {
-    /// The server's URL [default: the server of --data, else that of the last taskd login, else http://127.0.0.1:8080]
+    /// The server's URL [default: the server of --data, else that of the last taskd login, else
+    /// http://127.0.0.1:8080]
     #[arg(long, env = "TASKD_SERVER", value_name = "URL", global = true)]
     pub server: Option<String>,
-    /// The pin of the server's certificate authority [default: that of taskd login or of the server of --data, else the system's roots]
+    /// The pin of the server's certificate authority [default: that of taskd login or of the server
+    /// of --data, else the system's roots]
     #[arg(long, env = "TASKD_PIN", value_name = "PIN", global = true)]
     pub pin: Option<CaPin>,
-    /// A person's token [default: operator.token of the server that --data names, else that of taskd login]
+    /// A person's token [default: operator.token of the server that --data names, else that of
+    /// taskd login]
     #[arg(long, env = "TASKD_TOKEN", value_name = "TOKEN", hide_env_values = true, global = true)]
     pub token: Option<String>,
     /// A file that holds the token
@@ -247,14 +250,20 @@ impl CommandError {
     fn outcome(&self) -> Outcome {
         match self {
             Self::Client(error) => error.outcome(),
-            Self::Package(PackageError::Io { .. }) | Self::Io { .. } | Self::Broken(_) => Outcome::Failed,
+            Self::Package(PackageError::Io { .. }) | Self::Io { .. } | Self::Broken(_) => {
+                Outcome::Failed
+            }
             Self::Package(_) | Self::Key(_) | Self::Usage(_) => Outcome::Usage,
         }
     }
 }
 
 /// Runs one command to its end. Results are on stdout, everything else has been said on stderr.
-pub async fn run(connection: &Connection, command: Command, command_line: fn() -> clap::Command) -> ExitCode {
+pub async fn run(
+    connection: &Connection,
+    command: Command,
+    command_line: fn() -> clap::Command,
+) -> ExitCode {
     let outcome = match dispatch(connection, command, command_line).await {
         Ok(outcome) => outcome,
         Err(error) => {
@@ -314,8 +323,8 @@ pub(crate) struct Session {
 }
 
 impl Connection {
-    /// Who types a directory means its server, not the one that is in the environment; what goes with that one is not for
-    /// this one.
+    /// Who types a directory means its server, not the one that is in the environment; what goes
+    /// with that one is not for this one.
     pub(crate) fn prefer_what_is_typed(&mut self, is_typed: impl Fn(&str) -> bool) {
         if is_typed("data") && !is_typed("server") && self.server.take().is_some() {
             self.token.take_if(|_| !is_typed("token"));

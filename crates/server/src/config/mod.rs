@@ -37,7 +37,8 @@ pub struct Config {
     pub http: SocketAddr,
     /// Where MQTT listens; port 0 takes a free one.
     pub mqtt: SocketAddr,
-    /// The MQTT brokers to be a client of, one at a time; absent: the server's own, which listens at `mqtt`.
+    /// The MQTT brokers to be a client of, one at a time; absent: the server's own, which listens
+    /// at `mqtt`.
     pub broker: Option<BrokerUrls>,
     /// The authority behind its certificate; absent: the system's roots vouch for it.
     pub broker_pin: Option<CaPin>,
@@ -59,7 +60,8 @@ pub struct Config {
     pub public_mqtt_host: Option<String>,
     /// The MQTT port robots are told; absent: the one that is bound.
     pub public_mqtt_port: Option<u16>,
-    /// After how long a silent robot that polls counts as offline; robots poll every 10 s unless told otherwise.
+    /// After how long a silent robot that polls counts as offline; robots poll every 10 s unless
+    /// told otherwise.
     pub presence_timeout: Duration,
     /// How blobs are read.
     pub blob_read: BlobRead,
@@ -69,8 +71,8 @@ pub struct Config {
     pub max_http_connections: usize,
     /// The most MQTT connections at once; more are refused.
     pub max_mqtt_connections: usize,
-    /// The most connections of one address that have shown no good token yet, over MQTT sent no CONNECT; the oldest is closed for a
-    /// further one.
+    /// The most connections of one address that have shown no good token yet, over MQTT sent no
+    /// CONNECT; the oldest is closed for a further one.
     pub max_silent_per_address: usize,
     /// The addresses of reverse proxies that are believed about where a request came from.
     pub trusted_proxies: Vec<IpAddr>,
@@ -80,7 +82,8 @@ pub struct Config {
     pub max_blob_bytes: u64,
     /// The most bytes that are unpacked of a package that comes as a directory.
     pub max_upload_bytes: u64,
-    /// The most bytes that are kept of what one robot brings back; absent: 40 GB, or less on a small disk.
+    /// The most bytes that are kept of what one robot brings back; absent: 40 GB, or less on a
+    /// small disk.
     pub max_robot_bytes: Option<u64>,
     /// How packages travel to robots.
     pub delivery: DeliverySettings,
@@ -96,7 +99,8 @@ pub struct Config {
     pub enrolment_uses: u64,
     /// How many robots may enrol in a minute; by one token half of them.
     pub enrolment_per_minute: u64,
-    /// What people's packages and uploads leave free on the disk; absent: a fortieth of it, 1 GB at most.
+    /// What people's packages and uploads leave free on the disk; absent: a fortieth of it, 1 GB at
+    /// most.
     pub disk_reserve: Option<u64>,
 }
 
@@ -205,7 +209,9 @@ pub enum ConfigError {
         reason: String,
     },
     /// No data directory is given and there is no home to put it in.
-    #[error("--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one")]
+    #[error(
+        "--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one"
+    )]
     NoDataDirectory,
     /// A password stands where every user of the machine can read it.
     #[error(
@@ -264,7 +270,8 @@ pub enum ConfigError {
 }
 
 /// Variables that other commands and tasks use; `serve` is not confused by finding them.
-const FOREIGN_VARIABLES: [&str; 5] = ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
+const FOREIGN_VARIABLES: [&str; 5] =
+    ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
 /// What the test suite's own variables start with.
 const TEST_VARIABLES: &str = "TASKD_TEST_";
 /// The largest configuration file that is read.
@@ -311,13 +318,16 @@ impl Config {
         }
     }
 
-    /// Merges the sources. `environment` is the process's, handed in so that tests need not change it.
+    /// Merges the sources. `environment` is the process's, handed in so that tests need not change
+    /// it.
     pub fn load(
         flags: &ServeFlags,
         environment: impl IntoIterator<Item = (OsString, OsString)>,
     ) -> Result<Self, ConfigError> {
         let environment: Vec<(OsString, OsString)> = environment.into_iter().collect();
-        let variable = |name: &str| environment.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone());
+        let variable = |name: &str| {
+            environment.iter().find(|(key, _)| key == name).map(|(_, value)| value.clone())
+        };
         let mut config = Self::with_data(PathBuf::new());
         let file = flags.config.clone().or_else(|| variable("TASKD_CONFIG").map(PathBuf::from));
         if let Some(path) = file {
@@ -326,7 +336,8 @@ impl Config {
         config.apply_environment(&environment)?;
         for (name, text) in &flags.settings {
             // A broker's URL always has a password.
-            if *name == "broker" && text != "embedded" || *name == "database" && has_password(text) {
+            if *name == "broker" && text != "embedded" || *name == "database" && has_password(text)
+            {
                 return Err(ConfigError::PasswordInSight { name });
             }
             config.apply(&name.replace('-', "_"), text, Origin::Flag(format!("--{name}")))?;
@@ -341,17 +352,23 @@ impl Config {
     /// Refuses settings that do not go together.
     fn check(&self) -> Result<(), ConfigError> {
         self.oidc.check()?;
-        let is_exposed = |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
+        let is_exposed =
+            |broker: &&BrokerUrl| !broker.tls && !broker.is_loopback() && !self.allow_plaintext;
         let brokers = self.broker.as_ref().map(BrokerUrls::all).unwrap_or_default();
         if let Some(broker) = brokers.iter().find(is_exposed) {
             return Err(ConfigError::PlaintextBroker { address: broker.address() });
         }
-        if brokers.len() > 1 && (self.public_mqtt_host.is_some() || self.public_mqtt_port.is_some()) {
+        if brokers.len() > 1 && (self.public_mqtt_host.is_some() || self.public_mqtt_port.is_some())
+        {
             return Err(ConfigError::OnePlaceForSeveralBrokers);
         }
         match (&self.tls.certificate, &self.tls.key) {
-            (Some(_), None) => Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" }),
-            (None, Some(_)) => Err(ConfigError::HalfACertificate { given: "tls.key", missing: "tls.certificate" }),
+            (Some(_), None) => {
+                Err(ConfigError::HalfACertificate { given: "tls.certificate", missing: "tls.key" })
+            }
+            (None, Some(_)) => {
+                Err(ConfigError::HalfACertificate { given: "tls.key", missing: "tls.certificate" })
+            }
             _ => Ok(()),
         }?;
         if self.tls.client_certificates && !self.encrypts() {
@@ -374,7 +391,10 @@ impl Config {
     fn reached_from_elsewhere(&self) -> Option<(&'static str, SocketAddr)> {
         // Nothing listens for MQTT beside an external broker.
         let mqtt = self.broker.is_none().then_some(("mqtt", self.mqtt));
-        [("http", self.http)].into_iter().chain(mqtt).find(|(_, address)| !address.ip().is_loopback())
+        [("http", self.http)]
+            .into_iter()
+            .chain(mqtt)
+            .find(|(_, address)| !address.ip().is_loopback())
     }
 
     fn apply(&mut self, key: &str, text: &str, origin: Origin) -> Result<(), ConfigError> {
@@ -393,21 +413,34 @@ impl Config {
         let text = std::fs::read_to_string(path).map_err(unreadable)?;
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
             // Not the line itself, which may hold a password.
-            let line = error.span().map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            let line = error
+                .span()
+                .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
             let line = line.map(|line| format!("line {line}: ")).unwrap_or_default();
             syntax(format!("{line}{}", error.message()))
         })?;
         for (key, value) in table {
             match value {
-                toml::Value::Table(table) if tables::is_known(&key) => self.apply_table(path, &key, table)?,
-                value => self.apply_value(&key, value, Origin::File { key: key.clone(), path: path.to_owned() })?,
+                toml::Value::Table(table) if tables::is_known(&key) => {
+                    self.apply_table(path, &key, table)?
+                }
+                value => self.apply_value(
+                    &key,
+                    value,
+                    Origin::File { key: key.clone(), path: path.to_owned() },
+                )?,
             }
         }
         Ok(())
     }
 
     /// A setting from a file. `key` is its name all in one, `origin` where it stands.
-    fn apply_value(&mut self, key: &str, value: toml::Value, origin: Origin) -> Result<(), ConfigError> {
+    fn apply_value(
+        &mut self,
+        key: &str,
+        value: toml::Value,
+        origin: Origin,
+    ) -> Result<(), ConfigError> {
         let text = match value {
             toml::Value::String(text) => text,
             toml::Value::Integer(number) => number.to_string(),
@@ -417,8 +450,12 @@ impl Config {
                     return Err(ConfigError::Unknown { hint: nearest(key), origin });
                 }
                 let reason = match other {
-                    toml::Value::Array(_) => "expected a text, a whole number or true or false, not an array",
-                    toml::Value::Table(_) => "expected a text, a whole number or true or false, not a table",
+                    toml::Value::Array(_) => {
+                        "expected a text, a whole number or true or false, not an array"
+                    }
+                    toml::Value::Table(_) => {
+                        "expected a text, a whole number or true or false, not a table"
+                    }
                     _ => "expected a text, a whole number or true or false",
                 };
                 return Err(ConfigError::Value { origin, reason: reason.to_owned() });
@@ -427,15 +464,26 @@ impl Config {
         self.apply(key, &text, origin)
     }
 
-    fn apply_environment(&mut self, environment: &[(OsString, OsString)]) -> Result<(), ConfigError> {
+    fn apply_environment(
+        &mut self,
+        environment: &[(OsString, OsString)],
+    ) -> Result<(), ConfigError> {
         for (name, value) in environment {
-            let Some(name) = name.to_str().filter(|name| name.starts_with("TASKD_")) else { continue };
-            if name == "TASKD_CONFIG" || FOREIGN_VARIABLES.contains(&name) || name.starts_with(TEST_VARIABLES) {
+            let Some(name) = name.to_str().filter(|name| name.starts_with("TASKD_")) else {
+                continue;
+            };
+            if name == "TASKD_CONFIG"
+                || FOREIGN_VARIABLES.contains(&name)
+                || name.starts_with(TEST_VARIABLES)
+            {
                 continue;
             }
             let origin = Origin::Variable(name.to_owned());
             let Some(text) = value.to_str() else {
-                return Err(ConfigError::Value { origin, reason: "the value is not UTF-8".to_owned() });
+                return Err(ConfigError::Value {
+                    origin,
+                    reason: "the value is not UTF-8".to_owned(),
+                });
             };
             self.apply(&name["TASKD_".len()..].to_ascii_lowercase(), text, origin)?;
         }
@@ -446,7 +494,8 @@ impl Config {
 /// The data directory of someone who names none.
 pub fn default_data_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     let set = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
-    let base = set("XDG_DATA_HOME").or_else(|| set("HOME").map(|home| home.join(".local/share")))?;
+    let base =
+        set("XDG_DATA_HOME").or_else(|| set("HOME").map(|home| home.join(".local/share")))?;
     Some(base.join("taskd"))
 }
 
@@ -461,14 +510,21 @@ pub struct ServeFlags {
 
 impl clap::Args for ServeFlags {
     fn augment_args(command: clap::Command) -> clap::Command {
-        let config = Arg::new("config").long("config").value_name("FILE").value_parser(clap::value_parser!(PathBuf));
-        let mut command = command.arg(config.help("TOML file with the settings below, '_' in place of '-'"));
+        let config = Arg::new("config")
+            .long("config")
+            .value_name("FILE")
+            .value_parser(clap::value_parser!(PathBuf));
+        let mut command =
+            command.arg(config.help("TOML file with the settings below, '_' in place of '-'"));
         for setting in SETTINGS {
             let arg = Arg::new(setting.name).long(setting.name).help(setting.help);
             let arg = arg.value_name(setting.value_name).action(ArgAction::Set);
             let is_switch = setting.value_name == "BOOL";
-            let arg =
-                if is_switch { arg.num_args(0..=1).require_equals(true).default_missing_value("true") } else { arg };
+            let arg = if is_switch {
+                arg.num_args(0..=1).require_equals(true).default_missing_value("true")
+            } else {
+                arg
+            };
             command = command.arg(arg);
         }
         command
@@ -481,7 +537,8 @@ impl clap::Args for ServeFlags {
 
 impl clap::FromArgMatches for ServeFlags {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let text = |name: &'static str| matches.get_one::<String>(name).map(|text| (name, text.clone()));
+        let text =
+            |name: &'static str| matches.get_one::<String>(name).map(|text| (name, text.clone()));
         Ok(Self {
             config: matches.get_one::<PathBuf>("config").cloned(),
             settings: SETTINGS.iter().filter_map(|setting| text(setting.name)).collect(),
@@ -499,16 +556,22 @@ pub fn lifetime(text: &str) -> Result<Duration, String> {
     const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
     match parse_duration(text) {
         Some(time) if !time.is_zero() && time <= MOST => Ok(time),
-        _ => Err(format!("{text:?} is not a time: expected for example 90s, 15m, 12h or 7d, at most 3650d")),
+        _ => Err(format!(
+            "{text:?} is not a time: expected for example 90s, 15m, 12h or 7d, at most 3650d"
+        )),
     }
 }
 
 /// Reads how many, which is at least one.
 pub fn at_least_one(text: &str) -> Result<u64, String> {
-    text.parse().ok().filter(|count| *count > 0).ok_or_else(|| "expected a whole number, 1 or more".to_owned())
+    text.parse()
+        .ok()
+        .filter(|count| *count > 0)
+        .ok_or_else(|| "expected a whole number, 1 or more".to_owned())
 }
 
-/// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means seconds.
+/// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means
+/// seconds.
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let number: u64 = text[..split].parse().ok()?;
@@ -533,7 +596,8 @@ fn nearest(key: &str) -> String {
     }
 }
 
-/// Whether a database's URL has a password: `user:password@`, or in its query. A file's name may hold an `@`.
+/// Whether a database's URL has a password: `user:password@`, or in its query. A file's name may
+/// hold an `@`.
 fn has_password(url: &str) -> bool {
     let Some(("postgres" | "postgresql", rest)) = url.split_once("://") else { return false };
     let (place, query) = rest.split_once('?').unwrap_or((rest, ""));
@@ -561,19 +625,25 @@ mod tests {
         };
         let env = env.iter().map(|(name, value)| (OsString::from(name), OsString::from(value)));
         let env = env.chain([(OsString::from("HOME"), OsString::from("/home/ada"))]);
-        Config::load(&flags, env).map_err(|error| error.to_string().replace(&path.display().to_string(), "taskd.toml"))
+        Config::load(&flags, env)
+            .map_err(|error| error.to_string().replace(&path.display().to_string(), "taskd.toml"))
     }
 
     #[test]
     fn flags_win_over_variables_over_the_file_over_defaults() {
-        let file = Some("http = \"127.0.0.1:1\"\nmqtt = \"127.0.0.1:1\"\ndata = \"/file\"\nassignment_expiry = \"2d\"");
+        let file = Some(
+            "http = \"127.0.0.1:1\"\nmqtt = \"127.0.0.1:1\"\ndata = \"/file\"\nassignment_expiry = \"2d\"",
+        );
         let env = [("TASKD_HTTP", "127.0.0.1:2"), ("TASKD_MQTT", "127.0.0.1:2"), ("PATH", "/bin")];
         let config = load(&[("http", "127.0.0.1:3")], &env, file).expect("loads");
         assert_eq!((config.http.port(), config.mqtt.port()), (3, 2));
         assert_eq!(config.data, PathBuf::from("/file"));
         assert_eq!(config.assignment_expiry, Duration::from_secs(172_800));
         assert_eq!(config.desired_lifetime, Duration::from_secs(30 * 86_400));
-        assert_eq!(load(&[], &[], None).expect("loads").data, PathBuf::from("/home/ada/.local/share/taskd"));
+        assert_eq!(
+            load(&[], &[], None).expect("loads").data,
+            PathBuf::from("/home/ada/.local/share/taskd")
+        );
     }
 
     #[test]
@@ -589,11 +659,26 @@ mod tests {
         for (file, expected) in [
             ("htpt = 1", "htpt in taskd.toml: there is no such setting"),
             ("[limits]\nx = 1", "limits in taskd.toml: there is no such setting"),
-            ("http = [1]", "http in taskd.toml: expected a text, a whole number or true or false, not an array"),
-            ("[delivery]\nqos = 3", "delivery.qos in taskd.toml: \"3\" is not a quality of service: 0, 1 or 2"),
-            ("[delivery]\npart_byts = 3", "delivery.part_byts in taskd.toml: there is no such setting; delivery_part_"),
-            ("[delivery]\nqos = [3]", "delivery.qos in taskd.toml: expected a text, a whole number"),
-            ("[transfers]\nmax = 0", "transfers.max in taskd.toml: \"0\" is not a whole number from 1"),
+            (
+                "http = [1]",
+                "http in taskd.toml: expected a text, a whole number or true or false, not an array",
+            ),
+            (
+                "[delivery]\nqos = 3",
+                "delivery.qos in taskd.toml: \"3\" is not a quality of service: 0, 1 or 2",
+            ),
+            (
+                "[delivery]\npart_byts = 3",
+                "delivery.part_byts in taskd.toml: there is no such setting; delivery_part_",
+            ),
+            (
+                "[delivery]\nqos = [3]",
+                "delivery.qos in taskd.toml: expected a text, a whole number",
+            ),
+            (
+                "[transfers]\nmax = 0",
+                "transfers.max in taskd.toml: \"0\" is not a whole number from 1",
+            ),
             ("blob_read = \"sendfile\"", "blob_read in taskd.toml: \"sendfile\" is neither"),
             ("assignment_expiry = \"0s\"", "assignment_expiry in taskd.toml: \"0s\" is not a time"),
             ("http =", "taskd.toml is not valid TOML"),
@@ -608,7 +693,8 @@ mod tests {
     #[test]
     fn plain_text_beyond_loopback_must_be_allowed() {
         let elsewhere = ("mqtt", "0.0.0.0:1883");
-        let message = load(&[elsewhere, ("tls-private-ca", "false")], &[], None).expect_err("refused");
+        let message =
+            load(&[elsewhere, ("tls-private-ca", "false")], &[], None).expect_err("refused");
         assert!(message.starts_with("mqtt = 0.0.0.0:1883: unencrypted"), "{message}");
         let encrypts = |flags: &[_], file| load(flags, &[], file).expect("allowed").encrypts();
         let own = Some("[tls]\ncertificate = \"/etc/c.pem\"\nkey = \"/etc/k.pem\"");
@@ -631,21 +717,26 @@ mod tests {
         for (file, expected) in [
             ("[tls]\ncertificate = \"c.pem\"", "tls.certificate: tls.key is missing"),
             ("[tls]\nkey = \"k.pem\"", "tls.key: tls.certificate is missing"),
-            ("[tls]\nnames = \"a b\"", "tls.names in taskd.toml: \"a b\" is neither a host name nor an address"),
+            (
+                "[tls]\nnames = \"a b\"",
+                "tls.names in taskd.toml: \"a b\" is neither a host name nor an address",
+            ),
             ("[tls]\nclient_certificates = true", "tls.client_certificates: robots can't show"),
             ("[tls]\ncert = \"c.pem\"", "tls.cert in taskd.toml: there is no such setting"),
         ] {
             let message = load(&[], &[], Some(file)).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");
         }
-        let names = load(&[("tls-names", "fleet.lab, 10.0.0.7")], &[], None).expect("loads").tls.names;
+        let names =
+            load(&[("tls-names", "fleet.lab, 10.0.0.7")], &[], None).expect("loads").tls.names;
         assert_eq!(names, ["fleet.lab", "10.0.0.7"]);
     }
 
     #[test]
     fn an_external_broker_and_its_password_stay_out_of_sight() {
         let url = "mqtt://taskd:swordfish@localhost:1884";
-        let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None).expect("loads");
+        let config = load(&[], &[("TASKD_BROKER", url), ("TASKD_MQTT", "0.0.0.0:1883")], None)
+            .expect("loads");
         assert!(!format!("{config:?}").contains("swordfish"));
         assert_eq!(config.broker.expect("external").first().address(), "localhost:1884");
         let back = load(&[("broker", "embedded")], &[("TASKD_BROKER", url)], None).expect("loads");
@@ -653,7 +744,8 @@ mod tests {
         let elsewhere = Some("broker = \"mqtt://taskd:swordfish@broker.lab\"");
         for message in [
             load(&[("broker", url)], &[], None).expect_err("readable by everybody"),
-            load(&[], &[("TASKD_BROKER", "tcp://taskd:swordfish@localhost")], None).expect_err("no such scheme"),
+            load(&[], &[("TASKD_BROKER", "tcp://taskd:swordfish@localhost")], None)
+                .expect_err("no such scheme"),
             load(&[], &[], elsewhere).expect_err("readable on the way"),
         ] {
             assert!(message.contains("broker") || message.contains("BROKER"), "{message}");
@@ -670,7 +762,8 @@ mod tests {
         let one_place = load(&[("public-mqtt-host", "wifi.lab")], &[("TASKD_BROKER", both)], None);
         assert!(one_place.expect_err("one host for two").contains("public_mqtt_host"));
         let plain = both.replace("mqtts", "mqtt");
-        let refused = load(&[], &[("TASKD_BROKER", &plain)], None).expect_err("readable on the way");
+        let refused =
+            load(&[], &[("TASKD_BROKER", &plain)], None).expect_err("readable on the way");
         assert!(refused.contains("broker.lab:1883"), "{refused}");
     }
 
@@ -684,16 +777,20 @@ mod tests {
         ] {
             assert_eq!(load(&[("database", url)], &[], None).is_err(), is_secret, "{url}");
         }
-        let message = load(&[("database", "mysql://ada:secret@host/db")], &[], None).expect_err("refused");
+        let message =
+            load(&[("database", "mysql://ada:secret@host/db")], &[], None).expect_err("refused");
         assert!(!message.contains("secret"), "{message}");
     }
 
     #[test]
     fn durations_have_units() {
-        for (text, ms) in [("250ms", 250), ("90s", 90_000), ("90", 90_000), ("2m", 120_000), ("1h", 3_600_000)] {
+        for (text, ms) in
+            [("250ms", 250), ("90s", 90_000), ("90", 90_000), ("2m", 120_000), ("1h", 3_600_000)]
+        {
             assert_eq!(parse_duration(text), Some(Duration::from_millis(ms)), "{text}");
         }
-        for bad in ["", "s", "-1s", "1.5h", "1w", "99999999999999999999s", "18446744073709551615d"] {
+        for bad in ["", "s", "-1s", "1.5h", "1w", "99999999999999999999s", "18446744073709551615d"]
+        {
             assert_eq!(parse_duration(bad), None, "{bad}");
         }
     }

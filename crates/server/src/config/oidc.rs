@@ -1,5 +1,6 @@
-//! `[oidc]`: the OpenID Connect provider by which people may sign in, and `[[oidc.rules]]`, which give them what they may do
-//! by what the provider says of them. Without a rule that fits nobody may anything.
+//! `[oidc]`: the OpenID Connect provider by which people may sign in, and `[[oidc.rules]]`, which
+//! give them what they may do by what the provider says of them. Without a rule that fits nobody
+//! may anything.
 
 use std::path::PathBuf;
 
@@ -69,7 +70,8 @@ impl OidcSettings {
         format!("{}/api/v1/oidc/callback", self.public_url)
     }
 
-    /// The settings if there are any; an error if something is missing that they don't work without.
+    /// The settings if there are any; an error if something is missing that they don't work
+    /// without.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         if *self == Self::default() {
             return Ok(());
@@ -100,7 +102,11 @@ pub fn private_url(text: &str) -> Result<String, String> {
     let url = Url::parse(text).map_err(|_| format!("{text:?} is not a URL"))?;
     let is_local = matches!(url.host_str(), Some("localhost" | "127.0.0.1" | "[::1]"));
     let is_private = url.scheme() == "https" || url.scheme() == "http" && is_local;
-    if !is_private || !url.username().is_empty() || url.password().is_some() || url.fragment().is_some() {
+    if !is_private
+        || !url.username().is_empty()
+        || url.password().is_some()
+        || url.fragment().is_some()
+    {
         return Err(format!("{text:?} is not a URL that begins with https://"));
     }
     Ok(text.to_owned())
@@ -109,10 +115,13 @@ pub fn private_url(text: &str) -> Result<String, String> {
 /// Where browsers reach the server: scheme, host and port.
 pub(super) fn public_url(text: &str) -> Result<String, String> {
     let url = Url::parse(text).ok().filter(|url| matches!(url.scheme(), "http" | "https"));
-    let url = url.filter(|url| url.path() == "/" && url.query().is_none() && url.fragment().is_none());
+    let url =
+        url.filter(|url| url.path() == "/" && url.query().is_none() && url.fragment().is_none());
     let url = url.filter(|url| url.username().is_empty() && url.password().is_none());
     let found = url.map(|url| url.origin().ascii_serialization());
-    found.ok_or_else(|| format!("{text:?} is not a URL without a path, like https://fleet.example.org"))
+    found.ok_or_else(|| {
+        format!("{text:?} is not a URL without a path, like https://fleet.example.org")
+    })
 }
 
 /// `[[oidc.rules]]`, counted from 1.
@@ -124,29 +133,50 @@ pub(super) fn rules(value: toml::Value) -> Result<Vec<RoleRule>, Wrong> {
     if values.len() > MAX_RULES {
         return Err(wrong(format!("{} rules, at most {MAX_RULES} are possible", values.len())));
     }
-    let below = |at: usize, (key, reason): (String, String)| Wrong { key: format!("rules[{}]{key}", at + 1), reason };
-    values.into_iter().enumerate().map(|(at, value)| rule(value).map_err(|wrong| below(at, wrong))).collect()
+    let below = |at: usize, (key, reason): (String, String)| Wrong {
+        key: format!("rules[{}]{key}", at + 1),
+        reason,
+    };
+    values
+        .into_iter()
+        .enumerate()
+        .map(|(at, value)| rule(value).map_err(|wrong| below(at, wrong)))
+        .collect()
 }
 
 fn rule(value: toml::Value) -> Result<RoleRule, (String, String)> {
-    let toml::Value::Table(table) = value else { return Err((String::new(), "expected a table".to_owned())) };
+    let toml::Value::Table(table) = value else {
+        return Err((String::new(), "expected a table".to_owned()));
+    };
     let (mut claim, mut wanted, mut roles, mut robots) = (None, None, None, None);
     for (key, value) in table {
         let wrong = |reason: String| (format!(".{key}"), reason);
         let text = value.as_str().filter(|text| (1..=MAX_TEXT_BYTES).contains(&text.len()));
-        let text = text.ok_or_else(|| wrong(format!("expected a text of 1 to {MAX_TEXT_BYTES} bytes")))?;
+        let text =
+            text.ok_or_else(|| wrong(format!("expected a text of 1 to {MAX_TEXT_BYTES} bytes")))?;
         match key.as_str() {
             "claim" => claim = Some(text.to_owned()),
             "value" => wanted = Some(text.to_owned()),
-            "roles" => roles = Some(text.parse::<Roles>().map_err(|error| wrong(error.to_string()))?),
-            "robots" => robots = Some(text.parse::<Selector>().map_err(|error| wrong(error.to_string()))?),
-            _ => return Err(wrong("there is no such key: expected claim, value, roles or robots".to_owned())),
+            "roles" => {
+                roles = Some(text.parse::<Roles>().map_err(|error| wrong(error.to_string()))?)
+            }
+            "robots" => {
+                robots = Some(text.parse::<Selector>().map_err(|error| wrong(error.to_string()))?)
+            }
+            _ => {
+                return Err(wrong(
+                    "there is no such key: expected claim, value, roles or robots".to_owned(),
+                ));
+            }
         }
     }
     let missing = |key: &str, what: &str| (format!(".{key}"), format!("missing: {what}"));
     Ok(RoleRule {
-        claim: claim.ok_or_else(|| missing("claim", "what the provider says of somebody, like groups"))?,
-        value: wanted.ok_or_else(|| missing("value", "what the claim has to be, or to have among its values"))?,
+        claim: claim
+            .ok_or_else(|| missing("claim", "what the provider says of somebody, like groups"))?,
+        value: wanted.ok_or_else(|| {
+            missing("value", "what the claim has to be, or to have among its values")
+        })?,
         roles: roles.ok_or_else(|| missing("roles", "what they may do then"))?,
         robots: robots.filter(|robots| robots.to_string() != "*"),
     })
@@ -178,19 +208,32 @@ mod tests {
 
     #[test]
     fn all_of_the_table_is_read() {
-        let oidc = load(&[], &[("TASKD_OIDC_SCOPES", "openid groups")], Some(FILE)).expect("loads").oidc;
+        let oidc =
+            load(&[], &[("TASKD_OIDC_SCOPES", "openid groups")], Some(FILE)).expect("loads").oidc;
         assert_eq!(oidc.redirect_uri(), "https://fleet.example.org/api/v1/oidc/callback");
-        assert_eq!((oidc.scopes.as_str(), oidc.name_claim.as_str()), ("openid groups", "preferred_username"));
-        let rules: Vec<_> = oidc.rules.iter().map(|rule| (rule.value.as_str(), rule.roles.to_string())).collect();
-        assert_eq!(rules, [("robotics", "operator,publisher".to_owned()), ("admins", "admin".to_owned())]);
-        assert_eq!(oidc.rules[0].robots.as_ref().map(Selector::to_string).as_deref(), Some("site=lab"));
+        assert_eq!(
+            (oidc.scopes.as_str(), oidc.name_claim.as_str()),
+            ("openid groups", "preferred_username")
+        );
+        let rules: Vec<_> =
+            oidc.rules.iter().map(|rule| (rule.value.as_str(), rule.roles.to_string())).collect();
+        assert_eq!(
+            rules,
+            [("robotics", "operator,publisher".to_owned()), ("admins", "admin".to_owned())]
+        );
+        assert_eq!(
+            oidc.rules[0].robots.as_ref().map(Selector::to_string).as_deref(),
+            Some("site=lab")
+        );
         assert_eq!(oidc.rules[1].robots, None);
         assert_eq!(load(&[], &[], None).expect("loads").oidc, OidcSettings::default());
     }
 
     #[test]
     fn what_is_missing_or_wrong_is_named() {
-        let without = |line: &str| FILE.lines().filter(|given| !given.contains(line)).collect::<Vec<_>>().join("\n");
+        let without = |line: &str| {
+            FILE.lines().filter(|given| !given.contains(line)).collect::<Vec<_>>().join("\n")
+        };
         for (file, expected) in [
             (without("issuer ="), "oidc.issuer is missing"),
             (without("client_id ="), "oidc.client_id is missing"),
@@ -198,7 +241,10 @@ mod tests {
             (FILE.split("[[").next().expect("a part").to_owned(), "oidc.rules is missing"),
             ("[oidc]\nrules = 1".to_owned(), "oidc.rules in taskd.toml: expected [[oidc.rules]]"),
             ("[oidc]\nrules = [1]".to_owned(), "oidc.rules[1] in taskd.toml: expected a table"),
-            (FILE.replace("\"operator,", "\"root,"), "oidc.rules[1].roles in taskd.toml: \"root\" is not a role"),
+            (
+                FILE.replace("\"operator,", "\"root,"),
+                "oidc.rules[1].roles in taskd.toml: \"root\" is not a role",
+            ),
             (FILE.replace("site=lab", "site=lab=x"), "oidc.rules[1].robots in taskd.toml: "),
             (
                 FILE.replace("value = \"admins\"", "valeu = \"x\""),
@@ -214,17 +260,29 @@ mod tests {
                 FILE.replace("org/\"", "org/x\""),
                 "oidc.public_url in taskd.toml: \"https://fleet.example.org/x\" is not",
             ),
-            (FILE.replace("title =", "secret ="), "oidc.secret in taskd.toml: there is no such setting"),
+            (
+                FILE.replace("title =", "secret ="),
+                "oidc.secret in taskd.toml: there is no such setting",
+            ),
         ] {
             let message = load(&[], &[], Some(&file)).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");
         }
-        for good in ["https://id.example/x", "http://localhost:9400", "http://127.0.0.1:1/x", "http://[::1]:1"] {
+        for good in [
+            "https://id.example/x",
+            "http://localhost:9400",
+            "http://127.0.0.1:1/x",
+            "http://[::1]:1",
+        ] {
             assert_eq!(private_url(good).as_deref(), Ok(good));
         }
-        for bad in
-            ["http://10.0.0.1", "ftp://localhost", "https://a:b@id.example", "https://id.example#x", "id.example"]
-        {
+        for bad in [
+            "http://10.0.0.1",
+            "ftp://localhost",
+            "https://a:b@id.example",
+            "https://id.example#x",
+            "id.example",
+        ] {
             assert!(private_url(bad).is_err(), "{bad}");
         }
     }

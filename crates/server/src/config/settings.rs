@@ -1,4 +1,5 @@
-//! The one table of all settings that have a flag, a variable and a key in the file, and how their values are read.
+//! The one table of all settings that have a flag, a variable and a key in the file, and how their
+//! values are read.
 
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
@@ -9,7 +10,8 @@ use super::oidc::{private_url, public_url};
 use super::{BlobRead, Config, lifetime};
 use crate::domain::delivery::shown_bytes;
 
-/// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable `TASKD_TOPIC_PREFIX`.
+/// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable
+/// `TASKD_TOPIC_PREFIX`.
 pub(super) struct Setting {
     pub(super) name: &'static str,
     pub(super) value_name: &'static str,
@@ -190,19 +192,25 @@ pub(super) const SETTINGS: &[Setting] = &[
         name: "max-http-connections",
         value_name: "N",
         help: "Most HTTP connections at once [default: 20000]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_http_connections = n as usize),
+        set: |config, text| {
+            count(text, 1_000_000).map(|n| config.max_http_connections = n as usize)
+        },
     },
     Setting {
         name: "max-mqtt-connections",
         value_name: "N",
         help: "Most MQTT connections at once [default: 20000]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize),
+        set: |config, text| {
+            count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize)
+        },
     },
     Setting {
         name: "max-silent-per-address",
         value_name: "N",
         help: "Most connections of one address without a good token so far, over MQTT without CONNECT [default: 2048]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize),
+        set: |config, text| {
+            count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize)
+        },
     },
     Setting {
         name: "trusted-proxies",
@@ -234,7 +242,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         name: "oidc-client-secret-file",
         value_name: "FILE",
         help: "File with the secret that it gave this server, if it did",
-        set: |config, text| non_empty(text).map(|path| config.oidc.client_secret_file = Some(PathBuf::from(path))),
+        set: |config, text| {
+            non_empty(text).map(|path| config.oidc.client_secret_file = Some(PathBuf::from(path)))
+        },
     },
     Setting {
         name: "oidc-public-url",
@@ -276,7 +286,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         name: "max-upload-bytes",
         value_name: "SIZE",
         help: "Most that is unpacked of a package that the page brings as a directory [default: 4 GB]",
-        set: |config, text| size_within(text, 1, 1 << 50).map(|bytes| config.max_upload_bytes = bytes),
+        set: |config, text| {
+            size_within(text, 1, 1 << 50).map(|bytes| config.max_upload_bytes = bytes)
+        },
     },
     Setting {
         name: "delivery-part-bytes",
@@ -285,7 +297,8 @@ pub(super) const SETTINGS: &[Setting] = &[
         set: |config, text| {
             let most = u64::from(MAX_PART_BYTES).next_multiple_of(1 << 20);
             let bytes = size_within(text, u64::from(MIN_PART_BYTES), most)?;
-            config.delivery.part_bytes = u32::try_from(bytes).unwrap_or(MAX_PART_BYTES).min(MAX_PART_BYTES);
+            config.delivery.part_bytes =
+                u32::try_from(bytes).unwrap_or(MAX_PART_BYTES).min(MAX_PART_BYTES);
             Ok(())
         },
     },
@@ -329,7 +342,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         name: "transfers-bytes-per-s",
         value_name: "SIZE",
         help: "Most bytes per second that all of them get together [default: no limit]",
-        set: |config, text| size_within(text, 1024, 1 << 50).map(|n| config.transfers.all.bytes_per_s = Some(n)),
+        set: |config, text| {
+            size_within(text, 1024, 1 << 50).map(|n| config.transfers.all.bytes_per_s = Some(n))
+        },
     },
     Setting {
         name: "enrolment-approval",
@@ -355,7 +370,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         value_name: "SIZE",
         help: "What people's packages and uploads leave free on the disk for database, logs and reports; what robots bring \
                back leaves twice as much [default: a fortieth of the disk, 1 GB at most]",
-        set: |config, text| size_within(text, 0, 1 << 50).map(|bytes| config.disk_reserve = Some(bytes)),
+        set: |config, text| {
+            size_within(text, 0, 1 << 50).map(|bytes| config.disk_reserve = Some(bytes))
+        },
     },
     Setting {
         name: "robots-messages-per-s",
@@ -367,7 +384,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         name: "robots-bytes-per-s",
         value_name: "SIZE",
         help: "The same in bytes [default: 1 MB]",
-        set: |config, text| size_within(text, 64 << 10, 1 << 40).map(|n| config.robots.bytes_per_s = n),
+        set: |config, text| {
+            size_within(text, 64 << 10, 1 << 40).map(|n| config.robots.bytes_per_s = n)
+        },
     },
     Setting {
         name: "robots-requests-per-s",
@@ -380,7 +399,9 @@ pub(super) const SETTINGS: &[Setting] = &[
         value_name: "SIZE",
         help: "The most that is kept of what one robot brings back: beyond it the oldest goes [default: 40 GB, an eighth of the disk \
                at most]",
-        set: |config, text| size_within(text, 64 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = Some(bytes)),
+        set: |config, text| {
+            size_within(text, 64 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = Some(bytes))
+        },
     },
     Setting {
         name: "people-requests-per-s",
@@ -409,7 +430,8 @@ pub(super) const SETTINGS: &[Setting] = &[
     },
 ];
 
-/// The most that may ride inside an announcement: in base64 it still fits, beside a state of a few tasks.
+/// The most that may ride inside an announcement: in base64 it still fits, beside a state of a few
+/// tasks.
 const MAX_INLINE_BYTES: u64 = 64 * 1024;
 
 fn non_empty(text: &str) -> Result<String, String> {
@@ -429,7 +451,8 @@ fn boolean(text: &str) -> Result<bool, String> {
 }
 
 fn address(text: &str) -> Result<SocketAddr, String> {
-    let expected = || format!("{text:?} is not an address: expected host:port, for example 127.0.0.1:8080");
+    let expected =
+        || format!("{text:?} is not an address: expected host:port, for example 127.0.0.1:8080");
     text.to_socket_addrs().ok().and_then(|mut found| found.next()).ok_or_else(expected)
 }
 
@@ -446,9 +469,14 @@ fn host_names(text: &str) -> Result<Vec<String>, String> {
 }
 
 fn database_url(text: &str) -> Result<String, String> {
-    let known = ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
+    let known =
+        ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
     // The URL may hold a password: it is not repeated.
-    if known { Ok(text.to_owned()) } else { Err("expected a URL that starts with sqlite: or postgres://".to_owned()) }
+    if known {
+        Ok(text.to_owned())
+    } else {
+        Err("expected a URL that starts with sqlite: or postgres://".to_owned())
+    }
 }
 
 fn count(text: &str, most: u64) -> Result<u64, String> {
@@ -458,7 +486,8 @@ fn count(text: &str, most: u64) -> Result<u64, String> {
     }
 }
 
-/// Reads a number of bytes: a whole number, alone or with `B`, `KB`, `MB` or `GB`, each 1,024 of the one before.
+/// Reads a number of bytes: a whole number, alone or with `B`, `KB`, `MB` or `GB`, each 1,024 of
+/// the one before.
 pub(super) fn size(text: &str) -> Option<u64> {
     let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let number: u64 = text[..split].parse().ok()?;
@@ -473,7 +502,8 @@ pub(super) fn size(text: &str) -> Option<u64> {
 }
 
 fn size_within(text: &str, least: u64, most: u64) -> Result<u64, String> {
-    let expected = || format!("{text:?} is not a size from {} to {}", shown_bytes(least), shown_bytes(most));
+    let expected =
+        || format!("{text:?} is not a size from {} to {}", shown_bytes(least), shown_bytes(most));
     size(text).filter(|bytes| (least..=most).contains(bytes)).ok_or_else(expected)
 }
 
@@ -483,8 +513,14 @@ mod tests {
 
     #[test]
     fn sizes_have_units() {
-        let good =
-            [("65536", 65_536), ("1 KB", 1024), ("256KB", 262_144), ("9 MB", 9 << 20), ("1 GB", 1 << 30), ("7 B", 7)];
+        let good = [
+            ("65536", 65_536),
+            ("1 KB", 1024),
+            ("256KB", 262_144),
+            ("9 MB", 9 << 20),
+            ("1 GB", 1 << 30),
+            ("7 B", 7),
+        ];
         for (text, bytes) in good {
             assert_eq!(size(text), Some(bytes), "{text}");
         }
@@ -498,7 +534,10 @@ mod tests {
         let mut config = Config::with_data(PathBuf::new());
         let setting = Setting::by_key("trusted_proxies").expect("there");
         assert_eq!((setting.set)(&mut config, "::1, ::ffff:10.0.0.1"), Ok(()));
-        assert_eq!(config.trusted_proxies, [IpAddr::from([0, 0, 0, 0, 0, 0, 0, 1]), IpAddr::from([10, 0, 0, 1])]);
+        assert_eq!(
+            config.trusted_proxies,
+            [IpAddr::from([0, 0, 0, 0, 0, 0, 0, 1]), IpAddr::from([10, 0, 0, 1])]
+        );
         let error = (setting.set)(&mut config, "10.0.0.1,nginx").expect_err("refused");
         assert_eq!(error, "\"nginx\" is not an IP address");
         assert_eq!((setting.set)(&mut config, ""), Ok(()));

@@ -1,6 +1,7 @@
-//! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with the limits of each
-//! site, `[robots]` and `[people]` with what one may send, `[oidc]`, `[tls]`. What has one value is a setting like any other; the rest is read
-//! here. Every error names the key it is about.
+//! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with
+//! the limits of each site, `[robots]` and `[people]` with what one may send, `[oidc]`, `[tls]`.
+//! What has one value is a setting like any other; the rest is read here. Every error names the key
+//! it is about.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,7 +19,8 @@ const MAX_SITES: usize = 4096;
 /// The longest name of a rule.
 const MAX_NAME_CHARS: usize = 64;
 /// What a rule may use, by its word.
-const MECHANISMS: [Delivery; 4] = [Delivery::PushPull, Delivery::DirectPush, Delivery::Inline, Delivery::Poll];
+const MECHANISMS: [Delivery; 4] =
+    [Delivery::PushPull, Delivery::DirectPush, Delivery::Inline, Delivery::Poll];
 
 /// What bounds the transfers of packages over HTTP.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -68,8 +70,14 @@ pub(super) fn is_known(name: &str) -> bool {
 }
 
 impl Config {
-    pub(super) fn apply_table(&mut self, path: &Path, name: &str, table: toml::Table) -> Result<(), ConfigError> {
-        let origin = |key: String| Origin::File { key: format!("{name}.{key}"), path: path.to_owned() };
+    pub(super) fn apply_table(
+        &mut self,
+        path: &Path,
+        name: &str,
+        table: toml::Table,
+    ) -> Result<(), ConfigError> {
+        let origin =
+            |key: String| Origin::File { key: format!("{name}.{key}"), path: path.to_owned() };
         for (key, value) in table {
             let setting = format!("{name}_{key}");
             let read = match (name, key.as_str()) {
@@ -77,14 +85,20 @@ impl Config {
                 ("oidc", "rules") => oidc::rules(value).map(|rules| self.oidc.rules = rules),
                 ("transfers", "sites") => sites(value).map(|sites| self.transfers.sites = sites),
                 _ if Setting::by_key(&setting).is_none() => {
-                    return Err(ConfigError::Unknown { hint: nearest(&setting), origin: origin(key) });
+                    return Err(ConfigError::Unknown {
+                        hint: nearest(&setting),
+                        origin: origin(key),
+                    });
                 }
                 _ => {
                     self.apply_value(&setting, value, origin(key))?;
                     continue;
                 }
             };
-            read.map_err(|wrong| ConfigError::Value { origin: origin(wrong.key), reason: wrong.reason })?;
+            read.map_err(|wrong| ConfigError::Value {
+                origin: origin(wrong.key),
+                reason: wrong.reason,
+            })?;
         }
         Ok(())
     }
@@ -106,13 +120,18 @@ fn rules(value: toml::Value) -> Result<Vec<Rule>, Wrong> {
             Wrong { key: format!("rules[{}]{dot}{}", at + 1, wrong.key), reason: wrong.reason }
         };
         let own = |key: &str, reason: String| below(Wrong { key: key.to_owned(), reason });
-        let toml::Value::Table(table) = value else { return Err(own("", "expected a table".to_owned())) };
+        let toml::Value::Table(table) = value else {
+            return Err(own("", "expected a table".to_owned()));
+        };
         let rule = rule(table).map_err(below)?;
         if Rules::is_reserved(&rule.name) || rules.iter().any(|other| other.name == rule.name) {
             return Err(own("name", format!("{:?} is the name of another rule", rule.name)));
         }
         if let Some(last) = rules.last().filter(|last| last.conditions.is_empty()) {
-            return Err(own("", format!("it can never decide: the rule {:?} before it has no condition", last.name)));
+            return Err(own(
+                "",
+                format!("it can never decide: the rule {:?} before it has no condition", last.name),
+            ));
         }
         rules.push(rule);
     }
@@ -125,16 +144,25 @@ fn rule(table: toml::Table) -> Result<Rule, Wrong> {
         let read = match (key.as_str(), Condition::by_key(&key)) {
             ("name", _) => rule_name(&value).map(|read| name = Some(read)),
             ("use", _) => used(&value).map(|read| mechanism = Some(read)),
-            (_, Some(known)) => condition(known, &value).map(|read| conditions.push((key.clone(), read))),
+            (_, Some(known)) => {
+                condition(known, &value).map(|read| conditions.push((key.clone(), read)))
+            }
             _ => Err("there is no such condition; docs/delivery.md lists them".to_owned()),
         };
         read.map_err(|reason| Wrong { key, reason })?;
     }
-    let missing = |key: &str, what: &str| Wrong { key: key.to_owned(), reason: format!("missing: {what}") };
-    let name = name.ok_or_else(|| missing("name", "what the rule is called where a decision is shown"))?;
-    let mechanism = mechanism.ok_or_else(|| missing("use", "what is used where the rule matches"))?;
+    let missing =
+        |key: &str, what: &str| Wrong { key: key.to_owned(), reason: format!("missing: {what}") };
+    let name =
+        name.ok_or_else(|| missing("name", "what the rule is called where a decision is shown"))?;
+    let mechanism =
+        mechanism.ok_or_else(|| missing("use", "what is used where the rule matches"))?;
     check_possible(&conditions)?;
-    Ok(Rule { name, conditions: conditions.into_iter().map(|(_, condition)| condition).collect(), mechanism })
+    Ok(Rule {
+        name,
+        conditions: conditions.into_iter().map(|(_, condition)| condition).collect(),
+        mechanism,
+    })
 }
 
 fn rule_name(value: &toml::Value) -> Result<String, String> {
@@ -144,11 +172,13 @@ fn rule_name(value: &toml::Value) -> Result<String, String> {
             && !name.chars().any(char::is_control)
     };
     let name = value.as_str().filter(is_name);
-    name.map(str::to_owned).ok_or_else(|| format!("expected a text of 1 to {MAX_NAME_CHARS} printable characters"))
+    name.map(str::to_owned)
+        .ok_or_else(|| format!("expected a text of 1 to {MAX_NAME_CHARS} printable characters"))
 }
 
 fn used(value: &toml::Value) -> Result<Delivery, String> {
-    let found = value.as_str().and_then(|word| MECHANISMS.into_iter().find(|known| known.as_str() == word));
+    let found =
+        value.as_str().and_then(|word| MECHANISMS.into_iter().find(|known| known.as_str() == word));
     let words = || MECHANISMS.map(|known| format!("{:?}", known.as_str())).join(", ");
     found.ok_or_else(|| format!("{value} is none of {}", words()))
 }
@@ -156,7 +186,8 @@ fn used(value: &toml::Value) -> Result<Delivery, String> {
 fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String> {
     let (quantity, comparison) = match key {
         ConditionKey::Flag(flag) => {
-            let wanted = value.as_bool().ok_or_else(|| format!("{value} is neither true nor false"))?;
+            let wanted =
+                value.as_bool().ok_or_else(|| format!("{value} is neither true nor false"))?;
             return Ok(Condition::Flag(flag, wanted));
         }
         ConditionKey::Measure(quantity, comparison) => (quantity, comparison),
@@ -169,7 +200,9 @@ fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String
             (whole.or_else(|| rate(value.as_str()?)), "a rate, for example \"500 KB/s\"")
         }
         Unit::Milliseconds => {
-            let time = |text: &str| parse_duration(text).and_then(|time| u64::try_from(time.as_millis()).ok());
+            let time = |text: &str| {
+                parse_duration(text).and_then(|time| u64::try_from(time.as_millis()).ok())
+            };
             (value.as_str().and_then(time), "a time, for example \"100ms\"")
         }
         Unit::Percent => (whole.filter(|percent| *percent <= 100), "a whole number from 0 to 100"),
@@ -186,12 +219,16 @@ fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
         let Condition::Measure(quantity, comparison, value) = condition else { continue };
         let most = if quantity.unit() == Unit::Percent { 100 } else { u64::MAX };
         let known = ranges.entry(quantity.key()).or_insert((least_possible(*quantity), most));
-        let range = comparison.range(*value).map(|(least, most)| (least.max(known.0), most.min(known.1)));
+        let range =
+            comparison.range(*value).map(|(least, most)| (least.max(known.0), most.min(known.1)));
         match range.filter(|(least, most)| least <= most) {
             Some(range) => *known = range,
             None => {
                 let shown = quantity.unit().show(*value);
-                let reason = format!("{shown}: no {} can satisfy this and the rule's other conditions", quantity.key());
+                let reason = format!(
+                    "{shown}: no {} can satisfy this and the rule's other conditions",
+                    quantity.key()
+                );
                 return Err(Wrong { key: key.clone(), reason });
             }
         }
@@ -208,16 +245,26 @@ fn least_possible(quantity: Quantity) -> u64 {
 fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, Wrong> {
     let wrong = |key: String, reason: String| Wrong { key: format!("sites{key}"), reason };
     let toml::Value::Table(table) = value else {
-        return Err(wrong(String::new(), "expected [transfers.sites.NAME], tables by the label's value".to_owned()));
+        return Err(wrong(
+            String::new(),
+            "expected [transfers.sites.NAME], tables by the label's value".to_owned(),
+        ));
     };
     if table.len() > MAX_SITES {
-        return Err(wrong(String::new(), format!("{} sites, at most {MAX_SITES} are possible", table.len())));
+        return Err(wrong(
+            String::new(),
+            format!("{} sites, at most {MAX_SITES} are possible", table.len()),
+        ));
     }
     let mut sites = BTreeMap::new();
     for (name, value) in table {
-        let site: LabelValue = name.parse().map_err(|error| wrong(format!(".{name}"), format!("{error}")))?;
+        let site: LabelValue =
+            name.parse().map_err(|error| wrong(format!(".{name}"), format!("{error}")))?;
         let toml::Value::Table(limits) = value else {
-            return Err(wrong(format!(".{name}"), "expected a table with max or bytes_per_s".to_owned()));
+            return Err(wrong(
+                format!(".{name}"),
+                "expected a table with max or bytes_per_s".to_owned(),
+            ));
         };
         let mut read = SiteLimits::default();
         for (key, value) in limits {
@@ -229,9 +276,16 @@ fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, Wrong> 
                     let bytes = whole.or_else(|| size(value.as_str()?)).filter(at_least(1024));
                     (&mut read.bytes_per_s, bytes, "a size from 1 KB, for example \"10 MB\"")
                 }
-                _ => return Err(wrong(format!(".{name}.{key}"), "there is no such limit".to_owned())),
+                _ => {
+                    return Err(wrong(
+                        format!(".{name}.{key}"),
+                        "there is no such limit".to_owned(),
+                    ));
+                }
             };
-            *limit = Some(found.ok_or_else(|| wrong(format!(".{name}.{key}"), format!("{value} is not {expected}")))?);
+            *limit = Some(found.ok_or_else(|| {
+                wrong(format!(".{name}.{key}"), format!("{value} is not {expected}"))
+            })?);
         }
         sites.insert(site, read);
     }
@@ -271,25 +325,40 @@ mod tests {
             [transfers.sites.yard]
             bytes_per_s = "1 MB"
         "#;
-        let config = load(&[("transfers-max", "9")], &[("TASKD_DELIVERY_QOS", "0")], Some(file)).expect("loads");
+        let config = load(&[("transfers-max", "9")], &[("TASKD_DELIVERY_QOS", "0")], Some(file))
+            .expect("loads");
         let delivery = &config.delivery;
         assert_eq!((delivery.part_bytes, delivery.qos, delivery.inline_bytes), (1 << 20, 0, 1000));
         assert_eq!(delivery.site_label.as_str(), "hall");
-        let names: Vec<(&str, usize, Delivery)> =
-            delivery.own_rules.iter().map(|rule| (rule.name.as_str(), rule.conditions.len(), rule.mechanism)).collect();
-        assert_eq!(names, [("slow modems", 6, Delivery::Poll), ("everyone else", 0, Delivery::DirectPush)]);
+        let names: Vec<(&str, usize, Delivery)> = delivery
+            .own_rules
+            .iter()
+            .map(|rule| (rule.name.as_str(), rule.conditions.len(), rule.mechanism))
+            .collect();
+        assert_eq!(
+            names,
+            [("slow modems", 6, Delivery::Poll), ("everyone else", 0, Delivery::DirectPush)]
+        );
         let measure = |key: &str, value| match Condition::by_key(key) {
-            Some(ConditionKey::Measure(quantity, comparison)) => Condition::Measure(quantity, comparison, value),
+            Some(ConditionKey::Measure(quantity, comparison)) => {
+                Condition::Measure(quantity, comparison, value)
+            }
             other => panic!("{key}: {other:?}"),
         };
-        for (key, value) in
-            [("throughput_below", 512_000), ("rtt_above", 100), ("size_above", 262_144), ("battery_below", 20)]
-        {
+        for (key, value) in [
+            ("throughput_below", 512_000),
+            ("rtt_above", 100),
+            ("size_above", 262_144),
+            ("battery_below", 20),
+        ] {
             assert!(delivery.own_rules[0].conditions.contains(&measure(key, value)), "{key}");
         }
         let limits = |max, bytes_per_s| SiteLimits { max, bytes_per_s };
         assert_eq!(config.transfers.all, limits(Some(9), Some(20 << 20)));
-        assert_eq!(config.transfers.sites[&"lab".parse::<LabelValue>().expect("valid")], limits(Some(2), None));
+        assert_eq!(
+            config.transfers.sites[&"lab".parse::<LabelValue>().expect("valid")],
+            limits(Some(2), None)
+        );
         assert_eq!(config.transfers.sites.len(), 2);
     }
 
@@ -299,23 +368,53 @@ mod tests {
         for (second, expected) in [
             ("name = \"two\"", "delivery.rules[2].use in taskd.toml: missing"),
             ("use = \"poll\"", "delivery.rules[2].name in taskd.toml: missing"),
-            ("name = \"\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: expected a text"),
-            ("name = \"one\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: \"one\" is the name of another"),
+            (
+                "name = \"\"\nuse = \"poll\"",
+                "delivery.rules[2].name in taskd.toml: expected a text",
+            ),
+            (
+                "name = \"one\"\nuse = \"poll\"",
+                "delivery.rules[2].name in taskd.toml: \"one\" is the name of another",
+            ),
             (
                 "name = \"tiny\"\nuse = \"poll\"",
                 "delivery.rules[2].name in taskd.toml: \"tiny\" is the name of another",
             ),
-            ("name = \"ordered\"\nuse = \"poll\"", "delivery.rules[2].name in taskd.toml: \"ordered\" is the name"),
-            ("use = \"adaptive\"", "delivery.rules[2].use in taskd.toml: \"adaptive\" is none of \"push-pull\", "),
+            (
+                "name = \"ordered\"\nuse = \"poll\"",
+                "delivery.rules[2].name in taskd.toml: \"ordered\" is the name",
+            ),
+            (
+                "use = \"adaptive\"",
+                "delivery.rules[2].use in taskd.toml: \"adaptive\" is none of \"push-pull\", ",
+            ),
             ("use = 1", "delivery.rules[2].use in taskd.toml: 1 is none of"),
-            ("size_over = 1", "delivery.rules[2].size_over in taskd.toml: there is no such condition"),
-            ("size_above = \"9.7 MB\"", "delivery.rules[2].size_above in taskd.toml: \"9.7 MB\" is not a size, for"),
+            (
+                "size_over = 1",
+                "delivery.rules[2].size_over in taskd.toml: there is no such condition",
+            ),
+            (
+                "size_above = \"9.7 MB\"",
+                "delivery.rules[2].size_above in taskd.toml: \"9.7 MB\" is not a size, for",
+            ),
             ("size_above = -1", "delivery.rules[2].size_above in taskd.toml: -1 is not a size"),
-            ("throughput_below = \"fast\"", "delivery.rules[2].throughput_below in taskd.toml: \"fast\" is not a rate"),
+            (
+                "throughput_below = \"fast\"",
+                "delivery.rules[2].throughput_below in taskd.toml: \"fast\" is not a rate",
+            ),
             ("rtt_above = 100", "delivery.rules[2].rtt_above in taskd.toml: 100 is not a time"),
-            ("battery_below = 101", "delivery.rules[2].battery_below in taskd.toml: 101 is not a whole number from 0"),
-            ("losses_above = \"x\"", "delivery.rules[2].losses_above in taskd.toml: \"x\" is not a whole number"),
-            ("metered = \"yes\"", "delivery.rules[2].metered in taskd.toml: \"yes\" is neither true nor false"),
+            (
+                "battery_below = 101",
+                "delivery.rules[2].battery_below in taskd.toml: 101 is not a whole number from 0",
+            ),
+            (
+                "losses_above = \"x\"",
+                "delivery.rules[2].losses_above in taskd.toml: \"x\" is not a whole number",
+            ),
+            (
+                "metered = \"yes\"",
+                "delivery.rules[2].metered in taskd.toml: \"yes\" is neither true nor false",
+            ),
         ] {
             let message = load(&[], &[], Some(&format!("{good}{second}"))).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");
@@ -331,7 +430,9 @@ mod tests {
 
     #[test]
     fn what_can_never_be_is_refused() {
-        let rule = |conditions: &str| format!("[[delivery.rules]]\nname = \"one\"\nuse = \"poll\"\n{conditions}");
+        let rule = |conditions: &str| {
+            format!("[[delivery.rules]]\nname = \"one\"\nuse = \"poll\"\n{conditions}")
+        };
         for (conditions, key) in [
             ("size_below = 0", "size_below"),
             ("battery_above = 100", "battery_above"),
@@ -340,35 +441,57 @@ mod tests {
             ("rtt_above = \"10ms\"\nrtt_below = \"11ms\"", "rtt_below"),
         ] {
             let message = load(&[], &[], Some(&rule(conditions))).expect_err(conditions);
-            assert!(message.starts_with(&format!("delivery.rules[1].{key} in taskd.toml: ")), "{message}");
+            assert!(
+                message.starts_with(&format!("delivery.rules[1].{key} in taskd.toml: ")),
+                "{message}"
+            );
             assert!(message.contains("can satisfy this"), "{message}");
         }
         assert!(load(&[], &[], Some(&rule("rtt_above = \"10ms\"\nrtt_below = \"12ms\""))).is_ok());
         let dead = format!("{}\n[[delivery.rules]]\nname = \"two\"\nuse = \"poll\"", rule(""));
         let message = load(&[], &[], Some(&dead)).expect_err("never reached");
         assert!(
-            message.starts_with("delivery.rules[2] in taskd.toml: it can never decide: the rule \"one\""),
+            message.starts_with(
+                "delivery.rules[2] in taskd.toml: it can never decide: the rule \"one\""
+            ),
             "{message}"
         );
         let many: String = (0..=MAX_RULES)
-            .map(|n| format!("[[delivery.rules]]\nname = \"n{n}\"\nmetered = true\nuse = \"poll\"\n"))
+            .map(|n| {
+                format!("[[delivery.rules]]\nname = \"n{n}\"\nmetered = true\nuse = \"poll\"\n")
+            })
             .collect();
         let message = load(&[], &[], Some(&many)).expect_err("too many");
-        assert!(message.starts_with("delivery.rules in taskd.toml: 65 rules, at most 64"), "{message}");
+        assert!(
+            message.starts_with("delivery.rules in taskd.toml: 65 rules, at most 64"),
+            "{message}"
+        );
     }
 
     #[test]
     fn a_wrong_site_is_refused_by_its_key() {
         for (file, expected) in [
-            ("[transfers]\nsites = 1", "transfers.sites in taskd.toml: expected [transfers.sites.NAME]"),
+            (
+                "[transfers]\nsites = 1",
+                "transfers.sites in taskd.toml: expected [transfers.sites.NAME]",
+            ),
             ("[transfers.sites]\nlab = 1", "transfers.sites.lab in taskd.toml: expected a table"),
-            ("[transfers.sites.lab]\nmax = 0", "transfers.sites.lab.max in taskd.toml: 0 is not a whole number from 1"),
+            (
+                "[transfers.sites.lab]\nmax = 0",
+                "transfers.sites.lab.max in taskd.toml: 0 is not a whole number from 1",
+            ),
             (
                 "[transfers.sites.lab]\nbytes_per_s = 1",
                 "transfers.sites.lab.bytes_per_s in taskd.toml: 1 is not a size",
             ),
-            ("[transfers.sites.lab]\nmix = 1", "transfers.sites.lab.mix in taskd.toml: there is no such limit"),
-            ("[transfers.sites.\"a b\"]\nmax = 1", "transfers.sites.a b in taskd.toml: \"a b\" is not a valid label"),
+            (
+                "[transfers.sites.lab]\nmix = 1",
+                "transfers.sites.lab.mix in taskd.toml: there is no such limit",
+            ),
+            (
+                "[transfers.sites.\"a b\"]\nmax = 1",
+                "transfers.sites.a b in taskd.toml: \"a b\" is not a valid label",
+            ),
         ] {
             let message = load(&[], &[], Some(file)).expect_err(expected);
             assert!(message.starts_with(expected), "{message}");

@@ -10,8 +10,9 @@ pub struct TlsSettings {
     pub certificate: Option<PathBuf>,
     /// The file with its key.
     pub key: Option<PathBuf>,
-    /// Whether robots are told the pin of the private authority, which then also makes the certificate if there is no own
-    /// one. Absent: as is best for the addresses that are listened on.
+    /// Whether robots are told the pin of the private authority, which then also makes the
+    /// certificate if there is no own one. Absent: as is best for the addresses that are listened
+    /// on.
     pub private_ca: Option<bool>,
     /// Names and addresses that the authority's certificates are also good for.
     pub names: Vec<String>,

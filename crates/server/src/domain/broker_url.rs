@@ -1,5 +1,5 @@
-//! Where an external broker is and as whom the server signs in there: the setting `broker`, read. Its password is in no
-//! message and no debug output; it connects to nothing.
+//! Where an external broker is and as whom the server signs in there: the setting `broker`, read.
+//! Its password is in no message and no debug output; it connects to nothing.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -14,7 +14,8 @@ const MAX_BYTES: usize = 512;
 /// The most brokers in one list. A robot tries them one after another.
 const MAX_BROKERS: usize = 8;
 
-/// One URL or several, separated by commas: brokers with the same accounts, in the order in which they are tried.
+/// One URL or several, separated by commas: brokers with the same accounts, in the order in which
+/// they are tried.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BrokerUrls(Vec<BrokerUrl>);
 
@@ -34,10 +35,14 @@ impl FromStr for BrokerUrls {
     type Err = InvalidBrokerUrl;
 
     fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
-        let begins = |text: &str| SCHEMES.iter().any(|(scheme, ..)| text.trim_start().starts_with(scheme));
+        let begins =
+            |text: &str| SCHEMES.iter().any(|(scheme, ..)| text.trim_start().starts_with(scheme));
         // A password may hold a comma: only one that a URL follows separates.
-        let mut ends: Vec<usize> =
-            text.match_indices(',').map(|(at, _)| at).filter(|at| begins(&text[at + 1..])).collect();
+        let mut ends: Vec<usize> = text
+            .match_indices(',')
+            .map(|(at, _)| at)
+            .filter(|at| begins(&text[at + 1..]))
+            .collect();
         ends.push(text.len());
         let mut begin = 0;
         let mut urls: Vec<BrokerUrl> = Vec::with_capacity(ends.len());
@@ -73,22 +78,30 @@ pub struct BrokerUrl {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidBrokerUrl {
     /// It begins otherwise.
-    #[error("expected mqtt://USER:PASSWORD@HOST[:PORT] or mqtts://…, or \"embedded\" for the server's own broker")]
+    #[error(
+        "expected mqtt://USER:PASSWORD@HOST[:PORT] or mqtts://…, or \"embedded\" for the server's own broker"
+    )]
     Form,
     /// Without them the broker's access control list protects nothing.
     #[error("it names no user or no password: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
     NoCredentials,
     /// The user can't be written into the broker's files, or is a robot's.
-    #[error("its user name is not 1 to 64 letters, digits, '.', '_', '-' and '@', or has the form of a robot id")]
+    #[error(
+        "its user name is not 1 to 64 letters, digits, '.', '_', '-' and '@', or has the form of a robot id"
+    )]
     UserName,
     /// A character that only fits in as %XX.
-    #[error("its password holds a '%' that is not followed by two hex digits, or is longer than 512 bytes")]
+    #[error(
+        "its password holds a '%' that is not followed by two hex digits, or is longer than 512 bytes"
+    )]
     Password,
     /// No host, or one that no machine can have.
     #[error("its host is none: expected a name, an IPv4 address or an IPv6 address in brackets")]
     Host,
     /// Several URLs with different users or passwords.
-    #[error("its URLs name different users or passwords: the brokers of a list share one password file")]
+    #[error(
+        "its URLs name different users or passwords: the brokers of a list share one password file"
+    )]
     Accounts,
     /// More URLs than a robot would try.
     #[error("it names more than 8 brokers")]
@@ -102,7 +115,8 @@ impl BrokerUrl {
     /// Whether the host is this machine, by its name.
     pub fn is_loopback(&self) -> bool {
         let bare = self.host.trim_start_matches('[').trim_end_matches(']');
-        self.host == "localhost" || bare.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
+        self.host == "localhost"
+            || bare.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
     }
 
     /// `host:port`, as it may be shown.
@@ -115,32 +129,45 @@ impl FromStr for BrokerUrl {
     type Err = InvalidBrokerUrl;
 
     fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
-        let of_scheme = |(scheme, port, tls)| text.strip_prefix(scheme).map(|rest| (rest, port, tls));
-        let (rest, default_port, tls) = SCHEMES.into_iter().find_map(of_scheme).ok_or(InvalidBrokerUrl::Form)?;
+        let of_scheme =
+            |(scheme, port, tls)| text.strip_prefix(scheme).map(|rest| (rest, port, tls));
+        let (rest, default_port, tls) =
+            SCHEMES.into_iter().find_map(of_scheme).ok_or(InvalidBrokerUrl::Form)?;
         let rest = rest.strip_suffix('/').unwrap_or(rest);
         // A host has no '@', a password may.
         let (credentials, place) = rest.rsplit_once('@').ok_or(InvalidBrokerUrl::NoCredentials)?;
-        let (user_name, password) = credentials.split_once(':').ok_or(InvalidBrokerUrl::NoCredentials)?;
+        let (user_name, password) =
+            credentials.split_once(':').ok_or(InvalidBrokerUrl::NoCredentials)?;
         let user_name = decoded(user_name).ok_or(InvalidBrokerUrl::UserName)?;
         let password = decoded(password).ok_or(InvalidBrokerUrl::Password)?;
         if user_name.is_empty() || password.is_empty() {
             return Err(InvalidBrokerUrl::NoCredentials);
         }
         let is_plain = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'_' | b'-' | b'@');
-        if user_name.len() > 64 || !user_name.bytes().all(is_plain) || user_name.parse::<RobotId>().is_ok() {
+        if user_name.len() > 64
+            || !user_name.bytes().all(is_plain)
+            || user_name.parse::<RobotId>().is_ok()
+        {
             return Err(InvalidBrokerUrl::UserName);
         }
         let (host, port) = host_and_port(place)?;
-        Ok(Self { host: host.to_owned(), port: port.unwrap_or(default_port), tls, user_name, password })
+        Ok(Self {
+            host: host.to_owned(),
+            port: port.unwrap_or(default_port),
+            tls,
+            user_name,
+            password,
+        })
     }
 }
 
 fn host_and_port(place: &str) -> Result<(&str, Option<u16>), InvalidBrokerUrl> {
-    let end = if place.starts_with('[') { place.find(']').map(|at| at + 1) } else { place.find(':') };
+    let end =
+        if place.starts_with('[') { place.find(']').map(|at| at + 1) } else { place.find(':') };
     let (host, port) = place.split_at(end.unwrap_or(place.len()));
-    let is_address = host
-        .strip_prefix('[')
-        .is_some_and(|inner| inner.strip_suffix(']').is_some_and(|inner| inner.parse::<std::net::Ipv6Addr>().is_ok()));
+    let is_address = host.strip_prefix('[').is_some_and(|inner| {
+        inner.strip_suffix(']').is_some_and(|inner| inner.parse::<std::net::Ipv6Addr>().is_ok())
+    });
     let is_name = !host.is_empty()
         && host.len() <= 253
         && host.bytes().all(|b| b.is_ascii_alphanumeric() || matches!(b, b'.' | b'-' | b'_'));
@@ -197,14 +224,18 @@ mod tests {
         assert!(!url.is_loopback());
         assert!(!format!("{url:?}").contains("et@"), "{url:?}");
         let url: BrokerUrl = "mqtt://taskd:x@[::1]/".parse().expect("valid");
-        assert_eq!((url.address().as_str(), url.is_loopback(), url.tls), ("[::1]:1883", true, false));
+        assert_eq!(
+            (url.address().as_str(), url.is_loopback(), url.tls),
+            ("[::1]:1883", true, false)
+        );
         let url: BrokerUrl = "mqtts://taskd:x@broker.lab".parse().expect("valid");
         assert_eq!((url.address().as_str(), url.tls), ("broker.lab:8883", true));
     }
 
     #[test]
     fn list_of_urls_is_split_at_commas_before_a_url() {
-        let urls: BrokerUrls = "mqtt://taskd:a,b@one.lab, mqtts://taskd:a,b@two.lab:1".parse().expect("valid");
+        let urls: BrokerUrls =
+            "mqtt://taskd:a,b@one.lab, mqtts://taskd:a,b@two.lab:1".parse().expect("valid");
         let addresses: Vec<_> = urls.all().iter().map(|url| (url.address(), url.tls)).collect();
         assert_eq!(addresses, [("one.lab:1883".to_owned(), false), ("two.lab:1".to_owned(), true)]);
         assert_eq!(urls.first().password, "a,b");

@@ -1,5 +1,6 @@
-//! Which mechanism brings a package to a robot: rules, of which the first that matches decides. Functions of values;
-//! [`crate::orders::chooser`] gathers them, [`crate::config`] reads the operator's rules.
+//! Which mechanism brings a package to a robot: rules, of which the first that matches decides.
+//! Functions of values; [`crate::orders::chooser`] gathers them, [`crate::config`] reads the
+//! operator's rules.
 
 use std::fmt;
 
@@ -139,22 +140,28 @@ pub struct Rule {
     pub mechanism: Delivery,
 }
 
-/// All rules: the operator's, then the built-in ones. The last resort is to push the link and let the robot pull.
+/// All rules: the operator's, then the built-in ones. The last resort is to push the link and let
+/// the robot pull.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rules(Vec<Rule>);
 
 impl Rules {
-    /// `own` rules before the built-in ones. No rule puts more than `inline_bytes` into an announcement.
+    /// `own` rules before the built-in ones. No rule puts more than `inline_bytes` into an
+    /// announcement.
     pub fn new(own: Vec<Rule>, inline_bytes: u64) -> Self {
         let mut rules: Vec<Rule> = own.into_iter().chain(Self::built_in()).collect();
         for rule in rules.iter_mut().filter(|rule| rule.mechanism == Delivery::Inline) {
-            rule.conditions.push(Condition::Measure(Quantity::Size, Comparison::AtMost, inline_bytes));
+            rule.conditions.push(Condition::Measure(
+                Quantity::Size,
+                Comparison::AtMost,
+                inline_bytes,
+            ));
         }
         Self(rules)
     }
 
-    /// The rules that hold after the operator's: nothing was measured to be faster or cheaper than these and the last resort,
-    /// see docs/delivery.md.
+    /// The rules that hold after the operator's: nothing was measured to be faster or cheaper than
+    /// these and the last resort, see docs/delivery.md.
     pub fn built_in() -> Vec<Rule> {
         // The announcement's size, which is the setting, is added to its conditions.
         vec![Rule { name: "tiny".to_owned(), conditions: Vec::new(), mechanism: Delivery::Inline }]
@@ -162,8 +169,14 @@ impl Rules {
 
     /// All of them in their order, in words, with the last resort.
     pub fn views(&self) -> Vec<RuleView> {
-        let said = |rule: &Rule| rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ");
-        let last = Rule { name: OTHERWISE.to_owned(), conditions: Vec::new(), mechanism: Delivery::PushPull };
+        let said = |rule: &Rule| {
+            rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ")
+        };
+        let last = Rule {
+            name: OTHERWISE.to_owned(),
+            conditions: Vec::new(),
+            mechanism: Delivery::PushPull,
+        };
         let view = |(order, rule): (u64, &Rule)| RuleView {
             order,
             name: rule.name.clone(),
@@ -176,7 +189,8 @@ impl Rules {
 
     /// Whether `name` is taken by a rule that the operator did not write.
     pub fn is_reserved(name: &str) -> bool {
-        [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name) || Self::built_in().iter().any(|rule| rule.name == name)
+        [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name)
+            || Self::built_in().iter().any(|rule| rule.name == name)
     }
 
     /// Whether any rule asks for `quantity`.
@@ -192,7 +206,10 @@ pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> Deliver
         let because = format!("the order says {mechanism}");
         return DeliveryDecision { mechanism, rule: ORDERED.to_owned(), because };
     }
-    let matching = rules.0.iter().position(|rule| rule.conditions.iter().all(|condition| condition.holds(inputs)));
+    let matching = rules
+        .0
+        .iter()
+        .position(|rule| rule.conditions.iter().all(|condition| condition.holds(inputs)));
     let (before, name, mechanism, conditions) = match matching {
         Some(at) => {
             let rule = &rules.0[at];
@@ -200,15 +217,18 @@ pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> Deliver
         }
         None => (rules.0.as_slice(), OTHERWISE, Delivery::PushPull, &[][..]),
     };
-    let decisive: Vec<Condition> =
-        if conditions.is_empty() { in_the_way(before, mechanism, inputs) } else { conditions.to_vec() };
+    let decisive: Vec<Condition> = if conditions.is_empty() {
+        in_the_way(before, mechanism, inputs)
+    } else {
+        conditions.to_vec()
+    };
     let said: Vec<String> = decisive.iter().map(|condition| condition.said_of(inputs)).collect();
     let because = if said.is_empty() { "it has no condition".to_owned() } else { said.join(", ") };
     DeliveryDecision { mechanism, rule: name.to_owned(), because }
 }
 
-/// What kept the rules before from choosing something else than `mechanism`: of each its first condition that does not
-/// hold, of conditions about the same thing the last.
+/// What kept the rules before from choosing something else than `mechanism`: of each its first
+/// condition that does not hold, of conditions about the same thing the last.
 fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Condition> {
     let mut found: Vec<Condition> = Vec::new();
     for rule in before.iter().filter(|rule| rule.mechanism != mechanism) {
@@ -221,7 +241,8 @@ fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Cond
 }
 
 impl Condition {
-    /// Every condition there is, by its key in the configuration; those of quantities without their value.
+    /// Every condition there is, by its key in the configuration; those of quantities without their
+    /// value.
     pub fn by_key(key: &str) -> Option<ConditionKey> {
         if let Some(flag) = Flag::ALL.into_iter().find(|flag| flag.name() == key) {
             return Some(ConditionKey::Flag(flag));
@@ -247,9 +268,13 @@ impl Condition {
     fn said_of(&self, inputs: &Inputs) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
-                let Some(found) = quantity.of(inputs) else { return format!("{} not known", quantity.shown()) };
-                let said = if comparison.holds(found, value) { comparison } else { comparison.opposite() };
-                let (mut left, mut right) = (quantity.unit().show(found), quantity.unit().show(value));
+                let Some(found) = quantity.of(inputs) else {
+                    return format!("{} not known", quantity.shown());
+                };
+                let said =
+                    if comparison.holds(found, value) { comparison } else { comparison.opposite() };
+                let (mut left, mut right) =
+                    (quantity.unit().show(found), quantity.unit().show(value));
                 if left == right && found != value {
                     (left, right) = (format!("{found} B"), format!("{value} B"));
                 }
@@ -264,7 +289,12 @@ impl Condition {
     fn words(&self) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
-                format!("{} {} {}", quantity.shown(), comparison.sign(), quantity.unit().show(value))
+                format!(
+                    "{} {} {}",
+                    quantity.shown(),
+                    comparison.sign(),
+                    quantity.unit().show(value)
+                )
             }
             Self::Flag(flag, true) => flag.name().to_owned(),
             Self::Flag(flag, false) => format!("not {}", flag.name()),
@@ -334,9 +364,12 @@ impl Quantity {
             Self::Throughput => Unit::BytesPerSecond,
             Self::Rtt => Unit::Milliseconds,
             Self::Battery => Unit::Percent,
-            Self::Robots | Self::Batch | Self::SameSite | Self::Losses | Self::Reconnects | Self::Transfers => {
-                Unit::Count
-            }
+            Self::Robots
+            | Self::Batch
+            | Self::SameSite
+            | Self::Losses
+            | Self::Reconnects
+            | Self::Transfers => Unit::Count,
         }
     }
 
@@ -374,7 +407,9 @@ impl Unit {
 /// Bytes in the units in which the configuration gives them: `9.7 MB`.
 pub fn shown_bytes(bytes: u64) -> String {
     let units = [(1u64 << 30, "GB"), (1 << 20, "MB"), (1 << 10, "KB")];
-    let Some((one, unit)) = units.into_iter().find(|(one, _)| bytes >= *one) else { return format!("{bytes} B") };
+    let Some((one, unit)) = units.into_iter().find(|(one, _)| bytes >= *one) else {
+        return format!("{bytes} B");
+    };
     let tenths = (u128::from(bytes) * 10 + u128::from(one) / 2) / u128::from(one);
     if tenths.is_multiple_of(10) || tenths >= 1000 {
         format!("{} {unit}", tenths / 10)
@@ -453,7 +488,9 @@ impl Flag {
 impl fmt::Display for ConditionKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Measure(quantity, comparison) => write!(f, "{}_{}", quantity.key(), comparison.word()),
+            Self::Measure(quantity, comparison) => {
+                write!(f, "{}_{}", quantity.key(), comparison.word())
+            }
             Self::Flag(flag) => f.write_str(flag.name()),
         }
     }
@@ -470,18 +507,26 @@ mod tests {
 
     fn rule(name: &str, conditions: &[(&str, u64)], mechanism: Delivery) -> Rule {
         let condition = |(key, value): &(&str, u64)| match Condition::by_key(key).expect(key) {
-            ConditionKey::Measure(quantity, comparison) => Condition::Measure(quantity, comparison, *value),
+            ConditionKey::Measure(quantity, comparison) => {
+                Condition::Measure(quantity, comparison, *value)
+            }
             ConditionKey::Flag(flag) => Condition::Flag(flag, *value == 1),
         };
-        Rule { name: name.to_owned(), conditions: conditions.iter().map(condition).collect(), mechanism }
+        Rule {
+            name: name.to_owned(),
+            conditions: conditions.iter().map(condition).collect(),
+            mechanism,
+        }
     }
 
     fn decided(own: &[Rule], inputs: Inputs) -> (Delivery, String, String) {
-        let decision = choose(&Rules::new(own.to_vec(), 32 * KB), DeliveryChoice::Adaptive, &inputs);
+        let decision =
+            choose(&Rules::new(own.to_vec(), 32 * KB), DeliveryChoice::Adaptive, &inputs);
         (decision.mechanism, decision.rule, decision.because)
     }
 
-    /// What the condition `key` with `value` says of inputs that satisfy it, and of some that do not.
+    /// What the condition `key` with `value` says of inputs that satisfy it, and of some that do
+    /// not.
     #[track_caller]
     fn check(key: &str, value: u64, yes: Inputs, because: &str, no: Inputs) {
         let own = [rule("own", &[(key, value)], Delivery::Poll)];
@@ -513,17 +558,47 @@ mod tests {
             "lacking 0 B ≤ 10 B",
             Inputs { lacking: 11, ..of() },
         );
-        check("robots_at_least", 8, Inputs { robots: 40, ..of() }, "robots 40 ≥ 8", Inputs { robots: 7, ..of() });
-        check("batch_at_least", 8, Inputs { batch: 8, ..of() }, "batch 8 ≥ 8", Inputs { batch: 7, robots: 9, ..of() });
+        check(
+            "robots_at_least",
+            8,
+            Inputs { robots: 40, ..of() },
+            "robots 40 ≥ 8",
+            Inputs { robots: 7, ..of() },
+        );
+        check(
+            "batch_at_least",
+            8,
+            Inputs { batch: 8, ..of() },
+            "batch 8 ≥ 8",
+            Inputs { batch: 7, robots: 9, ..of() },
+        );
         let on_site = |robots| Inputs { same_site: Some(robots), ..of() };
         check("same_site_at_least", 3, on_site(4), "robots on site 4 ≥ 3", on_site(2));
         let carrying = |rate| Inputs { throughput_bytes_per_s: rate, ..of() };
-        check("throughput_below", MB, carrying(Some(MB / 2)), "throughput 512 KB/s < 1 MB/s", carrying(Some(MB)));
-        check("throughput_below", MB, carrying(Some(0)), "throughput 0 B/s < 1 MB/s", carrying(None));
+        check(
+            "throughput_below",
+            MB,
+            carrying(Some(MB / 2)),
+            "throughput 512 KB/s < 1 MB/s",
+            carrying(Some(MB)),
+        );
+        check(
+            "throughput_below",
+            MB,
+            carrying(Some(0)),
+            "throughput 0 B/s < 1 MB/s",
+            carrying(None),
+        );
         let away = |rtt_ms| Inputs { rtt_ms, ..of() };
         check("rtt_above", 100, away(Some(120)), "rtt 120 ms > 100 ms", away(Some(100)));
         check("rtt_above", 100, away(Some(101)), "rtt 101 ms > 100 ms", away(None));
-        check("losses_above", 2, Inputs { losses: 3, ..of() }, "losses 3 > 2", Inputs { losses: 2, ..of() });
+        check(
+            "losses_above",
+            2,
+            Inputs { losses: 3, ..of() },
+            "losses 3 > 2",
+            Inputs { losses: 2, ..of() },
+        );
         check(
             "reconnects_above",
             5,
@@ -562,7 +637,16 @@ mod tests {
                 assert_eq!(Condition::by_key(&key.to_string()), Some(key));
             }
         }
-        for unknown in ["", "size", "size_", "_above", "size_over", "sizeabove", "weather_above", "metered_above"] {
+        for unknown in [
+            "",
+            "size",
+            "size_",
+            "_above",
+            "size_over",
+            "sizeabove",
+            "weather_above",
+            "metered_above",
+        ] {
             assert_eq!(Condition::by_key(unknown), None, "{unknown}");
         }
     }
@@ -571,7 +655,8 @@ mod tests {
     #[test]
     fn the_built_in_rules_decide() {
         let expect = |size, mechanism, rule: &str, because: &str| {
-            let inputs = Inputs { size, batch: 40, robots: 40, connected: true, ..Inputs::default() };
+            let inputs =
+                Inputs { size, batch: 40, robots: 40, connected: true, ..Inputs::default() };
             assert_eq!(decided(&[], inputs), (mechanism, rule.to_owned(), because.to_owned()));
         };
         expect(20 * KB, Delivery::Inline, "tiny", "size 20 KB ≤ 32 KB");
@@ -591,9 +676,15 @@ mod tests {
         assert_eq!(decided(&own, slow).2, "rtt 150 ms > 100 ms, throughput 1 KB/s < 1 MB/s");
         assert_eq!(decided(&own, far).1, "far");
         let because = "rtt not known".to_owned();
-        assert_eq!(decided(&own, Inputs::default()), (Delivery::PushPull, "all others".to_owned(), because));
+        assert_eq!(
+            decided(&own, Inputs::default()),
+            (Delivery::PushPull, "all others".to_owned(), because)
+        );
         let only = [rule("all", &[], Delivery::Poll)];
-        assert_eq!(decided(&only, far), (Delivery::Poll, "all".to_owned(), "it has no condition".to_owned()));
+        assert_eq!(
+            decided(&only, far),
+            (Delivery::Poll, "all".to_owned(), "it has no condition".to_owned())
+        );
     }
 
     #[test]
@@ -609,15 +700,23 @@ mod tests {
     #[test]
     fn what_the_operator_ordered_is_not_discussed() {
         let rules = Rules::new(Vec::new(), 32 * KB);
-        let decision = choose(&rules, DeliveryChoice::DirectPush, &Inputs { metered: true, ..Inputs::default() });
+        let decision = choose(
+            &rules,
+            DeliveryChoice::DirectPush,
+            &Inputs { metered: true, ..Inputs::default() },
+        );
         assert_eq!((decision.mechanism, decision.rule.as_str()), (Delivery::DirectPush, "ordered"));
         assert_eq!(decision.because, "the order says direct-push");
     }
 
     #[test]
     fn bytes_are_shown_in_the_units_of_the_configuration() {
-        let shown = [0, 1023, 1024, 1536, 256 * KB, 10_171_187, 100 * MB + 52_429, u64::MAX].map(shown_bytes);
-        assert_eq!(shown, ["0 B", "1023 B", "1 KB", "1.5 KB", "256 KB", "9.7 MB", "100 MB", "17179869184 GB"]);
+        let shown = [0, 1023, 1024, 1536, 256 * KB, 10_171_187, 100 * MB + 52_429, u64::MAX]
+            .map(shown_bytes);
+        assert_eq!(
+            shown,
+            ["0 B", "1023 B", "1 KB", "1.5 KB", "256 KB", "9.7 MB", "100 MB", "17179869184 GB"]
+        );
     }
 
     proptest! {

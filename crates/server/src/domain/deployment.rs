@@ -1,4 +1,5 @@
-//! What may become of an assignment and of a deployment as a whole. Functions of values; nothing is read or stored here.
+//! What may become of an assignment and of a deployment as a whole. Functions of values; nothing is
+//! read or stored here.
 //!
 //! ```text
 //!             report            report             report
@@ -6,8 +7,8 @@
 //!    │                 │                    │
 //!    └─────────────────┴────────────────────┴── an order or the clock ──► superseded | cancelled | expired
 //! ```
-//! A robot's word moves an assignment only forward out of a phase that is not final, and only within the run that was
-//! asked for; only an order begins a new run.
+//! A robot's word moves an assignment only forward out of a phase that is not final, and only
+//! within the run that was asked for; only an order begins a new run.
 
 use task_proto::Generation;
 use task_proto::api::{DeploymentState, PhaseCount};
@@ -45,8 +46,8 @@ impl Standing {
         (next != *self).then_some(next)
     }
 
-    /// Where it stands once a robot that accepted `observed` no longer lists it, if it was taken out of the desired state
-    /// in generation `removed`: it has been stopped.
+    /// Where it stands once a robot that accepted `observed` no longer lists it, if it was taken
+    /// out of the desired state in generation `removed`: it has been stopped.
     pub fn after_absence(&self, removed: Option<Generation>, observed: Generation) -> Option<Self> {
         let gone = !self.phase.is_final() && removed.is_some_and(|removed| observed >= removed);
         gone.then(|| Self { phase: Phase::Stopped, progress: None, failure: None, ..self.clone() })
@@ -58,8 +59,8 @@ fn is_robots_word(phase: Phase) -> bool {
     !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Expired | Phase::Unknown)
 }
 
-/// Whether `phase`, in which an order for a `kind` has settled, counts against the rollout. What an operator ended does
-/// not.
+/// Whether `phase`, in which an order for a `kind` has settled, counts against the rollout. What an
+/// operator ended does not.
 pub fn is_failure(phase: Phase, kind: TaskKind) -> bool {
     phase.is_settled(kind)
         && !phase.is_success(kind)
@@ -67,7 +68,12 @@ pub fn is_failure(phase: Phase, kind: TaskKind) -> bool {
 }
 
 /// Where a deployment stands as a whole.
-pub fn state(kind: TaskKind, cancelled: bool, paused: bool, counts: &[PhaseCount]) -> DeploymentState {
+pub fn state(
+    kind: TaskKind,
+    cancelled: bool,
+    paused: bool,
+    counts: &[PhaseCount],
+) -> DeploymentState {
     if cancelled {
         DeploymentState::Cancelled
     } else if counts.iter().all(|count| count.phase.is_settled(kind)) {

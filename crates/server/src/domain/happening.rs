@@ -1,4 +1,5 @@
-//! Things that happened and are worth a look, as the place that notices them knows them. [`crate::orders::feed`] tells them.
+//! Things that happened and are worth a look, as the place that notices them knows them.
+//! [`crate::orders::feed`] tells them.
 
 use std::sync::Arc;
 

@@ -1,5 +1,5 @@
-//! A person who asks: who they are, what they may, which robots are theirs, and from where they ask. Values only; who has
-//! which token is the store's to say.
+//! A person who asks: who they are, what they may, which robots are theirs, and from where they
+//! ask. Values only; who has which token is the store's to say.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -10,7 +10,8 @@ use task_proto::person::{Permission, Role, Roles};
 use task_proto::selector::Selector;
 use task_proto::{RobotId, RobotName, TokenId, UserName};
 
-/// The name that stands for whoever holds the first token, the one in the data directory. No user has it.
+/// The name that stands for whoever holds the first token, the one in the data directory. No user
+/// has it.
 const FIRST: &str = "operator.token";
 
 /// Who asks.
@@ -33,7 +34,8 @@ pub struct Person {
 impl Person {
     /// Whoever holds `token`, the first one: an administrator of everything.
     pub fn first(token: TokenId) -> Self {
-        let (roles, scope, origin) = (Roles::one(Role::Admin), Scope::everything(), TokenOrigin::First);
+        let (roles, scope, origin) =
+            (Roles::one(Role::Admin), Scope::everything(), TokenOrigin::First);
         Self { name: first_name(), roles, scope, token, origin, address: None }
     }
 
@@ -45,12 +47,14 @@ impl Person {
     /// Whether this is the same person by the same token with the same rights, wherever they are.
     pub fn has_the_rights_of(&self, other: &Self) -> bool {
         let Self { name, roles, scope, token, origin, address: _ } = self;
-        (name, roles, scope, token, origin) == (&other.name, &other.roles, &other.scope, &other.token, &other.origin)
+        (name, roles, scope, token, origin)
+            == (&other.name, &other.roles, &other.scope, &other.token, &other.origin)
     }
 
     /// Whether they may. What concerns everybody is not for who is limited to some robots.
     pub fn may(&self, permission: Permission) -> bool {
-        self.roles.allow(permission) && (permission != Permission::Administer || self.scope.is_everything())
+        self.roles.allow(permission)
+            && (permission != Permission::Administer || self.scope.is_everything())
     }
 }
 
@@ -113,7 +117,10 @@ mod tests {
     #[test]
     fn what_concerns_everybody_is_not_for_who_is_limited() {
         let mut person = Person::first("0123456789ab".parse().expect("an id"));
-        assert!(person.is_first() && Permission::ALL.into_iter().all(|permission| person.may(permission)));
+        assert!(
+            person.is_first()
+                && Permission::ALL.into_iter().all(|permission| person.may(permission))
+        );
         person.scope = Scope::of([selector("site=lab")]);
         assert!(person.may(Permission::Maintain) && !person.may(Permission::Administer));
     }
@@ -121,10 +128,21 @@ mod tests {
     #[test]
     fn a_robot_is_in_a_scope_if_all_of_it_mean_it() {
         let (id, name) = (RobotId::random(), "atlas".parse().expect("a name"));
-        let labels: Labels = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
-        let covers = |texts: &[&str]| Scope::of(texts.iter().map(|text| selector(text))).covers(&id, &name, &labels);
-        assert!(covers(&[]) && covers(&["*"]) && covers(&["site=lab"]) && covers(&["site=lab", "atlas"]));
+        let labels: Labels =
+            [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
+        let covers = |texts: &[&str]| {
+            Scope::of(texts.iter().map(|text| selector(text))).covers(&id, &name, &labels)
+        };
+        assert!(
+            covers(&[])
+                && covers(&["*"])
+                && covers(&["site=lab"])
+                && covers(&["site=lab", "atlas"])
+        );
         assert!(!covers(&["site=field"]) && !covers(&["site=lab", "boreas"]));
-        assert_eq!(Scope::of([selector("site=lab"), selector("a,b")]).to_string(), "site=lab and a,b");
+        assert_eq!(
+            Scope::of([selector("site=lab"), selector("a,b")]).to_string(),
+            "site=lab and a,b"
+        );
     }
 }

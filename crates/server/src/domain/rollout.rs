@@ -1,11 +1,12 @@
-//! When a deployment's next batch begins, and when it pauses. Functions of values; [`crate::orders::advance`] carries it out.
+//! When a deployment's next batch begins, and when it pauses. Functions of values;
+//! [`crate::orders::advance`] carries it out.
 //!
-//! A batched rollout waits for robots that can act. A robot that is offline when its turn comes keeps
-//! its place and is passed over until it is back. A robot that goes offline after its batch began is
-//! waited for during [`OFFLINE_GRACE_MS`] or, where it has begun to work on the package, during
-//! [`LOST_AFTER_MS`]. After that time the rollout goes on without it. A robot that was lost while it worked
-//! on the package counts as a failure until it is back, so that a package that takes robots off
-//! the network stops at `max_failures`.
+//! A batched rollout waits for robots that can act. A robot that is offline when its turn comes
+//! keeps its place and is passed over until it is back. A robot that goes offline after its batch
+//! began is waited for during [`OFFLINE_GRACE_MS`] or, where it has begun to work on the package,
+//! during [`LOST_AFTER_MS`]. After that time the rollout goes on without it. A robot that was lost
+//! while it worked on the package counts as a failure until it is back, so that a package that
+//! takes robots off the network stops at `max_failures`.
 
 /// How long a robot that has not begun may be offline before its batch goes on without it: a
 /// reconnect or the restart of the agent takes less.
@@ -108,7 +109,8 @@ impl Tally {
 pub enum Move {
     /// Nothing, until something settles, a robot comes or goes, or the operator resumes it.
     Wait,
-    /// Begin a batch of so many robots: those that are ready or, without batches, all that are left.
+    /// Begin a batch of so many robots: those that are ready or, without batches, all that are
+    /// left.
     Release(u64),
     /// Only offline robots are left: let their time run.
     AwaitOffline,
@@ -151,7 +153,9 @@ mod tests {
     }
 
     fn any_robot() -> impl Strategy<Value = Robot> {
-        let offline = proptest::option::of((0u64..60, 1u64..120).prop_map(|(from, minutes)| (from, from + minutes)));
+        let offline = proptest::option::of(
+            (0u64..60, 1u64..120).prop_map(|(from, minutes)| (from, from + minutes)),
+        );
         (any::<bool>(), offline).prop_map(|(fails, offline)| Robot {
             fails,
             offline,
@@ -186,7 +190,8 @@ mod tests {
             max_failures in proptest::option::of(0u64..6),
         ) {
             let mut rollout = Rollout { batch, max_failures, forgiven: 0, paused: false };
-            // All are back for good after three hours, and a batch of one takes two minutes and at most ten of waiting.
+            // All are back for good after three hours, and a batch of one takes two minutes and at
+            // most ten of waiting.
             for minute in 0..(180 + 12 * robots.len() as u64) {
                 loop {
                     let now = tally(&robots, minute);
@@ -227,8 +232,8 @@ mod tests {
             prop_assert!(rollout.paused || robots.iter().all(|robot| robot.has_settled));
         }
 
-        /// However long the others stay away, those that are online have their turn within the hour that the absence of
-        /// one batch can cost.
+        /// However long the others stay away, those that are online have their turn within the hour
+        /// that the absence of one batch can cost.
         #[test]
         fn offline_robots_never_hold_back_the_others(absent in 1u64..50, online in 1u64..50, batch in 1u64..9) {
             let rollout = Rollout { batch: Some(batch), max_failures: Some(0), forgiven: 0, paused: false };
@@ -261,7 +266,10 @@ mod tests {
         let rollout = Rollout { batch: Some(2), max_failures: Some(0), forgiven: 0, paused: false };
         let tally = Tally { ready: 5, lost: 1, ..Tally::default() };
         assert_eq!(next_move(&rollout, &tally), Move::Pause);
-        assert_eq!(next_move(&Rollout { max_failures: Some(1), ..rollout }, &tally), Move::Release(2));
+        assert_eq!(
+            next_move(&Rollout { max_failures: Some(1), ..rollout }, &tally),
+            Move::Release(2)
+        );
         assert_eq!(next_move(&Rollout { max_failures: None, ..rollout }, &tally), Move::Release(2));
     }
 

@@ -1,5 +1,6 @@
-//! What robots say they lack of packages that are being fanned out: the newest word of each, for whoever fans out. Nobody
-//! else's is kept, so there is never more of it than robots with an assignment.
+//! What robots say they lack of packages that are being fanned out: the newest word of each, for
+//! whoever fans out. Nobody else's is kept, so there is never more of it than robots with an
+//! assignment.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -39,7 +40,9 @@ impl PartRequests {
     pub fn hear(&self, report: &Report) {
         for task in &report.tasks {
             let Some(missing) = &task.missing_parts else { continue };
-            let Some(desk) = lock(&self.0).get(&task.package.content.digest).cloned() else { continue };
+            let Some(desk) = lock(&self.0).get(&task.package.content.digest).cloned() else {
+                continue;
+            };
             let missing = missing.iter().take(MAX_MISSING_RANGES).copied().collect();
             lock(&desk.requests).insert(report.robot_id.clone(), missing);
             desk.news.notify_one();
@@ -69,6 +72,7 @@ impl Drop for Listening {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+    // half-done.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

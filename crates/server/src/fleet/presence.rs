@@ -1,5 +1,6 @@
-//! Who is there: which robot is connected over MQTT or polls over HTTP, from where and since when, and which robots have
-//! two instances that displace each other. Kept in memory only; it never talks to anyone and never reads a clock.
+//! Who is there: which robot is connected over MQTT or polls over HTTP, from where and since when,
+//! and which robots have two instances that displace each other. Kept in memory only; it never
+//! talks to anyone and never reads a clock.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -7,10 +8,12 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use task_proto::{Digest, InstanceId, RobotId};
 
-/// Within this time two returns of a displaced instance mean a duplicate, and after this much quiet it is over.
+/// Within this time two returns of a displaced instance mean a duplicate, and after this much quiet
+/// it is over.
 pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
-/// For so long the start of an agent that has its robot's work must not have been heard before another one gets it. An MQTT
-/// session without a sign of life ends by then, and an agent without one polls more often.
+/// For so long the start of an agent that has its robot's work must not have been heard before
+/// another one gets it. An MQTT session without a sign of life ends by then, and an agent without
+/// one polls more often.
 pub const HANDOVER_SILENCE_MS: u64 = 30 * 1000;
 /// For so long it is shown that another start has come and waits.
 const WAITING_SHOWN_MS: u64 = 60 * 1000;
@@ -60,7 +63,8 @@ pub struct Claim {
 pub struct Standing {
     /// Whether it has its robot's work; otherwise it waits.
     pub is_served: bool,
-    /// Whether that begins now, or begins to be known of its session: it is to be told of its state.
+    /// Whether that begins now, or begins to be known of its session: it is to be told of its
+    /// state.
     pub is_news: bool,
 }
 
@@ -70,7 +74,8 @@ struct Sightings {
     connection: Option<Connection>,
     /// `None`: it is only remembered.
     last_seen_ms: Option<u64>,
-    /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is away until it asks.
+    /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is
+    /// away until it asks.
     polled_ms: Option<u64>,
     instances: InstanceHistory,
     /// The instance that has the robot's work, and when it was last heard.
@@ -94,7 +99,13 @@ impl Presence {
     }
 
     /// The robot's MQTT session number `connection` began.
-    pub fn connected(&self, robot: &RobotId, address: Option<SocketAddr>, connection: u64, now_ms: u64) {
+    pub fn connected(
+        &self,
+        robot: &RobotId,
+        address: Option<SocketAddr>,
+        connection: u64,
+        now_ms: u64,
+    ) {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
         if sightings.connection.is_none_or(|known| known.number < connection) {
@@ -104,7 +115,8 @@ impl Presence {
         }
     }
 
-    /// The robot's MQTT session number `connection` ended. An end that comes after the next beginning changes nothing.
+    /// The robot's MQTT session number `connection` ended. An end that comes after the next
+    /// beginning changes nothing.
     pub fn disconnected(&self, robot: &RobotId, connection: u64, now_ms: u64) {
         if let Some(sightings) = self.robots().get_mut(robot)
             && sightings.connection.is_some_and(|known| known.number == connection)
@@ -121,8 +133,9 @@ impl Presence {
         heard(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
     }
 
-    /// The robot's agent said which it is, in the MQTT session number `connection` if in any. Another one than that which
-    /// has the robot's work waits for that one's end, or for its silence.
+    /// The robot's agent said which it is, in the MQTT session number `connection` if in any.
+    /// Another one than that which has the robot's work waits for that one's end, or for its
+    /// silence.
     pub fn claimed(
         &self,
         robot: &RobotId,
@@ -134,7 +147,8 @@ impl Presence {
         let mut robots = self.robots();
         let sightings = heard(&mut robots, robot, address, now_ms);
         sightings.instances.observe(&claim.instance, now_ms);
-        let is_its_session = connection.is_some() && connection == sightings.connection.map(|known| known.number);
+        let is_its_session =
+            connection.is_some() && connection == sightings.connection.map(|known| known.number);
         let is_first_word = is_its_session && sightings.speaker.as_ref() != Some(&claim.instance);
         if is_its_session {
             sightings.speaker = Some(claim.instance.clone());
@@ -143,7 +157,8 @@ impl Presence {
             sightings.waited_ms = Some(now_ms);
             return Standing { is_served: false, is_news: false };
         }
-        let is_known = sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
+        let is_known =
+            sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
         // The session of an older agent is told of its state without a word.
         let is_news = claim.place.is_some() && (is_first_word || !is_known);
         sightings.served = Some((claim, now_ms));
@@ -160,9 +175,12 @@ impl Presence {
         self.robots().get(robot).is_some_and(Sightings::takes_a_claim)
     }
 
-    /// Whether the robot's MQTT session is that of the agent which has its work, as far as its agents say.
+    /// Whether the robot's MQTT session is that of the agent which has its work, as far as its
+    /// agents say.
     pub fn may_be_told(&self, robot: &RobotId) -> bool {
-        self.robots().get(robot).is_none_or(|sightings| !sightings.takes_a_claim() || sightings.has_session())
+        self.robots()
+            .get(robot)
+            .is_none_or(|sightings| !sightings.takes_a_claim() || sightings.has_session())
     }
 
     /// The start of its agent that has its work.
@@ -180,15 +198,22 @@ impl Presence {
         self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
     }
 
-    /// For how long each of these robots has been offline, as far as this process knows; `None`: it is online.
-    pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
+    /// For how long each of these robots has been offline, as far as this process knows; `None`: it
+    /// is online.
+    pub fn offline_ms<'a>(
+        &self,
+        robots: impl IntoIterator<Item = &'a RobotId>,
+        now_ms: u64,
+    ) -> Vec<Option<u64>> {
         let known = self.robots();
         let offline_ms = |robot: &RobotId| {
-            let since_ms = match known.get(robot).and_then(|sightings| sightings.view(self.window_ms, now_ms)) {
-                Some(sighting) if sighting.online => return None,
-                Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
-                None => self.started_ms,
-            };
+            let since_ms =
+                match known.get(robot).and_then(|sightings| sightings.view(self.window_ms, now_ms))
+                {
+                    Some(sighting) if sighting.online => return None,
+                    Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
+                    None => self.started_ms,
+                };
             Some(now_ms.saturating_sub(since_ms))
         };
         robots.into_iter().map(offline_ms).collect()
@@ -199,13 +224,15 @@ impl Presence {
         self.robots().get(robot).is_some_and(|sightings| sightings.connection.is_some())
     }
 
-    /// Robots without a connection that were online at `since_ms` and no longer are at `now_ms`, because they were not
-    /// heard for the window.
+    /// Robots without a connection that were online at `since_ms` and no longer are at `now_ms`,
+    /// because they were not heard for the window.
     pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
         let robots = self.robots();
         let fell = robots.iter().filter(|(_, sightings)| {
-            let ends_ms = sightings.polled_ms.map(|polled_ms| polled_ms.saturating_add(self.window_ms));
-            sightings.connection.is_none() && ends_ms.is_some_and(|ends_ms| since_ms < ends_ms && ends_ms <= now_ms)
+            let ends_ms =
+                sightings.polled_ms.map(|polled_ms| polled_ms.saturating_add(self.window_ms));
+            sightings.connection.is_none()
+                && ends_ms.is_some_and(|ends_ms| since_ms < ends_ms && ends_ms <= now_ms)
         });
         fell.map(|(robot, _)| robot.clone()).collect()
     }
@@ -229,7 +256,8 @@ impl Presence {
     }
 
     fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, Sightings>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.robots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -241,7 +269,8 @@ fn heard<'a>(
     now_ms: u64,
 ) -> &'a mut Sightings {
     let sightings = entry(robots, robot);
-    let is_elsewhere = address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
+    let is_elsewhere =
+        address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
     // While there is a session its port is the robot's: each HTTP request may have another one.
     if address.is_some() && (sightings.connection.is_none() || is_elsewhere) {
         sightings.address = address;
@@ -261,7 +290,9 @@ fn entry<'a>(robots: &'a mut HashMap<RobotId, Sightings>, robot: &RobotId) -> &'
 fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
     let mut silent: Vec<(bool, Option<u64>, RobotId)> = robots
         .iter()
-        .map(|(robot, sightings)| (sightings.connection.is_some(), sightings.last_seen_ms, robot.clone()))
+        .map(|(robot, sightings)| {
+            (sightings.connection.is_some(), sightings.last_seen_ms, robot.clone())
+        })
         .collect();
     silent.sort_unstable();
     for (_, _, robot) in silent.into_iter().take(MAX_ROBOTS / 16) {
@@ -270,13 +301,15 @@ fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
 }
 
 impl Sightings {
-    /// Whether the robot's work is this agent's. That is so for the agent that has it, for one that could only begin after
-    /// that one had ended, and once that one was silent for long. An older agent does not say where it runs, so that a
-    /// restart of it can't be told from a copy: the next one follows at once, as it always did.
+    /// Whether the robot's work is this agent's. That is so for the agent that has it, for one that
+    /// could only begin after that one had ended, and once that one was silent for long. An older
+    /// agent does not say where it runs, so that a restart of it can't be told from a copy: the
+    /// next one follows at once, as it always did.
     fn gives_way_to(&self, claim: &Claim, now_ms: u64) -> bool {
         let Some((served, heard_ms)) = &self.served else { return true };
         let Some(place) = served.place else { return true };
-        let is_silent = !self.has_session() && now_ms.saturating_sub(*heard_ms) >= HANDOVER_SILENCE_MS;
+        let is_silent =
+            !self.has_session() && now_ms.saturating_sub(*heard_ms) >= HANDOVER_SILENCE_MS;
         served.instance == claim.instance || claim.place == Some(place) || is_silent
     }
 
@@ -303,21 +336,26 @@ impl Sightings {
     fn view(&self, window_ms: u64, now_ms: u64) -> Option<Sighting> {
         Some(Sighting {
             online: self.connection.is_some()
-                || self.polled_ms.is_some_and(|polled_ms| now_ms.saturating_sub(polled_ms) < window_ms),
+                || self
+                    .polled_ms
+                    .is_some_and(|polled_ms| now_ms.saturating_sub(polled_ms) < window_ms),
             address: self.address,
             connected_since_ms: self.connection.map(|connection| connection.since_ms),
             connection: self.connection.map(|connection| connection.number),
             last_seen_ms: self.last_seen_ms?,
             duplicate: self.instances.is_duplicate(now_ms),
-            waits: self.waited_ms.is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < WAITING_SHOWN_MS),
+            waits: self
+                .waited_ms
+                .is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < WAITING_SHOWN_MS),
         })
     }
 }
 
 /// The instances of one robot, by when each took the place of another.
 ///
-/// A restarted agent is a new instance and an old one never comes back, except for a message that was late. So two
-/// *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two machines share the identity.
+/// A restarted agent is a new instance and an old one never comes back, except for a message that
+/// was late. So two *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two
+/// machines share the identity.
 #[derive(Debug, Clone, Default)]
 pub struct InstanceHistory {
     changes: VecDeque<Change>,
@@ -431,7 +469,11 @@ mod tests {
         assert!(!presence.is_online(&robot, 100_000), "who hangs up is away at once");
         presence.connected(&robot, None, 8, 100_000);
         let sighting = presence.get(&robot, 100_000).expect("seen");
-        assert_eq!((sighting.connection, sighting.address), (Some(8), Some(address())), "known from before");
+        assert_eq!(
+            (sighting.connection, sighting.address),
+            (Some(8), Some(address())),
+            "known from before"
+        );
         presence.disconnected(&robot, 8, 100_000);
         presence.seen(&robot, address(), 100_001);
         assert!(presence.is_online(&robot, 100_500));
@@ -456,7 +498,13 @@ mod tests {
         let presence = Presence::new(1000, 0);
         let (robot, a, b) = (RobotId::random(), InstanceId::random(), InstanceId::random());
         for instance in [&a, &b, &a, &b] {
-            presence.claimed(&robot, None, None, Claim { instance: instance.clone(), place: None }, 1);
+            presence.claimed(
+                &robot,
+                None,
+                None,
+                Claim { instance: instance.clone(), place: None },
+                1,
+            );
         }
         assert!(presence.is_duplicate(&robot, 2));
         presence.ended_others(&robot);
@@ -471,8 +519,10 @@ mod tests {
 
     #[test]
     fn another_instance_waits_until_the_one_that_is_served_was_silent() {
-        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
-        let polls = |claim: &Claim, now_ms| presence.claimed(&robot, None, None, claim.clone(), now_ms);
+        let (presence, robot, original, copy) =
+            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        let polls =
+            |claim: &Claim, now_ms| presence.claimed(&robot, None, None, claim.clone(), now_ms);
         assert!(!presence.takes_a_claim(&robot), "nothing is known of it");
         let first = polls(&original, 0);
         assert!(first.is_served && first.is_news && presence.takes_a_claim(&robot));
@@ -495,12 +545,16 @@ mod tests {
             assert!(presence.claimed(&robot, None, None, claim(1), now_ms).is_news);
         }
         presence.remember(&robot, claim(2), 6);
-        assert!(presence.claimed(&robot, None, None, claim(1), 6).is_served, "what is known is newer");
+        assert!(
+            presence.claimed(&robot, None, None, claim(1), 6).is_served,
+            "what is known is newer"
+        );
     }
 
     #[test]
     fn instance_that_was_known_before_a_restart_of_the_server_is_waited_for() {
-        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        let (presence, robot, original, copy) =
+            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
         presence.remember(&robot, original.clone(), 1000);
         assert_eq!(presence.get(&robot, 1000), None, "it was not seen by this process");
         assert!(!presence.claimed(&robot, None, None, copy, 1001).is_served);
@@ -509,7 +563,8 @@ mod tests {
 
     #[test]
     fn session_is_told_once_its_agent_has_said_that_it_is_the_one() {
-        let (presence, robot, original, copy) = (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+        let (presence, robot, original, copy) =
+            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
         let says = |claim: &Claim, connection, now_ms| {
             presence.claimed(&robot, None, Some(connection), claim.clone(), now_ms).is_served
         };
@@ -522,7 +577,10 @@ mod tests {
         presence.connected(&robot, None, 2, later_ms);
         assert!(!presence.may_be_told(&robot), "it has not said who it is");
         assert!(!says(&copy, 2, later_ms) && !presence.may_be_told(&robot));
-        assert!(!says(&original, 1, later_ms + 1) || !presence.may_be_told(&robot), "said in a session that is over");
+        assert!(
+            !says(&original, 1, later_ms + 1) || !presence.may_be_told(&robot),
+            "said in a session that is over"
+        );
         presence.disconnected(&robot, 2, later_ms + 2);
         presence.connected(&robot, None, 3, later_ms + 2);
         assert!(says(&original, 3, later_ms + 3) && presence.may_be_told(&robot));
@@ -538,7 +596,10 @@ mod tests {
             assert!(presence.claimed(&robot, None, None, older, now_ms).is_served);
             assert!(!presence.takes_a_claim(&robot));
         }
-        assert!(presence.claimed(&robot, None, None, claim(1), 6).is_served, "an agent that was brought up to date");
+        assert!(
+            presence.claimed(&robot, None, None, claim(1), 6).is_served,
+            "an agent that was brought up to date"
+        );
         let older = Claim { instance: InstanceId::random(), place: None };
         assert!(!presence.claimed(&robot, None, None, older, 7).is_served);
     }
@@ -575,7 +636,11 @@ mod tests {
         presence.seen(&robot, "10.0.0.7:5001".parse().expect("valid"), 0);
         assert_eq!(shown().as_deref(), Some("10.0.0.7:4000"));
         presence.seen(&robot, "10.0.9.9:5002".parse().expect("valid"), 0);
-        assert_eq!(shown().as_deref(), Some("10.0.9.9:5002"), "it has moved, and its session has not noticed yet");
+        assert_eq!(
+            shown().as_deref(),
+            Some("10.0.9.9:5002"),
+            "it has moved, and its session has not noticed yet"
+        );
         presence.connected(&robot, "10.0.9.9:4001".parse().ok(), 2, 0);
         assert_eq!(shown().as_deref(), Some("10.0.9.9:4001"));
         presence.disconnected(&robot, 2, 0);

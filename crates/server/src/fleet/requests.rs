@@ -1,5 +1,6 @@
-//! Questions to robots that are under way: each waits here for its reply, for as long as an answer is of use and no
-//! longer. Nothing is stored: who asks waits, and a question lost with a connection is asked again by whoever wants to.
+//! Questions to robots that are under way: each waits here for its reply, for as long as an answer
+//! is of use and no longer. Nothing is stored: who asks waits, and a question lost with a
+//! connection is asked again by whoever wants to.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -59,7 +60,8 @@ impl Requests {
         ask: Ask,
         patience: Duration,
     ) -> Result<Answer, RequestError> {
-        let request = Request { id: RequestId::random(), ttl_ms: ttl_ms(patience), ask, signed: None };
+        let request =
+            Request { id: RequestId::random(), ttl_ms: ttl_ms(patience), ask, signed: None };
         self.put(broker, robot, request, patience).await
     }
 
@@ -99,7 +101,8 @@ impl Requests {
         }
     }
 
-    /// A reply came from `robot`. One that nobody waits for is dropped: it is late, doubled or made up.
+    /// A reply came from `robot`. One that nobody waits for is dropped: it is late, doubled or made
+    /// up.
     pub fn replied(&self, robot: &RobotId, reply: Reply) {
         let mut waiting = self.waiting();
         // Another robot can't answer in this one's place, even if it guessed the id.
@@ -111,7 +114,11 @@ impl Requests {
         }
     }
 
-    fn expect(&self, robot: &RobotId, id: RequestId) -> Result<(Place, oneshot::Receiver<Outcome>), RequestError> {
+    fn expect(
+        &self,
+        robot: &RobotId,
+        id: RequestId,
+    ) -> Result<(Place, oneshot::Receiver<Outcome>), RequestError> {
         let mut waiting = self.waiting();
         if waiting.len() >= MAX_UNDER_WAY {
             return Err(RequestError::Busy);
@@ -123,7 +130,8 @@ impl Requests {
     }
 
     fn waiting(&self) -> MutexGuard<'_, HashMap<RequestId, Waiting>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -132,7 +140,8 @@ fn ttl_ms(patience: Duration) -> u64 {
     u64::try_from(patience.as_millis()).unwrap_or(MAX_TTL_MS).min(MAX_TTL_MS)
 }
 
-/// Keeps a question's place; it is free again however the wait ends, also when whoever asked hangs up.
+/// Keeps a question's place; it is free again however the wait ends, also when whoever asked hangs
+/// up.
 struct Place {
     requests: Requests,
     id: RequestId,
@@ -149,7 +158,11 @@ mod tests {
     use super::*;
 
     fn reply(id: &RequestId, robot: &RobotId) -> Reply {
-        Reply { robot_id: robot.clone(), id: id.clone(), outcome: Outcome::Answer(Answer::Following) }
+        Reply {
+            robot_id: robot.clone(),
+            id: id.clone(),
+            outcome: Outcome::Answer(Answer::Following),
+        }
     }
 
     #[tokio::test]
@@ -169,8 +182,9 @@ mod tests {
     fn places_are_bounded_and_free_again_when_nobody_waits() {
         let requests = Requests::default();
         let robot = RobotId::random();
-        let places: Vec<_> =
-            (0..MAX_UNDER_WAY).map(|_| requests.expect(&robot, RequestId::random()).expect("room")).collect();
+        let places: Vec<_> = (0..MAX_UNDER_WAY)
+            .map(|_| requests.expect(&robot, RequestId::random()).expect("room"))
+            .collect();
         assert!(matches!(requests.expect(&robot, RequestId::random()), Err(RequestError::Busy)));
         drop(places);
         assert!(requests.waiting().is_empty());

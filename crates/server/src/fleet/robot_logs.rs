@@ -1,5 +1,6 @@
-//! The last log lines of each robot, and who follows them. Only memory: what a robot published by itself is here until
-//! newer lines take its place, all of it is on the robot. It never asks a robot.
+//! The last log lines of each robot, and who follows them. Only memory: what a robot published by
+//! itself is here until newer lines take its place, all of it is on the robot. It never asks a
+//! robot.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -95,7 +96,8 @@ pub struct Joined {
     pub follower: Follower,
     /// What it is told.
     pub told: broadcast::Receiver<Told>,
-    /// Whether it is the first: then somebody has to ask the robot, for as long as there are followers.
+    /// Whether it is the first: then somebody has to ask the robot, for as long as there are
+    /// followers.
     pub is_first: bool,
 }
 
@@ -153,7 +155,12 @@ impl RobotLogs {
         let state = self.state();
         let kept = state.robots.get(robot).filter(|kept| kept.received_ms > 0)?;
         let Kept { robot_ms, received_ms, suppressed, .. } = *kept;
-        Some(Remembered { lines: kept.lines.iter().cloned().collect(), robot_ms, received_ms, suppressed })
+        Some(Remembered {
+            lines: kept.lines.iter().cloned().collect(),
+            robot_ms,
+            received_ms,
+            suppressed,
+        })
     }
 
     /// Forgets a robot that was removed. Its followers' streams end.
@@ -181,11 +188,15 @@ impl RobotLogs {
         followed.levels.insert(number, level);
         followed.changed.notify_one();
         let told = followed.told.subscribe();
-        Joined { follower: Follower { logs: self.clone(), robot: robot.clone(), number }, told, is_first }
+        Joined {
+            follower: Follower { logs: self.clone(), robot: robot.clone(), number },
+            told,
+            is_first,
+        }
     }
 
-    /// The level that the followers of `robot` together want; `None` when nobody follows any more: whoever asks the
-    /// robot then ends, and the next follower is a first one.
+    /// The level that the followers of `robot` together want; `None` when nobody follows any more:
+    /// whoever asks the robot then ends, and the next follower is a first one.
     pub fn wanted(&self, robot: &RobotId) -> Option<LogLevel> {
         let mut state = self.state();
         let level = state.followed.get(robot)?.levels.values().min().copied();
@@ -216,7 +227,8 @@ impl RobotLogs {
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -274,13 +286,25 @@ mod tests {
     use task_proto::log::LogSource;
 
     fn batch(robot: &RobotId, texts: impl IntoIterator<Item = String>) -> LogBatch {
-        let line =
-            |text| LogLine { at_ms: 1, level: LogLevel::Warn, source: LogSource::Stderr, task: None, node: None, text };
-        LogBatch { robot_id: robot.clone(), now_ms: 5, lines: texts.into_iter().map(line).collect(), suppressed: 1 }
+        let line = |text| LogLine {
+            at_ms: 1,
+            level: LogLevel::Warn,
+            source: LogSource::Stderr,
+            task: None,
+            node: None,
+            text,
+        };
+        LogBatch {
+            robot_id: robot.clone(),
+            now_ms: 5,
+            lines: texts.into_iter().map(line).collect(),
+            suppressed: 1,
+        }
     }
 
     fn texts(logs: &RobotLogs, robot: &RobotId) -> Vec<String> {
-        logs.remembered(robot).map_or_else(Vec::new, |kept| kept.lines.into_iter().map(|line| line.text).collect())
+        logs.remembered(robot)
+            .map_or_else(Vec::new, |kept| kept.lines.into_iter().map(|line| line.text).collect())
     }
 
     #[test]
@@ -310,10 +334,20 @@ mod tests {
         }
         let bytes: usize = logs.state().robots.values().map(|kept| kept.bytes).sum();
         assert_eq!(bytes, logs.state().bytes);
-        assert!(robots.iter().all(|robot| texts(&logs, robot).last().is_some_and(|text| text == "the last")));
-        assert!(robots.iter().all(|robot| texts(&logs, robot).len() > 1), "nobody is left with nothing");
+        assert!(
+            robots
+                .iter()
+                .all(|robot| texts(&logs, robot).last().is_some_and(|text| text == "the last"))
+        );
+        assert!(
+            robots.iter().all(|robot| texts(&logs, robot).len() > 1),
+            "nobody is left with nothing"
+        );
         let has_room = |kept: &Kept| kept.lines.capacity() > 2 * kept.lines.len();
-        assert!(!logs.state().robots.values().any(has_room), "room that no line needs is given back");
+        assert!(
+            !logs.state().robots.values().any(has_room),
+            "room that no line needs is given back"
+        );
     }
 
     #[test]
@@ -352,7 +386,9 @@ mod tests {
         drop(second);
         assert_eq!(logs.wanted(&robot), Some(LogLevel::Warn));
         logs.take(batch(&robot, ["x".to_owned()]), 9);
-        assert!(matches!(first.told.try_recv(), Ok(Told::Lines(batch)) if batch.lines[0].text == "x"));
+        assert!(
+            matches!(first.told.try_recv(), Ok(Told::Lines(batch)) if batch.lines[0].text == "x")
+        );
         drop(first.follower);
         assert!(!logs.follow(&robot, LogLevel::Info).is_first, "whoever asks has not noticed yet");
         assert_eq!(logs.wanted(&robot), None);

@@ -1,5 +1,5 @@
-//! How robots' machines did in the last hour. Only memory, packed: a sample takes 16 bytes, so that ten thousand robots take
-//! about 10 MB, and none of it is ever written. It never asks a robot.
+//! How robots' machines did in the last hour. Only memory, packed: a sample takes 16 bytes, so that
+//! ten thousand robots take about 10 MB, and none of it is ever written. It never asks a robot.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -28,7 +28,8 @@ struct Kept {
     samples: VecDeque<Sample>,
 }
 
-/// A look at a machine in 16 bytes. Sizes are shares of what there is in all, which hardly ever changes.
+/// A look at a machine in 16 bytes. Sizes are shares of what there is in all, which hardly ever
+/// changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Sample {
     /// Seconds since the sample before.
@@ -111,7 +112,8 @@ impl RobotVitals {
     }
 
     fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, Kept>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -128,7 +130,9 @@ fn make_room(robots: &mut HashMap<RobotId, Kept>) {
 
 /// Without figures that can't be: a robot may say anything.
 fn sound(said: Vitals) -> Vitals {
-    let used = |used: Option<u64>, total: Option<u64>| used.zip(total).map(|(used, total)| used.min(total));
+    let used = |used: Option<u64>, total: Option<u64>| {
+        used.zip(total).map(|(used, total)| used.min(total))
+    };
     let finite = |value: Option<f32>, least: f32, most: f32| {
         value.filter(|value| value.is_finite()).map(|value| value.clamp(least, most))
     };
@@ -147,9 +151,13 @@ impl Sample {
     fn pack(vitals: &Vitals, after_s: u16) -> Self {
         let share = |used: Option<u64>, total: Option<u64>| {
             let shares = used.zip(total.filter(|total| *total > 0));
-            shares.map_or(NONE, |(used, total)| (used as f64 / total as f64 * f64::from(NONE - 1)).round() as u16)
+            shares.map_or(NONE, |(used, total)| {
+                (used as f64 / total as f64 * f64::from(NONE - 1)).round() as u16
+            })
         };
-        let hundredths = |value: Option<f32>| value.map_or(NONE, |value| (value * 100.0).round().min(65_534.0) as u16);
+        let hundredths = |value: Option<f32>| {
+            value.map_or(NONE, |value| (value * 100.0).round().min(65_534.0) as u16)
+        };
         let above_coldest = |celsius: f32| (celsius - COLDEST_C).round().clamp(0.0, 254.0) as u8;
         Self {
             after_s,
@@ -167,7 +175,9 @@ impl Sample {
     /// As it was at `at_ms`, on a machine whose sizes are those of `newest`.
     fn unpack(&self, at_ms: u64, newest: &Vitals) -> Vitals {
         let used = |share: u16, total: Option<u64>| {
-            total.filter(|_| share != NONE).map(|total| (total as f64 * f64::from(share) / f64::from(NONE - 1)) as u64)
+            total
+                .filter(|_| share != NONE)
+                .map(|total| (total as f64 * f64::from(share) / f64::from(NONE - 1)) as u64)
         };
         let hundredths = |value: u16| (value != NONE).then(|| f32::from(value) / 100.0);
         let (memory, disk) = (newest.memory_total_bytes, newest.disk_total_bytes);
@@ -182,7 +192,8 @@ impl Sample {
             network_out_bytes_per_s: self.network_out.unpack(),
             load_1m: hundredths(self.load),
             battery_percent: (self.battery != NONE_8).then_some(self.battery),
-            temperature_c: (self.temperature != NONE_8).then(|| f32::from(self.temperature) + COLDEST_C),
+            temperature_c: (self.temperature != NONE_8)
+                .then(|| f32::from(self.temperature) + COLDEST_C),
         }
     }
 }
@@ -192,7 +203,9 @@ impl Rate {
     const MOST: u64 = ((1 << Self::BITS) - 2) << 31;
 
     fn pack(bytes_per_s: Option<u64>) -> Self {
-        let Some(bytes_per_s) = bytes_per_s.map(|rate| rate.min(Self::MOST)) else { return Self(NONE) };
+        let Some(bytes_per_s) = bytes_per_s.map(|rate| rate.min(Self::MOST)) else {
+            return Self(NONE);
+        };
         let shift = (u64::BITS - bytes_per_s.leading_zeros()).saturating_sub(Self::BITS);
         let kept = bytes_per_s >> shift;
         // At most 11 bits above 5: it fits.
@@ -248,8 +261,11 @@ mod tests {
         robots.take(&robot, vitals(10.0), 7_200_000);
         robots.take(&robot, vitals(20.0), 60_000);
         robots.take(&robot, vitals(30.0), 120_000);
-        let hour: Vec<_> =
-            robots.last_hour(&robot, 120_000).iter().map(|said| (said.at_ms, said.cpu_percent)).collect();
+        let hour: Vec<_> = robots
+            .last_hour(&robot, 120_000)
+            .iter()
+            .map(|said| (said.at_ms, said.cpu_percent))
+            .collect();
         assert_eq!(hour, [(60_000, Some(20.0)), (120_000, Some(30.0))]);
     }
 
@@ -270,9 +286,13 @@ mod tests {
         let given = vitals(12.34);
         let packed = Sample::pack(&given, 60).unpack(9, &given);
         let near = |one: Option<u64>, other: Option<u64>| {
-            one.zip(other).is_some_and(|(one, other)| one.abs_diff(other) as f64 <= one as f64 * 0.001)
+            one.zip(other)
+                .is_some_and(|(one, other)| one.abs_diff(other) as f64 <= one as f64 * 0.001)
         };
-        assert_eq!((packed.at_ms, packed.cpu_percent, packed.load_1m), (9, Some(12.34), Some(0.42)));
+        assert_eq!(
+            (packed.at_ms, packed.cpu_percent, packed.load_1m),
+            (9, Some(12.34), Some(0.42))
+        );
         assert_eq!((packed.battery_percent, packed.temperature_c), (Some(80), Some(51.0)));
         assert!(near(given.memory_used_bytes, packed.memory_used_bytes), "{packed:?}");
         assert!(near(given.disk_used_bytes, packed.disk_used_bytes), "{packed:?}");
@@ -298,9 +318,18 @@ mod tests {
         };
         let (all, robot) = (RobotVitals::default(), RobotId::random());
         let newest = all.take(&robot, said, 5);
-        assert_eq!((newest.cpu_percent, newest.memory_used_bytes, newest.disk_used_bytes), (None, Some(0), None));
-        assert_eq!((newest.load_1m, newest.battery_percent, newest.temperature_c), (Some(0.0), Some(100), Some(200.0)));
+        assert_eq!(
+            (newest.cpu_percent, newest.memory_used_bytes, newest.disk_used_bytes),
+            (None, Some(0), None)
+        );
+        assert_eq!(
+            (newest.load_1m, newest.battery_percent, newest.temperature_c),
+            (Some(0.0), Some(100), Some(200.0))
+        );
         let packed = all.last_hour(&robot, 5).remove(0);
-        assert_eq!((packed.memory_used_bytes, packed.network_in_bytes_per_s), (None, Some(Rate::MOST)));
+        assert_eq!(
+            (packed.memory_used_bytes, packed.network_in_bytes_per_s),
+            (None, Some(Rate::MOST))
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! The API's one error shape: a status, a stable code for programs and a sentence for people. It never tells a caller
-//! what went wrong inside: that is logged.
+//! The API's one error shape: a status, a stable code for programs and a sentence for people. It
+//! never tells a caller what went wrong inside: that is logged.
 
 use std::io;
 
@@ -55,13 +55,15 @@ impl ApiError {
 
     /// 401: the robot was revoked.
     pub fn robot_revoked() -> Self {
-        let message = "this robot was revoked: it comes back only by an enrolment with a token made for it";
+        let message =
+            "this robot was revoked: it comes back only by an enrolment with a token made for it";
         Self::new(StatusCode::UNAUTHORIZED, ROBOT_REVOKED, message)
     }
 
     /// 403: the robot waits to be approved.
     pub fn awaits_approval() -> Self {
-        let message = "this robot waits to be approved: an administrator does that with taskd robot approve";
+        let message =
+            "this robot waits to be approved: an administrator does that with taskd robot approve";
         Self::new(StatusCode::FORBIDDEN, api::AWAITS_APPROVAL, message)
     }
 
@@ -72,7 +74,8 @@ impl ApiError {
 
     /// 403: it is not one of the person's robots, or concerns none of them.
     pub fn out_of_scope(what: impl std::fmt::Display, by: &Person) -> Self {
-        let message = format!("{what} is outside of {}'s scope {:?}", by.name, by.scope.to_string());
+        let message =
+            format!("{what} is outside of {}'s scope {:?}", by.name, by.scope.to_string());
         Self::new(StatusCode::FORBIDDEN, "out_of_scope", message)
     }
 
@@ -99,7 +102,11 @@ impl ApiError {
     /// 500: our own failure, logged here with its causes.
     pub fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error, "a request failed");
-        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "internal", "the server failed; its log says why")
+        Self::new(
+            StatusCode::INTERNAL_SERVER_ERROR,
+            "internal",
+            "the server failed; its log says why",
+        )
     }
 
     /// 507: the server's disk is full.
@@ -128,18 +135,22 @@ impl ApiError {
             _ => "UNSUPPORTED",
         };
         let body = json!({ "errors": [{ "code": code, "message": self.message }] });
-        // Registry clients send the password only after a Basic challenge; a page must not see one, or the browser
-        // would ask its user.
+        // Registry clients send the password only after a Basic challenge; a page must not see one,
+        // or the browser would ask its user.
         self.with_headers("Basic realm=\"taskd\"", Json(body))
     }
 
     fn with_headers(&self, challenge: &'static str, body: impl IntoResponse) -> Response {
         let mut response = (self.status, body).into_response();
         if self.status == StatusCode::UNAUTHORIZED {
-            response.headers_mut().insert(header::WWW_AUTHENTICATE, HeaderValue::from_static(challenge));
+            response
+                .headers_mut()
+                .insert(header::WWW_AUTHENTICATE, HeaderValue::from_static(challenge));
         }
         if matches!(self.status, StatusCode::TOO_MANY_REQUESTS | StatusCode::SERVICE_UNAVAILABLE) {
-            response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(self.retry_after_s));
+            response
+                .headers_mut()
+                .insert(header::RETRY_AFTER, HeaderValue::from(self.retry_after_s));
         }
         response
     }
@@ -195,7 +206,9 @@ impl From<ActionError> for ApiError {
         let status = match error {
             ActionError::Store(error) => return error.into(),
             ActionError::PasswordFailed => return Self::internal(&error),
-            ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => StatusCode::BAD_REQUEST,
+            ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => {
+                StatusCode::BAD_REQUEST
+            }
             ActionError::TokenRefused | ActionError::SignInRefused => StatusCode::UNAUTHORIZED,
             ActionError::TokenForOther { .. }
             | ActionError::OutOfScope { .. }
@@ -205,9 +218,9 @@ impl From<ActionError> for ApiError {
             ActionError::TooManyEnrolments { seconds } => {
                 return Self { retry_after_s: seconds, ..Self::too_many(error.to_string()) };
             }
-            ActionError::SignInBlocked { .. } | ActionError::TooManySignIns | ActionError::TooManyPending(_) => {
-                StatusCode::TOO_MANY_REQUESTS
-            }
+            ActionError::SignInBlocked { .. }
+            | ActionError::TooManySignIns
+            | ActionError::TooManyPending(_) => StatusCode::TOO_MANY_REQUESTS,
             ActionError::RobotNotFound(_)
             | ActionError::DeploymentNotFound(_)
             | ActionError::PackageNotFound(..)
@@ -246,7 +259,9 @@ impl From<ReportError> for ApiError {
             ReportError::RobotNotFound(_) => Self::not_found(error.to_string()),
             ReportError::TokenEnded(_) => Self::unauthorized(error.to_string()),
             ReportError::NotStored(Some(fault)) => fault.into(),
-            ReportError::Busy | ReportError::NotStored(None) => Self::unavailable(error.to_string()),
+            ReportError::Busy | ReportError::NotStored(None) => {
+                Self::unavailable(error.to_string())
+            }
         }
     }
 }

@@ -1,5 +1,6 @@
-//! The event stream: notices of change, gathered for a moment, read once from the store and sent to every listener whose
-//! robots they concern. It never replays: whoever missed something is told so and fetches the lists again.
+//! The event stream: notices of change, gathered for a moment, read once from the store and sent to
+//! every listener whose robots they concern. It never replays: whoever missed something is told so
+//! and fetches the lists again.
 
 use std::collections::{BTreeSet, HashSet, VecDeque};
 use std::convert::Infallible;
@@ -35,7 +36,8 @@ use crate::system::clock::Clock;
 const GATHER: Duration = Duration::from_millis(200);
 /// Events a slow listener may fall behind before it misses some.
 const BACKLOG: usize = 16 * 1024;
-/// And their bytes; of more than that the oldest go, and who has not taken them yet has missed them.
+/// And their bytes; of more than that the oldest go, and who has not taken them yet has missed
+/// them.
 const BACKLOG_BYTES: usize = 64 << 20;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
@@ -78,7 +80,8 @@ impl Drop for Text {
     }
 }
 
-/// The texts that wait for listeners, the oldest first. Those that all have taken are gone from it by themselves.
+/// The texts that wait for listeners, the oldest first. Those that all have taken are gone from it
+/// by themselves.
 #[derive(Debug, Clone, Default)]
 struct Backlog {
     texts: Arc<Mutex<VecDeque<Weak<Text>>>>,
@@ -89,12 +92,15 @@ impl Backlog {
     /// Keeps one more, in the place of the oldest if there are too many bytes.
     fn keep(&self, text: Arc<str>) -> Arc<Text> {
         self.kept_bytes.fetch_add(text.len(), Ordering::Relaxed);
-        let kept = Arc::new(Text { text: Mutex::new(Some(text)), kept_bytes: self.kept_bytes.clone() });
+        let kept =
+            Arc::new(Text { text: Mutex::new(Some(text)), kept_bytes: self.kept_bytes.clone() });
         let mut texts = self.texts.lock().unwrap_or_else(PoisonError::into_inner);
         texts.push_back(Arc::downgrade(&kept));
         while let Some(oldest) = texts.front() {
             match oldest.upgrade() {
-                Some(text) if self.kept_bytes.load(Ordering::Relaxed) > BACKLOG_BYTES => text.let_go(),
+                Some(text) if self.kept_bytes.load(Ordering::Relaxed) > BACKLOG_BYTES => {
+                    text.let_go()
+                }
                 Some(_) => break,
                 None => {}
             }
@@ -208,8 +214,9 @@ impl EventFeed {
             return Err(ApiError::unavailable("too many pages listen to events already"));
         }
         if all.iter().filter(|other| other.name == *name).count() >= MOST_OF_ONE {
-            let message =
-                format!("{name} listens to events and logs {MOST_OF_ONE} times already; close a page or a log");
+            let message = format!(
+                "{name} listens to events and logs {MOST_OF_ONE} times already; close a page or a log"
+            );
             return Err(ApiError::unavailable(message));
         }
         let listener = Listener { name: name.clone(), scope: scope.clone() };
@@ -252,13 +259,20 @@ impl EventFeed {
         }
     }
 
-    async fn send_all(&self, source: &EventSource, gathered: BTreeSet<Change>) -> Result<(), StoreError> {
+    async fn send_all(
+        &self,
+        source: &EventSource,
+        gathered: BTreeSet<Change>,
+    ) -> Result<(), StoreError> {
         let (mut robots, mut deployments) = (BTreeSet::new(), BTreeSet::new());
         for change in gathered {
             match change {
                 Change::Robot(id) => drop(robots.insert(id)),
                 Change::RobotRemoved(robot) => {
-                    self.send(&Event::RobotRemoved { id: robot.id.clone() }, Audience::Robot(Arc::new(*robot)));
+                    self.send(
+                        &Event::RobotRemoved { id: robot.id.clone() },
+                        Audience::Robot(Arc::new(*robot)),
+                    );
                 }
                 Change::Scopes => self.send(&Event::Missed, Audience::Limited),
                 Change::Package(name) => self.send(&Event::Package { name }, Audience::Everybody),
@@ -272,7 +286,12 @@ impl EventFeed {
         for mut robot in source.store.robots_among(&robots).await? {
             complete_robot(&mut robot, &source.presence, &source.conduct, &source.vitals, now_ms);
             let RobotView { id, name, mac, labels, .. } = &robot;
-            let known = KnownRobot { id: id.clone(), name: name.clone(), mac: *mac, labels: labels.clone() };
+            let known = KnownRobot {
+                id: id.clone(),
+                name: name.clone(),
+                mac: *mac,
+                labels: labels.clone(),
+            };
             self.send(&Event::Robot { robot: Box::new(robot) }, Audience::Robot(Arc::new(known)));
         }
         Ok(())
@@ -289,7 +308,8 @@ impl EventFeed {
         }
     }
 
-    /// Whoever has a limited scope gets their part of a deployment; it is read and written once for all with that scope.
+    /// Whoever has a limited scope gets their part of a deployment; it is read and written once for
+    /// all with that scope.
     async fn send_deployments(
         &self,
         source: &EventSource,
@@ -300,7 +320,8 @@ impl EventFeed {
         }
         let mut scopes = Vec::new();
         for scope in self.listeners.limited_scopes() {
-            let robots: HashSet<RobotId> = source.store.robots_in(&scope).await?.into_iter().collect();
+            let robots: HashSet<RobotId> =
+                source.store.robots_in(&scope).await?.into_iter().collect();
             scopes.push((scope, robots));
         }
         for id in deployments {
@@ -367,7 +388,9 @@ pub(super) async fn stream(
     let mut has_missed = false;
     let events = lines.filter_map(move |line| {
         let (name, text) = match line {
-            Ok(line) if !line.audience.includes(&place.listener.scope) => return std::future::ready(None),
+            Ok(line) if !line.audience.includes(&place.listener.scope) => {
+                return std::future::ready(None);
+            }
             Ok(line) => (line.name, line.text.get()),
             Err(_) => ("missed", None),
         };
@@ -380,14 +403,21 @@ pub(super) async fn stream(
         std::future::ready((!is_said).then_some(Ok(event)))
     });
     // A first line, so that proxies pass the headers on and the page knows that it is connected.
-    let greeting =
-        futures_util::stream::iter([Ok(SentEvent::default().retry(Duration::from_secs(2)).comment("hello"))]);
+    let greeting = futures_util::stream::iter([Ok(SentEvent::default()
+        .retry(Duration::from_secs(2))
+        .comment("hello"))]);
     let events = greeting.chain(events).take_until(end_of_stream(&app, by, None, &headers)?);
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 
-/// Whether the token still stands for the same person with the same rights, and the robot, if it is about one, is theirs.
-async fn still_may(app: &App, by: &Person, token: &Token, robot: Option<&RobotId>) -> Result<bool, StoreError> {
+/// Whether the token still stands for the same person with the same rights, and the robot, if it is
+/// about one, is theirs.
+async fn still_may(
+    app: &App,
+    by: &Person,
+    token: &Token,
+    robot: Option<&RobotId>,
+) -> Result<bool, StoreError> {
     match app.store.token_holder(token, app.clock.now_ms()).await? {
         Some(TokenHolder::Person(person)) if person.has_the_rights_of(by) => {}
         _ => return Ok(false),
@@ -397,8 +427,9 @@ async fn still_may(app: &App, by: &Person, token: &Token, robot: Option<&RobotId
     Ok(robot.is_some_and(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels)))
 }
 
-/// Resolves when whoever sent these headers may listen no longer: their session ended (perhaps since the guard looked), or
-/// what they may has changed, or `robot` is none of theirs any more. Whoever may something else then comes again and gets that.
+/// Resolves when whoever sent these headers may listen no longer: their session ended (perhaps
+/// since the guard looked), or what they may has changed, or `robot` is none of theirs any more.
+/// Whoever may something else then comes again and gets that.
 pub(super) fn end_of_stream(
     app: &App,
     by: Person,
@@ -411,7 +442,11 @@ pub(super) fn end_of_stream(
     } else {
         let session = app.sessions.find(headers, now_ms);
         let session = session.ok_or_else(|| ApiError::unauthorized("the session has ended"))?;
-        (session.token, session.ended, Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms)))
+        (
+            session.token,
+            session.ended,
+            Duration::from_millis(session.expires_at_ms.saturating_sub(now_ms)),
+        )
     };
     let (stop, app, mut rights) = (app.stop.clone(), app.clone(), app.changes.rights());
     let may_no_longer = async move {
@@ -456,8 +491,12 @@ mod tests {
             send();
         }
         assert_eq!(kept_bytes(), BACKLOG_BYTES);
-        let heard: Vec<bool> = (0..lines).map(|_| slow.try_recv().expect("a line").text.get().is_some()).collect();
-        assert!(heard[..3].iter().all(|was_kept| !was_kept) && heard[3..].iter().all(|was_kept| *was_kept));
+        let heard: Vec<bool> =
+            (0..lines).map(|_| slow.try_recv().expect("a line").text.get().is_some()).collect();
+        assert!(
+            heard[..3].iter().all(|was_kept| !was_kept)
+                && heard[3..].iter().all(|was_kept| *was_kept)
+        );
         assert_eq!(kept_bytes(), 0, "all of them were taken");
     }
 
@@ -466,7 +505,10 @@ mod tests {
         let (feed, everything) = (EventFeed::new(), Scope::everything());
         let lab = Scope::of(["site=lab".parse().expect("a selector")]);
         let mut held: Vec<Place> = (0..MOST_OF_ONE)
-            .map(|n| feed.place(&name("alice"), if n % 2 == 0 { &everything } else { &lab }).expect("room"))
+            .map(|n| {
+                feed.place(&name("alice"), if n % 2 == 0 { &everything } else { &lab })
+                    .expect("room")
+            })
             .collect();
         let refused = feed.place(&name("alice"), &lab).map(drop).expect_err("she has her share");
         assert_eq!((refused.status.as_u16(), refused.code), (503, "unavailable"));
@@ -482,8 +524,10 @@ mod tests {
     #[test]
     fn all_together_have_so_many_places() {
         let (feed, everything) = (EventFeed::new(), Scope::everything());
-        let comers: Vec<UserName> = (0..=MOST_LISTENERS).map(|n| name(&format!("user{n}"))).collect();
-        let held: Vec<Place> = comers[1..].iter().map(|name| feed.place(name, &everything).expect("room")).collect();
+        let comers: Vec<UserName> =
+            (0..=MOST_LISTENERS).map(|n| name(&format!("user{n}"))).collect();
+        let held: Vec<Place> =
+            comers[1..].iter().map(|name| feed.place(name, &everything).expect("room")).collect();
         let refused = feed.place(&comers[0], &everything).map(drop).expect_err("all are taken");
         assert_eq!((refused.status.as_u16(), refused.code), (503, "unavailable"));
         drop(held);

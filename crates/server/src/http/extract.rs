@@ -1,5 +1,5 @@
-//! What handlers take out of a request: JSON bodies, path and query parameters, the idempotency key. Whatever does not
-//! parse is refused here in the API's error shape, naming the field.
+//! What handlers take out of a request: JSON bodies, path and query parameters, the idempotency
+//! key. Whatever does not parse is refused here in the API's error shape, naming the field.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -16,7 +16,8 @@ use task_proto::api::MOST_ON_A_PAGE;
 use super::error::ApiError;
 use crate::orders::actions::IdempotencyKey;
 
-/// A JSON body from an operator. A field that this version does not know is refused: it would be an order half done.
+/// A JSON body from an operator. A field that this version does not know is refused: it would be an
+/// order half done.
 pub struct JsonBody<T>(pub T);
 
 /// A JSON body from an agent, which may be newer than this server: unknown fields are passed over.
@@ -42,16 +43,23 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequest<S> for TolerantJson<T> {
 }
 
 async fn json_bytes<S: Send + Sync>(request: Request, state: &S) -> Result<Bytes, ApiError> {
-    let content_type = request.headers().get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let content_type =
+        request.headers().get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok());
     let media_type = content_type.unwrap_or_default().split(';').next().unwrap_or_default().trim();
     if !media_type.eq_ignore_ascii_case("application/json") {
         let message = "Content-Type: expected application/json";
-        return Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message));
+        return Err(ApiError::new(
+            StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            "unsupported_media_type",
+            message,
+        ));
     }
     Bytes::from_request(request, state).await.map_err(|rejection| match rejection.status() {
-        StatusCode::PAYLOAD_TOO_LARGE => {
-            ApiError::new(StatusCode::PAYLOAD_TOO_LARGE, "too_large", "the body is larger than this route allows")
-        }
+        StatusCode::PAYLOAD_TOO_LARGE => ApiError::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            "too_large",
+            "the body is larger than this route allows",
+        ),
         _ => ApiError::invalid("the body ended before it was complete"),
     })
 }
@@ -81,13 +89,14 @@ fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), Api
     }
 }
 
-/// The path of a field that is not known, in the body or in what is in it. Inside, null and {} are the same as nothing, which
-/// is not written out again.
+/// The path of a field that is not known, in the body or in what is in it. Inside, null and {} are
+/// the same as nothing, which is not written out again.
 fn unknown_field(given: &serde_json::Map<String, Value>, known: &Value) -> Option<String> {
     given.iter().find_map(|(key, value)| {
         let Some(known) = known.get(key) else { return Some(key.clone()) };
-        let says_something =
-            |(_, value): &(&String, &Value)| !value.is_null() && value.as_object().is_none_or(|o| !o.is_empty());
+        let says_something = |(_, value): &(&String, &Value)| {
+            !value.is_null() && value.as_object().is_none_or(|o| !o.is_empty())
+        };
         let said = value.as_object()?.iter().filter(says_something);
         let given = said.map(|(key, value)| (key.clone(), value.clone())).collect();
         Some(format!("{key}.{}", unknown_field(&given, known)?))
@@ -102,7 +111,8 @@ impl<S: Send + Sync, T: FromStr<Err: Display>> FromRequestParts<S> for PathParam
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
         let missing = || ApiError::not_found("there is nothing at this path");
-        let params = RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
+        let params =
+            RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
         let (_, text) = params.iter().next().ok_or_else(missing)?;
         text.parse().map(Self).map_err(|error: T::Err| ApiError::not_found(error.to_string()))
     }
@@ -121,12 +131,15 @@ where
 
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
         let missing = || ApiError::not_found("there is nothing at this path");
-        let params = RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
+        let params =
+            RawPathParams::from_request_parts(parts, state).await.map_err(|_| missing())?;
         let mut texts = params.iter().map(|(_, text)| text);
         let first = texts.next().ok_or_else(missing)?;
-        let first = first.parse().map_err(|error: A::Err| ApiError::not_found(error.to_string()))?;
+        let first =
+            first.parse().map_err(|error: A::Err| ApiError::not_found(error.to_string()))?;
         let second = texts.next().ok_or_else(missing)?;
-        let second = second.parse().map_err(|error: B::Err| ApiError::not_found(error.to_string()))?;
+        let second =
+            second.parse().map_err(|error: B::Err| ApiError::not_found(error.to_string()))?;
         Ok(Self(first, second))
     }
 }
@@ -148,13 +161,16 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
 pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {
     match limit {
         None | Some(1..=MOST_ON_A_PAGE) => Ok(limit),
-        Some(other) => Err(ApiError::invalid(format!("limit: expected 1 to {MOST_ON_A_PAGE}, not {other}"))),
+        Some(other) => {
+            Err(ApiError::invalid(format!("limit: expected 1 to {MOST_ON_A_PAGE}, not {other}")))
+        }
     }
 }
 
 /// The key that makes an order safe to repeat.
 pub fn idempotency_key(value: Option<&HeaderValue>) -> Result<IdempotencyKey, ApiError> {
-    let value = value.ok_or_else(|| ApiError::invalid("Idempotency-Key: an order needs this header"))?;
+    let value =
+        value.ok_or_else(|| ApiError::invalid("Idempotency-Key: an order needs this header"))?;
     Ok(value.to_str().unwrap_or_default().parse()?)
 }
 
@@ -166,7 +182,9 @@ mod tests {
     #[test]
     fn a_body_that_does_not_fit_names_the_field() {
         let digest = task_proto::Digest::of(b"x");
-        let body = |rest: &str| format!(r#"{{"package": "talker", "manifest": "{digest}", "selector": "*"{rest}}}"#);
+        let body = |rest: &str| {
+            format!(r#"{{"package": "talker", "manifest": "{digest}", "selector": "*"{rest}}}"#)
+        };
         let cases = [
             ("{".to_owned(), "the body: EOF"),
             ("[]".to_owned(), "the body: "),

@@ -189,7 +189,13 @@ pub struct Route {
 impl Route {
     /// A route of the API, with a small body and the common deadline.
     #[expect(clippy::expect_used, reason = "the table is fixed, and a test builds it")]
-    fn new<H, T>(method: Method, path: &'static str, access: Access, handler: H, describe: fn(&mut Draft)) -> Self
+    fn new<H, T>(
+        method: Method,
+        path: &'static str,
+        access: Access,
+        handler: H,
+        describe: fn(&mut Draft),
+    ) -> Self
     where
         H: Handler<T, App>,
         T: 'static,
@@ -197,7 +203,16 @@ impl Route {
         let filter = MethodFilter::try_from(method.clone()).expect("a method that axum routes");
         let (body_bytes, deadline) = (SMALL_BODY_BYTES, Some(DEADLINE));
         let (waits_for_robot, handler) = (false, on(filter, handler));
-        Self { method: Some(method), path, access, body_bytes, deadline, waits_for_robot, handler, describe }
+        Self {
+            method: Some(method),
+            path,
+            access,
+            body_bytes,
+            deadline,
+            waits_for_robot,
+            handler,
+            describe,
+        }
     }
 
     /// A route for every method, whose handler streams and bounds itself.
@@ -207,7 +222,16 @@ impl Route {
         T: 'static,
     {
         let (body_bytes, waits_for_robot, handler) = (usize::MAX, false, any(handler));
-        Self { method: None, path, access, body_bytes, deadline: None, waits_for_robot, handler, describe }
+        Self {
+            method: None,
+            path,
+            access,
+            body_bytes,
+            deadline: None,
+            waits_for_robot,
+            handler,
+            describe,
+        }
     }
 
     fn body_bytes(self, body_bytes: usize) -> Self {
@@ -285,8 +309,10 @@ pub fn routes() -> Vec<Route> {
         route!(GET "/api/v1/robots/{robot}", Person(Read), robots::show),
         route!(PATCH "/api/v1/robots/{robot}", Person(Maintain), robots::edit),
         route!(DELETE "/api/v1/robots/{robot}", Person(Maintain), robots::remove),
-        route!(POST "/api/v1/bulk/labels", Person(Maintain), bulk::labels).body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/bulk/remove", Person(Maintain), bulk::remove).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/bulk/labels", Person(Maintain), bulk::labels)
+            .body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/bulk/remove", Person(Maintain), bulk::remove)
+            .body_bytes(ORDER_BODY_BYTES),
         route!(GET "/api/v1/pending-robots", Person(Administer), enroll::pending),
         route!(POST "/api/v1/robots/{robot}/approve", Person(Administer), enroll::approve),
         route!(POST "/api/v1/robots/{robot}/reject", Person(Administer), enroll::reject),
@@ -294,7 +320,8 @@ pub fn routes() -> Vec<Route> {
         route!(GET "/api/v1/robots/{robot}/desired", OwnRobot, robots::desired),
         route!(GET "/api/v1/robots/{robot}/mqtt", OwnRobot, broker::endpoint),
         route!(POST "/api/v1/robots/{robot}/token", OwnRobot, robots::next_token),
-        route!(POST "/api/v1/robots/{robot}/report", OwnRobot, robots::report).body_bytes(REPORT_BODY_BYTES),
+        route!(POST "/api/v1/robots/{robot}/report", OwnRobot, robots::report)
+            .body_bytes(REPORT_BODY_BYTES),
         route!(POST "/api/v1/robots/{robot}/telemetry", OwnRobot, vitals::telemetry),
         route!(GET "/api/v1/robots/{robot}/tasks", Person(Read), history::tasks),
         route!(GET "/api/v1/robots/{robot}/vitals", Person(Read), vitals::show),
@@ -313,23 +340,30 @@ fn routes_of_work() -> Vec<Route> {
         route!(GET "/api/v1/packages", Person(Read), packages::list),
         route!(POST "/api/v1/packages", Person(Publish), upload::package).streaming(),
         route!(GET "/api/v1/packages/{package}", Person(Read), packages::show),
-        route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff).within(archives::READING),
+        route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff)
+            .within(archives::READING),
         route!(GET "/api/v1/packages/{package}/{version}/files", Person(Read), packages::files)
             .within(archives::READING),
         route!(DELETE "/api/v1/packages/{package}/{version}", Person(Publish), packages::remove),
         route!(GET "/api/v1/outputs", Person(Read), outputs::list),
         route!(GET "/api/v1/deployments", Person(Read), deployments::list),
-        route!(POST "/api/v1/deployments", Person(Operate), deployments::create).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/deployments", Person(Operate), deployments::create)
+            .body_bytes(ORDER_BODY_BYTES),
         route!(GET "/api/v1/deployments/{deployment}", Person(Read), deployments::show),
         route!(POST "/api/v1/deployments/{deployment}/cancel", Person(Operate), deployments::cancel),
         route!(POST "/api/v1/deployments/{deployment}/resume", Person(Operate), deployments::resume),
         route!(POST "/api/v1/deployments/{deployment}/retry", Person(Operate), deployments::retry)
             .body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/tasks/{task}/start", Person(Operate), tasks::start).body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/tasks/{task}/restart", Person(Operate), tasks::restart).body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/tasks/{task}/rollback", Person(Operate), tasks::rollback).body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/tasks/{task}/stop", Person(Operate), tasks::stop).body_bytes(ORDER_BODY_BYTES),
-        route!(POST "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove).body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/start", Person(Operate), tasks::start)
+            .body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/restart", Person(Operate), tasks::restart)
+            .body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/rollback", Person(Operate), tasks::rollback)
+            .body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/stop", Person(Operate), tasks::stop)
+            .body_bytes(ORDER_BODY_BYTES),
+        route!(POST "/api/v1/tasks/{task}/remove", Person(Operate), tasks::remove)
+            .body_bytes(ORDER_BODY_BYTES),
         route!(GET "/api/v1/feed", Person(Read), feed::feed),
         route!(GET "/api/v1/events", Person(Read), events::stream).streaming(),
         route!(GET "/api/openapi.json", Anyone, openapi::show),
@@ -366,7 +400,8 @@ pub fn router(app: App) -> Router {
     // Nothing stands in the way of each request where nobody is to be believed.
     let router = match trusted.is_empty() {
         true => router,
-        false => router.layer(middleware::map_request_with_state(trusted, connection::proxy::see_through)),
+        false => router
+            .layer(middleware::map_request_with_state(trusted, connection::proxy::see_through)),
     };
     router.with_state(app)
 }
@@ -381,7 +416,8 @@ async fn method_not_allowed(request: Request) -> Response {
 }
 
 /// What a browser may do with an answer that is not the page: nothing.
-const ANSWER_POLICY: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
+const ANSWER_POLICY: &str =
+    "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
 
 /// Headers for browsers: nothing is ever framed or sniffed, or shown to other pages.
 async fn harden(mut response: Response) -> Response {
@@ -396,7 +432,9 @@ async fn harden(mut response: Response) -> Response {
     for (name, value) in HEADERS {
         headers.insert(name, HeaderValue::from_static(value));
     }
-    headers.entry(header::CONTENT_SECURITY_POLICY).or_insert(HeaderValue::from_static(ANSWER_POLICY));
+    headers
+        .entry(header::CONTENT_SECURITY_POLICY)
+        .or_insert(HeaderValue::from_static(ANSWER_POLICY));
     headers.entry(header::CACHE_CONTROL).or_insert(HeaderValue::from_static("no-store"));
     response
 }

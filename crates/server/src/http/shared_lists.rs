@@ -1,5 +1,6 @@
-//! Long lists, rendered once for all requests that may share the answer. A request never gets an answer that was begun before
-//! it came: while one rendering is under way, later requests for the same list wait and share the next one.
+//! Long lists, rendered once for all requests that may share the answer. A request never gets an
+//! answer that was begun before it came: while one rendering is under way, later requests for the
+//! same list wait and share the next one.
 
 use std::collections::HashMap;
 use std::marker::PhantomData;
@@ -30,7 +31,10 @@ pub(super) struct ListKey {
 impl ListKey {
     /// The list that a person with this scope gets at `uri`.
     pub(super) fn new(scope: &Scope, uri: &Uri) -> Self {
-        Self { scope: scope.selectors().iter().map(ToString::to_string).collect(), target: uri.to_string() }
+        Self {
+            scope: scope.selectors().iter().map(ToString::to_string).collect(),
+            target: uri.to_string(),
+        }
     }
 }
 
@@ -70,8 +74,8 @@ impl Default for SharedLists {
 }
 
 impl SharedLists {
-    /// The list with this key, from a rendering that begins after this call. If `render` fails, this request fails, and the
-    /// next one that waits renders.
+    /// The list with this key, from a rendering that begins after this call. If `render` fails,
+    /// this request fails, and the next one that waits renders.
     pub(super) async fn get<T: Serialize>(
         &self,
         key: ListKey,
@@ -86,7 +90,9 @@ impl SharedLists {
                 let _permit = self.renderings.acquire().await;
                 let begun = Instant::now();
                 let list = render.await?;
-                let body = Bytes::from(serde_json::to_vec(&list).map_err(|error| ApiError::internal(&error))?);
+                let body = Bytes::from(
+                    serde_json::to_vec(&list).map_err(|error| ApiError::internal(&error))?,
+                );
                 *last = Some(Rendering { begun, body: body.clone() });
                 body
             }
@@ -153,8 +159,13 @@ mod tests {
         assert!(poll_immediate(&mut later).await.is_none());
         release.send(()).expect("awaited");
         assert_eq!(&first.await.expect("rendered").body[..], b"\"first\"");
-        let bodies: Vec<_> = later.await.into_iter().map(|list| list.expect("rendered").body).collect();
-        assert!(bodies.iter().all(|body| body[..] == *b"\"second\"" && body.as_ptr() == bodies[0].as_ptr()));
+        let bodies: Vec<_> =
+            later.await.into_iter().map(|list| list.expect("rendered").body).collect();
+        assert!(
+            bodies
+                .iter()
+                .all(|body| body[..] == *b"\"second\"" && body.as_ptr() == bodies[0].as_ptr())
+        );
         assert_eq!(count.get(), 1);
         assert!(lists.lists().is_empty(), "nothing is kept");
     }
@@ -181,7 +192,8 @@ mod tests {
     #[tokio::test]
     async fn failed_or_dropped_rendering_leaves_the_list_to_the_next_request() {
         let lists = SharedLists::default();
-        let mut dropped = Box::pin(lists.get(key("/robots"), std::future::pending::<Result<(), _>>()));
+        let mut dropped =
+            Box::pin(lists.get(key("/robots"), std::future::pending::<Result<(), _>>()));
         assert!(poll_immediate(&mut dropped).await.is_none());
         let failed = lists.get(key("/robots"), async { Err::<(), _>(ApiError::not_found("gone")) });
         let good = lists.get(key("/robots"), async { Ok("good") });

@@ -12,7 +12,13 @@ use crate::fleet::robot_vitals::RobotVitals;
 use crate::limits::conduct::Conduct;
 
 /// Adds where a robot is, how it behaves and does, and what is wrong with its identity.
-pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Conduct, vitals: &RobotVitals, now_ms: u64) {
+pub fn complete_robot(
+    view: &mut RobotView,
+    presence: &Presence,
+    conduct: &Conduct,
+    vitals: &RobotVitals,
+    now_ms: u64,
+) {
     view.vitals = vitals.newest(&view.id);
     if let Some(text) = conduct.trouble(&view.id) {
         view.conditions.insert(0, Condition { code: "misbehaves".to_owned(), text });
@@ -24,7 +30,8 @@ pub fn complete_robot(view: &mut RobotView, presence: &Presence, conduct: &Condu
     if sighting.waits {
         let text = "another agent came with this robot's identity, and gets no work before the one that is known was \
                     silent for 30 s: the robot was started again, or its identity is used elsewhere";
-        view.conditions.insert(0, Condition { code: "instance_waits".to_owned(), text: text.to_owned() });
+        view.conditions
+            .insert(0, Condition { code: "instance_waits".to_owned(), text: text.to_owned() });
     }
     if sighting.duplicate {
         let text = "two agents use this robot's identity and keep displacing each other; enrol one of them again";
@@ -47,10 +54,13 @@ pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<D
     if assignments.is_empty() {
         return None;
     }
-    let count = |phase: &Phase| assignments.iter().filter(|assignment| assignment.phase == *phase).count() as u64;
+    let count = |phase: &Phase| {
+        assignments.iter().filter(|assignment| assignment.phase == *phase).count() as u64
+    };
     let counts = Phase::ALL.iter().map(|phase| PhaseCount { phase: *phase, count: count(phase) });
     view.counts = counts.filter(|counted| counted.count > 0).collect();
-    let (is_cancelled, is_paused) = (view.state == DeploymentState::Cancelled, view.state == DeploymentState::Paused);
+    let (is_cancelled, is_paused) =
+        (view.state == DeploymentState::Cancelled, view.state == DeploymentState::Paused);
     view.state = deployment::state(view.kind, is_cancelled, is_paused, &view.counts);
     Some(without_others(view))
 }

@@ -1,6 +1,7 @@
-//! How robots behave, and what follows: one that sends more than it may is slowed, on its own connection only; one that goes on
-//! with it, or does what none of ours would, is cut off and may come back after a while that doubles. What is known of a
-//! robot is in memory, and forgotten once it has behaved for long enough. It touches no socket and reads no clock.
+//! How robots behave, and what follows: one that sends more than it may is slowed, on its own
+//! connection only; one that goes on with it, or does what none of ours would, is cut off and may
+//! come back after a while that doubles. What is known of a robot is in memory, and forgotten once
+//! it has behaved for long enough. It touches no socket and reads no clock.
 
 use std::collections::{BTreeSet, HashMap};
 use std::fmt;
@@ -17,7 +18,8 @@ use super::rate_limit::{BURST, MAX_HELD, TokenBucket};
 
 /// How often the time that a robot has to stay away doubles.
 const MAX_DOUBLINGS: u32 = 6;
-/// How many more requests a robot may make for what it brings back: a run has up to 256 files, each of which takes some.
+/// How many more requests a robot may make for what it brings back: a run has up to 256 files, each
+/// of which takes some.
 const OUTPUT_REQUESTS: u64 = 10;
 /// What beginning a session costs, in messages.
 pub const SESSION_COST: u64 = 10;
@@ -29,7 +31,8 @@ pub struct ConductLimits {
     pub messages_per_s: u64,
     /// Bytes a second over MQTT, likewise; all of them count.
     pub bytes_per_s: u64,
-    /// Requests a second, likewise, those for a package's bytes excepted; and ten times as many for what it brings back.
+    /// Requests a second, likewise, those for a package's bytes excepted; and ten times as many for
+    /// what it brings back.
     pub requests_per_s: u64,
     /// How long it is slowed before it is cut off.
     pub patience: Duration,
@@ -65,7 +68,8 @@ pub enum Offence {
     TooLarge(usize),
 }
 
-/// By which way a robot comes. Who is cut off on one may still use the other: it must be able to hear that it should stop.
+/// By which way a robot comes. Who is cut off on one may still use the other: it must be able to
+/// hear that it should stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Way {
     /// A session.
@@ -87,7 +91,8 @@ pub enum Verdict {
     Cut(Instant),
 }
 
-/// All robots. One that does nothing unusual is known here only while it is connected, or was a moment ago.
+/// All robots. One that does nothing unusual is known here only while it is connected, or was a
+/// moment ago.
 #[derive(Debug)]
 pub struct Conduct {
     limits: ConductLimits,
@@ -122,7 +127,8 @@ struct Record {
 struct Allowance {
     messages: TokenBucket,
     bytes: Option<TokenBucket>,
-    /// Since when it is slowed, with no rest in between that would have filled half of what it may send at once.
+    /// Since when it is slowed, with no rest in between that would have filled half of what it may
+    /// send at once.
     slowed_since: Option<Instant>,
     barred_until: Option<Instant>,
 }
@@ -196,7 +202,8 @@ impl Record {
                 false
             }
             None => {
-                self.trouble = Some(Trouble { offence, cuts: 0, away: Duration::ZERO, last_at: now });
+                self.trouble =
+                    Some(Trouble { offence, cuts: 0, away: Duration::ZERO, last_at: now });
                 true
             }
         }
@@ -245,10 +252,15 @@ impl Conduct {
     /// What was done about robots so far.
     pub fn totals(&self) -> ConductTotals {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        ConductTotals { slowed: read(&self.slowed), cut: read(&self.cut), turned_away: read(&self.turned_away) }
+        ConductTotals {
+            slowed: read(&self.slowed),
+            cut: read(&self.cut),
+            turned_away: read(&self.turned_away),
+        }
     }
 
-    /// Waits until there is something else to show of robots, and says of which. Dropping the future loses none.
+    /// Waits until there is something else to show of robots, and says of which. Dropping the
+    /// future loses none.
     pub async fn news(&self) -> BTreeSet<RobotId> {
         loop {
             let news = std::mem::take(&mut *lock(&self.news));
@@ -259,7 +271,8 @@ impl Conduct {
         }
     }
 
-    /// Forgives those that have behaved for long enough, and forgets those of which there is nothing to know.
+    /// Forgives those that have behaved for long enough, and forgets those of which there is
+    /// nothing to know.
     pub fn forgive(&self, now: Instant) {
         let mut forgiven = Vec::new();
         lock(&self.robots).retain(|robot, shared| {
@@ -269,7 +282,8 @@ impl Conduct {
                 record.trouble = None;
                 forgiven.push(robot.clone());
             }
-            let is_nothing = record.trouble.is_none() && record.ways().all(|allowance| allowance.is_at_rest(now));
+            let is_nothing = record.trouble.is_none()
+                && record.ways().all(|allowance| allowance.is_at_rest(now));
             drop(record);
             // Whoever holds it would go on with a record that nobody else sees.
             !(is_nothing && Arc::strong_count(shared) == 1)
@@ -293,7 +307,8 @@ impl Watched {
         until
     }
 
-    /// It has sent so many messages, or requests, and bytes. What it sends is counted on all of its connections together.
+    /// It has sent so many messages, or requests, and bytes. What it sends is counted on all of its
+    /// connections together.
     pub fn sent(&self, messages: u64, bytes: u64, now: Instant) -> Verdict {
         let mut record = lock(&self.record);
         let (way, limits) = (self.way, &self.conduct.limits);
@@ -315,11 +330,13 @@ impl Watched {
         Verdict::Slow(until)
     }
 
-    /// It asks for something: [`Verdict::Slow`] says until when to hold it up, [`Verdict::Cut`] when it should ask again.
+    /// It asks for something: [`Verdict::Slow`] says until when to hold it up, [`Verdict::Cut`]
+    /// when it should ask again.
     pub fn asks(&self, now: Instant) -> Verdict {
         match self.sent(1, 0, now) {
             Verdict::Slow(until) if until > now + MAX_HELD => {
-                // It is not served, so it does not count: however many it sends at once, its next turn stays in sight.
+                // It is not served, so it does not count: however many it sends at once, its next
+                // turn stays in sight.
                 let mut record = lock(&self.record);
                 record.on(self.way).messages.give_back(1);
                 drop(record);
@@ -353,7 +370,9 @@ impl fmt::Display for Offence {
             Self::Messages => f.write_str("sends more over MQTT than a robot may"),
             Self::Requests => f.write_str("asks or reports more often than a robot may"),
             Self::Violation(what) => f.write_str(what),
-            Self::TooLarge(bytes) => write!(f, "sends a packet of {bytes} bytes, which is too large"),
+            Self::TooLarge(bytes) => {
+                write!(f, "sends a packet of {bytes} bytes, which is too large")
+            }
         }
     }
 }
@@ -364,13 +383,18 @@ impl fmt::Display for Trouble {
         match cuts {
             0 => write!(f, "it {offence}, and is slowed"),
             1 => write!(f, "it {offence}, and was cut off for {} s", away.as_secs_f64()),
-            cuts => write!(f, "it {offence}, and was cut off {cuts} times, the last time for {} s", away.as_secs_f64()),
+            cuts => write!(
+                f,
+                "it {offence}, and was cut off {cuts} times, the last time for {} s",
+                away.as_secs_f64()
+            ),
         }
     }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+    // half-done.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -383,7 +407,12 @@ mod tests {
     const SECOND: Duration = Duration::from_secs(1);
 
     fn conduct() -> Arc<Conduct> {
-        Conduct::new(ConductLimits { messages_per_s: 10, bytes_per_s: 1000, requests_per_s: 10, ..Default::default() })
+        Conduct::new(ConductLimits {
+            messages_per_s: 10,
+            bytes_per_s: 1000,
+            requests_per_s: 10,
+            ..Default::default()
+        })
     }
 
     #[test]
@@ -391,7 +420,11 @@ mod tests {
         let (conduct, robot, now) = (conduct(), RobotId::random(), Instant::now());
         let watched = conduct.watch(&robot, Way::Mqtt, now);
         for _ in 0..100 {
-            assert_eq!(watched.sent(1, 1, now), Verdict::Fine, "ten seconds' worth may come at once");
+            assert_eq!(
+                watched.sent(1, 1, now),
+                Verdict::Fine,
+                "ten seconds' worth may come at once"
+            );
         }
         assert_eq!(conduct.trouble(&robot), None);
         let mut at = now;
@@ -407,7 +440,10 @@ mod tests {
         };
         assert_eq!(until, at + Duration::from_secs(10));
         assert!((299..=301).contains(&sent), "{sent} messages in half a minute");
-        assert!(watched.barred_until(at + 9 * SECOND).is_some() && watched.barred_until(until).is_none());
+        assert!(
+            watched.barred_until(at + 9 * SECOND).is_some()
+                && watched.barred_until(until).is_none()
+        );
         // What is large counts by its bytes; what is due on the other way does not count here.
         let other = conduct.watch(&RobotId::random(), Way::Mqtt, now);
         assert_eq!(other.sent(1, 10_000, now), Verdict::Fine);
@@ -441,8 +477,17 @@ mod tests {
         }
         assert_eq!(away, [10, 20, 40, 80, 160, 320, 640, 640, 640]);
         let text = conduct.trouble(&robot).expect("shown");
-        assert!(text.contains("packet of 7 bytes") && text.contains("9 times") && text.contains("640 s"), "{text}");
-        assert_eq!(conduct.watch(&robot, Way::Http, now).barred_until(now - SECOND), None, "the other way stays open");
+        assert!(
+            text.contains("packet of 7 bytes")
+                && text.contains("9 times")
+                && text.contains("640 s"),
+            "{text}"
+        );
+        assert_eq!(
+            conduct.watch(&robot, Way::Http, now).barred_until(now - SECOND),
+            None,
+            "the other way stays open"
+        );
         conduct.forgive(now + 599 * SECOND);
         assert!(conduct.trouble(&robot).is_some());
         conduct.forgive(now + 600 * SECOND);
@@ -479,6 +524,9 @@ mod tests {
             }
         }
         assert_eq!(served + refused, 5_000);
-        assert!((215..=225).contains(&served), "{served}: the burst, ten seconds' worth, and who is held up");
+        assert!(
+            (215..=225).contains(&served),
+            "{served}: the burst, ten seconds' worth, and who is held up"
+        );
     }
 }

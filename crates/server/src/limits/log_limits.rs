@@ -1,5 +1,6 @@
-//! How many lines the log gets: of one kind about one robot so many a minute, and so many of one kind in all. What robots,
-//! people or strangers cause again and again fills no disk: what is left out is counted and said once a minute.
+//! How many lines the log gets: of one kind about one robot so many a minute, and so many of one
+//! kind in all. What robots, people or strangers cause again and again fills no disk: what is left
+//! out is counted and said once a minute.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -73,7 +74,9 @@ impl LogLimits {
             }
             for LeftOut { lines, robot, message } in self.turn() {
                 match robot {
-                    Some(robot) => tracing::warn!(robot, lines, "lines were left out like: {message}"),
+                    Some(robot) => {
+                        tracing::warn!(robot, lines, "lines were left out like: {message}")
+                    }
                     None => tracing::warn!(lines, "lines were left out like: {message}"),
                 }
             }
@@ -85,12 +88,15 @@ impl LogLimits {
         let kinds = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         let mut all = Vec::new();
         for Kind { robots, mut left_out, message, .. } in kinds.into_values() {
-            let mut robots: Vec<(String, u64)> = robots.into_iter().map(|(robot, (_, out))| (robot, out)).collect();
+            let mut robots: Vec<(String, u64)> =
+                robots.into_iter().map(|(robot, (_, out))| (robot, out)).collect();
             robots.retain(|(_, out)| *out > 0);
             robots.sort_by_key(|(_, out)| std::cmp::Reverse(*out));
             for (at, (robot, lines)) in robots.into_iter().enumerate() {
                 match at < MOST_NAMED {
-                    true => all.push(LeftOut { lines, robot: Some(robot), message: message.clone() }),
+                    true => {
+                        all.push(LeftOut { lines, robot: Some(robot), message: message.clone() })
+                    }
                     false => left_out += lines,
                 }
             }
@@ -164,7 +170,8 @@ mod tests {
     #[test]
     fn lines_about_one_robot_are_bounded_and_counted() {
         let (limits, count) = (LogLimits::default(), Arc::<AtomicU64>::default());
-        let subscriber = tracing_subscriber::registry().with(Counter(count.clone())).with(limits.clone());
+        let subscriber =
+            tracing_subscriber::registry().with(Counter(count.clone())).with(limits.clone());
         tracing::subscriber::with_default(subscriber, || {
             (0..1000).for_each(|_| complain(1));
             assert_eq!(count.swap(0, Relaxed), MOST_OF_ROBOT);
@@ -186,12 +193,16 @@ mod tests {
     #[test]
     fn lines_of_one_kind_are_bounded_however_many_robots_cause_them() {
         let (limits, count) = (LogLimits::default(), Arc::<AtomicU64>::default());
-        let subscriber = tracing_subscriber::registry().with(Counter(count.clone())).with(limits.clone());
+        let subscriber =
+            tracing_subscriber::registry().with(Counter(count.clone())).with(limits.clone());
         tracing::subscriber::with_default(subscriber, || {
             (0..10_000).for_each(complain);
             assert_eq!(count.swap(0, Relaxed), MOST_OF_KIND);
             let left_out = limits.turn();
-            assert_eq!((left_out.len(), left_out[0].lines, &left_out[0].robot), (1, 10_000 - MOST_OF_KIND, &None));
+            assert_eq!(
+                (left_out.len(), left_out[0].lines, &left_out[0].robot),
+                (1, 10_000 - MOST_OF_KIND, &None)
+            );
             // Without a robot it is the same.
             (0..1000).for_each(|_| tracing::warn!("the database is away"));
             assert_eq!(count.load(Relaxed), MOST_OF_KIND);

@@ -1,5 +1,5 @@
-//! How often something may be done, for each of many: at a steady rate, with some at once. It only counts; the caller
-//! refuses.
+//! How often something may be done, for each of many: at a steady rate, with some at once. It only
+//! counts; the caller refuses.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -29,7 +29,8 @@ impl Pace {
         Self::new(Duration::from_secs(60) / count, count / 6)
     }
 
-    /// Counts one of `key`, unless it has to wait: then nothing is counted, and this is for how long.
+    /// Counts one of `key`, unless it has to wait: then nothing is counted, and this is for how
+    /// long.
     pub fn take(&self, key: &str, now: Instant) -> Result<(), Duration> {
         let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
         let at = due.get(key).map_or(now, |at| (*at).max(now));

@@ -1,5 +1,5 @@
-//! Token buckets: how often something may be done for long, and how much of it at once after a rest. They read no clock and
-//! keep nobody waiting: they say when it is somebody's turn.
+//! Token buckets: how often something may be done for long, and how much of it at once after a
+//! rest. They read no clock and keep nobody waiting: they say when it is somebody's turn.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -10,14 +10,16 @@ use tokio::time::Instant;
 
 /// What may be done at once after a rest, as time at the rate.
 pub const BURST: Duration = Duration::from_secs(10);
-/// The most that may have been done too much, as time at the rate: beyond that a storm would lock its sender out for hours.
+/// The most that may have been done too much, as time at the rate: beyond that a storm would lock
+/// its sender out for hours.
 const MAX_DEBT: Duration = Duration::from_secs(10);
 /// How long a request may be held up; one that would wait longer is refused.
 pub const MAX_HELD: Duration = Duration::from_secs(2);
 /// Above this number of keys those are forgotten that have rested.
 const SWEEP_ABOVE: usize = 1_024;
 
-/// One limit. `next_at` is when the next one would be due if they came evenly; after a rest it is in the past.
+/// One limit. `next_at` is when the next one would be due if they came evenly; after a rest it is
+/// in the past.
 #[derive(Debug)]
 pub struct TokenBucket {
     /// How long one takes at the rate.
@@ -76,7 +78,8 @@ impl<K: Eq + Hash> RateLimiter<K> {
         Self { per_s, buckets: Mutex::default() }
     }
 
-    /// One more comes. What is refused does not count, so however many come at once, the next turn stays in sight.
+    /// One more comes. What is refused does not count, so however many come at once, the next turn
+    /// stays in sight.
     pub fn ask(&self, key: K, now: Instant) -> Turn {
         self.with(key, now, |bucket| match bucket.take(1, now) {
             until if until > now + MAX_HELD => {
@@ -101,7 +104,8 @@ impl<K: Eq + Hash> RateLimiter<K> {
     }
 
     fn buckets(&self) -> MutexGuard<'_, HashMap<K, TokenBucket>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.buckets.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

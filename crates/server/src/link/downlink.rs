@@ -1,11 +1,14 @@
-//! Tells robots of their desired state: the whole signed document where it fits into a message, and with it the blobs
-//! that ride along and still fit; else only its generation. A robot that can't be reached is no error, for both sides compare again when it connects.
+//! Tells robots of their desired state: the whole signed document where it fits into a message, and
+//! with it the blobs that ride along and still fit; else only its generation. A robot that can't be
+//! reached is no error, for both sides compare again when it connects.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use task_proto::desired::{BlobRef, Doorbell, Inline, MAX_DOORBELL_BYTES, MAX_PUSHED_ENVELOPE_BYTES};
+use task_proto::desired::{
+    BlobRef, Doorbell, Inline, MAX_DOORBELL_BYTES, MAX_PUSHED_ENVELOPE_BYTES,
+};
 use task_proto::{Digest, RobotId};
 use tokio_util::sync::CancellationToken;
 
@@ -88,7 +91,9 @@ impl Downlink {
                 }
                 riders.insert(blob.digest, bytes);
             }
-            Ok(None) => tracing::warn!(digest = %blob.digest, "a blob that is to ride along is not there"),
+            Ok(None) => {
+                tracing::warn!(digest = %blob.digest, "a blob that is to ride along is not there")
+            }
             Err(error) => tracing::warn!(
                 digest = %blob.digest,
                 error = &error as &dyn std::error::Error,
@@ -99,7 +104,9 @@ impl Downlink {
 
     fn is_to_be_told(&self, robot: &RobotId) -> bool {
         let is_known = self.presence.may_be_told(robot) || self.broker.is_external();
-        self.broker.may_reach(robot) && is_known && !self.presence.is_duplicate(robot, self.clock.now_ms())
+        self.broker.may_reach(robot)
+            && is_known
+            && !self.presence.is_duplicate(robot, self.clock.now_ms())
     }
 
     async fn ring(&self, robots: &[RobotId], riders: &mut Riders) {
@@ -121,7 +128,8 @@ impl Downlink {
             }
             let payload = match self.presence.may_be_told(&robot) {
                 true => payload(&desired, riders),
-                // Who is there at another broker is found out by ringing; over HTTP it has to say so to get more.
+                // Who is there at another broker is found out by ringing; over HTTP it has to say
+                // so to get more.
                 false if self.broker.is_external() => notice(&desired),
                 // Another agent has come meanwhile, and has not said yet which it is.
                 false => continue,
@@ -129,7 +137,9 @@ impl Downlink {
             match payload {
                 // It may have left meanwhile.
                 Ok(payload) => drop(self.broker.ring(&robot, payload)),
-                Err(error) => tracing::error!(%robot, %error, "a desired state could not be written"),
+                Err(error) => {
+                    tracing::error!(%robot, %error, "a desired state could not be written")
+                }
             }
         }
     }
@@ -186,7 +196,8 @@ mod tests {
     }
 
     fn pushed(desired: &Desired, riders: &[&[u8]]) -> (usize, Doorbell) {
-        let riders = riders.iter().map(|bytes| (Digest::of(bytes), Bytes::copy_from_slice(bytes))).collect();
+        let riders =
+            riders.iter().map(|bytes| (Digest::of(bytes), Bytes::copy_from_slice(bytes))).collect();
         let payload = payload(desired, &riders).expect("json");
         (payload.len(), serde_json::from_slice(&payload).expect("a doorbell"))
     }

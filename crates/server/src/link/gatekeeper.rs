@@ -1,6 +1,7 @@
-//! Who may come in over MQTT: the broker's question, answered from the database for each connection, so that a token
-//! that was revoked a moment ago no longer opens anything. A robot that comes in by a new token thereby ends its old one, by
-//! whatever way it comes: what follows of that is said here for both.
+//! Who may come in over MQTT: the broker's question, answered from the database for each
+//! connection, so that a token that was revoked a moment ago no longer opens anything. A robot that
+//! comes in by a new token thereby ends its old one, by whatever way it comes: what follows of that
+//! is said here for both.
 
 use std::sync::Arc;
 
@@ -45,7 +46,8 @@ impl StoreGatekeeper {
             error.log("a login over MQTT could not be checked");
             Refusal::Unavailable
         };
-        let admitted = self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;
+        let admitted =
+            self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;
         let Some(Admitted { holder, is_first_use }) = admitted else {
             let is_revoked = self.store.is_of_revoked_robot(&token).await.map_err(unchecked)?;
             return Err(if is_revoked { Refusal::NotAuthorised } else { Refusal::BadCredentials });
@@ -58,7 +60,9 @@ impl StoreGatekeeper {
                 Ok(Principal::Robot { robot, token_number, is_first_use })
             }
             // Over MQTT one hears every robot, so it is not for who is limited to some.
-            TokenHolder::Person(person) if person.may(Permission::Read) && person.scope.is_everything() => {
+            TokenHolder::Person(person)
+                if person.may(Permission::Read) && person.scope.is_everything() =>
+            {
                 Ok(Principal::Operator(person.name))
             }
             TokenHolder::Person(_) | TokenHolder::Enrolment | TokenHolder::Pending { .. } => {
@@ -74,9 +78,15 @@ impl Gatekeeper for StoreGatekeeper {
     }
 }
 
-/// The robot has used a token for the first time, which ended its others: its connections over HTTP are cut, nobody displaces
-/// it any more, and it is told of its state. Its MQTT session is the broker's to end.
-pub fn ended_others(presence: &Presence, http_connections: &HttpConnections, changes: &Changes, robot: &RobotId) {
+/// The robot has used a token for the first time, which ended its others: its connections over HTTP
+/// are cut, nobody displaces it any more, and it is told of its state. Its MQTT session is the
+/// broker's to end.
+pub fn ended_others(
+    presence: &Presence,
+    http_connections: &HttpConnections,
+    changes: &Changes,
+    robot: &RobotId,
+) {
     presence.ended_others(robot);
     http_connections.end(robot);
     changes.announce(Change::Robot(robot.clone()));

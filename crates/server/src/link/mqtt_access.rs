@@ -1,5 +1,6 @@
-//! What robots are told about MQTT, and what an external broker is told about robots: their passwords and client ids there,
-//! derived from the server's secret, and the broker's files. All of it is computed; nothing is stored and nobody is asked.
+//! What robots are told about MQTT, and what an external broker is told about robots: their
+//! passwords and client ids there, derived from the server's secret, and the broker's files. All of
+//! it is computed; nothing is stored and nobody is asked.
 
 mod mosquitto;
 mod nats;
@@ -14,7 +15,9 @@ use futures_util::future::join_all;
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use sha2::Sha256;
 use task_proto::CaPin;
-use task_proto::api::{BrokerCheck, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile};
+use task_proto::api::{
+    BrokerCheck, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile,
+};
 use task_proto::topic::TopicPrefix;
 use task_transport::{MqttLogin, displaces};
 use tokio::time::timeout;
@@ -72,12 +75,13 @@ impl Account {
 impl MqttAccess {
     /// Robots come to the server's own broker, with their tokens. `tls`: it speaks that.
     pub fn embedded(host: Option<String>, port: u16, prefix: TopicPrefix, tls: bool) -> Self {
-        let endpoint = MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
+        let endpoint =
+            MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
         Self { endpoint, external: None }
     }
 
-    /// Robots go to the external `brokers`, at `host` and `port` if these are given, and know them by `pin` if that is.
-    /// `current` is the one that the server was connected to last.
+    /// Robots go to the external `brokers`, at `host` and `port` if these are given, and know them
+    /// by `pin` if that is. `current` is the one that the server was connected to last.
     pub fn external(
         brokers: BrokerUrls,
         current: Arc<AtomicUsize>,
@@ -95,12 +99,17 @@ impl MqttAccess {
         };
         let places: Vec<MqttPlace> = brokers.all().iter().map(place).collect();
         let MqttPlace { host, port, tls } = place(brokers.first());
-        let endpoint = MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
+        let endpoint =
+            MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
         let checking = tokio::sync::Mutex::default();
-        Self { endpoint, external: Some(External { secret, brokers, places, current, pin, checking }) }
+        Self {
+            endpoint,
+            external: Some(External { secret, brokers, places, current, pin, checking }),
+        }
     }
 
-    /// What the robot needs to connect. With several brokers the first is the one that the server is connected to.
+    /// What the robot needs to connect. With several brokers the first is the one that the server
+    /// is connected to.
     pub fn endpoint_of(&self, credential: &BrokerCredential) -> MqttEndpoint {
         let Some(external) = &self.external else { return self.endpoint.clone() };
         let mut places = external.places.clone();
@@ -111,7 +120,14 @@ impl MqttAccess {
             client_id: Some(external.client_id_of(credential)),
             ca_pin: external.pin,
         };
-        MqttEndpoint { host, port, tls, external: Some(account), alternatives: places, ..self.endpoint.clone() }
+        MqttEndpoint {
+            host,
+            port,
+            tls,
+            external: Some(account),
+            alternatives: places,
+            ..self.endpoint.clone()
+        }
     }
 
     /// Whether robots go to an external broker.
@@ -119,14 +135,18 @@ impl MqttAccess {
         self.external.is_some()
     }
 
-    /// Mosquitto's files for the server and these robots; `None` without an external broker. Takes a moment for each robot.
+    /// Mosquitto's files for the server and these robots; `None` without an external broker. Takes
+    /// a moment for each robot.
     pub fn files(&self, robots: &[BrokerCredential]) -> Option<BrokerFiles> {
         let external = self.external.as_ref()?;
         let url = external.brokers.first();
         let accounts = external.accounts(robots);
         Some(BrokerFiles {
             acl: mosquitto::acl(&url.user_name, &self.endpoint.prefix),
-            passwd: accounts.iter().map(|account| mosquitto::passwd_line(external, account)).collect(),
+            passwd: accounts
+                .iter()
+                .map(|account| mosquitto::passwd_line(external, account))
+                .collect(),
             conf: mosquitto::conf(url),
         })
     }
@@ -134,36 +154,48 @@ impl MqttAccess {
     /// The same for a NATS server.
     pub fn nats_file(&self, robots: &[BrokerCredential]) -> Option<NatsFile> {
         let external = self.external.as_ref()?;
-        let authorization = nats::authorization(external, &external.accounts(robots), &self.endpoint.prefix);
         let authorization =
-            authorization.inspect_err(|error| tracing::error!(%error, "a password can't be hashed with bcrypt"));
+            nats::authorization(external, &external.accounts(robots), &self.endpoint.prefix);
+        let authorization = authorization
+            .inspect_err(|error| tracing::error!(%error, "a password can't be hashed with bcrypt"));
         Some(NatsFile { authorization: authorization.ok()? })
     }
 
-    /// Tests whether an account at each external broker can end the session of another by connecting with its client id;
-    /// `None` without such a broker. The two accounts and the client id are there for nothing else.
+    /// Tests whether an account at each external broker can end the session of another by
+    /// connecting with its client id; `None` without such a broker. The two accounts and the client
+    /// id are there for nothing else.
     pub async fn check(&self) -> Option<Vec<BrokerCheck>> {
         let external = self.external.as_ref()?;
         let _turn = external.checking.lock().await;
         let probes = external.probes();
-        let logins =
-            [0, 1].map(|at: usize| MqttLogin { user_name: &probes[at].user_name, password: &probes[at].password });
+        let logins = [0, 1].map(|at: usize| MqttLogin {
+            user_name: &probes[at].user_name,
+            password: &probes[at].password,
+        });
         let checks = external.brokers.all().iter().map(async |url| {
             let client_id = format!("{}-{:016x}", probes[0].user_name, rand::random::<u64>());
             let route = external_route(url, external.pin);
-            let (displaces, problem) = match timeout(CHECK_PATIENCE, displaces(&route, &client_id, logins)).await {
-                Ok(Ok(displaces)) => (Some(displaces), None),
-                Ok(Err(error)) => (None, Some(error.to_string())),
-                Err(_) => (None, Some(format!("the broker does not answer within {} s", CHECK_PATIENCE.as_secs()))),
-            };
+            let (displaces, problem) =
+                match timeout(CHECK_PATIENCE, displaces(&route, &client_id, logins)).await {
+                    Ok(Ok(displaces)) => (Some(displaces), None),
+                    Ok(Err(error)) => (None, Some(error.to_string())),
+                    Err(_) => (
+                        None,
+                        Some(format!(
+                            "the broker does not answer within {} s",
+                            CHECK_PATIENCE.as_secs()
+                        )),
+                    ),
+                };
             BrokerCheck { address: url.address(), displaces, problem }
         });
         Some(join_all(checks).await)
     }
 }
 
-/// The server's client id at an external broker. It stays over restarts, so that a session that the network has lost ends
-/// when the next one begins; and since it follows from the secret nobody else can connect with it.
+/// The server's client id at an external broker. It stays over restarts, so that a session that the
+/// network has lost ends when the next one begins; and since it follows from the secret nobody else
+/// can connect with it.
 pub fn server_client_id(secret: &[u8; 32]) -> String {
     format!("taskd-{}", URL_SAFE_NO_PAD.encode(&derived(secret, "client id of the server")[..16]))
 }
@@ -223,7 +255,15 @@ mod tests {
 
     fn external(brokers: &str, host: Option<String>, port: Option<u16>, secret: u8) -> MqttAccess {
         let brokers = brokers.parse().expect("valid");
-        MqttAccess::external(brokers, Arc::default(), None, host, port, TopicPrefix::default(), [secret; 32])
+        MqttAccess::external(
+            brokers,
+            Arc::default(),
+            None,
+            host,
+            port,
+            TopicPrefix::default(),
+            [secret; 32],
+        )
     }
 
     fn credential(robot: &str, number: u64) -> BrokerCredential {
@@ -251,7 +291,10 @@ mod tests {
         let (host, port) = (Some("wifi.lab".to_owned()), Some(1999));
         let named = external(url, None, None, 1);
         let told = external(url, host.clone(), port, 1);
-        assert_eq!((named.endpoint.host.as_deref(), named.endpoint.port), (Some("broker.lab"), 1883));
+        assert_eq!(
+            (named.endpoint.host.as_deref(), named.endpoint.port),
+            (Some("broker.lab"), 1883)
+        );
         assert_eq!((told.endpoint.host, told.endpoint.port), (host, 1999));
     }
 
@@ -261,15 +304,25 @@ mod tests {
         let files = access(1).files(&robots).expect("external");
         assert_eq!(access(1).files(&robots).expect("external").passwd, files.passwd);
         let lines: Vec<&str> = files.passwd.lines().collect();
-        assert!(lines[0].starts_with("server:$7$20000$") && lines[4].starts_with("r00000000000000b2:$7$101$"));
-        assert!(lines[1].starts_with("server-probe-1:$7$101$") && lines[2].starts_with("server-probe-2:$7$101$"));
-        let changed = access(1).files(&[robots[0].clone(), credential("r00000000000000b2", 4)]).expect("external");
+        assert!(
+            lines[0].starts_with("server:$7$20000$")
+                && lines[4].starts_with("r00000000000000b2:$7$101$")
+        );
+        assert!(
+            lines[1].starts_with("server-probe-1:$7$101$")
+                && lines[2].starts_with("server-probe-2:$7$101$")
+        );
+        let changed = access(1)
+            .files(&[robots[0].clone(), credential("r00000000000000b2", 4)])
+            .expect("external");
         let changed: Vec<&str> = changed.passwd.lines().collect();
         assert_eq!(changed[..4], lines[..4]);
         assert_ne!(changed[4], lines[4]);
         assert!(!files.passwd.contains("hunter2"));
         assert!(files.acl.contains("\npattern write taskd/v1/r/%u/status\n"), "{}", files.acl);
-        assert!(MqttAccess::embedded(None, 1, TopicPrefix::default(), false).files(&robots).is_none());
+        assert!(
+            MqttAccess::embedded(None, 1, TopicPrefix::default(), false).files(&robots).is_none()
+        );
     }
 
     #[test]
@@ -281,24 +334,40 @@ mod tests {
         let a = id(1, "r00000000000000a1", 0);
         assert!(a.starts_with("r00000000000000a1-") && a.len() == 17 + 1 + 22, "{a}");
         assert_eq!(id(1, "r00000000000000a1", 0), a);
-        assert!([id(2, "r00000000000000a1", 0), id(1, "r00000000000000a1", 1)].iter().all(|other| *other != a));
+        assert!(
+            [id(2, "r00000000000000a1", 0), id(1, "r00000000000000a1", 1)]
+                .iter()
+                .all(|other| *other != a)
+        );
         assert_ne!(server_client_id(&[1; 32]), server_client_id(&[2; 32]));
     }
 
     #[test]
     fn current_broker_is_the_first_place_that_robots_are_told() {
-        let brokers = "mqtt://server:x@one.lab,mqtts://server:x@two.lab,mqtt://server:x@127.0.0.1:7";
+        let brokers =
+            "mqtt://server:x@one.lab,mqtts://server:x@two.lab,mqtt://server:x@127.0.0.1:7";
         let current = Arc::new(AtomicUsize::new(0));
         let brokers = brokers.parse().expect("valid");
-        let access = MqttAccess::external(brokers, current.clone(), None, None, None, TopicPrefix::default(), [1; 32]);
+        let access = MqttAccess::external(
+            brokers,
+            current.clone(),
+            None,
+            None,
+            None,
+            TopicPrefix::default(),
+            [1; 32],
+        );
         let told = || {
             let endpoint = access.endpoint_of(&credential("r00000000000000a1", 0));
             let first = MqttPlace { host: endpoint.host, port: endpoint.port, tls: endpoint.tls };
             let places: Vec<MqttPlace> = [first].into_iter().chain(endpoint.alternatives).collect();
-            places.into_iter().map(|place| (place.host.unwrap_or_default(), place.port, place.tls)).collect::<Vec<_>>()
+            places
+                .into_iter()
+                .map(|place| (place.host.unwrap_or_default(), place.port, place.tls))
+                .collect::<Vec<_>>()
         };
-        let [one, two, three] =
-            [("one.lab", 1883, false), ("two.lab", 8883, true), ("", 7, false)].map(|(h, p, t)| (h.to_owned(), p, t));
+        let [one, two, three] = [("one.lab", 1883, false), ("two.lab", 8883, true), ("", 7, false)]
+            .map(|(h, p, t)| (h.to_owned(), p, t));
         assert_eq!(told(), [one.clone(), two.clone(), three.clone()]);
         current.store(1, Ordering::Relaxed);
         assert_eq!(told(), [two, one, three]);
@@ -310,12 +379,31 @@ mod tests {
         let nats = access(1).nats_file(&robots).expect("external").authorization;
         assert_eq!(access(1).nats_file(&robots).expect("external").authorization, nats);
         let robot = nats.split("r00000000000000a1\", password").nth(1).expect("the robot's user");
-        assert!(robot.starts_with(": \"$2a$04$") && robot.contains("allowed_connection_types: [\"MQTT\"]"), "{nats}");
-        assert!(robot.contains("publish: { allow: [\"taskd.v1.r.r00000000000000a1.status\", "), "{nats}");
-        assert!(robot.contains("subscribe: { allow: [\"taskd.v1.r.r00000000000000a1.desired\", "), "{nats}");
-        assert!(!nats.contains("$MQTT") && !nats.contains("deny"), "NATS needs its own subjects: {nats}");
-        assert!(!nats.contains("hunter2") && nats.contains("user: \"server\", password: \"$2a$11$"), "{nats}");
+        assert!(
+            robot.starts_with(": \"$2a$04$")
+                && robot.contains("allowed_connection_types: [\"MQTT\"]"),
+            "{nats}"
+        );
+        assert!(
+            robot.contains("publish: { allow: [\"taskd.v1.r.r00000000000000a1.status\", "),
+            "{nats}"
+        );
+        assert!(
+            robot.contains("subscribe: { allow: [\"taskd.v1.r.r00000000000000a1.desired\", "),
+            "{nats}"
+        );
+        assert!(
+            !nats.contains("$MQTT") && !nats.contains("deny"),
+            "NATS needs its own subjects: {nats}"
+        );
+        assert!(
+            !nats.contains("hunter2") && nats.contains("user: \"server\", password: \"$2a$11$"),
+            "{nats}"
+        );
         let files = access(1).files(&robots).expect("external");
-        assert!(files.conf.contains("\nlistener 1884\n") && files.conf.contains("\nuse_username_as_clientid true\n"));
+        assert!(
+            files.conf.contains("\nlistener 1884\n")
+                && files.conf.contains("\nuse_username_as_clientid true\n")
+        );
     }
 }

@@ -1,6 +1,7 @@
-//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines and vitals to memory, connections to
-//! presence. The broker has proven who speaks; what is said is checked here. It never answers by itself: robots that
-//! are behind are put on the list of those to ring.
+//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines and
+//! vitals to memory, connections to presence. The broker has proven who speaks; what is said is
+//! checked here. It never answers by itself: robots that are behind are put on the list of those to
+//! ring.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -28,7 +29,8 @@ use crate::system::clock::Clock;
 
 /// The largest status that is read.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
-/// A robot that is behind is rung again no sooner, or one that refuses its state would be rung for each report.
+/// A robot that is behind is rung again no sooner, or one that refuses its state would be rung for
+/// each report.
 const RING_AGAIN_MS: u64 = 5_000;
 
 /// Receives what the broker takes in.
@@ -55,7 +57,16 @@ impl Uplink {
         changes: Changes,
         clock: Clock,
     ) -> Self {
-        Self { reports, requests, logs, vitals, presence, changes, clock, reminded_ms: Mutex::default() }
+        Self {
+            reports,
+            requests,
+            logs,
+            vitals,
+            presence,
+            changes,
+            clock,
+            reminded_ms: Mutex::default(),
+        }
     }
 
     async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
@@ -68,7 +79,9 @@ impl Uplink {
             tracing::warn!(robot = %message.robot, "a report that no token vouches for is dropped");
             return Ok(());
         };
-        if !self.hear_claim(message, Claim { instance: report.instance.clone(), place: report.place }) {
+        if !self
+            .hear_claim(message, Claim { instance: report.instance.clone(), place: report.place })
+        {
             // It waits for the agent that is known, whose reports these are not.
             return Err(NotStored);
         }
@@ -132,13 +145,21 @@ impl Uplink {
     /// Which agent speaks in the session. Says whether it has its robot's work.
     fn hear_claim(&self, message: &RobotMessage, claim: Claim) -> bool {
         let (robot, connection) = (&message.robot, Some(message.connection));
-        claimed(&self.presence, &self.changes, robot, (message.peer, connection), claim, self.clock.now_ms())
+        claimed(
+            &self.presence,
+            &self.changes,
+            robot,
+            (message.peer, connection),
+            claim,
+            self.clock.now_ms(),
+        )
     }
 
     fn remind(&self, robot: &RobotId) {
         let now_ms = self.clock.now_ms();
         let mut reminded_ms = self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner);
-        if reminded_ms.get(robot).is_some_and(|at_ms| now_ms.saturating_sub(*at_ms) < RING_AGAIN_MS) {
+        if reminded_ms.get(robot).is_some_and(|at_ms| now_ms.saturating_sub(*at_ms) < RING_AGAIN_MS)
+        {
             return;
         }
         reminded_ms.insert(robot.clone(), now_ms);
@@ -181,7 +202,10 @@ impl Inbox for Uplink {
         self.presence.disconnected(robot, connection, self.clock.now_ms());
         self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
         self.changes.announce(Change::Robot(robot.clone()));
-        self.changes.happened(Happening::Presence(robot.clone(), self.presence.is_online(robot, self.clock.now_ms())));
+        self.changes.happened(Happening::Presence(
+            robot.clone(),
+            self.presence.is_online(robot, self.clock.now_ms()),
+        ));
     }
 
     fn everyone_may_be_there(&self) {
@@ -189,7 +213,8 @@ impl Inbox for Uplink {
     }
 }
 
-/// An agent said which it is, in a session if in any; says whether it has its robot's work, and tells it of that.
+/// An agent said which it is, in a session if in any; says whether it has its robot's work, and
+/// tells it of that.
 pub fn claimed(
     presence: &Presence,
     changes: &Changes,
@@ -198,7 +223,12 @@ pub fn claimed(
     claim: Claim,
     now_ms: u64,
 ) -> bool {
-    let shown = || presence.get(robot, now_ms).map(|sighting| (sighting.duplicate, sighting.waits)).unwrap_or_default();
+    let shown = || {
+        presence
+            .get(robot, now_ms)
+            .map(|sighting| (sighting.duplicate, sighting.waits))
+            .unwrap_or_default()
+    };
     let before = shown();
     let standing = presence.claimed(robot, peer, connection, claim, now_ms);
     if shown() != before {
@@ -211,7 +241,13 @@ pub fn claimed(
 }
 
 /// A robot was heard over HTTP; if it was away, that is news.
-pub fn heard(presence: &Presence, changes: &Changes, robot: &RobotId, peer: SocketAddr, now_ms: u64) {
+pub fn heard(
+    presence: &Presence,
+    changes: &Changes,
+    robot: &RobotId,
+    peer: SocketAddr,
+    now_ms: u64,
+) {
     let was_online = presence.is_online(robot, now_ms);
     presence.seen(robot, peer, now_ms);
     if !was_online {

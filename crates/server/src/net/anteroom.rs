@@ -1,8 +1,9 @@
-//! Connections whose client has not said anything yet, by where they come from. Each address has a number of places: when
-//! they are taken, a newcomer gets the place of whoever has been silent for longest there, unless nobody has been for long.
-//! A listener that is full as a whole may ask the one of all who has.
-//! So a crowd of silent connections pushes out itself, while a fleet that comes back at once from behind one address, whose
-//! robots speak within moments, is let in whole. It never touches a socket.
+//! Connections whose client has not said anything yet, by where they come from. Each address has a
+//! number of places: when they are taken, a newcomer gets the place of whoever has been silent for
+//! longest there, unless nobody has been for long. A listener that is full as a whole may ask the
+//! one of all who has. So a crowd of silent connections pushes out itself, while a fleet that comes
+//! back at once from behind one address, whose robots speak within moments, is let in whole. It
+//! never touches a socket.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv6Addr};
@@ -11,7 +12,8 @@ use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 
-/// Nobody has to leave sooner: a client may be far away, or one of thousands that a slow machine has to serve.
+/// Nobody has to leave sooner: a client may be far away, or one of thousands that a slow machine
+/// has to serve.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// All who wait before one listener.
@@ -47,12 +49,14 @@ impl Anteroom {
         Arc::new(Self { places: places.max(1), waiting: Mutex::default() })
     }
 
-    /// Takes a place for a connection from `address`; whoever has been there for longest may have to leave.
+    /// Takes a place for a connection from `address`; whoever has been there for longest may have
+    /// to leave.
     pub fn enter(self: &Arc<Self>, address: IpAddr, now: Instant) -> Place {
         let address = network(address);
         let leave = CancellationToken::new();
         let mut waiting = self.waiting();
-        let neighbours = waiting.by_address.get(&address).filter(|neighbours| neighbours.len() >= self.places);
+        let neighbours =
+            waiting.by_address.get(&address).filter(|neighbours| neighbours.len() >= self.places);
         if let Some(oldest) = neighbours.and_then(|neighbours| neighbours.first().copied()) {
             waiting.send_away(oldest, now);
         }
@@ -63,7 +67,8 @@ impl Anteroom {
         Place { room: self.clone(), number, leave }
     }
 
-    /// Whoever has been here for longest has to leave, wherever it is from; false if nobody has been here for long.
+    /// Whoever has been here for longest has to leave, wherever it is from; false if nobody has
+    /// been here for long.
     pub fn make_room(&self, now: Instant) -> bool {
         let mut waiting = self.waiting();
         let oldest = waiting.everybody.keys().next().copied();
@@ -71,7 +76,8 @@ impl Anteroom {
     }
 
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -114,10 +120,13 @@ impl Drop for Place {
     }
 }
 
-/// What one machine can't leave: its address, and with IPv6 the network of which it may have any address.
+/// What one machine can't leave: its address, and with IPv6 the network of which it may have any
+/// address.
 fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
-        IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into(),
+        IpAddr::V6(address) => {
+            Ipv6Addr::from_bits(address.to_bits() & !u128::from(u64::MAX)).into()
+        }
         address => address,
     }
 }
@@ -132,8 +141,10 @@ mod tests {
         let later = start + PATIENCE;
         let here: IpAddr = "192.0.2.1".parse().expect("an address");
         let elsewhere = room.enter("192.0.2.2".parse().expect("an address"), start);
-        let [first, second] =
-            [room.enter(here, start), room.enter("::ffff:192.0.2.1".parse().expect("an address"), start)];
+        let [first, second] = [
+            room.enter(here, start),
+            room.enter("::ffff:192.0.2.1".parse().expect("an address"), start),
+        ];
         assert!(!first.leave().is_cancelled());
         let third = room.enter(here, later);
         assert!(first.leave().is_cancelled());
@@ -157,7 +168,10 @@ mod tests {
         assert!(room.make_room(start + PATIENCE));
         assert!(oldest.leave().is_cancelled() && !next.leave().is_cancelled());
         drop(next);
-        assert!(!room.make_room(start + PATIENCE), "the first has been asked, the second has spoken");
+        assert!(
+            !room.make_room(start + PATIENCE),
+            "the first has been asked, the second has spoken"
+        );
     }
 
     #[test]
@@ -173,7 +187,8 @@ mod tests {
     #[test]
     fn an_empty_room_remembers_nobody() {
         let (room, start) = (Anteroom::new(1), Instant::now());
-        let places: Vec<Place> = (0..50).map(|last| room.enter([192, 0, 2, last].into(), start)).collect();
+        let places: Vec<Place> =
+            (0..50).map(|last| room.enter([192, 0, 2, last].into(), start)).collect();
         let same = room.enter([192, 0, 2, 0].into(), start + PATIENCE);
         drop((places, same));
         assert!(room.waiting().by_address.is_empty());

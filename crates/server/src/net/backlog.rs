@@ -5,8 +5,8 @@ use std::net::SocketAddr;
 
 use tokio::net::{TcpListener, TcpSocket};
 
-/// Connections that may wait to be accepted, as far as the system allows. Whoever finds no room tries again after one
-/// second, then two, then four.
+/// Connections that may wait to be accepted, as far as the system allows. Whoever finds no room
+/// tries again after one second, then two, then four.
 const BACKLOG: u32 = 16 * 1024;
 
 /// Listens on `address`; port 0 takes a free one. To be called on a runtime.

@@ -1,6 +1,7 @@
-//! The HTTP connections on which a good token was shown, by holder: the person, robot or enrolment token. A holder's
-//! connections can be cut all at once, when a robot is revoked, and a holder that has more than its share loses the oldest
-//! when connections run out. Connections on which no token was shown are the `Anteroom`'s.
+//! The HTTP connections on which a good token was shown, by holder: the person, robot or enrolment
+//! token. A holder's connections can be cut all at once, when a robot is revoked, and a holder that
+//! has more than its share loses the oldest when connections run out. Connections on which no token
+//! was shown are the `Anteroom`'s.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,11 +11,12 @@ use task_proto::{RobotId, UserName};
 use tokio::sync::OwnedMutexGuard;
 use tokio_util::sync::CancellationToken;
 
-/// A holder never has too many connections with this number of them: a browser opens six, an agent fewer.
+/// A holder never has too many connections with this number of them: a browser opens six, an agent
+/// fewer.
 const ALWAYS_ALLOWED: usize = 8;
 
-/// The account that a connection is counted for. Of holders with equally many connections the last in this order loses one
-/// first.
+/// The account that a connection is counted for. Of holders with equally many connections the last
+/// in this order loses one first.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Holder {
     /// A robot, with whichever of its tokens.
@@ -75,7 +77,8 @@ impl HttpConnections {
     }
 
     fn register(self: &Arc<Self>, holder: &Holder, connection: &Connection) {
-        let mut registration = connection.registration.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut registration =
+            connection.registration.lock().unwrap_or_else(PoisonError::into_inner);
         if registration.as_ref().is_some_and(|registration| registration.holder == *holder) {
             return;
         }
@@ -83,7 +86,8 @@ impl HttpConnections {
         self.held().change(holder, |connections| {
             connections.insert(number, connection.cut.clone());
         });
-        *registration = Some(Registration { connections: self.clone(), holder: holder.clone(), number });
+        *registration =
+            Some(Registration { connections: self.clone(), holder: holder.clone(), number });
     }
 
     /// Cuts all connections of the robot.
@@ -93,21 +97,30 @@ impl HttpConnections {
         ended.values().for_each(CancellationToken::cancel);
     }
 
-    /// Cuts the oldest connection of the holder with the most, if that is more than its fair share of `limit` connections.
-    /// False if no holder has more.
+    /// Cuts the oldest connection of the holder with the most, if that is more than its fair share
+    /// of `limit` connections. False if no holder has more.
     pub fn cut_oldest_of_largest(&self, limit: usize) -> bool {
         let mut held = self.held();
         let share = held.fair_share(limit);
-        let largest = held.by_count.last().filter(|(count, _)| *count > share).map(|(_, holder)| holder.clone());
+        let largest = held
+            .by_count
+            .last()
+            .filter(|(count, _)| *count > share)
+            .map(|(_, holder)| holder.clone());
         let Some(holder) = largest else { return false };
         let oldest = held.change(&holder, BTreeMap::pop_first);
         drop(held);
-        tracing::debug!(?holder, share, "connections run out: the oldest of the holder with the most is cut");
+        tracing::debug!(
+            ?holder,
+            share,
+            "connections run out: the oldest of the holder with the most is cut"
+        );
         oldest.inspect(|(_, cut)| cut.cancel()).is_some()
     }
 
     fn held(&self) -> MutexGuard<'_, Held> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.held.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -119,7 +132,11 @@ impl Held {
     }
 
     /// Changes a holder's connections, and keeps the order by number in step.
-    fn change<T>(&mut self, holder: &Holder, change: impl FnOnce(&mut BTreeMap<u64, CancellationToken>) -> T) -> T {
+    fn change<T>(
+        &mut self,
+        holder: &Holder,
+        change: impl FnOnce(&mut BTreeMap<u64, CancellationToken>) -> T,
+    ) -> T {
         let connections = self.by_holder.entry(holder.clone()).or_default();
         let before = connections.len();
         let changed = change(connections);
@@ -138,8 +155,9 @@ impl Held {
 }
 
 impl Arrival<'_> {
-    /// The request on `connection` is this holder's. False if a robot's tokens ended since the request came: as this
-    /// connection was not registered yet, it was not cut, and the token has to be looked up again.
+    /// The request on `connection` is this holder's. False if a robot's tokens ended since the
+    /// request came: as this connection was not registered yet, it was not cut, and the token has
+    /// to be looked up again.
     pub fn identified(self, holder: &Holder, connection: &Connection) -> bool {
         self.connections.register(holder, connection);
         self.connections.robots_ended.load(Ordering::SeqCst) == self.robots_ended
@@ -196,7 +214,9 @@ impl Connection {
 
 impl Drop for Registration {
     fn drop(&mut self) {
-        self.connections.held().change(&self.holder, |connections| connections.remove(&self.number));
+        self.connections
+            .held()
+            .change(&self.holder, |connections| connections.remove(&self.number));
     }
 }
 
@@ -230,7 +250,8 @@ mod tests {
         let strangers = connected(&all, &Holder::Robot(other.clone()), 1);
         all.end(&one);
         assert_eq!((cut(&own), cut(&strangers)), (vec![true; 2], vec![false]));
-        // A connection that another robot's requests come by, behind a proxy, is that one's; or nobody's.
+        // A connection that another robot's requests come by, behind a proxy, is that one's; or
+        // nobody's.
         all.arrival().identified(&Holder::Robot(one.clone()), &strangers[0]);
         all.end(&other);
         strangers[0].release();
@@ -254,12 +275,19 @@ mod tests {
     fn holder_with_the_most_loses_its_oldest_until_it_has_its_share() {
         let all = Arc::new(HttpConnections::default());
         let viewer = connected(&all, &person("viewer"), 60);
-        let robots: Vec<_> = (0..5).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 4)).collect();
+        let robots: Vec<_> =
+            (0..5).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 4)).collect();
         let operator = connected(&all, &person("operator"), 1);
         let cuts = (0..100).filter(|_| all.cut_oldest_of_largest(80)).count();
         assert_eq!(cuts, 50, "80 connections for eight holders: ten each");
         assert_eq!(cut(&viewer), [vec![true; 50], vec![false; 10]].concat());
-        assert!(!robots.iter().flatten().chain(&operator).any(|connection| connection.cut.is_cancelled()));
+        assert!(
+            !robots
+                .iter()
+                .flatten()
+                .chain(&operator)
+                .any(|connection| connection.cut.is_cancelled())
+        );
     }
 
     #[test]
@@ -286,7 +314,8 @@ mod tests {
     #[test]
     fn few_connections_are_never_too_many() {
         let all = Arc::new(HttpConnections::default());
-        let _fleet: Vec<_> = (0..50).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 2)).collect();
+        let _fleet: Vec<_> =
+            (0..50).map(|_| connected(&all, &Holder::Robot(RobotId::random()), 2)).collect();
         assert!(!all.cut_oldest_of_largest(100), "each has its share");
         let small = Arc::new(HttpConnections::default());
         let flood = connected(&small, &person("viewer"), 4);

@@ -22,7 +22,8 @@ pub struct TooFewFiles {
     pub needed: usize,
 }
 
-/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use; says how many.
+/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use;
+/// says how many.
 pub fn raise() -> nix::Result<usize> {
     let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
     if allowed < most {
@@ -33,7 +34,10 @@ pub fn raise() -> nix::Result<usize> {
 
 /// How many files it takes for all connections that the settings allow.
 pub fn wanted(config: &Config) -> usize {
-    config.max_http_connections.saturating_add(config.max_mqtt_connections).saturating_add(OTHER_FILES)
+    config
+        .max_http_connections
+        .saturating_add(config.max_mqtt_connections)
+        .saturating_add(OTHER_FILES)
 }
 
 /// Refuses a limit with which the server would serve hardly anybody.
@@ -42,7 +46,8 @@ pub fn check(config: &Config, allowed: usize) -> Result<(), TooFewFiles> {
     if allowed < needed { Err(TooFewFiles { allowed, needed }) } else { Ok(()) }
 }
 
-/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and go.
+/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and
+/// go.
 pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
     check(config, allowed)?;
     if wanted(config) <= allowed {
@@ -50,7 +55,8 @@ pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
     }
     let room = allowed - OTHER_FILES;
     config.max_http_connections = config.max_http_connections.min(room / 3);
-    config.max_mqtt_connections = config.max_mqtt_connections.min(room - config.max_http_connections);
+    config.max_mqtt_connections =
+        config.max_mqtt_connections.min(room - config.max_http_connections);
     let (http, mqtt) = (config.max_http_connections, config.max_mqtt_connections);
     tracing::warn!(
         files = allowed,
@@ -74,7 +80,8 @@ mod tests {
     fn connections_are_fitted_to_the_limit_and_too_low_a_limit_is_refused() {
         let fitted = |http, mqtt, allowed| {
             let mut config = config(http, mqtt);
-            fit(&mut config, allowed).map(|()| (config.max_http_connections, config.max_mqtt_connections))
+            fit(&mut config, allowed)
+                .map(|()| (config.max_http_connections, config.max_mqtt_connections))
         };
         assert_eq!(fitted(20_000, 20_000, 40_500), Ok((20_000, 20_000)));
         assert_eq!(fitted(20_000, 20_000, 1024), Ok((174, 350)));

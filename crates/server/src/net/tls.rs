@@ -1,6 +1,7 @@
-//! TLS as both listeners speak it: with the operator's own certificate, or with one by the server's private authority. Who
-//! pinned that authority always gets the latter. Certificates change while connections live; none of them notices.
-//! It accepts no connection and keeps no time for a handshake: the listeners do.
+//! TLS as both listeners speak it: with the operator's own certificate, or with one by the server's
+//! private authority. Who pinned that authority always gets the latter. Certificates change while
+//! connections live; none of them notices. It accepts no connection and keeps no time for a
+//! handshake: the listeners do.
 
 mod authority;
 mod client;
@@ -32,7 +33,8 @@ use crate::config::TlsSettings;
 use crate::system::clock::Clock;
 use crate::system::data_directory::{DataDirectory, DataError};
 
-/// How often the authority makes new certificates, for names and addresses that the machine has got meanwhile.
+/// How often the authority makes new certificates, for names and addresses that the machine has got
+/// meanwhile.
 const RENEWAL: Duration = Duration::from_secs(7 * 86_400);
 
 /// Why there is no certificate to show.
@@ -102,15 +104,25 @@ struct Certificates {
 
 impl ResolvesServerCert for Shown {
     fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        let asks_for_pinned = hello.alpn().is_some_and(|mut asked| asked.any(|protocol| protocol == PINNED_PROTOCOL));
+        let asks_for_pinned =
+            hello.alpn().is_some_and(|mut asked| asked.any(|protocol| protocol == PINNED_PROTOCOL));
         let certificates = self.0.read().unwrap_or_else(PoisonError::into_inner);
-        Some(if asks_for_pinned { certificates.pinned.clone() } else { certificates.common.clone() })
+        Some(if asks_for_pinned {
+            certificates.pinned.clone()
+        } else {
+            certificates.common.clone()
+        })
     }
 }
 
 impl Tls {
-    /// Reads or makes what is to be shown. Own files that can't be used are an error here; later they are not.
-    pub fn open(settings: TlsSettings, data: &DataDirectory, clock: Clock) -> Result<Self, TlsError> {
+    /// Reads or makes what is to be shown. Own files that can't be used are an error here; later
+    /// they are not.
+    pub fn open(
+        settings: TlsSettings,
+        data: &DataDirectory,
+        clock: Clock,
+    ) -> Result<Self, TlsError> {
         let authority = Authority::open(data)?;
         let mut own = settings.own_files().map(|(certificate, key)| Files::new(certificate, key));
         let now_ms = clock.now_ms();
@@ -129,14 +141,23 @@ impl Tls {
             false => builder.with_no_client_auth(),
         };
         let mut config = builder.with_cert_resolver(shown.clone());
-        // Robots that come back all at once do so for half of the work, and the server remembers none of them.
+        // Robots that come back all at once do so for half of the work, and the server remembers
+        // none of them.
         config.ticketer = ring::Ticketer::new().map_err(TlsError::Unusable)?;
         config.send_tls13_tickets = 1;
         let acceptor = TlsAcceptor::from(Arc::new(config));
-        Ok(Self(Arc::new(Parts { acceptor, shown, authority, own: own.map(Mutex::new), settings, clock })))
+        Ok(Self(Arc::new(Parts {
+            acceptor,
+            shown,
+            authority,
+            own: own.map(Mutex::new),
+            settings,
+            clock,
+        })))
     }
 
-    /// Shakes hands; gives what the client has proven on that occasion. Waits for it for as long as it takes.
+    /// Shakes hands; gives what the client has proven on that occasion. Waits for it for as long as
+    /// it takes.
     pub async fn accept<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
@@ -154,7 +175,8 @@ impl Tls {
         self.0.authority.pin()
     }
 
-    /// The pin that robots are told: none where the system's root certificates vouch for the operator's own certificate.
+    /// The pin that robots are told: none where the system's root certificates vouch for the
+    /// operator's own certificate.
     pub fn told_pin(&self) -> Option<CaPin> {
         self.0.settings.tells_pin().then(|| self.pin())
     }
@@ -231,7 +253,8 @@ impl fmt::Debug for Tls {
     }
 }
 
-/// What the machine is reached by, as far as it knows, and what the operator says besides. Who trusts a pin does not look.
+/// What the machine is reached by, as far as it knows, and what the operator says besides. Who
+/// trusts a pin does not look.
 fn names_of_this_machine(further: &[String]) -> Vec<String> {
     let mut names = vec!["localhost".to_owned()];
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();

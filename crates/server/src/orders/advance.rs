@@ -1,4 +1,5 @@
-//! Moves rollouts on, inside the write that may have settled something: carries out what [`crate::domain::rollout`] decides.
+//! Moves rollouts on, inside the write that may have settled something: carries out what
+//! [`crate::domain::rollout`] decides.
 
 use std::collections::BTreeSet;
 
@@ -10,8 +11,8 @@ use super::chooser::Chooser;
 use crate::domain::rollout::{Move, Part, Tally, next_move};
 use crate::store::{OpenRobot, OpenRollout, StoreError, Write};
 
-/// Begins the next batch of each of `touched` that is due, or pauses it. A batch that takes another deployment's place on
-/// some robot may settle that one's batch, so that one is looked at as well.
+/// Begins the next batch of each of `touched` that is due, or pauses it. A batch that takes another
+/// deployment's place on some robot may settle that one's batch, so that one is looked at as well.
 pub async fn advance(
     write: &mut Write,
     chooser: &Chooser,
@@ -20,7 +21,8 @@ pub async fn advance(
     consequences: &mut Consequences,
 ) -> Result<(), StoreError> {
     let mut waiting = touched;
-    // Ends, because each turn but the last of a deployment releases an assignment, and none is ever taken back.
+    // Ends, because each turn but the last of a deployment releases an assignment, and none is ever
+    // taken back.
     while let Some(deployment) = waiting.pop_first() {
         let Some(open) = write.rollout(&deployment).await? else { continue };
         let parts = parts(chooser, &open, now_ms);
@@ -35,7 +37,9 @@ pub async fn advance(
                 }
                 let released = write.release(&deployment, count, now_ms).await?;
                 consequences.deployments.extend(released.superseded.iter().cloned());
-                for (robot, mechanism) in chooser.decide(write, &deployment, &released.robots, now_ms).await? {
+                for (robot, mechanism) in
+                    chooser.decide(write, &deployment, &released.robots, now_ms).await?
+                {
                     // Robots that are to ask by themselves are not rung.
                     match mechanism {
                         Delivery::Poll => consequences.robots.insert(robot),
@@ -57,20 +61,25 @@ pub async fn advance(
 /// The part that each robot on which a deployment has not settled has in its rollout now.
 pub fn parts(chooser: &Chooser, open: &OpenRollout, now_ms: u64) -> Vec<Part> {
     let offline_ms = chooser.offline_ms(open.robots.iter().map(|one| &one.robot), now_ms);
-    let part = |(one, offline_ms): (&OpenRobot, Option<u64>)| match Part::of(one.standing, offline_ms) {
-        // A revoked robot takes its turn, and shows nothing.
-        Part::Offline if one.is_revoked => Part::Ready,
-        Part::Busy | Part::Lost if one.is_revoked || one.has_run => Part::Ignored,
-        part => part,
-    };
+    let part =
+        |(one, offline_ms): (&OpenRobot, Option<u64>)| match Part::of(one.standing, offline_ms) {
+            // A revoked robot takes its turn, and shows nothing.
+            Part::Offline if one.is_revoked => Part::Ready,
+            Part::Busy | Part::Lost if one.is_revoked || one.has_run => Part::Ignored,
+            part => part,
+        };
     open.robots.iter().zip(offline_ms).map(part).collect()
 }
 
 /// The offline robots whose turn would come before that of the next `count` which are ready.
 fn passed_over<'a>(open: &'a OpenRollout, parts: &[Part], count: u64) -> Vec<&'a RobotId> {
-    let ready = parts.iter().enumerate().filter(|(_, part)| **part == Part::Ready).map(|(index, _)| index);
-    let last = usize::try_from(count.saturating_sub(1)).ok().and_then(|skipped| ready.clone().nth(skipped));
+    let ready =
+        parts.iter().enumerate().filter(|(_, part)| **part == Part::Ready).map(|(index, _)| index);
+    let last = usize::try_from(count.saturating_sub(1))
+        .ok()
+        .and_then(|skipped| ready.clone().nth(skipped));
     let before = last.unwrap_or(parts.len());
-    let offline = open.robots.iter().zip(parts).take(before).filter(|(_, part)| **part == Part::Offline);
+    let offline =
+        open.robots.iter().zip(parts).take(before).filter(|(_, part)| **part == Part::Offline);
     offline.map(|(one, _)| &one.robot).collect()
 }

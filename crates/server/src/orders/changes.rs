@@ -1,5 +1,6 @@
-//! What has changed, told to whoever listens after the commit: notices for the event stream, and the robots whose
-//! desired state is new. It holds nothing that would be missed after a crash: both sides compare again on connect.
+//! What has changed, told to whoever listens after the commit: notices for the event stream, and
+//! the robots whose desired state is new. It holds nothing that would be missed after a crash: both
+//! sides compare again on connect.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -144,11 +145,13 @@ impl Changes {
         self.bells.rung.notify_one();
     }
 
-    /// Waits until there are robots to ring and takes them all. Made for one caller, the downlink; dropping the future
-    /// loses none.
+    /// Waits until there are robots to ring and takes them all. Made for one caller, the downlink;
+    /// dropping the future loses none.
     pub async fn take_rings(&self) -> Rings {
         loop {
-            let taken = std::mem::take(&mut *self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner));
+            let taken = std::mem::take(
+                &mut *self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner),
+            );
             if taken != Rings::default() {
                 return taken;
             }
@@ -183,6 +186,9 @@ mod tests {
         assert_eq!(taken, Rings { everyone: false, robots: BTreeSet::from([robot.clone()]) });
         changes.ring_everyone();
         changes.ring([robot.clone()]);
-        assert_eq!(changes.take_rings().await, Rings { everyone: true, robots: BTreeSet::from([robot]) });
+        assert_eq!(
+            changes.take_rings().await,
+            Rings { everyone: true, robots: BTreeSet::from([robot]) }
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! Decides, inside the write that begins a batch, how the bytes travel to each of its robots: gathers what is known, lets
-//! [`crate::domain::delivery`] choose, stores the choice with its reason. It never changes what was decided before.
+//! Decides, inside the write that begins a batch, how the bytes travel to each of its robots:
+//! gathers what is known, lets [`crate::domain::delivery`] choose, stores the choice with its
+//! reason. It never changes what was decided before.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -51,7 +52,11 @@ impl ServerLoad {
 
 impl Chooser {
     /// Decides by `settings` and by what `presence` and `load` say at the time.
-    pub fn new(settings: &DeliverySettings, presence: Arc<Presence>, load: Arc<ServerLoad>) -> Self {
+    pub fn new(
+        settings: &DeliverySettings,
+        presence: Arc<Presence>,
+        load: Arc<ServerLoad>,
+    ) -> Self {
         Self {
             rules: Arc::new(settings.rules()),
             inline_bytes: settings.inline_bytes.into(),
@@ -67,7 +72,11 @@ impl Chooser {
     }
 
     /// For how long each of these robots has been offline; `None`: it is online.
-    pub fn offline_ms<'a>(&self, robots: impl IntoIterator<Item = &'a RobotId>, now_ms: u64) -> Vec<Option<u64>> {
+    pub fn offline_ms<'a>(
+        &self,
+        robots: impl IntoIterator<Item = &'a RobotId>,
+        now_ms: u64,
+    ) -> Vec<Option<u64>> {
         self.presence.offline_ms(robots, now_ms)
     }
 
@@ -93,7 +102,8 @@ impl Chooser {
         let decide = |facts: RobotFacts| {
             let inputs = self.inputs_of(&facts, &order.package, sites.as_ref(), common, now_ms);
             let decision = choose(&self.rules, order.choice, &inputs);
-            let inputs = serde_json::to_string(&inputs).expect("plain numbers always have a JSON form");
+            let inputs =
+                serde_json::to_string(&inputs).expect("plain numbers always have a JSON form");
             Decided { robot: facts.robot, decision, inputs }
         };
         let decided: Vec<Decided> = known.into_iter().map(decide).collect();
@@ -123,7 +133,10 @@ impl Chooser {
             lacking: lacking_bytes(package, facts.has.as_ref()),
             same_site: sites.map(on_site),
             connected: sighting.as_ref().is_some_and(|sighting| sighting.connection.is_some()),
-            metered: facts.labels.iter().any(|(key, value)| (key.as_str(), value.as_str()) == ("metered", "true")),
+            metered: facts
+                .labels
+                .iter()
+                .any(|(key, value)| (key.as_str(), value.as_str()) == ("metered", "true")),
             throughput_bytes_per_s: link.throughput_bytes_per_s,
             rtt_ms: link.rtt_ms.map(u64::from),
             losses: link.losses.into(),
@@ -133,7 +146,8 @@ impl Chooser {
         }
     }
 
-    /// How many robots of `deployment` are on each site; `None` where no rule asks, for all their labels must be read.
+    /// How many robots of `deployment` are on each site; `None` where no rule asks, for all their
+    /// labels must be read.
     async fn robots_by_site(
         &self,
         write: &mut Write,
@@ -145,8 +159,11 @@ impl Chooser {
         }
         let mut sites = HashMap::new();
         for (robot, labels) in write.labels_in(deployment).await? {
-            let address =
-                self.presence.get(&robot, now_ms).and_then(|sighting| sighting.address).map(|address| address.ip());
+            let address = self
+                .presence
+                .get(&robot, now_ms)
+                .and_then(|sighting| sighting.address)
+                .map(|address| address.ip());
             if let Some(site) = self.site_of(&labels, address) {
                 *sites.entry(site).or_default() += 1;
             }
@@ -188,9 +205,15 @@ fn lacking_bytes(package: &PackageRef, has: Option<&TaskReport>) -> u64 {
         | Phase::Succeeded
         | Phase::Stopped
         | Phase::RolledBack => 0,
-        Phase::Fetching => package.content.size.saturating_sub(has.progress.map_or(0, |progress| progress.done)),
+        Phase::Fetching => {
+            package.content.size.saturating_sub(has.progress.map_or(0, |progress| progress.done))
+        }
         _ => package.content.size,
     };
     let BlobRef { digest, size } = package.config;
-    content.saturating_add(if has.package.config.digest == digest && content == 0 { 0 } else { size })
+    content.saturating_add(if has.package.config.digest == digest && content == 0 {
+        0
+    } else {
+        size
+    })
 }

@@ -1,6 +1,7 @@
-//! The feed: the last things in the fleet that are worth a look, in memory. What happens is gathered for a moment and told
-//! together where it is much of the same, so that a restart of the server is one line and not ten thousand. It decides nothing,
-//! and what must not be lost is in the audit.
+//! The feed: the last things in the fleet that are worth a look, in memory. What happens is
+//! gathered for a moment and told together where it is much of the same, so that a restart of the
+//! server is one line and not ten thousand. It decides nothing, and what must not be lost is in the
+//! audit.
 
 mod pending;
 
@@ -105,7 +106,8 @@ impl Feed {
     }
 
     fn entries(&self) -> MutexGuard<'_, Entries> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -160,9 +162,12 @@ fn one_line(text: &str) -> String {
 fn about_broker(health: &Health, was_well: &mut bool) -> Option<Said> {
     let (is_well, text) = match health {
         Health::Serving => (true, "the MQTT broker is back".to_owned()),
-        Health::Recovering(seen) | Health::Failed(seen) => (false, format!("the MQTT broker: {seen}")),
+        Health::Recovering(seen) | Health::Failed(seen) => {
+            (false, format!("the MQTT broker: {seen}"))
+        }
     };
-    (std::mem::replace(was_well, is_well) != is_well).then(|| about_server(FeedKind::Broker, is_well, text))
+    (std::mem::replace(was_well, is_well) != is_well)
+        .then(|| about_server(FeedKind::Broker, is_well, text))
 }
 
 fn about_disk(source: &FeedSource, had_room: &mut bool) -> Option<Said> {
@@ -170,7 +175,8 @@ fn about_disk(source: &FeedSource, had_room: &mut bool) -> Option<Said> {
     let percent = free.saturating_mul(100).checked_div(all)?;
     let has_room = percent >= LEAST_FREE_PERCENT;
     let text = format!("{percent}% of the server's disk are free");
-    (std::mem::replace(had_room, has_room) != has_room).then(|| about_server(FeedKind::Disk, has_room, text))
+    (std::mem::replace(had_room, has_room) != has_room)
+        .then(|| about_server(FeedKind::Disk, has_room, text))
 }
 
 fn about_server(kind: FeedKind, is_well: bool, text: String) -> Said {
@@ -186,7 +192,10 @@ mod tests {
     fn the_feed_is_bounded_and_its_numbers_grow() {
         let feed = Feed::new(1000);
         for number in 0..=MAX_FEED_ENTRIES as u64 {
-            assert_eq!(feed.say(about_server(FeedKind::Disk, true, String::new()), 7), 1000 + number);
+            assert_eq!(
+                feed.say(about_server(FeedKind::Disk, true, String::new()), 7),
+                1000 + number
+            );
         }
         assert_eq!(feed.after(0).len(), MAX_FEED_ENTRIES);
         assert!(feed.get(1000).is_none() && feed.get(1001).is_some());
@@ -198,8 +207,16 @@ mod tests {
         let mut was_well = true;
         assert!(about_broker(&Health::Serving, &mut was_well).is_none());
         let trouble = Health::Recovering("no canary".to_owned());
-        assert_eq!(about_broker(&trouble, &mut was_well).map(|said| said.level), Some(LogLevel::Error));
-        assert!(about_broker(&Health::Recovering("still none".to_owned()), &mut was_well).is_none());
-        assert_eq!(about_broker(&Health::Serving, &mut was_well).map(|said| said.level), Some(LogLevel::Info));
+        assert_eq!(
+            about_broker(&trouble, &mut was_well).map(|said| said.level),
+            Some(LogLevel::Error)
+        );
+        assert!(
+            about_broker(&Health::Recovering("still none".to_owned()), &mut was_well).is_none()
+        );
+        assert_eq!(
+            about_broker(&Health::Serving, &mut was_well).map(|said| said.level),
+            Some(LogLevel::Info)
+        );
     }
 }

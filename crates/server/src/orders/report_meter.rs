@@ -1,5 +1,5 @@
-//! How many reports were stored in the last minute, and how long each took: counted in bins that grow by a fifth, so that
-//! counting one is an addition. It only counts.
+//! How many reports were stored in the last minute, and how long each took: counted in bins that
+//! grow by a fifth, so that counting one is an addition. It only counts.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -10,7 +10,8 @@ use tokio::time::Instant;
 /// What is shown is of this long, in slots of which the oldest is dropped.
 const SLOTS: usize = 12;
 const SLOT: Duration = Duration::from_secs(5);
-/// Bins of times, the first up to [`FIRST_MS`], each further one by [`GROWTH`] longer; the last has all that are longer.
+/// Bins of times, the first up to [`FIRST_MS`], each further one by [`GROWTH`] longer; the last has
+/// all that are longer.
 const BINS: usize = 64;
 const FIRST_MS: f64 = 0.1;
 const GROWTH: f64 = 1.2;
@@ -58,7 +59,8 @@ impl ReportMeter {
             }
         }
         let all: u64 = bins.iter().sum();
-        let (window, lasted) = (SLOT.as_secs_f64() * SLOTS as f64, now.duration_since(self.began).as_secs_f64());
+        let (window, lasted) =
+            (SLOT.as_secs_f64() * SLOTS as f64, now.duration_since(self.began).as_secs_f64());
         let of = |share: f64| {
             let wanted = (all as f64 * share).ceil() as u64;
             let mut seen = 0;
@@ -98,7 +100,10 @@ mod tests {
         assert!((95.0..=105.0).contains(&seen.per_s), "{seen:?}");
         assert!(seen.latency_ms_p50.is_some_and(|ms| (2.0..2.5).contains(&ms)), "{seen:?}");
         meter.stored(at(59), Duration::from_secs(3600));
-        assert!(meter.read(at(59)).latency_ms_p99.is_some_and(|ms| ms < 50.0), "one of six thousand");
+        assert!(
+            meter.read(at(59)).latency_ms_p99.is_some_and(|ms| ms < 50.0),
+            "one of six thousand"
+        );
         assert_eq!(meter.read(at(200)).latency_ms_p50, None);
     }
 }

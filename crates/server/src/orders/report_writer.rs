@@ -1,7 +1,8 @@
-//! The one writer of reports: a bounded queue, emptied in batches, each one write to the store. A caller's future resolves
-//! when its report is stored. Of several reports of a robot in a batch only the last is written; the others are
-//! acknowledged with it, since each is a whole snapshot. What it wrote before it remembers ([`memory`]), so that a batch
-//! of robots that go on reporting reads nothing, and writes only what has changed.
+//! The one writer of reports: a bounded queue, emptied in batches, each one write to the store. A
+//! caller's future resolves when its report is stored. Of several reports of a robot in a batch
+//! only the last is written; the others are acknowledged with it, since each is a whole snapshot.
+//! What it wrote before it remembers ([`memory`]), so that a batch of robots that go on reporting
+//! reads nothing, and writes only what has changed.
 
 mod memory;
 
@@ -53,7 +54,8 @@ pub enum ReportError {
     /// No such robot, or no longer.
     #[error("there is no robot {0}")]
     RobotNotFound(RobotId),
-    /// Another token of the robot was used since the sender showed its own: it speaks for the robot no longer.
+    /// Another token of the robot was used since the sender showed its own: it speaks for the robot
+    /// no longer.
     #[error("robot {0} uses a newer token")]
     TokenEnded(RobotId),
     /// The queue stays full, or the server is stopping.
@@ -73,23 +75,37 @@ struct Submission {
 }
 
 impl ReportWriter {
-    /// Starts the writer. The task ends, after all that was handed in, when the last clone is dropped.
-    pub fn start(store: Store, clock: Clock, changes: Changes, chooser: Chooser) -> (Self, JoinHandle<()>) {
+    /// Starts the writer. The task ends, after all that was handed in, when the last clone is
+    /// dropped.
+    pub fn start(
+        store: Store,
+        clock: Clock,
+        changes: Changes,
+        chooser: Chooser,
+    ) -> (Self, JoinHandle<()>) {
         let (queue, submissions) = mpsc::channel(QUEUE);
         let (meter, database) = (ReportMeter::new(Instant::now()), store.state().clone());
-        (Self { queue, meter, database }, tokio::spawn(write_all(submissions, store, clock, changes, chooser)))
+        (
+            Self { queue, meter, database },
+            tokio::spawn(write_all(submissions, store, clock, changes, chooser)),
+        )
     }
 
-    /// Stores `report`, as far as it is kept, whose `robot_id` the caller has authenticated by the robot's token of this number. Resolves after
-    /// the commit.
-    pub async fn submit(&self, report: Report, token_number: u64) -> Result<ReportReply, ReportError> {
+    /// Stores `report`, as far as it is kept, whose `robot_id` the caller has authenticated by the
+    /// robot's token of this number. Resolves after the commit.
+    pub async fn submit(
+        &self,
+        report: Report,
+        token_number: u64,
+    ) -> Result<ReportReply, ReportError> {
         // It would wait behind what was handed in before, for nothing.
         if !self.database.is_there() {
             return Err(ReportError::NotStored(Some(Fault::Away)));
         }
         let (came, report) = (Instant::now(), report.tidied());
         let (answer, answered) = oneshot::channel();
-        let submission = Submission { fingerprint: fingerprint(&report), report, token_number, answer };
+        let submission =
+            Submission { fingerprint: fingerprint(&report), report, token_number, answer };
         self.queue.send_timeout(submission, PATIENCE).await.map_err(|_| ReportError::Busy)?;
         let reply = answered.await.map_err(|_| ReportError::Busy)??;
         self.meter.stored(Instant::now(), came.elapsed());
@@ -118,10 +134,13 @@ async fn write_all(
     let mut memory = Memory::default();
     while submissions.recv_many(&mut batch, MAX_BATCH).await > 0 {
         let newest = newest_by_robot(&batch);
-        let answers = match write_with_retries(&store, &chooser, &mut memory, &newest, &clock).await {
+        let answers = match write_with_retries(&store, &chooser, &mut memory, &newest, &clock).await
+        {
             Ok((answers, consequences)) => {
                 changes.publish(consequences);
-                newest.iter().for_each(|submission| changes.part_requests().hear(&submission.report));
+                newest
+                    .iter()
+                    .for_each(|submission| changes.part_requests().hear(&submission.report));
                 Ok(answers)
             }
             Err(error) => {
@@ -130,20 +149,23 @@ async fn write_all(
             }
         };
         for Submission { report, token_number, answer, .. } in batch.drain(..) {
-            let reply =
-                answers.as_ref().map_err(Clone::clone).and_then(|answers| match answers.get(&report.robot_id) {
+            let reply = answers.as_ref().map_err(Clone::clone).and_then(|answers| {
+                match answers.get(&report.robot_id) {
                     None => Err(ReportError::RobotNotFound(report.robot_id)),
-                    Some(answer) if token_number < answer.token_number => Err(ReportError::TokenEnded(report.robot_id)),
+                    Some(answer) if token_number < answer.token_number => {
+                        Err(ReportError::TokenEnded(report.robot_id))
+                    }
                     Some(answer) => Ok(answer.reply.clone()),
-                });
+                }
+            });
             // A caller that has gone away does not need to know.
             let _ = answer.send(reply);
         }
     }
 }
 
-/// The same for reports that differ only in what passes: times, and how far a phase has come. That is not worth writing
-/// a report again; where assignments stand is stored apart from it.
+/// The same for reports that differ only in what passes: times, and how far a phase has come. That
+/// is not worth writing a report again; where assignments stand is stored apart from it.
 fn fingerprint(report: &Report) -> u64 {
     let mut lasting = report.clone();
     (lasting.seq, lasting.uptime_ms, lasting.observed_generation) = (0, 0, Generation(0));
@@ -160,7 +182,8 @@ fn fingerprint(report: &Report) -> u64 {
 fn newest_by_robot(batch: &[Submission]) -> Vec<&Submission> {
     let mut newest: HashMap<&RobotId, &Submission> = HashMap::new();
     // An agent that came with a newer token may count its starts from 1 again.
-    let position = |submission: &Submission| (submission.token_number, position(&submission.report));
+    let position =
+        |submission: &Submission| (submission.token_number, position(&submission.report));
     for submission in batch {
         let last = newest.entry(&submission.report.robot_id).or_insert(submission);
         if position(submission) > position(last) {
@@ -205,7 +228,8 @@ async fn write_with_retries(
         match error.fault() {
             // Another try would find the same. Robots keep their reports and send them again.
             Some(Fault::Corrupt | Fault::Full) => return Err(error),
-            // One that was restarted is soon there again. Reports that come meanwhile do not get as far as this.
+            // One that was restarted is soon there again. Reports that come meanwhile do not get as
+            // far as this.
             Some(Fault::Away) => {
                 let there = tokio::time::timeout(PATIENCE, store.state().there()).await;
                 there.map_err(|_| error)?;
@@ -231,7 +255,8 @@ async fn write_batch(
     let mut write = store.begin_keeping_rights().await?;
     let turn = write.turn();
     memory.learn(&mut write, reports.iter().map(|submission| &submission.report.robot_id)).await?;
-    // A report that is older than the stored one is acknowledged, so that it is not sent again, and ignored.
+    // A report that is older than the stored one is acknowledged, so that it is not sent again, and
+    // ignored.
     let is_news = |submission: &&Submission| {
         memory.get(&submission.report.robot_id).is_some_and(|known| {
             submission.token_number >= known.robot.token_number
@@ -241,20 +266,25 @@ async fn write_batch(
     let news: Vec<&Submission> = reports.iter().copied().filter(is_news).collect();
     let mut consequences = Consequences::default();
     consequences.robots.extend(news.iter().map(|submission| submission.report.robot_id.clone()));
-    let moved = write_standings(&mut write, memory, &news, now_ms, &mut consequences.happenings).await?;
+    let moved =
+        write_standings(&mut write, memory, &news, now_ms, &mut consequences.happenings).await?;
     write_reports(&mut write, memory, &news, now_ms).await?;
     consequences.deployments.extend(moved.iter().cloned());
-    let rolls = advance_waiting(&mut write, chooser, memory, moved, now_ms, &mut consequences).await?;
+    let rolls =
+        advance_waiting(&mut write, chooser, memory, moved, now_ms, &mut consequences).await?;
     let mut answers: Answers = reports
         .iter()
         .filter_map(|submission| memory.get(&submission.report.robot_id))
         .map(|known| answer(known.robot.clone()))
         .collect();
     // A batch that has just been released may have raised generations.
-    let rung: Vec<RobotId> = consequences.rings.iter().filter(|robot| answers.contains_key(*robot)).cloned().collect();
+    let rung: Vec<RobotId> =
+        consequences.rings.iter().filter(|robot| answers.contains_key(*robot)).cloned().collect();
     answers.extend(write.reported_robots(&rung).await?.into_iter().map(answer));
     write.commit().await?;
-    consequences.happenings.extend(news.iter().flat_map(|submission| newly_wrong(memory, &submission.report)));
+    consequences
+        .happenings
+        .extend(news.iter().flat_map(|submission| newly_wrong(memory, &submission.report)));
     if rolls {
         memory.forget();
     } else {
@@ -264,12 +294,13 @@ async fn write_batch(
 }
 
 fn answer(robot: ReportedRobot) -> (RobotId, Answer) {
-    let reply = ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels };
+    let reply =
+        ReportReply { generation: robot.generation, name: robot.name, labels: robot.labels };
     (robot.id, Answer { reply, token_number: robot.token_number })
 }
 
-/// Moves on those of the deployments that have robots whose batch has not begun. Says whether there were any: then
-/// generations and assignments may have changed.
+/// Moves on those of the deployments that have robots whose batch has not begun. Says whether there
+/// were any: then generations and assignments may have changed.
 async fn advance_waiting(
     write: &mut Write,
     chooser: &Chooser,
@@ -279,7 +310,9 @@ async fn advance_waiting(
     consequences: &mut Consequences,
 ) -> Result<bool, StoreError> {
     let mut waiting = BTreeSet::new();
-    for deployment in moved.into_iter().filter(|deployment| memory.may_wait(deployment)).collect::<Vec<_>>() {
+    for deployment in
+        moved.into_iter().filter(|deployment| memory.may_wait(deployment)).collect::<Vec<_>>()
+    {
         if write.rollout(&deployment).await?.is_some() {
             waiting.insert(deployment);
         } else {
@@ -291,7 +324,8 @@ async fn advance_waiting(
     Ok(rolls)
 }
 
-/// Stores where the robots' assignments stand after `news`. Returns the deployments of which some phase has changed.
+/// Stores where the robots' assignments stand after `news`. Returns the deployments of which some
+/// phase has changed.
 async fn write_standings(
     write: &mut Write,
     memory: &mut Memory,
@@ -306,7 +340,9 @@ async fn write_standings(
         for assignment in &mut known.open {
             let next = match task_of(report, assignment) {
                 Some(task) => assignment.standing.after(task),
-                None => assignment.standing.after_absence(assignment.removed, report.observed_generation),
+                None => assignment
+                    .standing
+                    .after_absence(assignment.removed, report.observed_generation),
             };
             let Some(next) = next else { continue };
             let is_moved = next.phase != assignment.standing.phase;
@@ -353,22 +389,25 @@ async fn write_reports(
 /// What a robot did not say was wrong with it before.
 fn newly_wrong(memory: &mut Memory, report: &Report) -> Vec<Happening> {
     let news = memory.new_conditions(&report.robot_id, &report.conditions).into_iter();
-    let text = |condition: &Condition| format!("{}: {}", condition.code.replace('_', " "), condition.text);
-    news.map(|one| Happening::Robot(report.robot_id.clone(), FeedKind::RobotCondition, text(one))).collect()
+    let text =
+        |condition: &Condition| format!("{}: {}", condition.code.replace('_', " "), condition.text);
+    news.map(|one| Happening::Robot(report.robot_id.clone(), FeedKind::RobotCondition, text(one)))
+        .collect()
 }
 
 /// A phase that is worth a look, or that mends one.
 fn worth_a_look(robot: &ReportedRobot, assignment: &OpenAssignment) -> Option<Happening> {
     let OpenAssignment { deployment, standing, .. } = assignment;
-    matches!(standing.phase, Phase::Failed | Phase::RolledBack | Phase::Running | Phase::Succeeded).then(|| {
-        Happening::Task(Arc::new(TaskNews {
-            robot: robot.id.clone(),
-            name: robot.name.clone(),
-            deployment: deployment.clone(),
-            phase: standing.phase,
-            failure: standing.failure.clone(),
-        }))
-    })
+    matches!(standing.phase, Phase::Failed | Phase::RolledBack | Phase::Running | Phase::Succeeded)
+        .then(|| {
+            Happening::Task(Arc::new(TaskNews {
+                robot: robot.id.clone(),
+                name: robot.name.clone(),
+                deployment: deployment.clone(),
+                phase: standing.phase,
+                failure: standing.failure.clone(),
+            }))
+        })
 }
 
 fn task_of<'a>(report: &'a Report, assignment: &OpenAssignment) -> Option<&'a TaskReport> {

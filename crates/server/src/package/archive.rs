@@ -1,5 +1,6 @@
-//! The content's bytes: a tree as tar+zstd, the same for the same tree wherever and whenever it is made. Bytes stream
-//! from the files through tar, hash, zstd and hash into the output; nothing is held whole.
+//! The content's bytes: a tree as tar+zstd, the same for the same tree wherever and whenever it is
+//! made. Bytes stream from the files through tar, hash, zstd and hash into the output; nothing is
+//! held whole.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -13,14 +14,20 @@ use task_proto::manifest::ContentFacts;
 use super::PackageError;
 use super::tree::{Entry, Tree};
 
-/// zstd's own default: half the speed of the fastest, and the next levels gain a few percent for twice the time.
+/// zstd's own default: half the speed of the fastest, and the next levels gain a few percent for
+/// twice the time.
 const ZSTD_LEVEL: i32 = 3;
-/// 2000-01-01: one time for all files. Not zero, because Python's zip and wheel tools refuse times before 1980.
+/// 2000-01-01: one time for all files. Not zero, because Python's zip and wheel tools refuse times
+/// before 1980.
 const MTIME_S: u64 = 946_684_800;
 
 /// Writes `tree` to `output`. Gives the compressed blob and what is in it.
-pub(super) fn write(tree: &Tree, output: &mut impl Write) -> Result<(BlobRef, ContentFacts), PackageError> {
-    let output_failed = |source| PackageError::Io { what: "can't write the packed content".to_owned(), source };
+pub(super) fn write(
+    tree: &Tree,
+    output: &mut impl Write,
+) -> Result<(BlobRef, ContentFacts), PackageError> {
+    let output_failed =
+        |source| PackageError::Io { what: "can't write the packed content".to_owned(), source };
     let mut compressed = Hashing::new(output);
     // One thread and no checksum of zstd's own: the digest covers everything.
     let encoder = zstd::Encoder::new(&mut compressed, ZSTD_LEVEL).map_err(output_failed)?;
@@ -32,10 +39,18 @@ pub(super) fn write(tree: &Tree, output: &mut impl Write) -> Result<(BlobRef, Co
     let (tar_digest, tar_size, encoder) = plain.finish();
     encoder.finish().map_err(output_failed)?;
     let (digest, size, _) = compressed.finish();
-    Ok((BlobRef { digest, size }, ContentFacts { tar_digest, tar_size, entries: tree.entries.len() as u64 }))
+    Ok((
+        BlobRef { digest, size },
+        ContentFacts { tar_digest, tar_size, entries: tree.entries.len() as u64 },
+    ))
 }
 
-fn append<W: Write>(archive: &mut tar::Builder<W>, tree: &Tree, path: &str, entry: &Entry) -> Result<(), PackageError> {
+fn append<W: Write>(
+    archive: &mut tar::Builder<W>,
+    tree: &Tree,
+    path: &str,
+    entry: &Entry,
+) -> Result<(), PackageError> {
     let failed = |source| PackageError::Io { what: format!("can't pack {path}"), source };
     let mut header = Header::new_gnu();
     header.set_mtime(MTIME_S);
@@ -63,7 +78,8 @@ fn append<W: Write>(archive: &mut tar::Builder<W>, tree: &Tree, path: &str, entr
     }
 }
 
-/// A file that must have the size its header says: one that grows or shrinks meanwhile would spoil the archive.
+/// A file that must have the size its header says: one that grows or shrinks meanwhile would spoil
+/// the archive.
 struct Exactly {
     file: File,
     left: u64,

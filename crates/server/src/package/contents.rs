@@ -1,5 +1,6 @@
-//! What is in a package that was packed, and what differs between two. An archive is read as a stream and never unpacked:
-//! whoever may push can have pushed any bytes, so it is held to all that a robot holds it to, but for where links lead.
+//! What is in a package that was packed, and what differs between two. An archive is read as a
+//! stream and never unpacked: whoever may push can have pushed any bytes, so it is held to all that
+//! a robot holds it to, but for where links lead.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -15,7 +16,11 @@ use task_proto::manifest::{ContentFacts, TaskManifest};
 const MAX_NAMES_BYTES: u64 = 16 << 20;
 
 /// The entries of `content`, sorted by path. Blocks, and reads all of it.
-pub fn list(content: impl Read, content_size: u64, facts: &ContentFacts) -> Result<Vec<PackageFile>, UnpackError> {
+pub fn list(
+    content: impl Read,
+    content_size: u64,
+    facts: &ContentFacts,
+) -> Result<Vec<PackageFile>, UnpackError> {
     let mut entries = Entries::announced(content, content_size, facts, &Limits::default())?;
     let mut files: BTreeMap<String, PackageFile> = BTreeMap::new();
     let mut names_bytes = 0;
@@ -34,7 +39,12 @@ pub fn list(content: impl Read, content_size: u64, facts: &ContentFacts) -> Resu
         }
         names_bytes += (path.len() + file.target.as_ref().map_or(0, String::len)) as u64;
         if names_bytes > MAX_NAMES_BYTES {
-            return Err(Refusal::Limit { what: "bytes of names", found: names_bytes, limit: MAX_NAMES_BYTES }.into());
+            return Err(Refusal::Limit {
+                what: "bytes of names",
+                found: names_bytes,
+                limit: MAX_NAMES_BYTES,
+            }
+            .into());
         }
         if files.contains_key(&path) {
             return Err(Refusal::entry(path.as_bytes(), "the name is there twice").into());
@@ -45,19 +55,36 @@ pub fn list(content: impl Read, content_size: u64, facts: &ContentFacts) -> Resu
 }
 
 /// An entry without its digest, if it is a file; a second name of a file is that file.
-fn file(path: &str, kind: &Kind, files: &BTreeMap<String, PackageFile>) -> Result<PackageFile, Refusal> {
-    let entry =
-        |kind, mode, size, target| PackageFile { path: path.to_owned(), kind, mode, size, digest: None, target };
+fn file(
+    path: &str,
+    kind: &Kind,
+    files: &BTreeMap<String, PackageFile>,
+) -> Result<PackageFile, Refusal> {
+    let entry = |kind, mode, size, target| PackageFile {
+        path: path.to_owned(),
+        kind,
+        mode,
+        size,
+        digest: None,
+        target,
+    };
     match kind {
         Kind::Directory => Ok(entry(PackageFileKind::Directory, 0o755, 0, None)),
         Kind::File { size, executable } => {
             Ok(entry(PackageFileKind::File, if *executable { 0o755 } else { 0o644 }, *size, None))
         }
-        Kind::Symlink { target } => Ok(entry(PackageFileKind::Link, 0o777, 0, Some(target.clone()))),
-        Kind::HardLink { target } => match files.get(target).filter(|file| file.kind == PackageFileKind::File) {
-            Some(file) => Ok(PackageFile { path: path.to_owned(), ..file.clone() }),
-            None => Err(Refusal::entry(path.as_bytes(), "a hard link must name an earlier file of the archive")),
-        },
+        Kind::Symlink { target } => {
+            Ok(entry(PackageFileKind::Link, 0o777, 0, Some(target.clone())))
+        }
+        Kind::HardLink { target } => {
+            match files.get(target).filter(|file| file.kind == PackageFileKind::File) {
+                Some(file) => Ok(PackageFile { path: path.to_owned(), ..file.clone() }),
+                None => Err(Refusal::entry(
+                    path.as_bytes(),
+                    "a hard link must name an earlier file of the archive",
+                )),
+            }
+        }
     }
 }
 
@@ -77,7 +104,11 @@ pub fn diff(from: Vec<PackageFile>, to: Vec<PackageFile>) -> PackageDiff {
             Ordering::Greater => diff.added.extend(to.next()),
             Ordering::Equal => {
                 let changed = from.next().zip(to.next()).filter(|(from, to)| from != to);
-                diff.changed.extend(changed.map(|(from, to)| ChangedFile { path: to.path.clone(), from, to }));
+                diff.changed.extend(changed.map(|(from, to)| ChangedFile {
+                    path: to.path.clone(),
+                    from,
+                    to,
+                }));
             }
         }
     }
@@ -118,10 +149,14 @@ mod tests {
         assert_eq!(paths, ["data", "data/a.txt", "data/b.txt", "gone.txt", "link", "task.toml"]);
         assert_eq!((old[1].size, old[1].mode, old[1].digest), (1, 0o644, Some(Digest::of(b"a"))));
         assert_eq!((old[0].kind, old[0].digest), (PackageFileKind::Directory, None));
-        assert_eq!((old[4].kind, old[4].target.as_deref()), (PackageFileKind::Link, Some("data/a.txt")));
+        assert_eq!(
+            (old[4].kind, old[4].target.as_deref()),
+            (PackageFileKind::Link, Some("data/a.txt"))
+        );
         let new = listed(&packed(&[("data/a.txt", "a"), ("data/b.txt", "bb"), ("new.txt", "")]));
         let diff = diff(old, new);
-        let paths = |files: &[PackageFile]| files.iter().map(|file| file.path.clone()).collect::<Vec<_>>();
+        let paths =
+            |files: &[PackageFile]| files.iter().map(|file| file.path.clone()).collect::<Vec<_>>();
         assert_eq!(
             (paths(&diff.added), paths(&diff.removed)),
             (vec!["new.txt".to_owned()], vec!["gone.txt".to_owned()])
@@ -135,7 +170,9 @@ mod tests {
         let packed = packed(&[("data/a.txt", "a")]);
         let content = std::fs::read(packed.content.path()).unwrap();
         let facts = ContentFacts { entries: 2, ..packed.manifest.content };
-        for (content, facts) in [(&content[..], facts), (&content[..50], packed.manifest.content), (b"x", facts)] {
+        for (content, facts) in
+            [(&content[..], facts), (&content[..50], packed.manifest.content), (b"x", facts)]
+        {
             let refused = list(content, content.len() as u64, &facts);
             assert!(matches!(refused, Err(UnpackError::Refused(_))), "{refused:?}");
         }

@@ -1,5 +1,6 @@
-//! What `taskd run` says in the place of a package's own `[run]`: another launch file, other arguments. It becomes part of
-//! the manifest, so that what ran on a robot is pinned by its digest like everything else.
+//! What `taskd run` says in the place of a package's own `[run]`: another launch file, other
+//! arguments. It becomes part of the manifest, so that what ran on a robot is pinned by its digest
+//! like everything else.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +9,8 @@ use task_proto::manifest::{Ready, Run, TaskManifest};
 /// A launch file and its arguments.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Launch {
-    /// The ROS package that has the file; absent: that of the manifest's own launch file, else the one of its name.
+    /// The ROS package that has the file; absent: that of the manifest's own launch file, else the
+    /// one of its name.
     pub ros_package: Option<String>,
     /// The file's name.
     pub file: String,
@@ -24,11 +26,12 @@ impl Launch {
         manifest
     }
 
-    /// The package's own arguments stay where it is its own launch file, below those that are given. What it promises of
-    /// its graph it promises of that file alone.
+    /// The package's own arguments stay where it is its own launch file, below those that are
+    /// given. What it promises of its graph it promises of that file alone.
     pub(super) fn replace(&self, run: &mut Run, ready: &mut Ready, name: &str) {
         let own = run.launch.take();
-        let ros_package = self.ros_package.clone().or_else(|| own.as_ref().map(|[package, _]| package.clone()));
+        let ros_package =
+            self.ros_package.clone().or_else(|| own.as_ref().map(|[package, _]| package.clone()));
         let launch = [ros_package.unwrap_or_else(|| name.to_owned()), self.file.clone()];
         if own.as_ref() != Some(&launch) {
             run.args.clear();
@@ -50,8 +53,14 @@ mod tests {
     }
 
     fn own() -> (Run, Ready) {
-        let args = [("rate", "1"), ("map", "m")].map(|(key, value)| (key.to_owned(), value.to_owned())).into();
-        let run = Run { launch: Some(["say".to_owned(), "own.launch.py".to_owned()]), args, ..Run::default() };
+        let args = [("rate", "1"), ("map", "m")]
+            .map(|(key, value)| (key.to_owned(), value.to_owned()))
+            .into();
+        let run = Run {
+            launch: Some(["say".to_owned(), "own.launch.py".to_owned()]),
+            args,
+            ..Run::default()
+        };
         (run, Ready { nodes: vec!["/talker".to_owned()], ..Ready::default() })
     }
 
@@ -59,7 +68,10 @@ mod tests {
     fn the_packages_own_launch_file_keeps_what_is_not_said_otherwise() {
         let (mut run, mut ready) = own();
         launch("own.launch.py").replace(&mut run, &mut ready, "talker");
-        assert_eq!(run.args.iter().map(|(k, v)| format!("{k}:={v}")).collect::<Vec<_>>(), ["map:=m", "rate:=5"]);
+        assert_eq!(
+            run.args.iter().map(|(k, v)| format!("{k}:={v}")).collect::<Vec<_>>(),
+            ["map:=m", "rate:=5"]
+        );
         assert_eq!(ready.nodes, ["/talker"]);
     }
 
@@ -69,8 +81,12 @@ mod tests {
         launch("other.launch.py").replace(&mut run, &mut ready, "talker");
         assert_eq!(run.launch, Some(["say".to_owned(), "other.launch.py".to_owned()]));
         assert_eq!((run.args.len(), ready), (1, Ready::default()));
-        let (mut run, mut ready) = (Run { exec: Some(vec!["x".to_owned()]), ..Run::default() }, Ready::default());
+        let (mut run, mut ready) =
+            (Run { exec: Some(vec!["x".to_owned()]), ..Run::default() }, Ready::default());
         launch("a.launch.py").replace(&mut run, &mut ready, "talker");
-        assert_eq!((run.launch.map(|[package, _]| package), run.exec), (Some("talker".to_owned()), None));
+        assert_eq!(
+            (run.launch.map(|[package, _]| package), run.exec),
+            (Some("talker".to_owned()), None)
+        );
     }
 }

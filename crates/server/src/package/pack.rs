@@ -1,12 +1,14 @@
-//! Makes a package of a directory: checks it, packs its files, and describes them in the OCI way. The same directory gives
-//! the same digests, whoever packs it, wherever and whenever.
+//! Makes a package of a directory: checks it, packs its files, and describes them in the OCI way.
+//! The same directory gives the same digests, whoever packs it, wherever and whenever.
 
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO, MAX_MANIFEST_BYTES, TaskManifest};
+use task_proto::manifest::{
+    CONTENT_RATIO_FREE_BYTES, MAX_CONTENT_RATIO, MAX_MANIFEST_BYTES, TaskManifest,
+};
 use task_proto::oci::ImageManifest;
 use tempfile::NamedTempFile;
 
@@ -64,7 +66,9 @@ fn pack_as(dir: &Path, launch: Option<&Launch>, temporary: &Path) -> Result<Pack
     let (content_blob, facts) = archive::write(&tree, &mut output)?;
     output.flush().map_err(failed)?;
     drop(output);
-    if facts.tar_size > content_blob.size.saturating_mul(MAX_CONTENT_RATIO).max(CONTENT_RATIO_FREE_BYTES) {
+    if facts.tar_size
+        > content_blob.size.saturating_mul(MAX_CONTENT_RATIO).max(CONTENT_RATIO_FREE_BYTES)
+    {
         let reason = format!(
             "compresses more than {MAX_CONTENT_RATIO} times ({} to {} bytes), which robots refuse; leave out what is empty",
             facts.tar_size, content_blob.size
@@ -81,13 +85,19 @@ fn pack_as(dir: &Path, launch: Option<&Launch>, temporary: &Path) -> Result<Pack
 }
 
 fn invalid(dir: &Path, file: &str, reason: String) -> PackageError {
-    PackageError::Invalid { dir: dir.to_owned(), problems: vec![Problem { file: file.to_owned(), reason }] }
+    PackageError::Invalid {
+        dir: dir.to_owned(),
+        problems: vec![Problem { file: file.to_owned(), reason }],
+    }
 }
 
-/// Compact JSON with the fields in the order of their declaration and maps sorted: one text for one value.
+/// Compact JSON with the fields in the order of their declaration and maps sorted: one text for one
+/// value.
 fn json<T: serde::Serialize>(value: &T) -> Result<Vec<u8>, PackageError> {
-    serde_json::to_vec(value)
-        .map_err(|error| PackageError::Io { what: "can't write the task manifest".to_owned(), source: error.into() })
+    serde_json::to_vec(value).map_err(|error| PackageError::Io {
+        what: "can't write the task manifest".to_owned(),
+        source: error.into(),
+    })
 }
 
 fn blob(bytes: &[u8]) -> BlobRef {
@@ -120,13 +130,21 @@ mod tests {
             let path = dir.path().join(path);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(&path, content).unwrap();
-            fs::set_permissions(&path, Permissions::from_mode(if *executable { 0o755 } else { 0o644 })).unwrap();
+            fs::set_permissions(
+                &path,
+                Permissions::from_mode(if *executable { 0o755 } else { 0o644 }),
+            )
+            .unwrap();
         }
         dir
     }
 
     fn plain() -> TempDir {
-        tree(&[("task.toml", TASK, false), ("run.sh", "#!/bin/sh\n", true), ("data/a.txt", "a", false)])
+        tree(&[
+            ("task.toml", TASK, false),
+            ("run.sh", "#!/bin/sh\n", true),
+            ("data/a.txt", "a", false),
+        ])
     }
 
     fn talker() -> TempDir {
@@ -140,7 +158,9 @@ mod tests {
 
     fn problems(dir: &TempDir) -> Vec<String> {
         match pack(dir.path()) {
-            Err(PackageError::Invalid { problems, .. }) => problems.iter().map(ToString::to_string).collect(),
+            Err(PackageError::Invalid { problems, .. }) => {
+                problems.iter().map(ToString::to_string).collect()
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -148,7 +168,10 @@ mod tests {
     /// Asserts that the tree is refused for exactly one reason, which has `expected` in it.
     fn refused(dir: &TempDir, expected: &str) {
         let problems = problems(dir);
-        assert!(problems.len() == 1 && problems[0].contains(expected), "expected {expected:?}, got {problems:#?}");
+        assert!(
+            problems.len() == 1 && problems[0].contains(expected),
+            "expected {expected:?}, got {problems:#?}"
+        );
     }
 
     fn names(packed: &Packed) -> Vec<String> {
@@ -156,7 +179,11 @@ mod tests {
         assert_eq!(Digest::of(&plain), packed.manifest.content.tar_digest);
         assert_eq!(plain.len() as u64, packed.manifest.content.tar_size);
         let mut archive = tar::Archive::new(&plain[..]);
-        archive.entries().unwrap().map(|entry| entry.unwrap().path().unwrap().display().to_string()).collect()
+        archive
+            .entries()
+            .unwrap()
+            .map(|entry| entry.unwrap().path().unwrap().display().to_string())
+            .collect()
     }
 
     #[test]
@@ -167,8 +194,11 @@ mod tests {
         fs::write(dir.path().join(&long), "long").unwrap();
         symlink("data/a.txt", dir.path().join("link")).unwrap();
         let packed = pack(dir.path()).unwrap();
-        let digests =
-            [packed.manifest.content.tar_digest, packed.package.content.digest, packed.package.manifest.digest];
+        let digests = [
+            packed.manifest.content.tar_digest,
+            packed.package.content.digest,
+            packed.package.manifest.digest,
+        ];
         // A change here means that every package changes its digest: say so in the commit.
         assert_eq!(
             digests.map(|digest| digest.to_string()),
@@ -189,7 +219,8 @@ mod tests {
         let manifest: ImageManifest = serde_json::from_slice(&packed.manifest_bytes).unwrap();
         assert_eq!(manifest.package_blobs(), Some((packed.package.config, packed.package.content)));
         assert_eq!(
-            serde_json::from_slice::<task_proto::manifest::TaskManifest>(&packed.config_bytes).unwrap(),
+            serde_json::from_slice::<task_proto::manifest::TaskManifest>(&packed.config_bytes)
+                .unwrap(),
             packed.manifest
         );
         assert_eq!(names(&packed), ["data", "data/a.txt", "run.sh", "task.toml"]);
@@ -244,12 +275,22 @@ mod tests {
     #[test]
     fn package_xml_gives_what_task_toml_leaves_out() {
         let packed = pack(talker().path()).unwrap();
-        assert_eq!((packed.manifest.name.as_str(), packed.manifest.version.as_str()), ("talker", "1.0.0"));
+        assert_eq!(
+            (packed.manifest.name.as_str(), packed.manifest.version.as_str()),
+            ("talker", "1.0.0")
+        );
         assert_eq!(packed.manifest.exec_depends, ["rclpy"]);
         let dir = talker();
-        fs::write(dir.path().join("task.toml"), format!("name = \"other\"\nversion = \"2\"\n{LAUNCH}")).unwrap();
+        fs::write(
+            dir.path().join("task.toml"),
+            format!("name = \"other\"\nversion = \"2\"\n{LAUNCH}"),
+        )
+        .unwrap();
         let packed = pack(dir.path()).unwrap();
-        assert_eq!((packed.manifest.name.as_str(), packed.manifest.version.as_str()), ("other", "2"));
+        assert_eq!(
+            (packed.manifest.name.as_str(), packed.manifest.version.as_str()),
+            ("other", "2")
+        );
     }
 
     #[test]
@@ -259,18 +300,27 @@ mod tests {
             fs::create_dir_all(path.parent().unwrap()).unwrap();
             fs::write(path, text).unwrap();
         };
-        let bad = XML.replace("<build_type>ament_python</build_type>", "<build_type>ament_cmake</build_type>");
+        let bad = XML.replace(
+            "<build_type>ament_python</build_type>",
+            "<build_type>ament_cmake</build_type>",
+        );
         let dir = talker();
         add(&dir, "test/fixtures/package.xml", &bad);
         pack(dir.path()).expect("a package's own files are no packages");
         let dir = tree(&[(
             "task.toml",
-            &LAUNCH.replacen("[run]", "name = \"all\"\nversion = \"1\"\n[build]\ntool = \"colcon\"\n[run]", 1),
+            &LAUNCH.replacen(
+                "[run]",
+                "name = \"all\"\nversion = \"1\"\n[build]\ntool = \"colcon\"\n[run]",
+                1,
+            ),
             false,
         )]);
-        for (path, text) in
-            [("src/talker/package.xml", XML), ("src/talker/setup.py", ""), ("src/talker/launch/talker.launch.py", "")]
-        {
+        for (path, text) in [
+            ("src/talker/package.xml", XML),
+            ("src/talker/setup.py", ""),
+            ("src/talker/launch/talker.launch.py", ""),
+        ] {
             add(&dir, path, text);
         }
         add(&dir, "third_party/old/package.xml", &bad);
@@ -318,12 +368,22 @@ mod tests {
         );
         let mail = XML.replace("a@example.org", "a@localhost");
         refused(
-            &with(LAUNCH, &[("package.xml", &mail, false), ("setup.py", "", false), ("talker.launch.py", "", false)]),
+            &with(
+                LAUNCH,
+                &[
+                    ("package.xml", &mail, false),
+                    ("setup.py", "", false),
+                    ("talker.launch.py", "", false),
+                ],
+            ),
             "package.xml: <maintainer>: \"a@localhost\" is not a valid e-mail address; colcon would not take it",
         );
         let no_type = XML.replace("<build_type>ament_python</build_type>", "");
         refused(
-            &with(&format!("{head}[run]\nexec = [\"true\"]\n"), &[("package.xml", &no_type, false)]),
+            &with(
+                &format!("{head}[run]\nexec = [\"true\"]\n"),
+                &[("package.xml", &no_type, false)],
+            ),
             "package.xml: export.build_type: is absent; say build.tool in task.toml",
         );
         let other = "[run]\nlaunch = [\"nav2\", \"x.launch.py\"]\n";
@@ -357,10 +417,15 @@ mod tests {
             ("lib/x", "runs where src/ and install/ are"),
             ("src/gone", "is not in this directory"),
         ] {
-            fs::write(dir.path().join("task.toml"), format!("[run]\nexec = [\"{command}\"]\n")).unwrap();
+            fs::write(dir.path().join("task.toml"), format!("[run]\nexec = [\"{command}\"]\n"))
+                .unwrap();
             refused(&dir, reason);
         }
-        fs::write(dir.path().join("task.toml"), "[run]\nexec = [\"install/talker/lib/talker/talker\"]\n").unwrap();
+        fs::write(
+            dir.path().join("task.toml"),
+            "[run]\nexec = [\"install/talker/lib/talker/talker\"]\n",
+        )
+        .unwrap();
         assert!(pack(dir.path()).is_ok());
     }
 
@@ -412,17 +477,24 @@ mod tests {
     #[test]
     fn a_bomb_is_refused_before_it_travels() {
         let dir = plain();
-        fs::File::create(dir.path().join("zeros")).unwrap().set_len(CONTENT_RATIO_FREE_BYTES + 1).unwrap();
+        fs::File::create(dir.path().join("zeros"))
+            .unwrap()
+            .set_len(CONTENT_RATIO_FREE_BYTES + 1)
+            .unwrap();
         refused(&dir, "compresses more than 200 times");
     }
 
     /// A random tree: path → (content, executable), directories implied.
     fn files() -> impl Strategy<Value = Vec<(String, Vec<u8>, bool)>> {
         let name = prop::sample::select(vec!["a", "b", "a-b", "a.b", "ä", "Z", "0"]);
-        let path = prop::collection::vec(name, 1..4).prop_map(|parts| format!("tree/{}/file", parts.join("/")));
+        let path = prop::collection::vec(name, 1..4)
+            .prop_map(|parts| format!("tree/{}/file", parts.join("/")));
         let content = prop::collection::vec(any::<u8>(), 0..600);
         prop::collection::btree_map(path, (content, any::<bool>()), 0..12).prop_map(|files| {
-            files.into_iter().map(|(path, (content, executable))| (path, content, executable)).collect()
+            files
+                .into_iter()
+                .map(|(path, (content, executable))| (path, content, executable))
+                .collect()
         })
     }
 
@@ -439,7 +511,8 @@ mod tests {
             fs::write(&path, content).unwrap();
             let mode = 0o600 | group_bits | if *executable { 0o100 } else { 0 };
             fs::set_permissions(&path, Permissions::from_mode(mode)).unwrap();
-            let time = std::time::UNIX_EPOCH + std::time::Duration::from_secs(mtime_s.unsigned_abs());
+            let time =
+                std::time::UNIX_EPOCH + std::time::Duration::from_secs(mtime_s.unsigned_abs());
             fs::File::options().write(true).open(&path).unwrap().set_modified(time).unwrap();
         }
         fs::create_dir_all(&root).unwrap();

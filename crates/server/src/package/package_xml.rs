@@ -1,5 +1,6 @@
-//! Reads a ROS `package.xml`, formats 1 to 3 (REP 127, 140, 149): the few elements that matter here, and the rules by
-//! which ROS's own tools would reject the file, because they reject it silently.
+//! Reads a ROS `package.xml`, formats 1 to 3 (REP 127, 140, 149): the few elements that matter
+//! here, and the rules by which ROS's own tools would reject the file, because they reject it
+//! silently.
 
 use roxmltree::{Document, Node};
 
@@ -15,8 +16,8 @@ pub struct PackageXml {
     pub version: String,
     /// What builds it.
     pub build_type: BuildType,
-    /// Names from exec_depend, depend and run_depend, sorted, each once. Without those that have a condition, which only
-    /// a robot could judge.
+    /// Names from exec_depend, depend and run_depend, sorted, each once. Without those that have a
+    /// condition, which only a robot could judge.
     pub exec_depends: Vec<String>,
     /// Those that have one.
     pub conditional_depends: Vec<String>,
@@ -59,8 +60,11 @@ pub fn parse(text: &str) -> Result<PackageXml, String> {
         .collect();
     types.dedup();
     let build_type = match types.len() {
-        // Before formats knew build types there was only catkin, and it had to be named as the build tool.
-        0 if texts(package, "buildtool_depend").any(|name| name == "catkin") => BuildType::One("catkin".to_owned()),
+        // Before formats knew build types there was only catkin, and it had to be named as the
+        // build tool.
+        0 if texts(package, "buildtool_depend").any(|name| name == "catkin") => {
+            BuildType::One("catkin".to_owned())
+        }
         0 => BuildType::Absent,
         1 => BuildType::One(types.remove(0)),
         _ => BuildType::Several(types),
@@ -80,16 +84,19 @@ pub fn parse(text: &str) -> Result<PackageXml, String> {
 fn depends(package: Node<'_, '_>, conditional: bool) -> Vec<String> {
     let tags = ["exec_depend", "depend", "run_depend"];
     let elements = tags.iter().flat_map(|tag| children(package, tag));
-    let mut names: Vec<String> =
-        elements.filter(|element| element.has_attribute("condition") == conditional).map(text_of).collect();
+    let mut names: Vec<String> = elements
+        .filter(|element| element.has_attribute("condition") == conditional)
+        .map(text_of)
+        .collect();
     names.retain(|name| !name.is_empty());
     names.sort();
     names.dedup();
     names
 }
 
-/// The rules of catkin_pkg's `Package.validate`: a file that breaks one is no ROS package to colcon, which then builds an
-/// ament_python package as plain Python, without its ROS index entries, and says nothing.
+/// The rules of catkin_pkg's `Package.validate`: a file that breaks one is no ROS package to
+/// colcon, which then builds an ament_python package as plain Python, without its ROS index
+/// entries, and says nothing.
 fn invalid(package: Node<'_, '_>) -> Vec<String> {
     let mut invalid = Vec::new();
     for tag in ["name", "version", "description"] {
@@ -132,7 +139,10 @@ fn invalid(package: Node<'_, '_>) -> Vec<String> {
     invalid
 }
 
-fn children<'a, 'input>(node: Node<'a, 'input>, tag: &'a str) -> impl Iterator<Item = Node<'a, 'input>> {
+fn children<'a, 'input>(
+    node: Node<'a, 'input>,
+    tag: &'a str,
+) -> impl Iterator<Item = Node<'a, 'input>> {
     node.children().filter(move |child| child.has_tag_name(tag))
 }
 
@@ -144,7 +154,8 @@ fn text_of(node: Node<'_, '_>) -> String {
 fn texts<'a>(node: Node<'a, '_>, tag: &'a str) -> impl Iterator<Item = String> {
     children(node, tag)
         .map(|child| {
-            let text: String = child.descendants().filter(Node::is_text).filter_map(|text| text.text()).collect();
+            let text: String =
+                child.descendants().filter(Node::is_text).filter_map(|text| text.text()).collect();
             text.trim().to_owned()
         })
         .filter(|text| !text.is_empty())
@@ -157,18 +168,24 @@ fn is_package_name(name: &str) -> bool {
 
 fn is_version(version: &str) -> bool {
     let numbers: Vec<_> = version.split('.').collect();
-    numbers.len() == 3 && numbers.iter().all(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))
+    numbers.len() == 3
+        && numbers.iter().all(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
 /// catkin_pkg's pattern: `local(.local)*@domain(.domain)*.xx`.
 fn is_email(email: &str) -> bool {
     let words = |text: &str, extra: &[u8]| {
-        text.split('.')
-            .all(|word| !word.is_empty() && word.bytes().all(|b| b.is_ascii_alphanumeric() || extra.contains(&b)))
+        text.split('.').all(|word| {
+            !word.is_empty()
+                && word.bytes().all(|b| b.is_ascii_alphanumeric() || extra.contains(&b))
+        })
     };
     let Some((local, domain)) = email.split_once('@') else { return false };
     let Some((domain, last)) = domain.rsplit_once('.') else { return false };
-    words(local, b"-_%+") && words(domain, b"-%") && last.len() >= 2 && last.bytes().all(|b| b.is_ascii_alphabetic())
+    words(local, b"-_%+")
+        && words(domain, b"-%")
+        && last.len() >= 2
+        && last.bytes().all(|b| b.is_ascii_alphabetic())
 }
 
 #[cfg(test)]
@@ -214,12 +231,20 @@ mod tests {
     #[test]
     fn what_colcon_would_silently_reject_is_named() {
         for (from, to, reason) in [
-            ("a@example.org", "a@localhost", "<maintainer>: \"a@localhost\" is not a valid e-mail address"),
+            (
+                "a@example.org",
+                "a@localhost",
+                "<maintainer>: \"a@localhost\" is not a valid e-mail address",
+            ),
             ("a@example.org", "", "<maintainer>: \"\" is not a valid e-mail address"),
             (" email=\"a@example.org\"", "", "<maintainer>: \"A\" has no email"),
             ("<license>Apache-2.0</license>", "", "<license> is absent or empty"),
             ("1.2.3", "1.2", "<version>: \"1.2\" is not three numbers like 1.0.0"),
-            ("<name>talker</name>", "<name>my talker</name>", "<name>: \"my talker\" is not a ROS package name"),
+            (
+                "<name>talker</name>",
+                "<name>my talker</name>",
+                "<name>: \"my talker\" is not a ROS package name",
+            ),
             ("<name>talker</name>", "", "<name> is absent or empty"),
         ] {
             let xml = parse(&TALKER.replace(from, to)).expect("well-formed");
@@ -231,7 +256,10 @@ mod tests {
     fn other_documents_are_refused() {
         assert!(parse("<package><name>").is_err());
         assert_eq!(parse("<robot/>"), Err("the root element is <robot>, not <package>".to_owned()));
-        assert_eq!(parse("<package format=\"4\"/>"), Err("format \"4\" is none of 1, 2 and 3".to_owned()));
+        assert_eq!(
+            parse("<package format=\"4\"/>"),
+            Err("format \"4\" is none of 1, 2 and 3".to_owned())
+        );
     }
 
     #[test]
@@ -239,7 +267,18 @@ mod tests {
         for good in ["a@b.cc", "a.b+c@d-e.f.org", "a_%@x.io"] {
             assert!(is_email(good), "{good}");
         }
-        for bad in ["", "a", "a@b", "a@b.c", "a@@b.cc", "a..b@c.dd", "a@b..cc", "a@b.c1", "a b@c.dd", "ä@b.cc"] {
+        for bad in [
+            "",
+            "a",
+            "a@b",
+            "a@b.c",
+            "a@@b.cc",
+            "a..b@c.dd",
+            "a@b..cc",
+            "a@b.c1",
+            "a b@c.dd",
+            "ä@b.cc",
+        ] {
             assert!(!is_email(bad), "{bad}");
         }
     }

@@ -1,5 +1,5 @@
-//! Whether a package could be built and started: the manifest against the files that come with it. What only a robot can
-//! know (its underlay, its architecture) is not judged here.
+//! Whether a package could be built and started: the manifest against the files that come with it.
+//! What only a robot can know (its underlay, its architecture) is not judged here.
 
 use task_proto::manifest::{BuildTool, TaskManifest};
 
@@ -16,7 +16,11 @@ struct RosPackage {
 }
 
 /// Adds everything that keeps `manifest` and `tree` from running to `problems`.
-pub(super) fn check(manifest: &TaskManifest, tree: &Tree, problems: &mut Vec<Problem>) -> Result<(), PackageError> {
+pub(super) fn check(
+    manifest: &TaskManifest,
+    tree: &Tree,
+    problems: &mut Vec<Problem>,
+) -> Result<(), PackageError> {
     for problem in manifest.problems() {
         problems.push(Problem { file: task_toml::FILE.to_owned(), reason: problem.to_string() });
     }
@@ -42,8 +46,10 @@ const IGNORED_BY: [&str; 3] = ["COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE"]
 fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPackage>, PackageError> {
     const MAX_PACKAGES: usize = 1000;
     let mut packages = Vec::new();
-    let found =
-        tree.entries.keys().filter(|path| name_of(path) == package_xml::FILE && is_looked_at(tree, parent(path)));
+    let found = tree
+        .entries
+        .keys()
+        .filter(|path| name_of(path) == package_xml::FILE && is_looked_at(tree, parent(path)));
     for path in found.take(MAX_PACKAGES) {
         let Some(text) = read_text(&tree.root, path, problems)? else { continue };
         let directory = parent(path).to_owned();
@@ -57,14 +63,16 @@ fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPacka
     Ok(packages)
 }
 
-/// Whether build tools look for a package in `directory`: not where a file says no, nor below another package.
+/// Whether build tools look for a package in `directory`: not where a file says no, nor below
+/// another package.
 fn is_looked_at(tree: &Tree, directory: &str) -> bool {
     let has = |directory: &str, file: &str| match directory {
         "" => tree.entries.contains_key(file),
         directory => tree.entries.contains_key(&format!("{directory}/{file}")),
     };
     let is_ignored = |directory: &str| IGNORED_BY.iter().any(|file| has(directory, file));
-    let mut above = std::iter::successors(Some(directory), |below| (!below.is_empty()).then(|| parent(below)));
+    let mut above =
+        std::iter::successors(Some(directory), |below| (!below.is_empty()).then(|| parent(below)));
     above.all(|at| !is_ignored(at) && (at == directory || !has(at, package_xml::FILE)))
 }
 
@@ -80,18 +88,25 @@ fn name_of(path: &str) -> &str {
 fn check_build(tool: BuildTool, packages: &[RosPackage], tree: &Tree, problems: &mut Vec<Problem>) {
     let name = if tool == BuildTool::Colcon { "colcon" } else { "catkin" };
     if packages.is_empty() {
-        let reason = format!("build.tool: {name} needs a package.xml, and there is none; use \"none\" for plain files");
+        let reason = format!(
+            "build.tool: {name} needs a package.xml, and there is none; use \"none\" for plain files"
+        );
         problems.push(Problem { file: task_toml::FILE.to_owned(), reason });
     }
     for RosPackage { directory, xml } in packages {
-        let at = |file: &str| if directory.is_empty() { file.to_owned() } else { format!("{directory}/{file}") };
+        let at = |file: &str| {
+            if directory.is_empty() { file.to_owned() } else { format!("{directory}/{file}") }
+        };
         for reason in &xml.invalid {
-            let reason = format!("{reason}; {name} would not take it for a ROS package, without saying so");
+            let reason =
+                format!("{reason}; {name} would not take it for a ROS package, without saying so");
             problems.push(Problem { file: at(package_xml::FILE), reason });
         }
         let build_file = match &xml.build_type {
             package_xml::BuildType::One(kind) if kind == "ament_python" => "setup.py",
-            package_xml::BuildType::One(kind) if matches!(kind.as_str(), "ament_cmake" | "cmake" | "catkin") => {
+            package_xml::BuildType::One(kind)
+                if matches!(kind.as_str(), "ament_cmake" | "cmake" | "catkin") =>
+            {
                 "CMakeLists.txt"
             }
             _ => continue,
@@ -105,7 +120,8 @@ fn check_build(tool: BuildTool, packages: &[RosPackage], tree: &Tree, problems: 
     }
 }
 
-/// Traces of `colcon build --symlink-install` that are no links: they name directories of the machine that built.
+/// Traces of `colcon build --symlink-install` that are no links: they name directories of the
+/// machine that built.
 fn check_install_tree(tree: &Tree, problems: &mut Vec<Problem>) {
     let develop = |path: &&String| path.starts_with("install/") && path.ends_with(".egg-link");
     if let Some(path) = tree.entries.keys().find(develop) {
@@ -123,18 +139,25 @@ fn check_launch(
     problems: &mut Vec<Problem>,
 ) {
     let mut refuse = |reason: String| {
-        problems.push(Problem { file: task_toml::FILE.to_owned(), reason: format!("run.launch: {reason}") })
+        problems.push(Problem {
+            file: task_toml::FILE.to_owned(),
+            reason: format!("run.launch: {reason}"),
+        })
     };
     let has_file = |prefix: &str| {
         tree.entries.iter().any(|(path, entry)| {
             *entry != Entry::Directory
-                && path.strip_prefix(prefix).is_some_and(|rest| rest == file || rest.ends_with(&format!("/{file}")))
+                && path
+                    .strip_prefix(prefix)
+                    .is_some_and(|rest| rest == file || rest.ends_with(&format!("/{file}")))
         })
     };
     if manifest.build.tool == BuildTool::None {
         let shares = shares(package);
         if !is_in_install_tree(tree, package) {
-            refuse(format!("needs a package.xml to build {package:?} from, or an install/ tree that has it"));
+            refuse(format!(
+                "needs a package.xml to build {package:?} from, or an install/ tree that has it"
+            ));
         } else if !shares.iter().any(|share| has_file(share)) {
             refuse(format!("{file:?} is not in the install tree below share/{package}"));
         }
@@ -142,17 +165,24 @@ fn check_launch(
     }
     match packages.iter().find(|candidate| candidate.xml.name == package) {
         Some(found) => {
-            let prefix = if found.directory.is_empty() { String::new() } else { format!("{}/", found.directory) };
+            let prefix = if found.directory.is_empty() {
+                String::new()
+            } else {
+                format!("{}/", found.directory)
+            };
             if !has_file(&prefix) {
                 refuse(format!("{file:?} is not in the package {package:?}"));
             }
         }
         None if packages.iter().any(|found| found.xml.depends_on(package)) => {}
-        None => refuse(format!("{package:?} is neither in this directory nor an exec_depend of package.xml")),
+        None => refuse(format!(
+            "{package:?} is neither in this directory nor an exec_depend of package.xml"
+        )),
     }
 }
 
-/// Where an install tree has what `package` shares: it is isolated or merged, and in install/ or the directory itself.
+/// Where an install tree has what `package` shares: it is isolated or merged, and in install/ or
+/// the directory itself.
 fn shares(package: &str) -> [String; 4] {
     let isolated = |top: &str| format!("{top}{package}/share/{package}/");
     let merged = |top: &str| format!("{top}share/{package}/");
@@ -165,36 +195,51 @@ pub(super) fn is_in_install_tree(tree: &Tree, package: &str) -> bool {
     tree.entries.keys().any(|path| shares.iter().any(|share| path.starts_with(share)))
 }
 
-/// A command with a slash comes with the package, unless it is absolute. Where it is relative to: see docs/package.md.
-fn check_exec(tool: BuildTool, tree: &Tree, packages: &[RosPackage], command: &str, problems: &mut Vec<Problem>) {
+/// A command with a slash comes with the package, unless it is absolute. Where it is relative to:
+/// see docs/package.md.
+fn check_exec(
+    tool: BuildTool,
+    tree: &Tree,
+    packages: &[RosPackage],
+    command: &str,
+    problems: &mut Vec<Problem>,
+) {
     if !command.contains('/') || command.starts_with('/') {
         return;
     }
     let mut refuse = |reason: String| {
-        problems.push(Problem { file: task_toml::FILE.to_owned(), reason: format!("run.exec: {reason}") })
+        problems.push(Problem {
+            file: task_toml::FILE.to_owned(),
+            reason: format!("run.exec: {reason}"),
+        })
     };
     let path = command.trim_start_matches("./");
     let in_tree = match tool {
         BuildTool::None => path,
-        BuildTool::Colcon | BuildTool::Catkin => match (path.strip_prefix("src/"), path.strip_prefix("install/")) {
-            (Some(path), _) => path,
-            (None, Some(product)) => {
-                let package = product.split('/').next().unwrap_or_default();
-                let shared = ["bin", "lib", "share"].contains(&package);
-                if !shared && !packages.is_empty() && !packages.iter().any(|found| found.xml.name == package) {
-                    refuse(format!(
-                        "{command:?}: this directory has no package {package:?} that would be installed there"
-                    ));
+        BuildTool::Colcon | BuildTool::Catkin => {
+            match (path.strip_prefix("src/"), path.strip_prefix("install/")) {
+                (Some(path), _) => path,
+                (None, Some(product)) => {
+                    let package = product.split('/').next().unwrap_or_default();
+                    let shared = ["bin", "lib", "share"].contains(&package);
+                    if !shared
+                        && !packages.is_empty()
+                        && !packages.iter().any(|found| found.xml.name == package)
+                    {
+                        refuse(format!(
+                            "{command:?}: this directory has no package {package:?} that would be installed there"
+                        ));
+                    }
+                    return;
                 }
-                return;
+                (None, None) => {
+                    refuse(format!(
+                        "{command:?}: a package that is built runs where src/ and install/ are; begin with one of them"
+                    ));
+                    return;
+                }
             }
-            (None, None) => {
-                refuse(format!(
-                    "{command:?}: a package that is built runs where src/ and install/ are; begin with one of them"
-                ));
-                return;
-            }
-        },
+        }
     };
     match tree.resolve(in_tree) {
         Some(Entry::File { executable: true, .. }) => {}

@@ -1,5 +1,6 @@
-//! What a package's directory says of itself: `task.toml`, with what it leaves out taken from `package.xml`, merged into
-//! a task manifest, and the files that belong to it. It collects everything that is wrong before it gives up.
+//! What a package's directory says of itself: `task.toml`, with what it leaves out taken from
+//! `package.xml`, merged into a task manifest, and the files that belong to it. It collects
+//! everything that is wrong before it gives up.
 
 use std::fs;
 use std::io;
@@ -26,14 +27,17 @@ pub(super) struct Source {
 /// Reads and checks `dir`, as what runs by `launch` if that is given.
 pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, PackageError> {
     let invalid = |problems| PackageError::Invalid { dir: dir.to_owned(), problems };
-    let not_a_directory = |reason: &str| invalid(vec![Problem { file: ".".to_owned(), reason: reason.to_owned() }]);
+    let not_a_directory =
+        |reason: &str| invalid(vec![Problem { file: ".".to_owned(), reason: reason.to_owned() }]);
     match fs::metadata(dir) {
         Ok(metadata) if metadata.is_dir() => {}
         Ok(_) => return Err(not_a_directory("is not a directory")),
         Err(error) if error.kind() == io::ErrorKind::NotFound => {
             return Err(not_a_directory("there is no such directory"));
         }
-        Err(source) => return Err(PackageError::Io { what: format!("can't read {}", dir.display()), source }),
+        Err(source) => {
+            return Err(PackageError::Io { what: format!("can't read {}", dir.display()), source });
+        }
     }
     let mut problems = Vec::new();
     let toml = read_text(dir, task_toml::FILE, &mut problems)?;
@@ -42,8 +46,12 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
     let is_said = launch.is_some() && xml.is_some();
     if toml.is_none() && !is_said && problems.is_empty() {
         let reason = match xml {
-            Some(_) => "is absent; package.xml does not say how the package is run: give [run] with launch or exec",
-            None => "is absent, and so is package.xml; a package needs at least task.toml with name, version and [run]",
+            Some(_) => {
+                "is absent; package.xml does not say how the package is run: give [run] with launch or exec"
+            }
+            None => {
+                "is absent, and so is package.xml; a package needs at least task.toml with name, version and [run]"
+            }
         };
         problems.push(Problem { file: task_toml::FILE.to_owned(), reason: reason.to_owned() });
         return Err(invalid(problems));
@@ -60,7 +68,10 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
         }
     });
     if let Some(launch) = launch {
-        let name = xml.as_ref().map(|xml| xml.name.clone()).or_else(|| toml.name.as_ref().map(ToString::to_string));
+        let name = xml
+            .as_ref()
+            .map(|xml| xml.name.clone())
+            .or_else(|| toml.name.as_ref().map(ToString::to_string));
         launch.replace(&mut toml.run, &mut toml.ready, &name.unwrap_or_default());
     }
     let tool = build_tool(&toml, xml.as_ref(), &mut problems);
@@ -79,17 +90,24 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
 
 /// `build.tool`, or what `package.xml` implies.
 fn build_tool(toml: &TaskToml, xml: Option<&PackageXml>, problems: &mut Vec<Problem>) -> BuildTool {
-    let (None, Some(xml)) = (toml.build_tool, xml) else { return toml.build_tool.unwrap_or(BuildTool::None) };
+    let (None, Some(xml)) = (toml.build_tool, xml) else {
+        return toml.build_tool.unwrap_or(BuildTool::None);
+    };
     let reason = match &xml.build_type {
         BuildType::One(name) => match name.as_str() {
             "ament_python" | "ament_cmake" | "cmake" => return BuildTool::Colcon,
             "catkin" => return BuildTool::Catkin,
-            other => format!("export.build_type: {other:?} is none of ament_python, ament_cmake, cmake and catkin"),
+            other => format!(
+                "export.build_type: {other:?} is none of ament_python, ament_cmake, cmake and catkin"
+            ),
         },
         BuildType::Absent => "export.build_type: is absent".to_owned(),
-        BuildType::Several(names) => format!("export.build_type: there are several ({})", names.join(", ")),
+        BuildType::Several(names) => {
+            format!("export.build_type: there are several ({})", names.join(", "))
+        }
     };
-    let reason = format!("{reason}; say build.tool in task.toml: \"colcon\", \"catkin\" or \"none\"");
+    let reason =
+        format!("{reason}; say build.tool in task.toml: \"colcon\", \"catkin\" or \"none\"");
     problems.push(Problem { file: package_xml::FILE.to_owned(), reason });
     BuildTool::None
 }
@@ -104,10 +122,15 @@ fn merge(
 ) -> Option<TaskManifest> {
     let mut missing = |key: &'static str, text: Option<&String>, reason: Option<String>| {
         let reason = match (text.filter(|text| !text.is_empty()), reason) {
-            (Some(_), Some(reason)) => format!("<{key}>: {reason}; give another {key} in task.toml"),
+            (Some(_), Some(reason)) => {
+                format!("<{key}>: {reason}; give another {key} in task.toml")
+            }
             _ if toml_is_whole => {
                 let hint = if xml.is_some() { "; package.xml does not give it either" } else { "" };
-                problems.push(Problem { file: task_toml::FILE.to_owned(), reason: format!("{key}: is absent{hint}") });
+                problems.push(Problem {
+                    file: task_toml::FILE.to_owned(),
+                    reason: format!("{key}: is absent{hint}"),
+                });
                 return;
             }
             _ => return,
@@ -121,7 +144,10 @@ fn merge(
             missing(
                 "name",
                 text,
-                parsed.clone().and_then(Result::err).map(|error: task_proto::id::InvalidId| error.to_string()),
+                parsed
+                    .clone()
+                    .and_then(Result::err)
+                    .map(|error: task_proto::id::InvalidId| error.to_string()),
             );
         }
         parsed.and_then(Result::ok)
@@ -133,7 +159,10 @@ fn merge(
             missing(
                 "version",
                 text,
-                parsed.clone().and_then(Result::err).map(|error: task_proto::id::InvalidId| error.to_string()),
+                parsed
+                    .clone()
+                    .and_then(Result::err)
+                    .map(|error: task_proto::id::InvalidId| error.to_string()),
             );
         }
         parsed.and_then(Result::ok)

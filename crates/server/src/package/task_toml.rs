@@ -1,5 +1,5 @@
-//! Reads `task.toml`. It is strict: a key that does not exist and a value of the wrong type are problems, and all of them
-//! are found in one go. What the keys mean together is not judged here.
+//! Reads `task.toml`. It is strict: a key that does not exist and a value of the wrong type are
+//! problems, and all of them are found in one go. What the keys mean together is not judged here.
 
 use std::collections::BTreeMap;
 
@@ -40,10 +40,17 @@ pub struct TaskToml {
 pub fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
     let mut file = TaskToml::default();
     match text.parse::<toml::Table>() {
-        Ok(table) => Section { path: String::new(), table, known: Vec::new(), problems }.read_file(&mut file),
+        Ok(table) => {
+            Section { path: String::new(), table, known: Vec::new(), problems }.read_file(&mut file)
+        }
         Err(error) => {
-            let line = error.span().map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
-            problems.push(Problem { file: FILE.to_owned(), reason: format!("line {line}: {}", error.message()) });
+            let line = error
+                .span()
+                .map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            problems.push(Problem {
+                file: FILE.to_owned(),
+                reason: format!("line {line}: {}", error.message()),
+            });
         }
     }
     file
@@ -110,7 +117,10 @@ impl Section<'_> {
             Ok(value) => *slot = value,
             Err(error) => {
                 let error: toml::de::Error = error;
-                self.problem(key, format!("{} (it is {written})", in_file_words(error.message().trim_end())));
+                self.problem(
+                    key,
+                    format!("{} (it is {written})", in_file_words(error.message().trim_end())),
+                );
             }
         }
     }
@@ -122,11 +132,15 @@ impl Section<'_> {
             None => {}
             Some(toml::Value::Table(table)) => {
                 let path = format!("{}{key}.", self.path);
-                let mut section = Section { path, table, known: Vec::new(), problems: self.problems };
+                let mut section =
+                    Section { path, table, known: Vec::new(), problems: self.problems };
                 read(&mut section);
                 section.finish();
             }
-            Some(other) => self.problem(key, format!("expected a table, written [{key}] (it is {})", brief(&other))),
+            Some(other) => self.problem(
+                key,
+                format!("expected a table, written [{key}] (it is {})", brief(&other)),
+            ),
         }
     }
 
@@ -149,13 +163,18 @@ impl Section<'_> {
         let tables = match self.table.remove("parameters") {
             None => return,
             Some(toml::Value::Table(tables)) => tables,
-            Some(other) => return self.problem("parameters", format!("expected a table (it is {})", brief(&other))),
+            Some(other) => {
+                return self
+                    .problem("parameters", format!("expected a table (it is {})", brief(&other)));
+            }
         };
         for (node, value) in tables {
             let toml::Value::Table(parameters) = value else {
                 self.problem(
                     "parameters",
-                    format!("expected one table per node, like [parameters.\"/mapper\"], not {node:?}"),
+                    format!(
+                        "expected one table per node, like [parameters.\"/mapper\"], not {node:?}"
+                    ),
                 );
                 continue;
             };
@@ -181,7 +200,10 @@ impl Section<'_> {
     }
 
     fn problem(&mut self, key: &str, reason: String) {
-        self.problems.push(Problem { file: FILE.to_owned(), reason: format!("{}{key}: {reason}", self.path) });
+        self.problems.push(Problem {
+            file: FILE.to_owned(),
+            reason: format!("{}{key}: {reason}", self.path),
+        });
     }
 }
 
@@ -194,7 +216,9 @@ fn parameter(value: &toml::Value) -> Result<serde_json::Value, &'static str> {
         toml::Value::String(text) => Ok(text.as_str().into()),
         toml::Value::Float(number) if number.is_finite() => Ok((*number).into()),
         toml::Value::Float(_) => Err("must be a finite number"),
-        toml::Value::Array(list) if list.iter().any(|item| item.is_array() || item.is_table()) => Err(EXPECTED),
+        toml::Value::Array(list) if list.iter().any(|item| item.is_array() || item.is_table()) => {
+            Err(EXPECTED)
+        }
         toml::Value::Array(list) if list.windows(2).any(|pair| !pair[0].same_type(&pair[1])) => {
             Err("a list's values must be of one type")
         }
@@ -207,12 +231,17 @@ fn parameter(value: &toml::Value) -> Result<serde_json::Value, &'static str> {
 fn brief(value: &toml::Value) -> String {
     const MAX_CHARS: usize = 60;
     let text = value.to_string().replace('\n', " ");
-    if text.chars().count() <= MAX_CHARS { text } else { text.chars().take(MAX_CHARS).chain(['…']).collect() }
+    if text.chars().count() <= MAX_CHARS {
+        text
+    } else {
+        text.chars().take(MAX_CHARS).chain(['…']).collect()
+    }
 }
 
 /// The known key that `key` is probably meant to be: at most two letters away, and not all of them.
 fn nearest<'k>(key: &str, known: &[&'k str]) -> Option<&'k str> {
-    let (distance, best) = known.iter().map(|candidate| (distance(key, candidate), *candidate)).min()?;
+    let (distance, best) =
+        known.iter().map(|candidate| (distance(key, candidate), *candidate)).min()?;
     (distance <= 2 && distance < best.len()).then_some(best)
 }
 
@@ -280,8 +309,14 @@ mod tests {
         assert_eq!(problems, []);
         assert_eq!(file.name.expect("name").as_str(), "corridor_mapping");
         assert_eq!(file.build_tool, Some(BuildTool::Colcon));
-        assert_eq!(file.run.launch, Some(["corridor_mapping".to_owned(), "mapping.launch.py".to_owned()]));
-        assert_eq!((file.run.kind, file.run.on_boot, file.run.restart), (TaskKind::Job, OnBoot::Hold, Restart::Never));
+        assert_eq!(
+            file.run.launch,
+            Some(["corridor_mapping".to_owned(), "mapping.launch.py".to_owned()])
+        );
+        assert_eq!(
+            (file.run.kind, file.run.on_boot, file.run.restart),
+            (TaskKind::Job, OnBoot::Hold, Restart::Never)
+        );
         assert_eq!((file.run.stop_timeout_s, file.ready.hold_s, file.ready.timeout_s), (3, 1, 20));
         assert_eq!(file.parameters["/mapper"]["resolution"], serde_json::json!(0.05));
         assert_eq!(file.parameters["/mapper"]["frames"], serde_json::json!(["map", "odom"]));
@@ -303,7 +338,10 @@ mod tests {
             "task.toml: ready.hold_s: ",
             "task.toml: outputs.paths: ",
         ] {
-            assert!(found.iter().any(|problem| problem.starts_with(expected)), "{expected:?} not in {found:#?}");
+            assert!(
+                found.iter().any(|problem| problem.starts_with(expected)),
+                "{expected:?} not in {found:#?}"
+            );
         }
         assert_eq!(found.len(), 8, "{found:#?}");
     }
@@ -316,7 +354,10 @@ mod tests {
 
     #[test]
     fn sections_must_be_tables_and_parameters_must_be_ros_values() {
-        assert_eq!(problems("run = 3"), ["task.toml: run: expected a table, written [run] (it is 3)"]);
+        assert_eq!(
+            problems("run = 3"),
+            ["task.toml: run: expected a table, written [run] (it is 3)"]
+        );
         let found = problems(
             "[parameters]\nx = 1\n[parameters.\"/n\"]\na = nan\nb = [1, 2.0]\nc = { d = 1 }\ne = 2020-01-01\n",
         );

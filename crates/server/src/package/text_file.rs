@@ -1,4 +1,5 @@
-//! The small text files of a package's directory: regular, UTF-8 and of bounded size, or a problem that is named.
+//! The small text files of a package's directory: regular, UTF-8 and of bounded size, or a problem
+//! that is named.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
@@ -9,8 +10,13 @@ use super::{PackageError, Problem};
 /// The largest text file that is read.
 const MAX_TEXT_BYTES: u64 = 1024 * 1024;
 
-/// The text file `name` in `dir`; `None` if it is not there or can't be used, which is then a problem.
-pub(super) fn read_text(dir: &Path, name: &str, problems: &mut Vec<Problem>) -> Result<Option<String>, PackageError> {
+/// The text file `name` in `dir`; `None` if it is not there or can't be used, which is then a
+/// problem.
+pub(super) fn read_text(
+    dir: &Path,
+    name: &str,
+    problems: &mut Vec<Problem>,
+) -> Result<Option<String>, PackageError> {
     let path = dir.join(name);
     let mut refuse = |reason: String| problems.push(Problem { file: name.to_owned(), reason });
     // Only a regular file is opened: a FIFO would wait for ever.
@@ -25,12 +31,17 @@ pub(super) fn read_text(dir: &Path, name: &str, problems: &mut Vec<Problem>) -> 
             refuse("is not a regular file".to_owned());
             return Ok(None);
         }
-        Err(source) => return Err(PackageError::Io { what: format!("can't read {}", path.display()), source }),
+        Err(source) => {
+            return Err(PackageError::Io {
+                what: format!("can't read {}", path.display()),
+                source,
+            });
+        }
     }
     let mut bytes = Vec::new();
-    File::open(&path)
-        .and_then(|file| file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes))
-        .map_err(|source| PackageError::Io { what: format!("can't read {}", path.display()), source })?;
+    File::open(&path).and_then(|file| file.take(MAX_TEXT_BYTES).read_to_end(&mut bytes)).map_err(
+        |source| PackageError::Io { what: format!("can't read {}", path.display()), source },
+    )?;
     match String::from_utf8(bytes) {
         Ok(text) => Ok(Some(text)),
         Err(_) => {

@@ -1,12 +1,14 @@
-//! A package's files: walks the directory, leaves out what does not belong, and refuses what must not travel. It follows
-//! no link and opens no file but `.taskdignore`.
+//! A package's files: walks the directory, leaves out what does not belong, and refuses what must
+//! not travel. It follows no link and opens no file but `.taskdignore`.
 
 use std::collections::BTreeMap;
 use std::fs::{self, Metadata};
 use std::os::unix::fs::{FileTypeExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 
-use task_proto::manifest::{MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES, MAX_CONTENT_PATH_BYTES, MAX_CONTENT_TAR_BYTES};
+use task_proto::manifest::{
+    MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES, MAX_CONTENT_PATH_BYTES, MAX_CONTENT_TAR_BYTES,
+};
 
 use super::{PackageError, Problem};
 
@@ -15,7 +17,8 @@ const IGNORE_FILE: &str = ".taskdignore";
 /// What never belongs to a package, at any depth.
 const NEVER_PACKED: [&str; 3] = [".git", "__pycache__", IGNORE_FILE];
 
-/// A package's files by path, which is relative, with `/`. A map sorts paths bytewise, so a directory precedes what is in it.
+/// A package's files by path, which is relative, with `/`. A map sorts paths bytewise, so a
+/// directory precedes what is in it.
 #[derive(Debug)]
 pub(super) struct Tree {
     pub(super) root: PathBuf,
@@ -31,10 +34,16 @@ pub(super) enum Entry {
 }
 
 impl Tree {
-    /// Walks `root`. With `built_on_robot` a build's products at the top are left out: the robot makes its own.
-    pub(super) fn walk(root: &Path, built_on_robot: bool, problems: &mut Vec<Problem>) -> Result<Self, PackageError> {
+    /// Walks `root`. With `built_on_robot` a build's products at the top are left out: the robot
+    /// makes its own.
+    pub(super) fn walk(
+        root: &Path,
+        built_on_robot: bool,
+        problems: &mut Vec<Problem>,
+    ) -> Result<Self, PackageError> {
         let patterns = read_patterns(root, problems)?;
-        let mut walk = Walk { patterns, built_on_robot, bytes: 0, entries: BTreeMap::new(), problems };
+        let mut walk =
+            Walk { patterns, built_on_robot, bytes: 0, entries: BTreeMap::new(), problems };
         let mut waiting = vec![String::new()];
         while let Some(directory) = waiting.pop() {
             walk.directory(root, &directory, &mut waiting)?;
@@ -75,15 +84,25 @@ struct Walk<'p> {
 }
 
 impl Walk<'_> {
-    fn directory(&mut self, root: &Path, directory: &str, waiting: &mut Vec<String>) -> Result<(), PackageError> {
+    fn directory(
+        &mut self,
+        root: &Path,
+        directory: &str,
+        waiting: &mut Vec<String>,
+    ) -> Result<(), PackageError> {
         let shown = root.join(directory);
-        let unreadable = |source| PackageError::Io { what: format!("can't read {}", shown.display()), source };
+        let unreadable =
+            |source| PackageError::Io { what: format!("can't read {}", shown.display()), source };
         for item in fs::read_dir(&shown).map_err(unreadable)? {
             let item = item.map_err(unreadable)?;
             let name = item.file_name();
             let prefix = if directory.is_empty() { String::new() } else { format!("{directory}/") };
-            let Some(name) = name.to_str().filter(|name| !name.chars().any(char::is_control)) else {
-                self.refuse(&format!("{prefix}{}", name.display()), "the name is not printable UTF-8".to_owned());
+            let Some(name) = name.to_str().filter(|name| !name.chars().any(char::is_control))
+            else {
+                self.refuse(
+                    &format!("{prefix}{}", name.display()),
+                    "the name is not printable UTF-8".to_owned(),
+                );
                 continue;
             };
             let path = format!("{prefix}{name}");
@@ -108,14 +127,20 @@ impl Walk<'_> {
         Ok(())
     }
 
-    fn entry(&mut self, full: &Path, path: &str, metadata: &Metadata) -> Result<Option<Entry>, PackageError> {
+    fn entry(
+        &mut self,
+        full: &Path,
+        path: &str,
+        metadata: &Metadata,
+    ) -> Result<Option<Entry>, PackageError> {
         let kind = metadata.file_type();
         if kind.is_dir() {
             return Ok(Some(Entry::Directory));
         }
         if kind.is_file() {
             self.bytes = self.bytes.saturating_add(metadata.len());
-            // The owner's bit alone: the others depend on the umask of whoever checked the tree out.
+            // The owner's bit alone: the others depend on the umask of whoever checked the tree
+            // out.
             let executable = metadata.permissions().mode() & 0o100 != 0;
             return Ok(Some(Entry::File { size: metadata.len(), executable }));
         }
@@ -138,7 +163,9 @@ impl Walk<'_> {
     }
 
     fn link(&mut self, path: &str, target: &Path) -> Option<Entry> {
-        let Some(text) = target.to_str().filter(|text| !text.is_empty() && !text.chars().any(char::is_control)) else {
+        let Some(text) =
+            target.to_str().filter(|text| !text.is_empty() && !text.chars().any(char::is_control))
+        else {
             self.refuse(path, "the link's target is not printable UTF-8".to_owned());
             return None;
         };
@@ -150,7 +177,8 @@ impl Walk<'_> {
     }
 
     fn is_left_out(&self, full: &Path, path: &str, name: &str, is_directory: bool) -> bool {
-        // Beside an install tree that is the package, only what colcon itself marks as its own is no part of it.
+        // Beside an install tree that is the package, only what colcon itself marks as its own is
+        // no part of it.
         let is_product = || match path {
             "install" => self.built_on_robot,
             "build" | "log" => self.built_on_robot || full.join("COLCON_IGNORE").exists(),
@@ -177,7 +205,8 @@ fn link_refusal(path: &str, target: &str) -> Option<String> {
     let depth = path.matches('/').count();
     let leaves = target.starts_with('/') || up > depth;
     let out_of_install = path.starts_with("install/") && (leaves || up == depth);
-    if out_of_install || (leaves && ["/build/", "/src/"].iter().any(|place| target.contains(place))) {
+    if out_of_install || (leaves && ["/build/", "/src/"].iter().any(|place| target.contains(place)))
+    {
         return Some(format!(
             "is a link to {target:?}: the tree was built with --symlink-install and is not complete without the \
              directories its links lead to; build it again without --symlink-install"
@@ -187,10 +216,13 @@ fn link_refusal(path: &str, target: &str) -> Option<String> {
         return Some(format!("is a link to {target:?}, which leaves the package's directory"));
     }
     // Behind another link ".." would lead somewhere else than the text says.
-    parts[up..].contains(&"..").then(|| format!("is a link to {target:?}; \"..\" may only stand at its beginning"))
+    parts[up..]
+        .contains(&"..")
+        .then(|| format!("is a link to {target:?}; \"..\" may only stand at its beginning"))
 }
 
-/// `path` without empty and `.` parts and with `..` resolved by the text; `None` if it leaves the tree.
+/// `path` without empty and `.` parts and with `..` resolved by the text; `None` if it leaves the
+/// tree.
 fn normalised(path: &str) -> Option<String> {
     let mut parts = Vec::new();
     for part in path.split('/') {
@@ -215,12 +247,17 @@ struct Pattern {
 impl Pattern {
     fn matches(&self, path: &str, name: &str, is_directory: bool) -> bool {
         (is_directory || !self.only_directories)
-            && glob_matches(self.glob.as_bytes(), if self.anchored { path } else { name }.as_bytes())
+            && glob_matches(
+                self.glob.as_bytes(),
+                if self.anchored { path } else { name }.as_bytes(),
+            )
     }
 }
 
 fn read_patterns(root: &Path, problems: &mut Vec<Problem>) -> Result<Vec<Pattern>, PackageError> {
-    let Some(text) = super::text_file::read_text(root, IGNORE_FILE, problems)? else { return Ok(Vec::new()) };
+    let Some(text) = super::text_file::read_text(root, IGNORE_FILE, problems)? else {
+        return Ok(Vec::new());
+    };
     let mut patterns = Vec::new();
     for (number, line) in text.lines().enumerate() {
         let line = line.trim();
@@ -242,10 +279,11 @@ fn read_patterns(root: &Path, problems: &mut Vec<Problem>) -> Result<Vec<Pattern
     Ok(patterns)
 }
 
-/// Whether `glob` describes `text`: `?` is one character of a name, `*` any number of them, `**` crosses directories.
+/// Whether `glob` describes `text`: `?` is one character of a name, `*` any number of them, `**`
+/// crosses directories.
 fn glob_matches(glob: &[u8], text: &[u8]) -> bool {
-    // The last star and where it was tried: one step back is enough, for `*` as for `**`, so this takes no more than
-    // the product of the lengths.
+    // The last star and where it was tried: one step back is enough, for `*` as for `**`, so this
+    // takes no more than the product of the lengths.
     let (mut g, mut t) = (0, 0);
     let mut star: Option<(usize, usize)> = None;
     let mut double: Option<(usize, usize)> = None;
@@ -287,16 +325,23 @@ mod tests {
         ] {
             assert!(glob_matches(glob.as_bytes(), text.as_bytes()), "{glob} {text}");
         }
-        for (glob, text) in
-            [("*.bag", "a.bags"), ("a/*/b", "a/x/y/b"), ("a?c", "a/c"), ("*", "a/b"), ("", "a"), ("a", "")]
-        {
+        for (glob, text) in [
+            ("*.bag", "a.bags"),
+            ("a/*/b", "a/x/y/b"),
+            ("a?c", "a/c"),
+            ("*", "a/b"),
+            ("", "a"),
+            ("a", ""),
+        ] {
             assert!(!glob_matches(glob.as_bytes(), text.as_bytes()), "{glob} {text}");
         }
     }
 
     #[test]
     fn links_stay_in_the_tree() {
-        for (path, target) in [("a", "b"), ("x/a", "../b"), ("x/a", "./b/c"), ("install/p/a", "../q/b")] {
+        for (path, target) in
+            [("a", "b"), ("x/a", "../b"), ("x/a", "./b/c"), ("install/p/a", "../q/b")]
+        {
             assert_eq!(link_refusal(path, target), None, "{path} -> {target}");
         }
         for (path, target, reason) in [

@@ -1,5 +1,5 @@
-//! The database beside the service: opened, waited for where its server is away, and checked in full now and then. It holds no
-//! SQL and serves nobody.
+//! The database beside the service: opened, waited for where its server is away, and checked in
+//! full now and then. It holds no SQL and serves nobody.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -38,7 +38,8 @@ pub struct Database {
 }
 
 impl Database {
-    /// Opens the database at `url`. A Postgres that is away or has no connection left is left to [`Self::attend`].
+    /// Opens the database at `url`. A Postgres that is away or has no connection left is left to
+    /// [`Self::attend`].
     pub async fn open(
         url: &str,
         operator: FirstOperator,
@@ -98,7 +99,8 @@ impl Database {
         }
     }
 
-    /// Asks the database whether it is there; does what is to be done once, if that was not done yet.
+    /// Asks the database whether it is there; does what is to be done once, if that was not done
+    /// yet.
     async fn bring_up(&mut self) -> Result<(), StoreError> {
         if !self.store.state().is_open() {
             self.store.prepare().await?;
@@ -124,7 +126,8 @@ impl Database {
         Ok(())
     }
 
-    /// Makes sure that the token in the directory opens this database, which may be new or restored.
+    /// Makes sure that the token in the directory opens this database, which may be new or
+    /// restored.
     async fn register_operator(&self) -> Result<(), StoreError> {
         let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
         if self.store.token_holder(token, now_ms).await?.is_some() {

@@ -1,4 +1,5 @@
-//! Periodic jobs beside the listeners: each waits for its interval or an event, and asks another part to act.
+//! Periodic jobs beside the listeners: each waits for its interval or an event, and asks another
+//! part to act.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -37,7 +38,9 @@ pub(super) async fn expire_assignments(app: App) {
         match app.actions.expire().await {
             // They come back with a token that is good, if they have one.
             Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
-            Err(ActionError::Store(error)) => error.log("assignments could not be looked through for expired ones"),
+            Err(ActionError::Store(error)) => {
+                error.log("assignments could not be looked through for expired ones")
+            }
             Err(error) => tracing::error!(
                 error = &error as &dyn std::error::Error,
                 "assignments could not be looked through for expired ones"
@@ -46,7 +49,8 @@ pub(super) async fn expire_assignments(app: App) {
     }
 }
 
-/// Moves rollouts on where robots come or stay away: what a report or an order changes moves them on by itself.
+/// Moves rollouts on where robots come or stay away: what a report or an order changes moves them
+/// on by itself.
 pub(super) async fn advance_rollouts(app: App) {
     let mut ticks = ticks(ROLLOUT_INTERVAL);
     let mut happenings = app.changes.happenings();
@@ -57,7 +61,10 @@ pub(super) async fn advance_rollouts(app: App) {
             () = robot_came(&mut happenings) => {}
         }
         if let Err(error) = app.actions.advance_rollouts().await {
-            tracing::error!(error = &error as &dyn std::error::Error, "rollouts could not be moved on");
+            tracing::error!(
+                error = &error as &dyn std::error::Error,
+                "rollouts could not be moved on"
+            );
         }
         // Robots that come at once, as after a restart, are looked at once.
         tokio::select! {
@@ -94,7 +101,11 @@ pub(super) async fn show_conduct(app: App) {
         };
         for robot in news {
             if let Some(text) = app.conduct.trouble(&robot) {
-                app.changes.happened(Happening::Robot(robot.clone(), FeedKind::RobotMisbehaved, text));
+                app.changes.happened(Happening::Robot(
+                    robot.clone(),
+                    FeedKind::RobotMisbehaved,
+                    text,
+                ));
             }
             app.changes.announce(Change::Robot(robot));
         }

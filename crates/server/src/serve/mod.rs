@@ -21,7 +21,9 @@ use self::jobs::{advance_rollouts, expire_assignments, notice_silence, show_cond
 use crate::auth::oidc::{OidcSetUpError, Provider};
 use crate::blobs::collector;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
-use crate::broker::{Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits};
+use crate::broker::{
+    Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits,
+};
 use crate::config::{Config, TlsSettings};
 use crate::fleet::presence::Presence;
 use crate::fleet::requests::Requests;
@@ -64,7 +66,8 @@ const WRITER_PATIENCE: Duration = Duration::from_secs(3);
 const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
 /// How long a TLS handshake may take before an HTTP request.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-/// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no more than so many bytes.
+/// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no
+/// more than so many bytes.
 const RESERVE_SHARE: u64 = 40;
 const MAX_RESERVE_BYTES: u64 = 1 << 30;
 /// What is kept of one robot is at most this share of the disk, unless somebody wants more.
@@ -101,7 +104,8 @@ pub enum ServeError {
     },
 }
 
-/// A server that runs until it is stopped. Dropped without [`Server::stop`], its tasks end with the runtime.
+/// A server that runs until it is stopped. Dropped without [`Server::stop`], its tasks end with the
+/// runtime.
 pub struct Server {
     data: DataDirectory,
     addresses: Addresses,
@@ -121,34 +125,72 @@ impl Server {
         let data = DataDirectory::open(&config.data)?;
         let key = data.signing_key()?;
         let public_key = key.public_key();
-        let tls = config.encrypts().then(|| Tls::open(tls_settings(&config), &data, clock.clone())).transpose()?;
-        let presence = Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
+        let tls = config
+            .encrypts()
+            .then(|| Tls::open(tls_settings(&config), &data, clock.clone()))
+            .transpose()?;
+        let presence =
+            Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
         let database = open_database(&config, &data, presence.clone(), clock.clone()).await?;
         let (store, unusable) = (database.store().clone(), database.unusable());
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
-        let http = listen(config.http).map_err(|source| ServeError::Listen { address: config.http, source })?;
-        let http_address = http.local_addr().map_err(|source| ServeError::Listen { address: config.http, source })?;
+        let http = listen(config.http)
+            .map_err(|source| ServeError::Listen { address: config.http, source })?;
+        let http_address = http
+            .local_addr()
+            .map_err(|source| ServeError::Listen { address: config.http, source })?;
 
         let changes = Changes::new();
-        let (load, http_connections) = (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
+        let (load, http_connections) =
+            (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
         let settings = action_settings(&config, tls.as_ref());
-        let actions = Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, chooser.clone());
-        let (writer, reports) = ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
-        let (requests, logs, vitals) = (Requests::default(), RobotLogs::new(), RobotVitals::default());
-        let (heard, said, done, told) = (requests.clone(), logs.clone(), vitals.clone(), changes.clone());
-        let uplink = Uplink::new(writer.clone(), heard, said, done, presence.clone(), changes.clone(), clock.clone());
-        let gatekeeper =
-            StoreGatekeeper::new(store.clone(), clock.clone(), presence.clone(), http_connections.clone(), told);
+        let actions = Actions::new(
+            store.clone(),
+            clock.clone(),
+            changes.clone(),
+            key,
+            settings,
+            chooser.clone(),
+        );
+        let (writer, reports) =
+            ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
+        let (requests, logs, vitals) =
+            (Requests::default(), RobotLogs::new(), RobotVitals::default());
+        let (heard, said, done, told) =
+            (requests.clone(), logs.clone(), vitals.clone(), changes.clone());
+        let uplink = Uplink::new(
+            writer.clone(),
+            heard,
+            said,
+            done,
+            presence.clone(),
+            changes.clone(),
+            clock.clone(),
+        );
+        let gatekeeper = StoreGatekeeper::new(
+            store.clone(),
+            clock.clone(),
+            presence.clone(),
+            http_connections.clone(),
+            told,
+        );
         let conduct = Conduct::new(config.robots);
         let broker = broker_config(&config, tls.clone(), conduct.clone());
-        let (broker, mqtt) = start_broker(&config, broker, &data, Arc::new(gatekeeper), Arc::new(uplink)).await?;
+        let (broker, mqtt) =
+            start_broker(&config, broker, &data, Arc::new(gatekeeper), Arc::new(uplink)).await?;
 
         let has_provider = !config.oidc.issuer.is_empty();
-        let provider = has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
+        let provider =
+            has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
-        let (stop, tasks, http_traffic) = (CancellationToken::new(), TaskTracker::new(), Arc::<HttpTotals>::default());
-        let facts = Arc::new(ServerFacts::new(&config, &blobs, listeners(http_address, &broker, tls.is_some())));
+        let (stop, tasks, http_traffic) =
+            (CancellationToken::new(), TaskTracker::new(), Arc::<HttpTotals>::default());
+        let facts = Arc::new(ServerFacts::new(
+            &config,
+            &blobs,
+            listeners(http_address, &broker, tls.is_some()),
+        ));
         let app = App::new(AppParts {
             feed: Feed::new(clock.now_ms()),
             clock,
@@ -190,11 +232,24 @@ impl Server {
         }
         tasks.spawn(watch_load(app.clone(), load));
         tasks.spawn(database.attend(stop.clone()));
-        let (router, connections, traffic) = (crate::http::router(app), http_connections, http_traffic);
+        let (router, connections, traffic) =
+            (crate::http::router(app), http_connections, http_traffic);
         let service = listener::Service { router, tls: tls.clone(), connections, traffic };
-        let http = listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
+        let http =
+            listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
         let addresses = publish(&data, http_address, &broker, tls.as_ref().map(Tls::pin))?;
-        Ok(Self { data, addresses, store, unusable, broker, tls, stop, tasks, http: tokio::spawn(http), reports })
+        Ok(Self {
+            data,
+            addresses,
+            store,
+            unusable,
+            broker,
+            tls,
+            stop,
+            tasks,
+            http: tokio::spawn(http),
+            reports,
+        })
     }
 
     /// Where it listens.
@@ -207,7 +262,8 @@ impl Server {
         &self.data
     }
 
-    /// Takes a certificate that was put in the place of the one in use, if there is one that can be used.
+    /// Takes a certificate that was put in the place of the one in use, if there is one that can be
+    /// used.
     pub fn reload_certificate(&self) -> Result<(), TlsError> {
         self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
@@ -234,7 +290,8 @@ impl Server {
         }
     }
 
-    /// Stops within ten seconds: listeners close, requests and sessions end, what was handed in is stored.
+    /// Stops within ten seconds: listeners close, requests and sessions end, what was handed in is
+    /// stored.
     pub async fn stop(self) {
         self.data.unpublish();
         self.stop.cancel();
@@ -242,7 +299,8 @@ impl Server {
         if http.is_err() {
             tracing::error!("the HTTP listener had failed");
         }
-        // The writer ends when nobody can hand in reports any more: the broker's inbox and the routes were the last.
+        // The writer ends when nobody can hand in reports any more: the broker's inbox and the
+        // routes were the last.
         drop(self.broker);
         self.tasks.close();
         let drained = async {
@@ -277,8 +335,14 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         clock: app.clock.clone(),
     };
     tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
-    let (store, blobs, clock, stop) = (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
-    tasks.spawn(keep_checked(store.clone(), clock.clone(), config.database_check_interval, stop.clone()));
+    let (store, blobs, clock, stop) =
+        (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
+    tasks.spawn(keep_checked(
+        store.clone(),
+        clock.clone(),
+        config.database_check_interval,
+        stop.clone(),
+    ));
     tasks.spawn(collector::run(store, blobs, clock, config.blob_grace, stop));
     tasks.spawn(expire_assignments(app.clone()));
     let worker = FanOutWorker {
@@ -320,8 +384,10 @@ async fn open_database(
     presence: Arc<Presence>,
     clock: Clock,
 ) -> Result<Database, ServeError> {
-    let url = config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
-    let operator = FirstOperator { token: data.operator_token()?, path: data.operator_token_path() };
+    let url =
+        config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
+    let operator =
+        FirstOperator { token: data.operator_token()?, path: data.operator_token_path() };
     Ok(Database::open(&url, operator, presence, clock).await?)
 }
 
@@ -338,7 +404,10 @@ fn publish(
     match data.publish(&addresses) {
         Err(error @ DataError::Full { .. }) => {
             let error = &error as &dyn std::error::Error;
-            tracing::warn!(error, "commands on this machine do not find the server; name it with --server");
+            tracing::warn!(
+                error,
+                "commands on this machine do not find the server; name it with --server"
+            );
         }
         published => published?,
     }
@@ -374,8 +443,12 @@ fn blob_settings(config: &Config) -> BlobSettings {
     BlobSettings {
         reading: config.blob_read,
         max_blob_bytes: config.max_blob_bytes,
-        max_robot_bytes: config.max_robot_bytes.unwrap_or(defaults.max_robot_bytes.min(disk_bytes / ROBOT_SHARE)),
-        reserve_bytes: config.disk_reserve.unwrap_or(MAX_RESERVE_BYTES.min(disk_bytes / RESERVE_SHARE)),
+        max_robot_bytes: config
+            .max_robot_bytes
+            .unwrap_or(defaults.max_robot_bytes.min(disk_bytes / ROBOT_SHARE)),
+        reserve_bytes: config
+            .disk_reserve
+            .unwrap_or(MAX_RESERVE_BYTES.min(disk_bytes / RESERVE_SHARE)),
         ..defaults
     }
 }
@@ -405,7 +478,8 @@ async fn start_broker(
         let port = config.public_mqtt_port.unwrap_or(bound);
         return Ok((broker, MqttAccess::embedded(host, port, prefix, encrypts)));
     };
-    let (secret, pin, current) = (data.broker_secret()?, config.broker_pin, Arc::<AtomicUsize>::default());
+    let (secret, pin, current) =
+        (data.broker_secret()?, config.broker_pin, Arc::<AtomicUsize>::default());
     let access = MqttAccess::external(
         brokers.clone(),
         current.clone(),
@@ -422,8 +496,11 @@ async fn start_broker(
 
 /// Where the server listens, as bound.
 fn listeners(http: SocketAddr, broker: &Broker, tls: bool) -> Vec<ListenerView> {
-    let view =
-        |kind: &str, address: SocketAddr| ListenerView { kind: kind.to_owned(), address: address.to_string(), tls };
+    let view = |kind: &str, address: SocketAddr| ListenerView {
+        kind: kind.to_owned(),
+        address: address.to_string(),
+        tls,
+    };
     [("http", Some(http)), ("mqtt", broker.local_addr())]
         .into_iter()
         .filter_map(|(kind, address)| Some(view(kind, address?)))
@@ -442,7 +519,11 @@ fn broker_config(config: &Config, tls: Option<Tls>, conduct: Arc<Conduct>) -> Br
 /// An address that works from this machine: "all interfaces" is none that one could connect to.
 fn reachable(mut bound: SocketAddr) -> SocketAddr {
     if bound.ip().is_unspecified() {
-        bound.set_ip(if bound.is_ipv4() { [127, 0, 0, 1].into() } else { std::net::Ipv6Addr::LOCALHOST.into() });
+        bound.set_ip(if bound.is_ipv4() {
+            [127, 0, 0, 1].into()
+        } else {
+            std::net::Ipv6Addr::LOCALHOST.into()
+        });
     }
     bound
 }

@@ -1,4 +1,5 @@
-//! How bytes travel: what is known of the robots when a batch begins, and what was decided for each.
+//! How bytes travel: what is known of the robots when a batch begins, and what was decided for
+//! each.
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{DeliveryChoice, DeliveryDecision};
@@ -49,7 +50,10 @@ pub struct Decided {
 
 impl Write {
     /// What `deployment` says about how it travels.
-    pub async fn delivery_order(&mut self, deployment: &DeploymentId) -> Result<DeliveryOrder, StoreError> {
+    pub async fn delivery_order(
+        &mut self,
+        deployment: &DeploymentId,
+    ) -> Result<DeliveryOrder, StoreError> {
         let row = sqlx::query(
             "SELECT delivery, package,
                  (SELECT COUNT(*) FROM assignments WHERE deployment_id = deployments.id) AS robots
@@ -66,7 +70,11 @@ impl Write {
     }
 
     /// What is known of `robots`, which may have `content` already.
-    pub async fn robot_facts(&mut self, robots: &[RobotId], content: &Digest) -> Result<Vec<RobotFacts>, StoreError> {
+    pub async fn robot_facts(
+        &mut self,
+        robots: &[RobotId],
+        content: &Digest,
+    ) -> Result<Vec<RobotFacts>, StoreError> {
         let mut facts = Vec::with_capacity(robots.len());
         for group in groups(robots) {
             // Few reports name the content; only those are read.
@@ -88,18 +96,29 @@ impl Write {
     }
 
     /// The labels of all robots of `deployment`.
-    pub async fn labels_in(&mut self, deployment: &DeploymentId) -> Result<Vec<(RobotId, Labels)>, StoreError> {
+    pub async fn labels_in(
+        &mut self,
+        deployment: &DeploymentId,
+    ) -> Result<Vec<(RobotId, Labels)>, StoreError> {
         let rows: Vec<(String, String)> = sqlx::query_as(
             "SELECT r.id, r.labels FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1",
         )
         .bind(deployment.as_str())
         .fetch_all(self.connection())
         .await?;
-        rows.iter().map(|(robot, labels)| Ok((id("robots.id", robot)?, from_json("robots.labels", labels)?))).collect()
+        rows.iter()
+            .map(|(robot, labels)| {
+                Ok((id("robots.id", robot)?, from_json("robots.labels", labels)?))
+            })
+            .collect()
     }
 
     /// Stores what was decided for robots of `deployment`.
-    pub async fn store_decisions(&mut self, deployment: &DeploymentId, decided: &[Decided]) -> Result<(), StoreError> {
+    pub async fn store_decisions(
+        &mut self,
+        deployment: &DeploymentId,
+        decided: &[Decided],
+    ) -> Result<(), StoreError> {
         for group in groups(decided) {
             let sql = format!(
                 "WITH v (robot_id, mechanism, rule, because, inputs) AS ({})

@@ -71,11 +71,14 @@ const READERS: u32 = 6;
 const SHARED_READERS: u32 = 4;
 /// How long a statement waits for a connection or for another process's write.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// The same for a connection to Postgres: less than a request has, so that who asked is told why there is no answer.
+/// The same for a connection to Postgres: less than a request has, so that who asked is told why
+/// there is no answer.
 const POSTGRES_PATIENCE: Duration = Duration::from_secs(20);
-/// How long a connection to a database server may take; who asked has to be told in time that there is none.
+/// How long a connection to a database server may take; who asked has to be told in time that there
+/// is none.
 const CONNECT: Duration = Duration::from_secs(5);
-/// Part of a SQLite URL: the file belongs to this process alone, which keeps in memory what it otherwise shares by a file.
+/// Part of a SQLite URL: the file belongs to this process alone, which keeps in memory what it
+/// otherwise shares by a file.
 const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
 
 /// The database. Clones share its connections.
@@ -127,7 +130,9 @@ pub enum StoreError {
         source: sqlx::migrate::MigrateError,
     },
     /// A later version of this program has brought its tables further.
-    #[error("database {url} was last used by a newer taskd (its tables are at {version}): install that one again")]
+    #[error(
+        "database {url} was last used by a newer taskd (its tables are at {version}): install that one again"
+    )]
     Newer {
         /// Which, without its password.
         url: String,
@@ -146,7 +151,9 @@ pub enum StoreError {
         finding: String,
     },
     /// It takes a write to open it, and there is no room.
-    #[error("database {url} can't be opened on a full disk: make at least 16 MB free on its file system")]
+    #[error(
+        "database {url} can't be opened on a full disk: make at least 16 MB free on its file system"
+    )]
     NoRoom {
         /// Which, without its password.
         url: String,
@@ -164,7 +171,9 @@ pub enum StoreError {
     #[error("your rights have changed since this request began; sign in, or send it again")]
     RightsEnded,
     /// The person has done it very often.
-    #[error("{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s")]
+    #[error(
+        "{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s"
+    )]
     TooManyActs {
         /// Who.
         who: String,
@@ -185,7 +194,8 @@ impl StoreError {
         matches!(self, Self::Statement(sqlx::Error::Database(error)) if error.is_unique_violation())
     }
 
-    /// The fault of the database that this shows; `None` if the statement itself is wrong or refused.
+    /// The fault of the database that this shows; `None` if the statement itself is wrong or
+    /// refused.
     pub fn fault(&self) -> Option<Fault> {
         match self {
             Self::Open { source, .. } | Self::Statement(source) => Fault::of(source),
@@ -197,7 +207,8 @@ impl StoreError {
         }
     }
 
-    /// Logs that `what` was not done, unless the change of the database's state that explains it was logged already.
+    /// Logs that `what` was not done, unless the change of the database's state that explains it
+    /// was logged already.
     pub fn log(&self, what: &'static str) {
         match self.fault() {
             Some(Fault::Away | Fault::Corrupt | Fault::Full) => {
@@ -208,7 +219,8 @@ impl StoreError {
     }
 }
 
-/// A write in progress: the only one, for it holds the write lock. Dropped without [`Write::commit`], it never was.
+/// A write in progress: the only one, for it holds the write lock. Dropped without
+/// [`Write::commit`], it never was.
 pub struct Write {
     lent: Lent,
     turn: u64,
@@ -265,12 +277,14 @@ pub fn sqlite_url(path: &Path) -> String {
 }
 
 impl Store {
-    /// Opens the database at a `sqlite:` or `postgres:` URL, looks for damage and brings its tables up to date.
+    /// Opens the database at a `sqlite:` or `postgres:` URL, looks for damage and brings its tables
+    /// up to date.
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         match Self::open_at(url).await {
             Err(error) if error.fault() == Some(Fault::Full) && !is_postgres(url) => {
                 let separator = if url.contains('?') { '&' } else { '?' };
-                let store = Self::open_at(&format!("{url}{separator}{WITHOUT_SHARED_MEMORY}")).await;
+                let store =
+                    Self::open_at(&format!("{url}{separator}{WITHOUT_SHARED_MEMORY}")).await;
                 let no_room = |error: StoreError| match error.fault() {
                     Some(Fault::Full) => StoreError::NoRoom { url: without_password(url) },
                     _ => error,
@@ -330,8 +344,12 @@ impl Store {
         } else {
             match check_quickly(&self.url).await.map_err(|error| self.open_error(error))? {
                 Checked::Sound => {}
-                Checked::Damaged(finding) => return Err(StoreError::Damaged { url: url(), finding }),
-                Checked::Interrupted => tracing::info!("the database is large: the check goes on while it is served"),
+                Checked::Damaged(finding) => {
+                    return Err(StoreError::Damaged { url: url(), finding });
+                }
+                Checked::Interrupted => {
+                    tracing::info!("the database is large: the check goes on while it is served")
+                }
             }
         }
         database::migrate::run(connection).await.map_err(|source| match source {
@@ -368,49 +386,58 @@ impl Store {
     pub async fn size(&self) -> Result<DatabaseSize, StoreError> {
         let (kind, sql) = match self.is_postgres {
             true => ("postgres", "SELECT pg_database_size(current_database())"),
-            false => ("sqlite", "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"),
+            false => (
+                "sqlite",
+                "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()",
+            ),
         };
         // One that must not be asked this is none the worse for it.
-        let bytes: Option<i64> = sqlx::query_scalar(sql).fetch_optional(&self.reads).await.unwrap_or_default();
+        let bytes: Option<i64> =
+            sqlx::query_scalar(sql).fetch_optional(&self.reads).await.unwrap_or_default();
         Ok(DatabaseSize { kind, bytes: bytes.map(rows::number) })
     }
 
-    /// Begins a write. Its first statement is an update of one row that every write updates, so on both databases a
-    /// second write waits here, before it has read anything, until the first has ended.
+    /// Begins a write. Its first statement is an update of one row that every write updates, so on
+    /// both databases a second write waits here, before it has read anything, until the first has
+    /// ended.
     pub async fn begin(&self) -> Result<Write, StoreError> {
         let mut write = self.begin_keeping_rights().await?;
         write.changes_access();
         Ok(write)
     }
 
-    /// Begins a write that changes nobody's rights, like what robots report, or that is never committed.
+    /// Begins a write that changes nobody's rights, like what robots report, or that is never
+    /// committed.
     pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
         if self.state.corruption().is_some() {
             return Err(StoreError::Corrupt);
         }
         let mut lent = self.writes.lend().await?;
         lent.begin().await?;
-        let turn: i64 = sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
-            .fetch_one(lent.connection())
-            .await?;
+        let turn: i64 =
+            sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
+                .fetch_one(lent.connection())
+                .await?;
         let ending = self.access.until_ended();
         let everybodys = self.everybodys.clone();
         Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None, everybodys })
     }
 }
 
-/// Makes the file of a SQLite database that is to be created, so that only its owner reads it: SQLite gives the files beside
-/// it the same mode. What can't be made is said by whoever opens it.
+/// Makes the file of a SQLite database that is to be created, so that only its owner reads it:
+/// SQLite gives the files beside it the same mode. What can't be made is said by whoever opens it.
 fn make_file(url: &str) {
     if !url.contains("mode=rwc") {
         return;
     }
     if let Ok(options) = SqliteConnectOptions::from_str(url) {
-        let _ = File::options().write(true).create_new(true).mode(0o600).open(options.get_filename());
+        let _ =
+            File::options().write(true).create_new(true).mode(0o600).open(options.get_filename());
     }
 }
 
-/// A connection of its own for what takes as long as it takes. It is asked for once, so that what is wrong is said at once.
+/// A connection of its own for what takes as long as it takes. It is asked for once, so that what
+/// is wrong is said at once.
 async fn first_connection(url: &str) -> Result<AnyConnection, sqlx::Error> {
     let mut connection = match is_postgres(url) {
         true => bounded(CONNECT, AnyConnection::connect(url)).await?,
@@ -431,11 +458,13 @@ fn is_postgres(url: &str) -> bool {
 }
 
 /// What every SQLite connection begins with. FULL: a commit survives a power cut.
-const SQLITE_SESSION: &str = "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
+const SQLITE_SESSION: &str =
+    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
      PRAGMA busy_timeout = 30000;";
-/// What Postgres does by itself with a session of a server that is gone without a word, for it may hold the write lock, which
-/// the next one waits for. By default it keeps such a session for hours.
-const POSTGRES_SESSION: &str = "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
+/// What Postgres does by itself with a session of a server that is gone without a word, for it may
+/// hold the write lock, which the next one waits for. By default it keeps such a session for hours.
+const POSTGRES_SESSION: &str =
+    "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
      SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;";
 /// And with a statement before the server gives up waiting for its answer.
 const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
@@ -452,13 +481,26 @@ fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState)
     // A file does not fall silent: it is slow.
     let session = [SQLITE_SESSION, cache].concat();
     let forever = Duration::MAX;
-    Terms { url, session, count, shared, answer: forever, greeting: forever, connect: PATIENCE, wait: PATIENCE, state }
+    Terms {
+        url,
+        session,
+        count,
+        shared,
+        answer: forever,
+        greeting: forever,
+        connect: PATIENCE,
+        wait: PATIENCE,
+        state,
+    }
 }
 
-/// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut out.
+/// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut
+/// out.
 fn without_password(url: &str) -> String {
     let shown = match (url.find("://"), url.rfind('@')) {
-        (Some(scheme), Some(at)) if scheme + 3 < at => format!("{}{}", &url[..scheme + 3], &url[at + 1..]),
+        (Some(scheme), Some(at)) if scheme + 3 < at => {
+            format!("{}{}", &url[..scheme + 3], &url[at + 1..])
+        }
         _ => url.to_owned(),
     };
     shown.split('?').next().unwrap_or_default().to_owned()
@@ -482,9 +524,13 @@ mod tests {
         let refused = async |name: &str| {
             let url = sqlite_url(&directory.path().join(name));
             // Far below what a pool would wait for.
-            let opened = tokio::time::timeout(PATIENCE / 3, Store::open(&url)).await.expect("at once");
+            let opened =
+                tokio::time::timeout(PATIENCE / 3, Store::open(&url)).await.expect("at once");
             let error = opened.expect_err("refused");
-            format!("{error}: {}", std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default())
+            format!(
+                "{error}: {}",
+                std::error::Error::source(&error).map(ToString::to_string).unwrap_or_default()
+            )
         };
         std::fs::write(directory.path().join("torn"), vec![7; 8192]).expect("written");
         let torn = refused("torn").await;
@@ -493,7 +539,8 @@ mod tests {
         assert!(missing.contains("/no/such can't be opened"), "{missing}");
         let url = sqlite_url(&directory.path().join("newer"));
         let store = Store::open(&url).await.expect("opens");
-        let newer = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+        let newer =
+            "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
                      VALUES (9999, 'later', TRUE, x'00', 0)";
         sqlx::query(newer).execute(&store.reads).await.expect("written");
         store.close().await;
@@ -505,10 +552,15 @@ mod tests {
     async fn a_database_and_what_lies_beside_it_are_for_their_owner_alone() {
         use std::os::unix::fs::PermissionsExt as _;
         let directory = tempfile::tempdir().expect("a directory");
-        let store = Store::open(&sqlite_url(&directory.path().join("a b.sqlite"))).await.expect("opens");
+        let store =
+            Store::open(&sqlite_url(&directory.path().join("a b.sqlite"))).await.expect("opens");
         store.begin().await.expect("begins").commit().await.expect("written");
-        let files = std::fs::read_dir(directory.path()).expect("there").map(|entry| entry.expect("an entry"));
-        let modes: Vec<_> = files.map(|file| file.metadata().expect("there").permissions().mode() & 0o777).collect();
+        let files = std::fs::read_dir(directory.path())
+            .expect("there")
+            .map(|entry| entry.expect("an entry"));
+        let modes: Vec<_> = files
+            .map(|file| file.metadata().expect("there").permissions().mode() & 0o777)
+            .collect();
         assert_eq!(modes, [0o600; 3], "the database, its log and the index of that");
         store.close().await;
     }

@@ -1,4 +1,5 @@
-//! Between columns and types: numbers, JSON and ids, and lists of rows as one statement's `VALUES`. It knows no table.
+//! Between columns and types: numbers, JSON and ids, and lists of rows as one statement's `VALUES`.
+//! It knows no table.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -9,8 +10,8 @@ use task_proto::{DeploymentId, RobotId};
 
 use super::StoreError;
 
-/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its plan is reused. More would
-/// be slower: for each parameter SQLite looks through the names of all.
+/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its
+/// plan is reused. More would be slower: for each parameter SQLite looks through the names of all.
 const MAX_ROWS: usize = 64;
 
 /// A stored number, which is never negative.
@@ -35,7 +36,10 @@ pub(super) fn json<T: Serialize>(value: &T) -> String {
 }
 
 /// JSON text of `column` read back.
-pub(super) fn from_json<T: DeserializeOwned>(column: &'static str, text: &str) -> Result<T, StoreError> {
+pub(super) fn from_json<T: DeserializeOwned>(
+    column: &'static str,
+    text: &str,
+) -> Result<T, StoreError> {
     serde_json::from_str(text).map_err(|_| StoreError::Unreadable { column })
 }
 
@@ -53,8 +57,12 @@ pub(super) fn word<T: Serialize>(value: &T) -> String {
 }
 
 /// The word of `column` read back.
-pub(super) fn from_word<T: DeserializeOwned>(column: &'static str, text: &str) -> Result<T, StoreError> {
-    serde_json::from_value(serde_json::Value::String(text.to_owned())).map_err(|_| StoreError::Unreadable { column })
+pub(super) fn from_word<T: DeserializeOwned>(
+    column: &'static str,
+    text: &str,
+) -> Result<T, StoreError> {
+    serde_json::from_value(serde_json::Value::String(text.to_owned()))
+        .map_err(|_| StoreError::Unreadable { column })
 }
 
 /// An id of `column` read back.
@@ -63,12 +71,17 @@ pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, Stor
 }
 
 /// The same for a column that may be empty.
-pub(super) fn optional<T: FromStr>(column: &'static str, text: Option<String>) -> Result<Option<T>, StoreError> {
+pub(super) fn optional<T: FromStr>(
+    column: &'static str,
+    text: Option<String>,
+) -> Result<Option<T>, StoreError> {
     text.map(|text| id(column, &text)).transpose()
 }
 
 /// Whose part of which deployment each row is.
-pub(super) fn parts_of(rows: Vec<(String, String)>) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+pub(super) fn parts_of(
+    rows: Vec<(String, String)>,
+) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
     let read = |(deployment, robot): (String, String)| {
         Ok((id("assignments.deployment_id", &deployment)?, id("assignments.robot_id", &robot)?))
     };
@@ -85,14 +98,18 @@ pub(super) fn groups<T>(mut rows: &[T]) -> impl Iterator<Item = &[T]> {
     })
 }
 
-/// `VALUES (CAST($n AS TEXT), …), …` for `rows` rows whose columns have `types`, counting parameters from `first`.
+/// `VALUES (CAST($n AS TEXT), …), …` for `rows` rows whose columns have `types`, counting
+/// parameters from `first`.
 pub(super) fn values(first: usize, rows: usize, types: &[&str]) -> String {
     let mut text = String::from("VALUES ");
     for row in 0..rows {
         text.push_str(if row == 0 { "(" } else { ", (" });
         for (column, kind) in types.iter().enumerate() {
             let separator = if column == 0 { "" } else { ", " };
-            text.push_str(&format!("{separator}CAST(${} AS {kind})", first + row * types.len() + column));
+            text.push_str(&format!(
+                "{separator}CAST(${} AS {kind})",
+                first + row * types.len() + column
+            ));
         }
         text.push(')');
     }
@@ -105,7 +122,8 @@ mod tests {
 
     #[test]
     fn a_number_beyond_the_columns_range_is_the_last_in_it() {
-        for (given, kept) in [(0, 0), (1 << 53, 1 << 53), (1 << 63, i64::MAX), (u64::MAX, i64::MAX)] {
+        for (given, kept) in [(0, 0), (1 << 53, 1 << 53), (1 << 63, i64::MAX), (u64::MAX, i64::MAX)]
+        {
             assert_eq!(stored(given), kept, "{given}");
         }
     }

@@ -1,6 +1,7 @@
-//! When assignments came into their phases, as a text that only grows at its end: a letter for the phase, thirteen digits for
-//! the moment, three for the try. So each step costs nothing beyond the write of the row that it comes with, and nobody has to
-//! read what is there to add to it. In the middle of a long one steps are dropped.
+//! When assignments came into their phases, as a text that only grows at its end: a letter for the
+//! phase, thirteen digits for the moment, three for the try. So each step costs nothing beyond the
+//! write of the row that it comes with, and nobody has to read what is there to add to it. In the
+//! middle of a long one steps are dropped.
 
 use sqlx::Row as _;
 use task_proto::DeploymentId;
@@ -53,7 +54,8 @@ pub(super) fn grown(step: &str) -> String {
     )
 }
 
-/// [`grown`] by a phase into which a person or the server brought the assignment, at the moment that this parameter holds.
+/// [`grown`] by a phase into which a person or the server brought the assignment, at the moment
+/// that this parameter holds.
 pub(super) fn grown_by(phase: Phase, now: &str) -> String {
     let digits = format!("CAST(CAST({now} AS BIGINT) AS TEXT)");
     let padded = format!("substr('0000000000000' || {digits}, length({digits}) + 1)");
@@ -65,7 +67,11 @@ pub(super) fn read(text: &str) -> Vec<TimelineEntry> {
     let entry = |step: &[u8]| {
         let step = std::str::from_utf8(step).ok()?;
         let phase = Phase::ALL.into_iter().find(|phase| step.starts_with(letter(*phase)))?;
-        Some(TimelineEntry { phase, at_ms: step.get(1..14)?.parse().ok()?, attempt: step.get(14..)?.parse().ok()? })
+        Some(TimelineEntry {
+            phase,
+            at_ms: step.get(1..14)?.parse().ok()?,
+            attempt: step.get(14..)?.parse().ok()?,
+        })
     };
     text.as_bytes().chunks(STEP).filter_map(entry).collect()
 }
@@ -94,7 +100,8 @@ fn letter(phase: Phase) -> char {
 }
 
 impl Store {
-    /// What was ordered for a robot, a page of it; `None`: there is no such deployment to begin before.
+    /// What was ordered for a robot, a page of it; `None`: there is no such deployment to begin
+    /// before.
     pub async fn task_history(
         &self,
         robot: &RobotId,
@@ -103,7 +110,8 @@ impl Store {
         let before = match query.before {
             None => i64::MAX,
             Some(before) => {
-                let asked = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1").bind(before.as_str());
+                let asked = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1")
+                    .bind(before.as_str());
                 match asked.fetch_optional(&self.reads).await? {
                     Some(number) => number,
                     None => return Ok(None),
@@ -150,7 +158,9 @@ fn past_assignment(row: &sqlx::any::AnyRow) -> Result<PastAssignment, StoreError
         timeline: read(row.try_get("timeline")?),
         created_at_ms: number(row.try_get("created_at_ms")?),
         updated_at_ms: number(row.try_get("updated_at_ms")?),
-        superseded_by: superseded_by.map(|newer| id("assignments.superseded_by", &newer)).transpose()?,
+        superseded_by: superseded_by
+            .map(|newer| id("assignments.superseded_by", &newer))
+            .transpose()?,
     })
 }
 
@@ -164,7 +174,8 @@ mod tests {
             .zip(Phase::ALL)
             .map(|(at, phase)| TimelineEntry { phase, at_ms: 1_800_000_000_000 + at, attempt: 7 })
             .collect();
-        let stored: String = entries.iter().map(|entry| step(entry.phase, entry.at_ms, entry.attempt)).collect();
+        let stored: String =
+            entries.iter().map(|entry| step(entry.phase, entry.at_ms, entry.attempt)).collect();
         assert_eq!(read(&stored), entries);
         assert_eq!(stored.len(), entries.len() * STEP);
         assert_eq!(read(&step(Phase::Running, u64::MAX, u32::MAX))[0].attempt, 999);

@@ -1,5 +1,5 @@
-//! What time it is, in milliseconds since the Unix epoch. Nothing else reads the system's clock; whoever needs the time
-//! is given a `Clock` or a number. It never waits: waiting is tokio's.
+//! What time it is, in milliseconds since the Unix epoch. Nothing else reads the system's clock;
+//! whoever needs the time is given a `Clock` or a number. It never waits: waiting is tokio's.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -1,10 +1,13 @@
-//! The server's directory: made on the first start, locked while a server runs, home of the signing key, the private
-//! certificate authority, the secret behind robots' passwords at an external broker, the first operator's token and the
-//! addresses that are bound. It never touches the database or the blobs in it, but for who may read and write them.
+//! The server's directory: made on the first start, locked while a server runs, home of the signing
+//! key, the private certificate authority, the secret behind robots' passwords at an external
+//! broker, the first operator's token and the addresses that are bound. It never touches the
+//! database or the blobs in it, but for who may read and write them.
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Write as _};
-use std::os::unix::fs::{DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _};
+use std::os::unix::fs::{
+    DirBuilderExt as _, MetadataExt as _, OpenOptionsExt as _, PermissionsExt as _,
+};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -36,7 +39,8 @@ pub struct DataDirectory {
     lock: File,
 }
 
-/// What is bound, for programs on the same machine: the content of `addresses.json`, which exists while a server runs.
+/// What is bound, for programs on the same machine: the content of `addresses.json`, which exists
+/// while a server runs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Addresses {
     /// Where HTTP is reached, `host:port`.
@@ -55,7 +59,8 @@ impl Addresses {
         format!("{scheme}://{}", self.http)
     }
 
-    /// What was published last in the directory at `path`, by a server that may be gone: see [`is_locked`].
+    /// What was published last in the directory at `path`, by a server that may be gone: see
+    /// [`is_locked`].
     pub fn published(path: &Path) -> Option<Self> {
         serde_json::from_slice(&std::fs::read(path.join(ADDRESSES)).ok()?).ok()
     }
@@ -127,18 +132,25 @@ impl DataError {
 }
 
 impl Drop for DataDirectory {
-    /// The next server may start at once, also while a process that is just being started still has our files open.
+    /// The next server may start at once, also while a process that is just being started still has
+    /// our files open.
     fn drop(&mut self) {
         let _ = self.lock.unlock();
     }
 }
 
 impl DataDirectory {
-    /// Makes the directory if it is missing, and locks it. What a killed server published there is withdrawn.
+    /// Makes the directory if it is missing, and locks it. What a killed server published there is
+    /// withdrawn.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(DataError::io(path))?;
         let lock_path = path.join(LOCK);
-        let lock = OpenOptions::new().create(true).truncate(false).write(true).mode(0o600).open(&lock_path);
+        let lock = OpenOptions::new()
+            .create(true)
+            .truncate(false)
+            .write(true)
+            .mode(0o600)
+            .open(&lock_path);
         let lock = lock.map_err(DataError::io(&lock_path))?;
         loop {
             match lock.try_lock() {
@@ -149,15 +161,21 @@ impl DataDirectory {
                     return Ok(data);
                 }
                 // No server has it: commands do, which look whether one does, for a moment.
-                Err(TryLockError::WouldBlock) if lock.try_lock_shared().is_ok() => std::thread::yield_now(),
-                Err(TryLockError::WouldBlock) => return Err(DataError::InUse { path: path.to_owned() }),
-                Err(TryLockError::Error(source)) => return Err(DataError::Io { path: lock_path, source }),
+                Err(TryLockError::WouldBlock) if lock.try_lock_shared().is_ok() => {
+                    std::thread::yield_now()
+                }
+                Err(TryLockError::WouldBlock) => {
+                    return Err(DataError::InUse { path: path.to_owned() });
+                }
+                Err(TryLockError::Error(source)) => {
+                    return Err(DataError::Io { path: lock_path, source });
+                }
             }
         }
     }
 
-    /// Takes from other accounts what an earlier version, an umask or a copy has given them: nobody else writes to the
-    /// directory, and nobody else reads what is in it.
+    /// Takes from other accounts what an earlier version, an umask or a copy has given them: nobody
+    /// else writes to the directory, and nobody else reads what is in it.
     fn close_to_others(&self) -> Result<(), DataError> {
         let io_error = |source| DataError::Io { path: self.path.clone(), source };
         let own = std::fs::metadata(&self.path).map_err(io_error)?;
@@ -168,18 +186,23 @@ impl DataDirectory {
             } else if mode & 0o002 != 0 {
                 return Err(DataError::OpenToAll { path: self.path.clone() });
             } else {
-                tracing::warn!("the group of {shown} can write to it, and so replace the server's keys");
+                tracing::warn!(
+                    "the group of {shown} can write to it, and so replace the server's keys"
+                );
             }
         }
         for entry in std::fs::read_dir(&self.path).map_err(io_error)? {
             let path = entry.map_err(io_error)?.path();
-            // What a link leads to is somewhere else, and a command may take its own file away meanwhile.
+            // What a link leads to is somewhere else, and a command may take its own file away
+            // meanwhile.
             let Ok(found) = path.symlink_metadata() else { continue };
             if found.is_symlink() || found.mode() & 0o077 == 0 {
                 continue;
             }
             match std::fs::set_permissions(&path, Permissions::from_mode(found.mode() & 0o700)) {
-                Ok(()) => tracing::info!("others could look into {}: they can no longer", path.display()),
+                Ok(()) => {
+                    tracing::info!("others could look into {}: they can no longer", path.display())
+                }
                 Err(error) => tracing::warn!(%error, "others can look into {}", path.display()),
             }
         }
@@ -191,7 +214,8 @@ impl DataDirectory {
         &self.path
     }
 
-    /// An empty directory in it; what an earlier server left there is gone. One that is there stays, so that this takes no room.
+    /// An empty directory in it; what an earlier server left there is gone. One that is there
+    /// stays, so that this takes no room.
     pub fn fresh_directory(&self, name: &str) -> Result<PathBuf, DataError> {
         let path = self.path.join(name);
         let clear = || {
@@ -214,24 +238,27 @@ impl DataDirectory {
         self.path.join(OPERATOR_TOKEN)
     }
 
-    /// The key that signs desired states, made on the first start. Robots pin it, so it is never replaced by itself.
+    /// The key that signs desired states, made on the first start. Robots pin it, so it is never
+    /// replaced by itself.
     pub fn signing_key(&self) -> Result<SigningKey, DataError> {
         let seed = self.secret(SIGNING_KEY, "a signing key", || SigningKey::random().to_bytes())?;
         Ok(SigningKey::from_bytes(seed))
     }
 
-    /// What robots' passwords at an external broker are derived from, made when it is first needed. With another one they
-    /// all have new passwords.
+    /// What robots' passwords at an external broker are derived from, made when it is first needed.
+    /// With another one they all have new passwords.
     pub fn broker_secret(&self) -> Result<[u8; 32], DataError> {
         self.secret(BROKER_SECRET, "a secret of 64 hex digits", rand::random)
     }
 
-    /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin it.
+    /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin
+    /// it.
     pub fn authority_key(&self, fresh: String) -> Result<String, DataError> {
         self.read_or_make(&self.path.join(AUTHORITY_KEY), || fresh)
     }
 
-    /// The authority's own certificate, as PEM, for those who import it; `fresh` on the first start.
+    /// The authority's own certificate, as PEM, for those who import it; `fresh` on the first
+    /// start.
     pub fn authority_certificate(&self, fresh: String) -> Result<String, DataError> {
         self.read_or_make(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
     }
@@ -269,13 +296,22 @@ impl DataDirectory {
     }
 
     /// 32 bytes in a file of their own, made on the first call.
-    fn secret(&self, name: &str, expected: &'static str, make: fn() -> [u8; 32]) -> Result<[u8; 32], DataError> {
+    fn secret(
+        &self,
+        name: &str,
+        expected: &'static str,
+        make: fn() -> [u8; 32],
+    ) -> Result<[u8; 32], DataError> {
         let path = self.path.join(name);
         let text = self.read_or_make(&path, || hex(&make()))?;
         unhex(text.trim()).ok_or(DataError::Content { path, expected })
     }
 
-    fn read_or_make(&self, path: &Path, make: impl FnOnce() -> String) -> Result<String, DataError> {
+    fn read_or_make(
+        &self,
+        path: &Path,
+        make: impl FnOnce() -> String,
+    ) -> Result<String, DataError> {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
                 let text = make();
@@ -296,7 +332,8 @@ impl DataDirectory {
         {
             return Err(error);
         }
-        let mut file = OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
+        let mut file =
+            OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
         file.write_all(text.as_bytes())?;
         file.sync_all()?;
         std::fs::rename(&partial, path)?;
@@ -321,7 +358,8 @@ mod tests {
         let path = parent.path().join("deep/data");
         let data = DataDirectory::open(&path).expect("opens");
         assert_eq!(mode(&path), 0o700);
-        let (key, token) = (data.signing_key().expect("made"), data.operator_token().expect("made"));
+        let (key, token) =
+            (data.signing_key().expect("made"), data.operator_token().expect("made"));
         assert_eq!(mode(&path.join(SIGNING_KEY)), 0o600);
         assert_eq!(mode(&data.operator_token_path()), 0o600);
         assert_eq!(data.signing_key().expect("read").to_bytes(), key.to_bytes());
@@ -337,7 +375,12 @@ mod tests {
         let (path, elsewhere) = (directory.path().join("data"), directory.path().join("elsewhere"));
         std::fs::create_dir(&path).expect("made");
         std::fs::create_dir(path.join("blobs")).expect("made");
-        for file in [&elsewhere, &path.join("taskd.sqlite"), &path.join("taskd.sqlite-wal"), &path.join(SIGNING_KEY)] {
+        for file in [
+            &elsewhere,
+            &path.join("taskd.sqlite"),
+            &path.join("taskd.sqlite-wal"),
+            &path.join(SIGNING_KEY),
+        ] {
             std::fs::write(file, "").expect("written");
             std::fs::set_permissions(file, Permissions::from_mode(0o664)).expect("set");
         }

@@ -1,4 +1,5 @@
-//! Orders that follow from earlier ones, told on every database: a task run anew, what failed once more, and back.
+//! Orders that follow from earlier ones, told on every database: a task run anew, what failed once
+//! more, and back.
 
 use task_proto::api::{PackageView, RetryDeployment};
 use task_proto::desired::DesiredTask;
@@ -56,7 +57,8 @@ impl Fleet {
             document: None,
         };
         let repository = RepositoryName::of_package(&task());
-        let put = self.database.store.put_manifest(&repository, &new, None, self.clock.now_ms()).await;
+        let put =
+            self.database.store.put_manifest(&repository, &new, None, self.clock.now_ms()).await;
         assert_eq!(put.expect("writes"), PutManifest::Stored);
         view
     }
@@ -106,14 +108,25 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     fleet.follow(&mut robots[1], Phase::Failed).await;
     fleet.follow(&mut robots[2], Phase::Running).await;
     let (key, third, task) = (random_key(), selector("r2"), task());
-    fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &third).await.expect("ordered");
+    fleet
+        .actions
+        .order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &third)
+        .await
+        .expect("ordered");
     fleet.follow(&mut robots[2], Phase::Stopped).await;
     fleet.changes.take_rings().await;
     let before = fleet.desired(&robots[0]).await.expect("state");
     // It failed on one, was stopped on one, and one never had it: there it begins.
     let again = fleet.deploy("1", |order| order.batch = Some(3)).await;
-    assert_eq!(fleet.phases(&again).await, [Phase::Running, Phase::Assigned, Phase::Assigned, Phase::Assigned]);
-    assert_eq!(fleet.desired(&robots[0]).await.expect("state"), before, "the robot hears of nothing");
+    assert_eq!(
+        fleet.phases(&again).await,
+        [Phase::Running, Phase::Assigned, Phase::Assigned, Phase::Assigned]
+    );
+    assert_eq!(
+        fleet.desired(&robots[0]).await.expect("state"),
+        before,
+        "the robot hears of nothing"
+    );
     assert_eq!(before.tasks[0].deployment, first);
     assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
     for robot in &mut robots {
@@ -123,7 +136,10 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     // Where it runs everywhere, all is settled at once, and nothing is left to cancel.
     let third = fleet.deploy("1", |_| ()).await;
     assert_eq!(fleet.deployment(&third).await.state, task_proto::api::DeploymentState::Settled);
-    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &third).await), "nothing_to_cancel");
+    assert_eq!(
+        code(fleet.actions.cancel_deployment(&fleet.operator, &third).await),
+        "nothing_to_cancel"
+    );
     // It can be forced, and another version is another.
     let forced = fleet.deploy("1", |order| order.restart = true).await;
     assert_eq!(fleet.phases(&forced).await, [Phase::Assigned; 4]);
@@ -137,7 +153,11 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     let job = package("7", TaskKind::Job);
     let order = crate::fleet::order_of(&job);
     for _ in 0..2 {
-        let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &job).await.expect("ordered");
+        let id = fleet
+            .actions
+            .create_deployment(&fleet.operator, &random_key(), &order, &job)
+            .await
+            .expect("ordered");
         assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, id);
         fleet.follow(&mut robots[0], Phase::Running).await;
     }
@@ -146,7 +166,12 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
 /// The report of a live process that `deployment` brought.
 fn active(deployment: &DeploymentId, version: &str) -> Option<ActiveVersion> {
     let manifest = Some(package(version, TaskKind::Service).package.manifest.digest);
-    Some(ActiveVersion { deployment: deployment.clone(), version: version.parse().expect("valid"), manifest, pid: 7 })
+    Some(ActiveVersion {
+        deployment: deployment.clone(),
+        version: version.parse().expect("valid"),
+        manifest,
+        pid: 7,
+    })
 }
 
 async fn package_that_came_back_after_a_failure_is_not_started_again(database: TestDatabase) {
@@ -171,13 +196,23 @@ async fn package_that_came_back_after_a_failure_is_not_started_again(database: T
     fleet.changes.take_rings().await;
     let back = fleet.roll_back("*").await.expect("ordered").deployments.remove(0);
     assert_eq!(fleet.changes.take_rings().await.robots.len(), 4, "the state of each is new");
-    assert_eq!(fleet.phases(&back).await, [Phase::Running, Phase::Running, Phase::Assigned, Phase::Assigned]);
-    let run = |task: &DesiredTask| (task.deployment.clone(), task.run, task.package.version.to_string());
+    assert_eq!(
+        fleet.phases(&back).await,
+        [Phase::Running, Phase::Running, Phase::Assigned, Phase::Assigned]
+    );
+    let run =
+        |task: &DesiredTask| (task.deployment.clone(), task.run, task.package.version.to_string());
     for (robot, deployment) in robots.iter().zip([&first, &first, &back, &back]) {
         let desired = fleet.desired(robot).await.expect("state");
-        assert_eq!(desired.tasks.iter().map(run).collect::<Vec<_>>(), [(deployment.clone(), 1, "1".to_owned())]);
+        assert_eq!(
+            desired.tasks.iter().map(run).collect::<Vec<_>>(),
+            [(deployment.clone(), 1, "1".to_owned())]
+        );
     }
-    assert_eq!(fleet.phases(&failed).await, [Phase::RolledBack, Phase::Failed, Phase::Failed, Phase::Superseded]);
+    assert_eq!(
+        fleet.phases(&failed).await,
+        [Phase::RolledBack, Phase::Failed, Phase::Failed, Phase::Superseded]
+    );
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
@@ -206,7 +241,8 @@ async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase
     fleet.follow(&mut robots[1], Phase::Failed).await;
     fleet.changes.take_rings().await;
     let (key, all, task) = (random_key(), selector("*"), task());
-    let restart = || fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Restart, &task, &all);
+    let restart =
+        || fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Restart, &task, &all);
     assert_eq!(names(&restart().await.expect("ordered")), ["r0", "r1"]);
     assert_eq!(names(&restart().await.expect("the same answer")), ["r0", "r1"]);
     assert_eq!(fleet.changes.take_rings().await.robots.len(), 2);
@@ -233,11 +269,15 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     // Somebody has seen to the last ones already.
     fleet.deploy("2", |order| order.selector = selector("r4")).await;
     for (order, robot) in [(TaskOrder::Stop, "r5"), (TaskOrder::Remove, "r6")] {
-        let ordered = fleet.actions.order_task(&fleet.operator, &random_key(), order, &task(), &selector(robot)).await;
+        let ordered = fleet
+            .actions
+            .order_task(&fleet.operator, &random_key(), order, &task(), &selector(robot))
+            .await;
         ordered.expect("ordered");
     }
     let retry = RetryDeployment::default();
-    let meant = fleet.actions.robots_to_retry(&fleet.operator, &id, &retry).await.expect("there are some");
+    let meant =
+        fleet.actions.robots_to_retry(&fleet.operator, &id, &retry).await.expect("there are some");
     assert_eq!(names(&meant), ["r1", "r2", "r3"]);
     assert_eq!(fleet.deployments().await.len(), 2, "a dry run orders nothing");
     let key = random_key();
@@ -247,17 +287,22 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     assert_eq!(fleet.phases(&new).await, [Phase::Assigned; 3]);
     assert_eq!(fleet.deployment(&new).await.package, fleet.deployment(&id).await.package);
     assert_eq!(code(fleet.retry(&fleet.operator, &id, &retry).await), "nothing_to_retry");
-    let other = RetryDeployment { code: Some(FailureCode::DISK_FULL), ..RetryDeployment::default() };
+    let other =
+        RetryDeployment { code: Some(FailureCode::DISK_FULL), ..RetryDeployment::default() };
     let reused = fleet.actions.retry_deployment(&fleet.operator, &key, &id, &other).await;
     assert_eq!(code(reused), "idempotency_key_reused");
-    // What expired or was taken back can be ordered again as well, but not once its package is gone.
+    // What expired or was taken back can be ordered again as well, but not once its package is
+    // gone.
     fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
     fleet.unpublish("1").await;
     assert_eq!(code(fleet.retry(&fleet.operator, &new, &retry).await), "package_not_found");
     fleet.publish("1").await;
     let third = fleet.retry(&fleet.operator, &new, &retry).await.expect("ordered");
     assert_eq!(fleet.phases(&third).await.len(), 3);
-    assert_eq!(code(fleet.retry(&fleet.operator, &DeploymentId::random(), &retry).await), "not_found");
+    assert_eq!(
+        code(fleet.retry(&fleet.operator, &DeploymentId::random(), &retry).await),
+        "not_found"
+    );
 }
 
 async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabase) {
@@ -288,9 +333,16 @@ async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabas
     };
     let new = fleet.retry(&fleet.operator, &id, &retry).await.expect("ordered");
     let view = fleet.deployment(&new).await;
-    let robots: Vec<_> = view.assignments.as_ref().expect("there").iter().map(|one| one.name.as_str()).collect();
+    let robots: Vec<_> =
+        view.assignments.as_ref().expect("there").iter().map(|one| one.name.as_str()).collect();
     assert_eq!(robots, ["r0", "r2"]);
-    let ways = (view.priority, view.max_failures, view.batch, view.delivery, view.selector.expect("whole").to_string());
+    let ways = (
+        view.priority,
+        view.max_failures,
+        view.batch,
+        view.delivery,
+        view.selector.expect("whole").to_string(),
+    );
     let delivery = task_proto::api::DeliveryChoice::PushPull;
     assert_eq!(ways, (7, Some(3), Some(4), delivery, "!r3".to_owned()));
     assert_eq!(view.expires_at_ms - view.created_at_ms, 600_000);
@@ -311,8 +363,12 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
-    let planned = fleet.actions.rollback(&fleet.operator, &task(), &selector("*")).await.expect("reads");
-    assert_eq!((names(&planned.robots), names(&planned.without)), (vec!["r0", "r1", "r2"], vec!["r3"]));
+    let planned =
+        fleet.actions.rollback(&fleet.operator, &task(), &selector("*")).await.expect("reads");
+    assert_eq!(
+        (names(&planned.robots), names(&planned.without)),
+        (vec!["r0", "r1", "r2"], vec!["r3"])
+    );
     assert_eq!((planned.deployments.len(), fleet.deployments().await.len()), (0, 3));
     fleet.changes.take_rings().await;
     let key = random_key();
@@ -322,7 +378,10 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     };
     let done = order().await;
     assert_eq!(order().await, done, "the same key orders once");
-    assert_eq!((&done.robots, &done.without, done.deployments.len()), (&planned.robots, &planned.without, 2));
+    assert_eq!(
+        (&done.robots, &done.without, done.deployments.len()),
+        (&planned.robots, &planned.without, 2)
+    );
     assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
     for (robot, version) in robots.iter().zip(["1", "1", "2", "3"]) {
         assert_eq!(fleet.version(robot).await, version);
@@ -331,7 +390,13 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     let mut paged = Vec::new();
     let mut before = None;
     loop {
-        let page = fleet.database.store.deployments(None, before.as_ref(), 1).await.expect("reads").expect("there");
+        let page = fleet
+            .database
+            .store
+            .deployments(None, before.as_ref(), 1)
+            .await
+            .expect("reads")
+            .expect("there");
         paged.extend(page.deployments.into_iter().map(|view| view.id));
         before = page.next;
         if before.is_none() {
@@ -348,7 +413,10 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     assert_eq!(fleet.version(&robots[0]).await, "3");
     let nobody = fleet.roll_back("r3").await;
     assert_eq!(code(nobody), "nothing_to_roll_back");
-    let unknown = fleet.actions.rollback(&fleet.operator, &"walker".parse().expect("a name"), &selector("*")).await;
+    let unknown = fleet
+        .actions
+        .rollback(&fleet.operator, &"walker".parse().expect("a name"), &selector("*"))
+        .await;
     assert_eq!(code(unknown), "no_robots_match");
 }
 
@@ -358,7 +426,12 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
         fleet.publish(version).await;
     }
     let mut robots = fleet.enroll(1).await;
-    let runs = [("1", Phase::Running), ("2", Phase::Succeeded), ("3", Phase::Failed), ("4", Phase::Running)];
+    let runs = [
+        ("1", Phase::Running),
+        ("2", Phase::Succeeded),
+        ("3", Phase::Failed),
+        ("4", Phase::Running),
+    ];
     for (version, phase) in runs {
         fleet.deploy(version, |_| ()).await;
         fleet.follow(&mut robots[0], phase).await;
@@ -369,12 +442,23 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
     fleet.follow(&mut robots[0], Phase::Failed).await;
     fleet.roll_back("*").await.expect("ordered");
     assert_eq!(fleet.version(&robots[0]).await, "2");
-    fleet.actions.cancel_deployment(&fleet.operator, &fleet.deployments().await[0].id).await.expect("cancelled");
+    fleet
+        .actions
+        .cancel_deployment(&fleet.operator, &fleet.deployments().await[0].id)
+        .await
+        .expect("cancelled");
     fleet.unpublish("2").await;
     fleet.roll_back("*").await.expect("ordered");
     assert_eq!(fleet.version(&robots[0]).await, "1");
-    let found = fleet.database.store.find_package(&task(), &Reference::Tag("1".parse().expect("a tag"))).await;
-    assert_eq!(found.expect("reads").map(|view| view.package), Some(package("1", TaskKind::Service).package));
+    let found = fleet
+        .database
+        .store
+        .find_package(&task(), &Reference::Tag("1".parse().expect("a tag")))
+        .await;
+    assert_eq!(
+        found.expect("reads").map(|view| view.package),
+        Some(package("1", TaskKind::Service).package)
+    );
 }
 
 async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
@@ -400,7 +484,11 @@ async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
     let own = RetryDeployment { selector: Some(selector("r0")), ..RetryDeployment::default() };
     let new = fleet.retry(&alice, &two, &own).await.expect("hers");
     assert_eq!(fleet.phases(&new).await.len(), 1);
-    let back = fleet.actions.roll_back(&alice, &random_key(), &task(), &selector("r0")).await.expect("hers");
+    let back = fleet
+        .actions
+        .roll_back(&alice, &random_key(), &task(), &selector("r0"))
+        .await
+        .expect("hers");
     assert_eq!(names(&back.robots), ["r0"]);
     assert_eq!(fleet.version(&robots[1]).await, "2");
 }

@@ -1,4 +1,5 @@
-//! A robot on MQTT that answers what it is asked, always the same: a small graph, a few parameters, a few lines of a log.
+//! A robot on MQTT that answers what it is asked, always the same: a small graph, a few parameters,
+//! a few lines of a log.
 
 use std::time::Duration;
 
@@ -35,13 +36,18 @@ impl Answering {
         // As the session says.
         let instance: InstanceId = "i00000000000000c3".parse().expect("an instance");
         let reply = move |question: &[u8]| {
-            let Request { id: question, ask, signed, .. } = serde_json::from_slice(question).expect("a question");
+            let Request { id: question, ask, signed, .. } =
+                serde_json::from_slice(question).expect("a question");
             assert_eq!(ask.changes_something(), signed.is_some());
             if let Some(signed) = signed {
                 let action = signed.open(ACTION_TYPE, &key).expect("signed by the server");
                 let action: Action = serde_json::from_slice(&action).expect("an action");
-                let meant =
-                    Action { robot_id: id.clone(), instance: instance.clone(), id: question.clone(), ask: ask.clone() };
+                let meant = Action {
+                    robot_id: id.clone(),
+                    instance: instance.clone(),
+                    id: question.clone(),
+                    ask: ask.clone(),
+                };
                 assert_eq!(action, meant);
             }
             let (outcome, told) = match answer(&ask) {
@@ -61,7 +67,8 @@ fn server_key(bench: &Bench) -> PublicKey {
 
 async fn session(bench: &Bench, robot: &Robot) -> Session {
     let identity = &robot.identity;
-    Session::open_at(&bench.server().addresses().mqtt, identity.robot_id.as_str(), &identity.token).await
+    Session::open_at(&bench.server().addresses().mqtt, identity.robot_id.as_str(), &identity.token)
+        .await
 }
 
 /// Robot `robot` publishes its log and goes, and the server knows that.
@@ -71,7 +78,8 @@ pub async fn publish_log_and_go(bench: &Bench, robot: &Robot) {
     session.publish("log", batch.to_string().into_bytes()).await;
     session.leave().await;
     let id = robot.identity.robot_id.as_str();
-    let is_there = async || !bench.taskd(&["robot", "info", id, "-o", "json"]).await.json()["mqtt"].is_null();
+    let is_there =
+        async || !bench.taskd(&["robot", "info", id, "-o", "json"]).await.json()["mqtt"].is_null();
     tokio::time::timeout(PATIENCE, async { while is_there().await {} }).await.expect("it is gone");
 }
 
@@ -111,32 +119,47 @@ fn answer(ask: &Ask) -> Result<Value, Refusal> {
         ] })
         }),
         Ask::Parameter { node, name } => match (known(node.as_str())?, name.as_str()) {
-            (_, "resolution") => Ok(json!({ "type": "parameters", "parameters": [{ "name": name, "value": 0.05 }] })),
+            (_, "resolution") => {
+                Ok(json!({ "type": "parameters", "parameters": [{ "name": name, "value": 0.05 }] }))
+            }
             (node, _) => Err(("no_such_parameter", format!("{node} has no parameter {name}"))),
         },
-        Ask::SetParameter { node, parameter } => match (known(node.as_str())?, parameter.value.is_string()) {
-            (_, false) => Ok(json!({ "type": "parameter_set", "parameter": parameter })),
-            (node, true) => {
-                let (name, value) = (&parameter.name, &parameter.value);
-                Err(("rejected", format!("{node} does not accept {name} = {value}: it gives no \u{1b}[31mreason")))
+        Ask::SetParameter { node, parameter } => {
+            match (known(node.as_str())?, parameter.value.is_string()) {
+                (_, false) => Ok(json!({ "type": "parameter_set", "parameter": parameter })),
+                (node, true) => {
+                    let (name, value) = (&parameter.name, &parameter.value);
+                    Err((
+                        "rejected",
+                        format!(
+                            "{node} does not accept {name} = {value}: it gives no \u{1b}[31mreason"
+                        ),
+                    ))
+                }
             }
-        },
+        }
         Ask::Lifecycle { node, transition } => match (known(node.as_str())?, transition) {
             (_, Transition::Deactivate) => Ok(json!({ "type": "lifecycle", "state": "inactive" })),
             (_, Transition::Shutdown) => Ok(json!({ "type": "lifecycle", "state": "finalized" })),
-            (node, other) => Err(("rejected", format!("{node} does not {}: it is active", other.as_str()))),
+            (node, other) => {
+                Err(("rejected", format!("{node} does not {}: it is active", other.as_str())))
+            }
         },
         Ask::Logs { task, level, since_ms, max_lines } => {
             logs(task.as_ref().map(|task| task.as_str()), *level, *since_ms, *max_lines)
         }
-        Ask::Follow { .. } | Ask::Vitals | Ask::Unknown => Err(("unsupported", "that is not answered".to_owned())),
+        Ask::Follow { .. } | Ask::Vitals | Ask::Unknown => {
+            Err(("unsupported", "that is not answered".to_owned()))
+        }
     }
 }
 
 /// The name of a node, if there is such a node.
 fn known(name: &str) -> Result<&str, Refusal> {
     let is_there = ["/camera", "/mapper", "/rviz"].contains(&name);
-    let absent = || ("no_such_node", format!("there is no node {name}; on the graph: /camera, /mapper, /rviz"));
+    let absent = || {
+        ("no_such_node", format!("there is no node {name}; on the graph: /camera, /mapper, /rviz"))
+    };
     is_there.then_some(name).ok_or_else(absent)
 }
 
@@ -162,7 +185,12 @@ fn node(name: &str) -> Result<Value, Refusal> {
     Ok(json!({ "type": "node", "age_ms": 300, "nodes": nodes }))
 }
 
-fn logs(task: Option<&str>, level: LogLevel, since_ms: Option<u64>, max_lines: u64) -> Result<Value, Refusal> {
+fn logs(
+    task: Option<&str>,
+    level: LogLevel,
+    since_ms: Option<u64>,
+    max_lines: u64,
+) -> Result<Value, Refusal> {
     if let Some(task) = task.filter(|task| !["mapping", "camera"].contains(task)) {
         return Err(("no_such_task", format!("there is no task {task}")));
     }
@@ -173,8 +201,10 @@ fn logs(task: Option<&str>, level: LogLevel, since_ms: Option<u64>, max_lines: u
             && task.is_none_or(|task| line["task"] == task)
             && since_ms.is_none_or(|since_ms| age_ms <= since_ms)
     };
-    let lines: Vec<Value> = lines().as_array().expect("lines").iter().filter(|line| wanted(line)).cloned().collect();
-    let newest = &lines[lines.len().saturating_sub(usize::try_from(max_lines).expect("a small number"))..];
+    let lines: Vec<Value> =
+        lines().as_array().expect("lines").iter().filter(|line| wanted(line)).cloned().collect();
+    let newest =
+        &lines[lines.len().saturating_sub(usize::try_from(max_lines).expect("a small number"))..];
     let suppressed = if level == LogLevel::Debug { 2 } else { 0 };
     Ok(
         json!({ "type": "logs", "robot_id": "r0000000000000000", "now_ms": NOW_MS, "lines": newest, "suppressed": suppressed }),

@@ -1,4 +1,5 @@
-//! The API as its clients use it: orders, their idempotency, what robots get and report, and the shapes of refusals.
+//! The API as its clients use it: orders, their idempotency, what robots get and report, and the
+//! shapes of refusals.
 
 use futures_util::StreamExt as _;
 use reqwest::{Method, StatusCode};
@@ -21,8 +22,12 @@ async fn an_order_travels_to_the_robot_and_its_report_back() {
     let ordered = server.deploy(&package, "*", "key-1").await;
     assert_eq!(ordered.assignments.as_ref().map(Vec::len), Some(1));
     let state = server.desired(&robot).await;
-    assert_eq!((state.robot_id.clone(), state.tasks[0].package.clone()), (robot.id.clone(), package));
-    let reply: ReportReply = server.report(&mut robot, &state, Phase::Running).await.json().await.expect("a reply");
+    assert_eq!(
+        (state.robot_id.clone(), state.tasks[0].package.clone()),
+        (robot.id.clone(), package)
+    );
+    let reply: ReportReply =
+        server.report(&mut robot, &state, Phase::Running).await.json().await.expect("a reply");
     assert_eq!(reply.generation, state.generation);
 
     let view = server.robot(&robot).await;
@@ -39,7 +44,8 @@ async fn what_goes_over_http_is_counted_at_the_sockets() {
     let body: PackageList = server.get("/api/v1/packages").await;
     let after: ServerInfo = server.get("/api/v1/server").await;
     assert_eq!(after.http.requests, before.http.requests + 2);
-    let answers = serde_json::to_vec(&before).expect("json").len() + serde_json::to_vec(&body).expect("json").len();
+    let answers = serde_json::to_vec(&before).expect("json").len()
+        + serde_json::to_vec(&body).expect("json").len();
     assert!(after.http.bytes_out > before.http.bytes_out + answers as u64, "{before:?} {after:?}");
     assert!(after.http.bytes_in > before.http.bytes_in, "{before:?} {after:?}");
 }
@@ -50,7 +56,12 @@ async fn a_robot_that_knows_its_state_gets_no_body() {
     let robot = server.enroll("atlas").await;
     let tag = server.ask_desired(&robot).await.headers()["etag"].clone();
     let path = format!("/api/v1/robots/{}/desired", robot.id);
-    let again = || server.bare(Method::GET, &path).bearer_auth(&robot.token).header("if-none-match", tag.clone());
+    let again = || {
+        server
+            .bare(Method::GET, &path)
+            .bearer_auth(&robot.token)
+            .header("if-none-match", tag.clone())
+    };
     assert_eq!(again().send().await.expect("an answer").status(), StatusCode::NOT_MODIFIED);
     let package = server.push("talker", "1.0.0").await;
     server.deploy(&package, "atlas", "key-1").await;
@@ -66,7 +77,8 @@ async fn the_same_key_is_the_same_order() {
     let generation = server.desired(&robot).await.generation;
     assert_eq!(server.deploy(&package, "*", "key-1").await.id, first.id);
     assert_eq!(server.desired(&robot).await.generation, generation);
-    let other = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "atlas" });
+    let other =
+        json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "atlas" });
     let reused = refusal(server.order("/api/v1/deployments", "key-1", &other)).await;
     assert_eq!(reused, (409, "idempotency_key_reused".to_owned()));
     assert_ne!(server.deploy(&package, "*", "key-2").await.id, first.id);
@@ -82,9 +94,13 @@ async fn a_dry_run_names_the_robots_and_orders_nothing() {
         "package": "talker", "manifest": package.manifest.digest, "selector": "atlas", "dry_run": true
     });
     let matched: MatchedRobots = server.post("/api/v1/deployments", &body).await;
-    assert_eq!(matched.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    assert_eq!(
+        matched.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        ["atlas"]
+    );
     assert!(server.desired(&robot).await.tasks.is_empty());
-    let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "nobody" });
+    let body =
+        json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "nobody" });
     let nobody = refusal(server.order("/api/v1/deployments", "key-1", &body)).await;
     assert_eq!(nobody, (404, "unknown_robots".to_owned()));
 }
@@ -120,13 +136,16 @@ async fn tasks_are_stopped_started_and_removed() {
     let package = server.push("talker", "1.0.0").await;
     server.deploy(&package, "*", "key-1").await;
     let order = json!({ "selector": "*" });
-    let matched: MatchedRobots = answer(server.order("/api/v1/tasks/talker/stop", "key-2", &order)).await;
+    let matched: MatchedRobots =
+        answer(server.order("/api/v1/tasks/talker/stop", "key-2", &order)).await;
     assert_eq!(matched.robots.len(), 1);
     assert_eq!(server.desired(&robot).await.tasks[0].wanted, task_proto::desired::Wanted::Stopped);
-    let _: MatchedRobots = answer(server.order("/api/v1/tasks/talker/start", "key-3", &order)).await;
+    let _: MatchedRobots =
+        answer(server.order("/api/v1/tasks/talker/start", "key-3", &order)).await;
     let started = server.desired(&robot).await.tasks[0].clone();
     assert_eq!((started.wanted, started.run), (task_proto::desired::Wanted::Running, 2));
-    let _: MatchedRobots = answer(server.order("/api/v1/tasks/talker/remove", "key-4", &order)).await;
+    let _: MatchedRobots =
+        answer(server.order("/api/v1/tasks/talker/remove", "key-4", &order)).await;
     assert!(server.desired(&robot).await.tasks.is_empty());
 }
 
@@ -136,13 +155,16 @@ async fn robots_are_found_edited_and_removed() {
     let robot = server.enroll("atlas").await;
     server.enroll("boreas").await;
     let edit = json!({ "name": "atlas-2", "labels": { "site": "lab" } });
-    let edited: Value = answer(server.request(Method::PATCH, "/api/v1/robots/atlas").json(&edit)).await;
+    let edited: Value =
+        answer(server.request(Method::PATCH, "/api/v1/robots/atlas").json(&edit)).await;
     assert_eq!(edited["name"], "atlas-2");
     let found: RobotList = server.get("/api/v1/robots?selector=site%3Dlab").await;
     assert_eq!(found.robots.len(), 1);
-    let taken = server.request(Method::PATCH, "/api/v1/robots/boreas").json(&json!({ "name": "atlas-2" }));
+    let taken =
+        server.request(Method::PATCH, "/api/v1/robots/boreas").json(&json!({ "name": "atlas-2" }));
     assert_eq!(refusal(taken).await, (409, "name_taken".to_owned()));
-    let removed = server.request(Method::DELETE, "/api/v1/robots/atlas-2").send().await.expect("an answer");
+    let removed =
+        server.request(Method::DELETE, "/api/v1/robots/atlas-2").send().await.expect("an answer");
     assert_eq!(removed.status(), StatusCode::NO_CONTENT);
     assert_eq!(server.ask_desired(&robot).await.status(), StatusCode::UNAUTHORIZED);
     assert_eq!(refusal(server.request(Method::GET, "/api/v1/robots/atlas-2")).await.0, 404);
@@ -153,7 +175,10 @@ async fn refusals_have_one_shape() {
     let server = TestServer::start().await;
     let get = |path: &str| server.request(Method::GET, path);
     let post = |body: String| {
-        server.request(Method::POST, "/api/v1/enrollment-tokens").header("content-type", "application/json").body(body)
+        server
+            .request(Method::POST, "/api/v1/enrollment-tokens")
+            .header("content-type", "application/json")
+            .body(body)
     };
     let cases = [
         (get("/nothing"), 404, "not_found"),
@@ -165,13 +190,19 @@ async fn refusals_have_one_shape() {
         (get("/api/v1/robots?selector=a%20b"), 400, "invalid_request"),
         (get("/api/v1/robots?selektor=*"), 400, "invalid_request"),
         (server.request(Method::PUT, "/api/v1/robots"), 405, "method_not_allowed"),
-        (server.request(Method::POST, "/api/v1/enrollment-tokens").body("{}"), 415, "unsupported_media_type"),
+        (
+            server.request(Method::POST, "/api/v1/enrollment-tokens").body("{}"),
+            415,
+            "unsupported_media_type",
+        ),
         (post("{".to_owned()), 400, "invalid_request"),
         (post(r#"{"uses": "two"}"#.to_owned()), 400, "invalid_request"),
         (post(r#"{"user": 2}"#.to_owned()), 400, "invalid_request"),
         (post(format!("{{\"labels\": {{\"a\": \"{}\"}}}}", "x".repeat(100_000))), 413, "too_large"),
         (
-            server.request(Method::POST, "/api/v1/tasks/talker/stop").json(&json!({"selector": "*"})),
+            server
+                .request(Method::POST, "/api/v1/tasks/talker/stop")
+                .json(&json!({"selector": "*"})),
             400,
             "invalid_request",
         ),
@@ -185,7 +216,12 @@ async fn refusals_have_one_shape() {
     let allow = server.request(Method::PUT, "/api/v1/robots").send().await.expect("an answer");
     assert!(allow.headers().contains_key("allow"));
     assert_eq!(allow.headers()["x-content-type-options"], "nosniff");
-    assert!(allow.headers()["content-security-policy"].to_str().expect("text").contains("default-src 'none'"));
+    assert!(
+        allow.headers()["content-security-policy"]
+            .to_str()
+            .expect("text")
+            .contains("default-src 'none'")
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -195,7 +231,9 @@ async fn a_known_mac_is_refused_without_a_token_for_that_robot() {
     let mac = server.get::<RobotList>("/api/v1/robots").await.robots[0].mac.to_string();
     let enroll = async |token: Value| {
         let token: Value = server.post("/api/v1/enrollment-tokens", &token).await;
-        let request = server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token["token"].as_str().expect("text"));
+        let request = server
+            .bare(Method::POST, "/api/v1/enroll")
+            .bearer_auth(token["token"].as_str().expect("text"));
         request.json(&json!({ "mac": mac }))
     };
     assert_eq!(refusal(enroll(json!({})).await).await, (409, "mac_known".to_owned()));

@@ -1,9 +1,12 @@
-//! Robots that wait to be approved: they have nothing, nobody can order them anything, and nobody waits for ever.
+//! Robots that wait to be approved: they have nothing, nobody can order them anything, and nobody
+//! waits for ever.
 
 use reqwest::Method;
 use serde_json::{Value, json};
 use task_proto::RobotId;
-use task_proto::api::{AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView};
+use task_proto::api::{
+    AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView,
+};
 use task_proto::token::Token;
 use taskd::domain::person::Scope;
 use taskd::net::tls::ClientProof;
@@ -23,7 +26,9 @@ on_both_databases! {
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
 
-async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(database: TestDatabase) {
+async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
+    database: TestDatabase,
+) {
     let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let holder = async |token: &Token| {
@@ -33,17 +38,29 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
             .expect("reads")
             .map(|admitted| admitted.holder)
     };
-    let order = CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
+    let order =
+        CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
     let token = fleet.enrolment_token(order).await;
     let one = fleet.try_enroll(&token, mac(1), Some("one")).await.expect("enrols");
     // An answer that was lost is mended as ever, and the robot goes on waiting.
-    let one = fleet.try_enroll(&token, mac(1), Some("one")).await.map(|again| (one, again)).expect("mended");
+    let one = fleet
+        .try_enroll(&token, mac(1), Some("one"))
+        .await
+        .map(|again| (one, again))
+        .expect("mended");
     assert!(one.0.awaits_approval && one.1.awaits_approval);
     let one = one.1;
-    assert_eq!(holder(&one.token).await, Some(TokenHolder::Pending { robot: one.robot_id.clone(), key: None }));
+    assert_eq!(
+        holder(&one.token).await,
+        Some(TokenHolder::Pending { robot: one.robot_id.clone(), key: None })
+    );
     let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
     assert_eq!(
-        store.matching_robots(&"*".parse().expect("valid"), &Scope::everything()).await.expect("reads").robots,
+        store
+            .matching_robots(&"*".parse().expect("valid"), &Scope::everything())
+            .await
+            .expect("reads")
+            .robots,
         []
     );
     assert_eq!(store.broker_credentials().await.expect("reads"), []);
@@ -54,11 +71,19 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     }
     assert!(matches!(holder(&one.token).await, Some(TokenHolder::Robot { .. })));
     assert_eq!(
-        store.matching_robots(&"*".parse().expect("valid"), &Scope::everything()).await.expect("reads").robots.len(),
+        store
+            .matching_robots(&"*".parse().expect("valid"), &Scope::everything())
+            .await
+            .expect("reads")
+            .robots
+            .len(),
         1
     );
     // Rejecting one that does not wait would be removing it.
-    assert_eq!(code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await), "not_pending");
+    assert_eq!(
+        code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await),
+        "not_pending"
+    );
 
     fleet.actions.reject_robot(&fleet.operator, &two.robot_id).await.expect("rejected");
     assert_eq!(holder(&two.token).await, None);
@@ -70,14 +95,20 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     fleet.clock.advance_ms(1);
     fleet.actions.expire().await.expect("looks");
     assert_eq!(holder(&two.token).await, None);
-    let left: Vec<RobotId> = store.robots().await.expect("reads").into_iter().map(|robot| robot.id).collect();
+    let left: Vec<RobotId> =
+        store.robots().await.expect("reads").into_iter().map(|robot| robot.id).collect();
     assert_eq!(left, [one.robot_id]);
 }
 
 async fn no_more_than_a_thousand_wait(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
-    let token =
-        fleet.enrolment_token(CreateEnrollmentToken { approval: true, unlimited: true, ..Default::default() }).await;
+    let token = fleet
+        .enrolment_token(CreateEnrollmentToken {
+            approval: true,
+            unlimited: true,
+            ..Default::default()
+        })
+        .await;
     let mut first = None;
     for number in 0..1_000 {
         let came = fleet.try_enroll(&token, mac(number), None).await.expect("enrols");
@@ -85,13 +116,17 @@ async fn no_more_than_a_thousand_wait(database: TestDatabase) {
     }
     let one_more = async || fleet.try_enroll(&token, mac(1_000), None).await;
     assert_eq!(code(one_more().await), "too_many_requests");
-    assert!(fleet.try_enroll(&token, mac(0), None).await.is_ok(), "who waits already may ask again");
+    assert!(
+        fleet.try_enroll(&token, mac(0), None).await.is_ok(),
+        "who waits already may ask again"
+    );
     fleet.actions.approve_robot(&fleet.operator, &first.expect("came")).await.expect("approved");
     assert!(one_more().await.expect("enrols").awaits_approval);
 }
 
 async fn enrol(server: &TestServer, token: &str, number: u8) -> EnrollResponse {
-    let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
+    let body =
+        json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
     answer(server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token).json(&body)).await
 }
 
@@ -120,14 +155,21 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
         assert_eq!(refused, (403, "awaits_approval".to_owned()), "{path}");
     }
     for path in ["/v2/".to_owned(), format!("/v2/talker/blobs/{}", package.content.digest)] {
-        let refused = server.bare(Method::GET, &path).bearer_auth(&came.token).send().await.expect("an answer");
+        let refused = server
+            .bare(Method::GET, &path)
+            .bearer_auth(&came.token)
+            .send()
+            .await
+            .expect("an answer");
         assert_eq!(refused.status(), 403, "{path}");
     }
     assert_eq!(connack(&server, came.robot_id.as_str(), &came.token).await, 5);
     // An order does not mean it, by whatever selector.
-    for (selector, why) in
-        [("*", "no_robots_match"), ("robot-1", "unknown_robots"), (came.robot_id.as_str(), "unknown_robots")]
-    {
+    for (selector, why) in [
+        ("*", "no_robots_match"),
+        ("robot-1", "unknown_robots"),
+        (came.robot_id.as_str(), "unknown_robots"),
+    ] {
         let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": selector });
         assert_eq!(refusal(server.order("/api/v1/deployments", selector, &body)).await.1, why);
     }
@@ -150,11 +192,13 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
     );
 
     // A robot that an administrator makes a token for is known already.
-    let own: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({ "robot": "robot-1" })).await;
+    let own: EnrollmentToken =
+        server.post("/api/v1/enrollment-tokens", &json!({ "robot": "robot-1" })).await;
     assert!(!enrol(&server, &own.token, 1).await.awaits_approval);
     let other = enrol(&server, &token.token, 2).await;
     act(&server, &other.robot_id, "reject").await;
-    let refused = server.bare(Method::GET, "/v2/").bearer_auth(&other.token).send().await.expect("an answer");
+    let refused =
+        server.bare(Method::GET, "/v2/").bearer_auth(&other.token).send().await.expect("an answer");
     assert_eq!(refused.status(), 401);
     assert_eq!(server.get::<PendingRobotList>("/api/v1/pending-robots").await.robots, []);
 }

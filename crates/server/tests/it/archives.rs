@@ -1,5 +1,5 @@
-//! One table of archives and manifests, and two verdicts on each: that of a push, and that of the function by which robots
-//! unpack. They must be the same.
+//! One table of archives and manifests, and two verdicts on each: that of a push, and that of the
+//! function by which robots unpack. They must be the same.
 
 use reqwest::StatusCode;
 use serde_json::{Value, json};
@@ -20,7 +20,12 @@ struct Case {
 }
 
 impl Case {
-    fn new(name: &'static str, content: Vec<u8>, facts: ContentFacts, refused: Option<&'static str>) -> Self {
+    fn new(
+        name: &'static str,
+        content: Vec<u8>,
+        facts: ContentFacts,
+        refused: Option<&'static str>,
+    ) -> Self {
         Self { name, content, facts, refused }
     }
 }
@@ -74,13 +79,33 @@ fn frames(tar: &[u8]) -> Vec<Case> {
         case("two frames", [frame(head), frame(tail)].concat(), None),
         case("a frame for each block", tar.chunks(512).flat_map(frame).collect(), None),
         case("an empty frame behind", [whole.clone(), frame(b"")].concat(), None),
-        case("skippable frames", [skippable(b"x"), frame(head), skippable(&[0; 9]), frame(tail)].concat(), None),
+        case(
+            "skippable frames",
+            [skippable(b"x"), frame(head), skippable(&[0; 9]), frame(tail)].concat(),
+            None,
+        ),
         case("a skippable frame behind", [whole.clone(), skippable(b"signature")].concat(), None),
         case("bytes behind the frame", [whole.clone(), b"more".to_vec()].concat(), Some("zstd")),
-        case("a second frame with more", [whole.clone(), frame(b"more")].concat(), Some("uncompressed bytes")),
-        case("a second frame that is cut", [frame(head), frame(tail)[..20].to_vec()].concat(), Some("zstd")),
-        case("a skippable frame that is cut", [whole.clone(), skippable(b"x")[..8].to_vec()].concat(), Some("zstd")),
-        case("a second frame with a wide window", [frame(head), wide_frame(tail)].concat(), Some("zstd")),
+        case(
+            "a second frame with more",
+            [whole.clone(), frame(b"more")].concat(),
+            Some("uncompressed bytes"),
+        ),
+        case(
+            "a second frame that is cut",
+            [frame(head), frame(tail)[..20].to_vec()].concat(),
+            Some("zstd"),
+        ),
+        case(
+            "a skippable frame that is cut",
+            [whole.clone(), skippable(b"x")[..8].to_vec()].concat(),
+            Some("zstd"),
+        ),
+        case(
+            "a second frame with a wide window",
+            [frame(head), wide_frame(tail)].concat(),
+            Some("zstd"),
+        ),
         case("no frame", b"content".to_vec(), Some("zstd")),
         case("nothing", Vec::new(), Some("")),
     ]
@@ -91,10 +116,26 @@ fn manifests(tar: &[u8]) -> Vec<Case> {
     let case = |name, facts, refused| Case::new(name, whole.clone(), facts, Some(refused));
     let sha512 = Algorithm::Sha512.digest(tar);
     vec![
-        case("another digest", ContentFacts { tar_digest: Digest::of(b"other"), ..good }, "content.tar_digest"),
-        case("a digest that nobody compares", ContentFacts { tar_digest: sha512, ..good }, "no SHA-256 digest"),
-        case("more bytes", ContentFacts { tar_size: good.tar_size + 512, ..good }, "the task manifest says"),
-        case("fewer bytes", ContentFacts { tar_size: good.tar_size - 512, ..good }, "the task manifest says"),
+        case(
+            "another digest",
+            ContentFacts { tar_digest: Digest::of(b"other"), ..good },
+            "content.tar_digest",
+        ),
+        case(
+            "a digest that nobody compares",
+            ContentFacts { tar_digest: sha512, ..good },
+            "no SHA-256 digest",
+        ),
+        case(
+            "more bytes",
+            ContentFacts { tar_size: good.tar_size + 512, ..good },
+            "the task manifest says",
+        ),
+        case(
+            "fewer bytes",
+            ContentFacts { tar_size: good.tar_size - 512, ..good },
+            "the task manifest says",
+        ),
         case("more entries", ContentFacts { entries: 3, ..good }, "entries in the archive: 2"),
         case("fewer entries", ContentFacts { entries: 1, ..good }, "entries in the archive: 2"),
     ]
@@ -109,14 +150,22 @@ fn names() -> Vec<Case> {
     let file = |path| (path, Type::Regular, "", &b"x"[..]);
     vec![
         of("a link within", &[file("a"), ("b/c", Type::Symlink, "../a", b"")], None),
-        of("a link that leaves", &[("b/c", Type::Symlink, "../../a", b"")], Some("leaves the package")),
+        of(
+            "a link that leaves",
+            &[("b/c", Type::Symlink, "../../a", b"")],
+            Some("leaves the package"),
+        ),
         of(
             "a link through another",
             &[("a", Type::Symlink, "b/..", b""), ("c", Type::Symlink, "a/../..", b"")],
             Some("leaves"),
         ),
         of("an absolute link", &[("b", Type::Symlink, "/etc", b"")], Some("leaves the package")),
-        of("a file below a link", &[("b", Type::Symlink, "c", b""), file("b/x")], Some("is a symbolic link")),
+        of(
+            "a file below a link",
+            &[("b", Type::Symlink, "c", b""), file("b/x")],
+            Some("is a symbolic link"),
+        ),
         of("a file below a file", &[file("b"), file("b/x")], Some("is a file")),
         of("a name twice", &[file("b"), file("./b")], Some("there twice")),
         of("a hard link to nothing", &[("b", Type::Link, "c", b"")], Some("an earlier file")),
@@ -130,7 +179,13 @@ fn names() -> Vec<Case> {
 fn unpacked(case: &Case) -> Result<(), String> {
     let directory = tempfile::tempdir().expect("a directory");
     let size = case.content.len() as u64;
-    match unpack(&case.content[..], size, &case.facts, &Limits::default(), &directory.path().join("tree")) {
+    match unpack(
+        &case.content[..],
+        size,
+        &case.facts,
+        &Limits::default(),
+        &directory.path().join("tree"),
+    ) {
         Ok(()) => Ok(()),
         Err(UnpackError::Refused(refusal)) => Err(refusal.to_string()),
         Err(error) => panic!("{}: {error}", case.name),
@@ -143,7 +198,9 @@ async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
     let content = registry.push_blob("talker", &case.content).await;
     let config = registry.push_blob("talker", task.to_string().as_bytes()).await;
     let package = ImageManifest::package(config, content);
-    let answer = registry.put_manifest("/v2/talker/manifests/1.0.0?force=true", MANIFEST_TYPE, &package).await;
+    let answer = registry
+        .put_manifest("/v2/talker/manifests/1.0.0?force=true", MANIFEST_TYPE, &package)
+        .await;
     if answer.status() == StatusCode::CREATED {
         return Ok(());
     }
@@ -160,14 +217,17 @@ async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
 #[tokio::test]
 async fn push_and_robot_come_to_the_same_verdict() {
     use tar::EntryType as Type;
-    let tar = tar_of(&[("main.sh", Type::Regular, "", &[b'x'; 900]), ("data", Type::Directory, "", b"")]);
+    let tar =
+        tar_of(&[("main.sh", Type::Regular, "", &[b'x'; 900]), ("data", Type::Directory, "", b"")]);
     let registry = TestRegistry::start().await;
     for case in frames(&tar).into_iter().chain(manifests(&tar)).chain(names()) {
         let (push, robot) = (pushed(&registry, &case).await, unpacked(&case));
         assert_eq!(push, robot, "{}", case.name);
         match (case.refused, robot) {
             (None, verdict) => assert_eq!(verdict, Ok(()), "{}", case.name),
-            (Some(words), Err(reason)) => assert!(reason.contains(words), "{}: {reason}", case.name),
+            (Some(words), Err(reason)) => {
+                assert!(reason.contains(words), "{}: {reason}", case.name)
+            }
             (Some(words), Ok(())) => panic!("{} is accepted, not refused for {words:?}", case.name),
         }
     }

@@ -1,5 +1,5 @@
-//! An act and its entry in the audit are one: with an audit that can't be written to, nothing is done; with one that can, each
-//! act leaves one entry. Every act that the API has is tried.
+//! An act and its entry in the audit are one: with an audit that can't be written to, nothing is
+//! done; with one that can, each act leaves one entry. Every act that the API has is tried.
 
 use reqwest::{Method, RequestBuilder};
 use serde_json::{Value, json};
@@ -43,23 +43,47 @@ impl Stage {
         let careful = json!({
             "package": "climber", "manifest": climber.manifest.digest, "selector": "*", "batch": 1, "max_failures": 0,
         });
-        let paused: DeploymentView = answer(server.order("/api/v1/deployments", "careful", &careful)).await;
+        let paused: DeploymentView =
+            answer(server.order("/api/v1/deployments", "careful", &careful)).await;
         let state = server.desired(&robot).await;
         assert_eq!(server.report(&mut robot, &state, Phase::Failed).await.status(), 200);
-        let (talker, walker) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
+        let (talker, walker) =
+            (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
         let unused = server.push("unused", "1.0.0").await;
         let path = format!("/v2/talker/manifests/{}", talker.manifest.digest);
-        let manifest = server.request(Method::GET, &path).send().await.expect("an answer").text().await.expect("text");
+        let manifest = server
+            .request(Method::GET, &path)
+            .send()
+            .await
+            .expect("an answer")
+            .text()
+            .await
+            .expect("text");
         let deployment = server.deploy(&talker, "*", "first").await.id.to_string();
         let user = json!({ "name": "alice", "roles": ["operator"], "password": PASSWORD });
         let _: Value = server.post("/api/v1/users", &user).await;
-        let log_in =
-            || server.bare(Method::POST, "/api/v1/login").json(&json!({ "user": "alice", "password": PASSWORD }));
+        let log_in = || {
+            server
+                .bare(Method::POST, "/api/v1/login")
+                .json(&json!({ "user": "alice", "password": PASSWORD }))
+        };
         let (signed_in, other_token) = (answer(log_in()).await, answer(log_in()).await);
         let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
         let enrolment = enrolment.token;
         let paused = paused.id.to_string();
-        Self { server, robot, unused, walker, manifest, deployment, paused, failed, enrolment, signed_in, other_token }
+        Self {
+            server,
+            robot,
+            unused,
+            walker,
+            manifest,
+            deployment,
+            paused,
+            failed,
+            enrolment,
+            signed_in,
+            other_token,
+        }
     }
 
     fn order(&self, path: &str, body: &Value) -> RequestBuilder {
@@ -68,7 +92,8 @@ impl Stage {
 
     /// Every act, by its name in the audit, in an order in which each can be done.
     fn acts(&self) -> Vec<(&'static str, RequestBuilder)> {
-        let request = |method, path: &str, body: Value| self.server.request(method, path).json(&body);
+        let request =
+            |method, path: &str, body: Value| self.server.request(method, path).json(&body);
         let bare = |method, path: &str, body: Value| self.server.bare(method, path).json(&body);
         let delete = |path: &str| self.server.request(Method::DELETE, path);
         let api = |path: &str| format!("/api/v1/{path}");
@@ -83,8 +108,12 @@ impl Stage {
             ("enrolment_token.create", request(Method::POST, &api("enrollment-tokens"), json!({}))),
             (
                 "robot.enroll",
-                bare(Method::POST, &api("enroll"), json!({ "mac": "02:00:00:00:00:07", "name": "ceto" }))
-                    .bearer_auth(&self.enrolment),
+                bare(
+                    Method::POST,
+                    &api("enroll"),
+                    json!({ "mac": "02:00:00:00:00:07", "name": "ceto" }),
+                )
+                .bearer_auth(&self.enrolment),
             ),
             ("robot.edit", request(Method::PATCH, &robot(""), json!({ "name": "argo" }))),
             ("robot.ask", request(Method::POST, &robot("/ask"), ask)),
@@ -92,39 +121,83 @@ impl Stage {
             ("task.stop", self.order(&api("tasks/talker/stop"), &all)),
             ("task.start", self.order(&api("tasks/talker/start"), &all)),
             ("task.restart", self.order(&api("tasks/talker/restart"), &all)),
-            ("deployment.retry", self.order(&api(&format!("deployments/{}/retry", self.failed)), &json!({}))),
+            (
+                "deployment.retry",
+                self.order(&api(&format!("deployments/{}/retry", self.failed)), &json!({})),
+            ),
             ("task.rollback", self.order(&api("tasks/runner/rollback"), &all)),
             (
                 "bulk.labels",
-                request(Method::POST, &api("bulk/labels"), json!({ "selector": "*", "set": { "a": "b" } })),
+                request(
+                    Method::POST,
+                    &api("bulk/labels"),
+                    json!({ "selector": "*", "set": { "a": "b" } }),
+                ),
             ),
             ("manifest.delete", delete(&api("packages/spare/1.0.0"))),
             ("task.remove", self.order(&api("tasks/talker/remove"), &all)),
             (
                 "deployment.cancel",
-                request(Method::POST, &api(&format!("deployments/{}/cancel", self.deployment)), json!({})),
+                request(
+                    Method::POST,
+                    &api(&format!("deployments/{}/cancel", self.deployment)),
+                    json!({}),
+                ),
             ),
             (
                 "deployment.resume",
-                request(Method::POST, &api(&format!("deployments/{}/resume", self.paused)), json!({})),
+                request(
+                    Method::POST,
+                    &api(&format!("deployments/{}/resume", self.paused)),
+                    json!({}),
+                ),
             ),
             ("manifest.push", manifest),
             ("tag.delete", delete("/v2/talker/manifests/2.0.0")),
-            ("manifest.delete", delete(&format!("/v2/unused/manifests/{}", unused.manifest.digest))),
+            (
+                "manifest.delete",
+                delete(&format!("/v2/unused/manifests/{}", unused.manifest.digest)),
+            ),
             ("blob.delete", delete(&format!("/v2/unused/blobs/{}", unused.content.digest))),
-            ("user.add", request(Method::POST, &api("users"), json!({ "name": "bob", "roles": ["viewer"] }))),
-            ("user.edit", request(Method::PATCH, &api("users/alice"), json!({ "roles": ["viewer"] }))),
-            ("sign_in", bare(Method::POST, &api("login"), json!({ "user": "alice", "password": PASSWORD }))),
-            ("sign_in", bare(Method::POST, &api("session"), json!({ "user": "alice", "password": PASSWORD }))),
+            (
+                "user.add",
+                request(Method::POST, &api("users"), json!({ "name": "bob", "roles": ["viewer"] })),
+            ),
+            (
+                "user.edit",
+                request(Method::PATCH, &api("users/alice"), json!({ "roles": ["viewer"] })),
+            ),
+            (
+                "sign_in",
+                bare(Method::POST, &api("login"), json!({ "user": "alice", "password": PASSWORD })),
+            ),
+            (
+                "sign_in",
+                bare(
+                    Method::POST,
+                    &api("session"),
+                    json!({ "user": "alice", "password": PASSWORD }),
+                ),
+            ),
             ("token.create", request(Method::POST, &api("tokens"), json!({ "user": "alice" }))),
             ("token.revoke", delete(&api(&format!("tokens/{}", self.other_token.id)))),
-            ("sign_out", bare(Method::DELETE, &api("session"), json!({})).bearer_auth(&self.signed_in.token)),
+            (
+                "sign_out",
+                bare(Method::DELETE, &api("session"), json!({})).bearer_auth(&self.signed_in.token),
+            ),
             (
                 "user.password",
-                request(Method::PUT, &api("users/alice/password"), json!({ "password": "another long one" })),
+                request(
+                    Method::PUT,
+                    &api("users/alice/password"),
+                    json!({ "password": "another long one" }),
+                ),
             ),
             ("user.remove", delete(&api("users/alice"))),
-            ("bulk.remove", request(Method::POST, &api("bulk/remove"), json!({ "selector": "boreas" }))),
+            (
+                "bulk.remove",
+                request(Method::POST, &api("bulk/remove"), json!({ "selector": "boreas" })),
+            ),
             ("robot.remove", delete(&robot(""))),
         ]
     }
@@ -149,7 +222,11 @@ async fn what_can_not_be_written_down_is_not_done() {
     for (act, request) in stage.acts() {
         let status = send(request, act, "/v2/talker/manifests/1.0.0").await;
         assert_eq!(status, 500, "{act}");
-        assert_eq!(contents(&stage.database()).await, was, "{act} was done, and nobody knows by whom");
+        assert_eq!(
+            contents(&stage.database()).await,
+            was,
+            "{act} was done, and nobody knows by whom"
+        );
     }
     rename(&stage.database(), "audit_elsewhere", "audit").await;
     assert_eq!(stage.entries().await, before);

@@ -49,12 +49,18 @@ impl Comer {
             Access::Person(_) => matches!(self, Operator | OperatorByPassword),
             Access::OwnRobot => self == Robot,
             Access::Enrolment => self == Enrolment,
-            Access::PersonOrRobot => matches!(self, Operator | OperatorByPassword | Robot | OtherRobot),
+            Access::PersonOrRobot => {
+                matches!(self, Operator | OperatorByPassword | Robot | OtherRobot)
+            }
         };
         match self {
             _ if is_let_in => None,
-            Nobody | Nonsense | Stranger | ExpiredEnrolment | RemovedRobot => Some(StatusCode::UNAUTHORIZED),
-            Operator | OperatorByPassword | Enrolment | Robot | OtherRobot => Some(StatusCode::FORBIDDEN),
+            Nobody | Nonsense | Stranger | ExpiredEnrolment | RemovedRobot => {
+                Some(StatusCode::UNAUTHORIZED)
+            }
+            Operator | OperatorByPassword | Enrolment | Robot | OtherRobot => {
+                Some(StatusCode::FORBIDDEN)
+            }
         }
     }
 }
@@ -73,11 +79,15 @@ struct Gathering {
 impl Gathering {
     async fn new() -> Self {
         let server = TestServer::start().await;
-        let (robot, other, removed) =
-            (server.enroll("atlas").await, server.enroll("boreas").await, server.enroll("ceto").await);
+        let (robot, other, removed) = (
+            server.enroll("atlas").await,
+            server.enroll("boreas").await,
+            server.enroll("ceto").await,
+        );
         let path = format!("/api/v1/robots/{}", removed.id);
         server.request(Method::DELETE, &path).send().await.expect("an answer");
-        let expired: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({ "ttl_s": 1 })).await;
+        let expired: EnrollmentToken =
+            server.post("/api/v1/enrollment-tokens", &json!({ "ttl_s": 1 })).await;
         let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
         server.clock.advance_ms(2_000);
         Self {
@@ -97,7 +107,9 @@ impl Gathering {
             Comer::Nonsense => request.header("authorization", "Bearer tsko_nonsense"),
             Comer::Stranger => request.bearer_auth(Token::random(TokenKind::Operator).reveal()),
             Comer::Operator => request.bearer_auth(self.server.operator.reveal()),
-            Comer::OperatorByPassword => request.basic_auth("anyone", Some(self.server.operator.reveal())),
+            Comer::OperatorByPassword => {
+                request.basic_auth("anyone", Some(self.server.operator.reveal()))
+            }
             Comer::Enrolment => request.bearer_auth(&self.enrolment),
             Comer::ExpiredEnrolment => request.bearer_auth(&self.expired_enrolment),
             Comer::Robot => request.bearer_auth(&self.robot),
@@ -107,7 +119,8 @@ impl Gathering {
     }
 
     fn request(&self, route: &Route) -> RequestBuilder {
-        let path = route.path.replace("{robot}", &self.robot_id).replace("{*path}", "talker/tags/list");
+        let path =
+            route.path.replace("{robot}", &self.robot_id).replace("{*path}", "talker/tags/list");
         let path = path.replace("{deployment}", "d0000000000000000").replace("{task}", "talker");
         self.server.bare(route.method.clone().unwrap_or(Method::GET), &path)
     }
@@ -124,26 +137,37 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
             if is_last_word && comer.refused(route.access).is_none() {
                 continue;
             }
-            let response = gathering.dress(gathering.request(&route), comer).send().await.expect("an answer");
-            let (status, shown) = (response.status(), format!("{:?} {} by {comer:?}", route.method, route.path));
+            let response =
+                gathering.dress(gathering.request(&route), comer).send().await.expect("an answer");
+            let (status, shown) =
+                (response.status(), format!("{:?} {} by {comer:?}", route.method, route.path));
             match comer.refused(route.access) {
                 Some(expected) => {
                     assert_eq!(status, expected, "{shown}");
                     let is_oci = route.path.starts_with("/v2");
                     assert_eq!(
-                        response.headers().get("www-authenticate").map(|value| value.as_bytes().starts_with(b"Basic")),
+                        response
+                            .headers()
+                            .get("www-authenticate")
+                            .map(|value| value.as_bytes().starts_with(b"Basic")),
                         (status == StatusCode::UNAUTHORIZED).then_some(is_oci),
                         "{shown}"
                     );
                     let body: Value = response.json().await.expect("json");
-                    assert!(body[if is_oci { "errors" } else { "error" }].is_array() == is_oci, "{shown}: {body}");
+                    assert!(
+                        body[if is_oci { "errors" } else { "error" }].is_array() == is_oci,
+                        "{shown}: {body}"
+                    );
                 }
                 // Within the registry a robot sees blobs only.
                 None if route.path == "/v2/{*path}" && comer == Comer::Robot => {}
                 None if route.path == "/v2/{*path}" && comer == Comer::OtherRobot => {}
                 None if route.path == "/api/v1/session" => {}
                 None => {
-                    assert!(!matches!(status, StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN), "{shown}: {status}");
+                    assert!(
+                        !matches!(status, StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN),
+                        "{shown}: {status}"
+                    );
                 }
             }
         }
@@ -153,7 +177,9 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
 #[tokio::test(flavor = "multi_thread")]
 async fn password_that_a_browser_adds_changes_nothing_for_a_foreign_page() {
     let server = TestServer::start().await;
-    let by_password = |method, path: &str| server.bare(method, path).basic_auth("any", Some(server.operator.reveal()));
+    let by_password = |method, path: &str| {
+        server.bare(method, path).basic_auth("any", Some(server.operator.reveal()))
+    };
     let create = || by_password(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
     let begin_push = || by_password(Method::POST, "/v2/talker/blobs/uploads/");
     for (header, foreign) in [
@@ -165,7 +191,11 @@ async fn password_that_a_browser_adds_changes_nothing_for_a_foreign_page() {
         assert_eq!(refusal(create().header(header, foreign)).await.0, 403, "{header}: {foreign}");
         let pushed = begin_push().header(header, foreign).send().await.expect("an answer");
         assert_eq!(pushed.status(), StatusCode::FORBIDDEN, "{header}: {foreign}");
-        let read = by_password(Method::GET, "/api/v1/me").header(header, foreign).send().await.expect("an answer");
+        let read = by_password(Method::GET, "/api/v1/me")
+            .header(header, foreign)
+            .send()
+            .await
+            .expect("an answer");
         assert_eq!(read.status(), StatusCode::OK, "no other page can read it");
     }
     // Registry clients send no origin; the API's own documentation page sends the server's.
@@ -192,26 +222,42 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
 
     let response = sign_in(&origin, server.operator.reveal()).send().await.expect("an answer");
     let cookie = response.headers()["set-cookie"].to_str().expect("text").to_owned();
-    assert!(cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && !cookie.contains("Secure"), "{cookie}");
+    assert!(
+        cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && !cookie.contains("Secure"),
+        "{cookie}"
+    );
     let cookie = cookie.split(';').next().expect("a pair").to_owned();
     let signed_in = |method, path: &str| server.bare(method, path).header("cookie", &cookie);
     let robots = signed_in(Method::GET, "/api/v1/robots").send().await.expect("an answer");
     assert_eq!(robots.status(), StatusCode::OK);
-    let view: SessionView =
-        signed_in(Method::GET, "/api/v1/session").send().await.expect("an answer").json().await.expect("json");
+    let view: SessionView = signed_in(Method::GET, "/api/v1/session")
+        .send()
+        .await
+        .expect("an answer")
+        .json()
+        .await
+        .expect("json");
     assert!(view.expires_at_ms.is_some());
 
     let create = || signed_in(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
     assert_eq!(refusal(create()).await, (403, "forbidden".to_owned()));
     assert_eq!(refusal(create().header("origin", "http://evil.example")).await.0, 403);
-    assert_eq!(create().header("origin", &origin).send().await.expect("an answer").status(), StatusCode::CREATED);
+    assert_eq!(
+        create().header("origin", &origin).send().await.expect("an answer").status(),
+        StatusCode::CREATED
+    );
 
     let events = signed_in(Method::GET, "/api/v1/events").send().await.expect("an answer");
     assert_eq!(events.status(), StatusCode::OK);
-    let out = signed_in(Method::DELETE, "/api/v1/session").header("origin", &origin).send().await.expect("an answer");
+    let out = signed_in(Method::DELETE, "/api/v1/session")
+        .header("origin", &origin)
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(out.status(), StatusCode::NO_CONTENT);
     assert_eq!(refusal(signed_in(Method::GET, "/api/v1/robots")).await.0, 401);
-    let heard = tokio::time::timeout(Duration::from_secs(9), events.text()).await.expect("the stream ends");
+    let heard =
+        tokio::time::timeout(Duration::from_secs(9), events.text()).await.expect("the stream ends");
     assert!(heard.expect("a proper end").contains("hello"));
 }
 
@@ -229,11 +275,16 @@ async fn sign_in_with(server: &TestServer, cookie: &str) -> String {
 async fn signing_in_ends_the_session_that_the_browser_had() {
     let server = TestServer::start().await;
     let robots = |cookie: &str| server.bare(Method::GET, "/api/v1/robots").header("cookie", cookie);
-    let (first, other) = (sign_in_with(&server, "theme=dark").await, sign_in_with(&server, "theme=dark").await);
+    let (first, other) =
+        (sign_in_with(&server, "theme=dark").await, sign_in_with(&server, "theme=dark").await);
     let wrong = json!({ "token": Token::random(TokenKind::Operator).reveal() });
     let wrong = server.bare(Method::POST, "/api/v1/session").header("cookie", &first).json(&wrong);
     assert_eq!(refusal(wrong).await.0, 401);
-    assert_eq!(robots(&first).send().await.expect("an answer").status(), StatusCode::OK, "only if that succeeds");
+    assert_eq!(
+        robots(&first).send().await.expect("an answer").status(),
+        StatusCode::OK,
+        "only if that succeeds"
+    );
     let second = sign_in_with(&server, &first).await;
     assert_eq!(refusal(robots(&first)).await.0, 401);
     for lives in [&second, &other] {
@@ -249,12 +300,20 @@ async fn a_browser_uses_nothing_that_it_kept_without_asking() {
     let (blob, manifest) = (package.content.digest, package.manifest.digest);
     for path in [format!("/v2/talker/blobs/{blob}"), format!("/v2/talker/manifests/{manifest}")] {
         let by_token = server.request(Method::GET, &path).send().await.expect("an answer");
-        assert_eq!(by_token.headers()["cache-control"], "private, max-age=31536000, immutable", "{path}");
+        assert_eq!(
+            by_token.headers()["cache-control"],
+            "private, max-age=31536000, immutable",
+            "{path}"
+        );
         let by_cookie = || server.bare(Method::GET, &path).header("cookie", &cookie);
         let whole = by_cookie().send().await.expect("an answer");
         assert_eq!(whole.status(), StatusCode::OK, "{path}");
         assert_eq!(whole.headers()["cache-control"], "private, no-cache", "{path}");
-        let known = by_cookie().header("if-none-match", &whole.headers()["etag"]).send().await.expect("an answer");
+        let known = by_cookie()
+            .header("if-none-match", &whole.headers()["etag"])
+            .send()
+            .await
+            .expect("an answer");
         assert_eq!(known.status(), StatusCode::NOT_MODIFIED, "{path}");
         assert_eq!(known.headers()["cache-control"], "private, no-cache", "{path}");
     }
@@ -268,8 +327,13 @@ async fn a_browser_uses_nothing_that_it_kept_without_asking() {
 async fn a_cookie_of_an_encrypted_server_takes_no_other_way() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.tls.private_ca = Some(true)).await;
-    let sign_in = server.bare(Method::POST, "/api/v1/session").json(&json!({ "token": server.operator.reveal() }));
+    let sign_in = server
+        .bare(Method::POST, "/api/v1/session")
+        .json(&json!({ "token": server.operator.reveal() }));
     let response = sign_in.send().await.expect("an answer");
     let cookie = response.headers()["set-cookie"].to_str().expect("text");
-    assert!(cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && cookie.ends_with("; Secure"), "{cookie}");
+    assert!(
+        cookie.contains("; HttpOnly; SameSite=Strict; Path=/;") && cookie.ends_with("; Secure"),
+        "{cookie}"
+    );
 }

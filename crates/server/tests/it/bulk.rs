@@ -1,4 +1,5 @@
-//! What is done to many robots at once: to all that are meant or to none, on every database, and over HTTP.
+//! What is done to many robots at once: to all that are meant or to none, on every database, and
+//! over HTTP.
 
 use std::collections::BTreeSet;
 
@@ -21,7 +22,10 @@ on_both_databases! {
 }
 
 fn labels(pairs: &[(&str, &str)]) -> Labels {
-    pairs.iter().map(|(key, value)| (key.parse().expect("a key"), value.parse().expect("a value"))).collect()
+    pairs
+        .iter()
+        .map(|(key, value)| (key.parse().expect("a key"), value.parse().expect("a value")))
+        .collect()
 }
 
 fn order(selector: &str, set: &[(&str, &str)], remove: &[&str]) -> BulkLabels {
@@ -37,8 +41,12 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     // More than one statement takes.
     let robots = fleet.enroll(75).await;
-    let label = async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, None, order).await;
-    assert_eq!(label(&order("*", &[("site", "lab"), ("room", "7")], &[])).await.expect("done").len(), 75);
+    let label =
+        async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, None, order).await;
+    assert_eq!(
+        label(&order("*", &[("site", "lab"), ("room", "7")], &[])).await.expect("done").len(),
+        75
+    );
     let mut notices = fleet.changes.subscribe();
     let meant = label(&order("!r0", &[("site", "field")], &["room", "none"])).await.expect("done");
     assert_eq!(meant.len(), 74);
@@ -50,7 +58,10 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     while let Ok(change) = notices.try_recv() {
         told.insert(change);
     }
-    assert!(robots[1..].iter().all(|robot| told.contains(&Change::Robot(robot.id.clone()))), "all are shown");
+    assert!(
+        robots[1..].iter().all(|robot| told.contains(&Change::Robot(robot.id.clone()))),
+        "all are shown"
+    );
     assert!(told.contains(&Change::Scopes) && !told.contains(&Change::Robot(robots[0].id.clone())));
 
     assert_eq!(code(label(&order("site=mars", &[("a", "b")], &[])).await), "no_robots_match");
@@ -63,7 +74,11 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     assert_eq!(code(label(&order("*", &[("a", "b")], &["a"])).await), "invalid_request");
     let many: Vec<(String, &str)> = (0..64).map(|number| (format!("k{number}"), "v")).collect();
     let many: Vec<(&str, &str)> = many.iter().map(|(key, value)| (key.as_str(), *value)).collect();
-    assert_eq!(code(label(&order("*", &many, &[])).await), "invalid_request", "with what they have it is one too many");
+    assert_eq!(
+        code(label(&order("*", &many, &[])).await),
+        "invalid_request",
+        "with what they have it is one too many"
+    );
     assert_eq!(fleet.view(&robots[0]).await.labels.len(), 2);
     label(&order("*", &many, &["site", "room"])).await.expect("just as many as there may be");
 }
@@ -71,7 +86,11 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
 async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(3).await;
-    fleet.actions.label_robots(&fleet.operator, None, &order("!r2", &[("site", "lab")], &[])).await.expect("done");
+    fleet
+        .actions
+        .label_robots(&fleet.operator, None, &order("!r2", &[("site", "lab")], &[]))
+        .await
+        .expect("done");
     let alice = fleet.limited("alice", "site=lab").await;
     for beyond in [order("*", &[("a", "b")], &[]), order("site=lab", &[("site", "field")], &[])] {
         assert_eq!(code(fleet.actions.label_robots(&alice, None, &beyond).await), "out_of_scope");
@@ -80,7 +99,11 @@ async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) 
     assert_eq!(code(fleet.actions.remove_robots(&alice, None, &everyone).await), "out_of_scope");
     assert_eq!(fleet.view(&robots[0]).await.labels, labels(&[("site", "lab")]));
     assert!(fleet.view(&robots[2]).await.labels.is_empty());
-    fleet.actions.label_robots(&alice, None, &order("site=lab", &[("a", "b")], &[])).await.expect("hers");
+    fleet
+        .actions
+        .label_robots(&alice, None, &order("site=lab", &[("a", "b")], &[]))
+        .await
+        .expect("hers");
     assert_eq!(fleet.view(&robots[1]).await.labels, labels(&[("a", "b"), ("site", "lab")]));
 }
 
@@ -96,7 +119,10 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     assert_eq!(gone.len(), 73);
     assert_eq!(remove().await.expect("the same order"), gone);
     let other = "*".parse().expect("a selector");
-    assert_eq!(code(fleet.actions.remove_robots(&fleet.operator, Some(&key), &other).await), "idempotency_key_reused");
+    assert_eq!(
+        code(fleet.actions.remove_robots(&fleet.operator, Some(&key), &other).await),
+        "idempotency_key_reused"
+    );
     let mut removed = 0;
     while let Ok(change) = notices.try_recv() {
         removed += usize::from(matches!(change, Change::RobotRemoved(_)));
@@ -131,7 +157,10 @@ async fn many_are_labelled_and_removed_over_http() {
     assert_eq!(list.robots.len(), 2);
     let remove = json!({ "selector": "site=lab,!boreas" });
     let removed: MatchedRobots = server.post("/api/v1/bulk/remove", &remove).await;
-    assert_eq!(removed.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    assert_eq!(
+        removed.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        ["atlas"]
+    );
     assert_eq!(server.ask_desired(&robots[0]).await.status(), 401);
     assert_eq!(server.ask_desired(&robots[1]).await.status(), 200);
     let refused = server.request(Method::POST, "/api/v1/bulk/remove").json(&remove);
@@ -154,7 +183,8 @@ async fn tasks_are_restarted_retried_and_rolled_back_over_http() {
     let state = server.desired(&robot).await;
     server.report(&mut robot, &state, Phase::Failed).await;
 
-    let restart = server.order("/api/v1/tasks/talker/restart", "restart", &json!({ "selector": "*" }));
+    let restart =
+        server.order("/api/v1/tasks/talker/restart", "restart", &json!({ "selector": "*" }));
     let restarted: MatchedRobots = answer(restart).await;
     assert_eq!(restarted.robots.len(), 1);
     assert_eq!(server.desired(&robot).await.tasks[0].run, 2);

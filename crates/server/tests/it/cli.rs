@@ -31,7 +31,8 @@ pub struct Ran {
 
 impl Ran {
     pub fn json(&self) -> Value {
-        serde_json::from_str(&self.stdout).unwrap_or_else(|_| panic!("{}\n{}", self.stdout, self.stderr))
+        serde_json::from_str(&self.stdout)
+            .unwrap_or_else(|_| panic!("{}\n{}", self.stdout, self.stderr))
     }
 
     #[track_caller]
@@ -123,7 +124,8 @@ impl Bench {
     pub fn package(&self, version: &str, extra: &str) -> String {
         let dir = self.dir.path().join(format!("hello-{version}"));
         std::fs::create_dir_all(&dir).unwrap();
-        let task = format!("name = \"hello\"\nversion = \"{version}\"\n[run]\nexec = [\"true\"]\n{extra}");
+        let task =
+            format!("name = \"hello\"\nversion = \"{version}\"\n[run]\nexec = [\"true\"]\n{extra}");
         std::fs::write(dir.join("task.toml"), task).unwrap();
         dir.to_str().unwrap().to_owned()
     }
@@ -133,10 +135,19 @@ impl Bench {
     }
 
     pub async fn enroll(&self, number: u8) -> Robot {
-        let token =
-            self.taskd(&["enroll-token", "create", "-o", "json"]).await.json()["token"].as_str().unwrap().to_owned();
+        let token = self.taskd(&["enroll-token", "create", "-o", "json"]).await.json()["token"]
+            .as_str()
+            .unwrap()
+            .to_owned();
         let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
-        let answer = self.http.post(self.url("/enroll")).bearer_auth(token).json(&body).send().await.unwrap();
+        let answer = self
+            .http
+            .post(self.url("/enroll"))
+            .bearer_auth(token)
+            .json(&body)
+            .send()
+            .await
+            .unwrap();
         assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
         Robot { identity: answer.json().await.unwrap(), seq: 0.into() }
     }
@@ -144,7 +155,8 @@ impl Bench {
     /// Robot `robot` brings these files back from a task called mapping.
     pub async fn bring_back(&self, robot: &Robot, files: &[(&str, &[u8])]) {
         let EnrollResponse { robot_id, token, .. } = &robot.identity;
-        let url = format!("http://{}/v2/outputs/{robot_id}/mapping", self.server().addresses().http);
+        let url =
+            format!("http://{}/v2/outputs/{robot_id}/mapping", self.server().addresses().http);
         let push = Push { client: self.http.clone(), url, token: token.clone() };
         let mut set = output(robot_id, 1, Vec::new());
         for (path, bytes) in files {
@@ -153,7 +165,8 @@ impl Bench {
         assert_eq!(push.output(&set).await, 201);
     }
 
-    /// Robot `robot` says that it has everything it was told to, and that the task of `deployment` is in `phase`.
+    /// Robot `robot` says that it has everything it was told to, and that the task of `deployment`
+    /// is in `phase`.
     pub async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
         let mut task = json!({
             "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
@@ -172,8 +185,10 @@ impl Bench {
 
     async fn report_tasks(&self, robot: &Robot, tasks: Value) {
         let id = &robot.identity.robot_id;
-        let view: RobotView =
-            serde_json::from_value(self.taskd(&["robot", "info", id.as_str(), "-o", "json"]).await.json()).unwrap();
+        let view: RobotView = serde_json::from_value(
+            self.taskd(&["robot", "info", id.as_str(), "-o", "json"]).await.json(),
+        )
+        .unwrap();
         let seq = robot.seq.get() + 1;
         robot.seq.set(seq);
         let report = json!({
@@ -182,7 +197,14 @@ impl Bench {
             "host": { "agent_version": "1", "hostname": "h", "arch": "x86_64" }, "tasks": tasks,
         });
         let url = self.url(&format!("/robots/{id}/report"));
-        let answer = self.http.post(url).bearer_auth(&robot.identity.token).json(&report).send().await.unwrap();
+        let answer = self
+            .http
+            .post(url)
+            .bearer_auth(&robot.identity.token)
+            .json(&report)
+            .send()
+            .await
+            .unwrap();
         assert!(answer.status().is_success(), "{}", answer.text().await.unwrap());
     }
 }
@@ -206,7 +228,11 @@ async fn a_run_that_is_unmet_says_what_runs_on() {
     let run = ["run", "robot-1", &new, "-o", "json", "--timeout", "60s"];
     let (ran, ()) = tokio::join!(bench.taskd(&run), async {
         let newest = loop {
-            let list = bench.taskd(&["deploy", "list", "-n", "1", "-o", "json"]).await.expect(0, "").json();
+            let list = bench
+                .taskd(&["deploy", "list", "-n", "1", "-o", "json"])
+                .await
+                .expect(0, "")
+                .json();
             let newest = list["deployments"][0].clone();
             if newest["package"]["version"] == "2" {
                 break newest;
@@ -236,7 +262,9 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
     let interrupted = tokio::task::spawn_blocking(move || {
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
         // It waits as soon as it says where the robot stands.
-        let id = lines.by_ref().find_map(|line| Some(line.strip_prefix("deployment ")?.split(':').next()?.to_owned()));
+        let id = lines
+            .by_ref()
+            .find_map(|line| Some(line.strip_prefix("deployment ")?.split(':').next()?.to_owned()));
         lines.by_ref().find(|line| line.starts_with("robot-1 assigned")).expect("it waits");
         let pid = nix::unistd::Pid::from_raw(child.id().try_into().unwrap());
         nix::sys::signal::kill(pid, nix::sys::signal::Signal::SIGINT).unwrap();
@@ -245,8 +273,10 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
     });
     let (id, said, status) = interrupted.await.unwrap();
     assert_eq!(status.code(), Some(130), "{said:?}");
-    let expected =
-        ["no longer waited for; the deployment goes on".to_owned(), format!("follow it: taskd deploy watch {id}")];
+    let expected = [
+        "no longer waited for; the deployment goes on".to_owned(),
+        format!("follow it: taskd deploy watch {id}"),
+    ];
     assert_eq!(said[said.len() - 3..][..2], expected);
     assert_eq!(said.last(), Some(&format!("cancel it: taskd deploy cancel {id}")));
     let view = bench.taskd(&["deploy", "info", &id, "-o", "json"]).await.expect(0, "").json();
@@ -257,8 +287,10 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
 async fn a_second_push_of_the_same_tree_transfers_no_blob() {
     let bench = Bench::start().await;
     let package = bench.package("1", "");
-    let first = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs transferred");
-    let second = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "nothing to upload");
+    let first =
+        bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs transferred");
+    let second =
+        bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "nothing to upload");
     assert_eq!(first.json(), second.json());
     let packed = bench.taskd(&["-o", "json", "pack", &package]).await.expect(0, "");
     assert_eq!(packed.json(), first.json());
@@ -283,7 +315,10 @@ async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
     run(without).await.expect(2, "no token");
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let nobody = format!("http://{nobody}");
-    bench.taskd(&["robot", "list", "--token", &other, "--server", &nobody]).await.expect(1, "can't reach the server");
+    bench
+        .taskd(&["robot", "list", "--token", &other, "--server", &nobody])
+        .await
+        .expect(1, "can't reach the server");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -296,7 +331,11 @@ async fn what_is_wrong_is_said_before_anything_travels() {
         .taskd(&["push", &wrong])
         .await
         .expect(2, "task.toml: run.kindd: there is no such key (did you mean run.kind?)");
-    assert!(ran.stderr.contains("task.toml: redy: there is no such key (did you mean ready?)"), "{}", ran.stderr);
+    assert!(
+        ran.stderr.contains("task.toml: redy: there is no such key (did you mean ready?)"),
+        "{}",
+        ran.stderr
+    );
     bench.taskd(&["push", "/nonexistent"]).await.expect(2, "there is no such directory");
     let packages = bench
         .http
@@ -322,7 +361,17 @@ async fn waiting_ends_with_the_outcome_of_all_robots() {
     let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
     bench.taskd(&wait).await.expect(3, "robot-2: failed (process_exited: exit code 3)");
 
-    let order = ["push", &package, "--to", "robot-1", "--restart", "--idempotency-key", "second", "-o", "json"];
+    let order = [
+        "push",
+        &package,
+        "--to",
+        "robot-1",
+        "--restart",
+        "--idempotency-key",
+        "second",
+        "-o",
+        "json",
+    ];
     let wait = [&order[..], &["--wait", "--timeout", "1m"]].concat();
     let deployment = bench.taskd(&order).await.expect(0, "supersedes").json();
     bench.report(&one, &deployment, "running").await;
@@ -346,7 +395,8 @@ async fn waiting_survives_a_restart_of_the_server() {
     assert!(stderr.any(|line| line.unwrap().starts_with("deployment ")));
     bench.restart().await;
     bench.report(&robot, &deployment, "running").await;
-    let said: Vec<String> = tokio::task::spawn_blocking(move || stderr.map(Result::unwrap).collect()).await.unwrap();
+    let said: Vec<String> =
+        tokio::task::spawn_blocking(move || stderr.map(Result::unwrap).collect()).await.unwrap();
     assert_eq!(waiting.wait().unwrap().code(), Some(0), "{said:?}");
 }
 
@@ -357,7 +407,10 @@ async fn many_robots_need_a_yes() {
         bench.enroll(number).await;
     }
     let package = bench.package("1", "");
-    let dry = bench.taskd(&["push", &package, "--to", "*", "--dry-run", "-o", "json"]).await.expect(0, "");
+    let dry = bench
+        .taskd(&["push", &package, "--to", "*", "--dry-run", "-o", "json"])
+        .await
+        .expect(0, "");
     assert_eq!(dry.json()["robots"].as_array().unwrap().len(), 11);
     bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "give --yes");
     bench.taskd(&["push", &package, "--to", "*", "--yes"]).await.expect(0, "to 11 robots");
@@ -373,18 +426,33 @@ async fn robots_and_deployments_are_shown_and_removed() {
     let id = robot.identity.robot_id.as_str();
     let list = bench.taskd(&["robot", "list"]).await.expect(0, "");
     let data = bench.data().display().to_string();
-    for order in
-        [["--data", &data, "robot", "list"], ["robot", "--data", &data, "list"], ["robot", "list", "--data", &data]]
-    {
-        assert_eq!(run(command(&order)).await.expect(0, "").stdout, list.stdout, "options stand anywhere");
+    for order in [
+        ["--data", &data, "robot", "list"],
+        ["robot", "--data", &data, "list"],
+        ["robot", "list", "--data", &data],
+    ] {
+        assert_eq!(
+            run(command(&order)).await.expect(0, "").stdout,
+            list.stdout,
+            "options stand anywhere"
+        );
     }
-    assert!(list.stdout.contains("robot-7") && !list.stdout.contains("02:00:00:00:00:07"), "{}", list.stdout);
+    assert!(
+        list.stdout.contains("robot-7") && !list.stdout.contains("02:00:00:00:00:07"),
+        "{}",
+        list.stdout
+    );
     let wide = bench.taskd(&["robot", "list", "-o", "wide"]).await.expect(0, "");
     assert!(wide.stdout.contains("02:00:00:00:00:07"), "{}", wide.stdout);
-    let deployment = bench.taskd(&["push", &bench.package("1", ""), "--to", "*", "-o", "json"]).await.json();
+    let deployment =
+        bench.taskd(&["push", &bench.package("1", ""), "--to", "*", "-o", "json"]).await.json();
     let deployment = deployment["id"].as_str().unwrap();
     let shown = bench.taskd(&["deploy", "info", deployment]).await.expect(0, "");
-    assert!(shown.stdout.contains("robot-7") && shown.stdout.contains("assigned"), "{}", shown.stdout);
+    assert!(
+        shown.stdout.contains("robot-7") && shown.stdout.contains("assigned"),
+        "{}",
+        shown.stdout
+    );
     assert!(shown.stdout.contains("delivery    adaptive\n"), "{}", shown.stdout);
     assert!(shown.stdout.contains("travels     inline: rule \"tiny\", size "), "{}", shown.stdout);
     assert!(!shown.stdout.contains("DELIVERY"), "{}", shown.stdout);
@@ -396,21 +464,35 @@ async fn robots_and_deployments_are_shown_and_removed() {
     );
     assert!(bench.taskd(&["deploy", "list"]).await.expect(0, "").stdout.contains(deployment));
     let (directory, ordered) = (bench.package("1", ""), ["--delivery", "poll", "--priority", "-7"]);
-    let urgent = bench.taskd(&[&["push", &directory, "--to", "*"], &ordered[..]].concat()).await.expect(0, "");
-    for said in ["delivery    poll\n", "priority    -7\n", "travels     poll: ordered, the order says poll\n"] {
+    let urgent = bench
+        .taskd(&[&["push", &directory, "--to", "*"], &ordered[..]].concat())
+        .await
+        .expect(0, "");
+    for said in [
+        "delivery    poll\n",
+        "priority    -7\n",
+        "travels     poll: ordered, the order says poll\n",
+    ] {
         assert!(urgent.stdout.contains(said), "{}", urgent.stdout);
     }
     let refused = bench.taskd(&["push", &directory, "--to", "*", "--priority", "101"]).await;
     refused.expect(2, "101 is not in -100..=100");
     let refused = bench.taskd(&["push", &directory, "--to", "*", "--delivery", "by-pigeon"]).await;
     refused.expect(2, "[possible values: adaptive, push-pull, direct-push, poll, inline]");
-    let cancelled = bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
+    let cancelled =
+        bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
     assert_eq!(cancelled.json()["state"], "cancelled");
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
     bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "give --yes");
     bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(0, id);
-    bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(2, "no robot has the name or id robot-7");
-    bench.taskd(&["robot", "info", "robot-7"]).await.expect(2, "no robot has the name or id robot-7");
+    bench
+        .taskd(&["robot", "rm", "robot-7", "--yes"])
+        .await
+        .expect(2, "no robot has the name or id robot-7");
+    bench
+        .taskd(&["robot", "info", "robot-7"])
+        .await
+        .expect(2, "no robot has the name or id robot-7");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -435,10 +517,15 @@ async fn a_version_means_what_was_pushed_under_it_by_force_last() {
     assert!(list().await.contains("hello:running/outdated"), "{}", list().await);
     let info = bench.taskd(&["robot", "info", "robot-1"]).await.expect(0, "").stdout;
     assert!(info.contains("1 (outdated)"), "{info}");
-    let info = bench.taskd(&["deploy", "info", deployment["id"].as_str().unwrap()]).await.expect(0, "").stdout;
+    let info = bench
+        .taskd(&["deploy", "info", deployment["id"].as_str().unwrap()])
+        .await
+        .expect(0, "")
+        .stdout;
     assert!(info.contains("a forced push gave this version to another package"), "{info}");
     let meant = async || {
-        let info = bench.taskd(&["package", "info", "hello:1", "-o", "json"]).await.expect(0, "").json();
+        let info =
+            bench.taskd(&["package", "info", "hello:1", "-o", "json"]).await.expect(0, "").json();
         info["package"]["manifest"]["digest"].clone()
     };
     assert_eq!(meant().await, second);
@@ -453,12 +540,16 @@ async fn a_list_that_is_cut_says_so() {
     for version in ["1", "2", "3"] {
         bench.taskd(&["push", &bench.package(version, ""), "--to", "*"]).await.expect(0, "");
     }
-    let list = async |limit: &str| bench.taskd(&["deploy", "list", "-n", limit, "-o", "json"]).await;
+    let list =
+        async |limit: &str| bench.taskd(&["deploy", "list", "-n", limit, "-o", "json"]).await;
     let versions = |ran: Ran| -> Vec<String> {
         let list = ran.json()["deployments"].as_array().unwrap().clone();
         list.iter().map(|one| one["package"]["version"].as_str().unwrap().to_owned()).collect()
     };
-    assert_eq!(versions(list("2").await.expect(0, "older ones are left out; -n shows more")), ["3", "2"]);
+    assert_eq!(
+        versions(list("2").await.expect(0, "older ones are left out; -n shows more")),
+        ["3", "2"]
+    );
     let whole = list("3").await;
     assert!(!whole.stderr.contains("left out"), "{}", whole.stderr);
     assert_eq!(versions(whole), ["3", "2", "1"]);

@@ -9,7 +9,8 @@ use crate::cli::{Bench, Ran, command, run};
 
 const PASSWORD: &str = "correct horse battery";
 
-/// A person at another machine: they know the server's URL, and what they signed in to is kept in their own directory.
+/// A person at another machine: they know the server's URL, and what they signed in to is kept in
+/// their own directory.
 struct Away<'a> {
     bench: &'a Bench,
 }
@@ -37,7 +38,8 @@ impl Away<'_> {
 
 fn input(bench: &Bench, lines: &[&str]) -> File {
     let path = bench.dir.path().join(format!("input-{:08x}", rand::random::<u32>()));
-    std::fs::write(&path, lines.iter().map(|line| format!("{line}\n")).collect::<String>()).unwrap();
+    std::fs::write(&path, lines.iter().map(|line| format!("{line}\n")).collect::<String>())
+        .unwrap();
     File::open(path).unwrap()
 }
 
@@ -51,7 +53,9 @@ async fn add_user(bench: &Bench, name: &str, more: &[&str]) -> Ran {
 async fn a_user_is_added_signs_in_and_out() {
     let bench = Bench::start().await;
     let away = Away { bench: &bench };
-    add_user(&bench, "alice", &["--role", "operator,publisher", "--robots", "site=lab"]).await.expect(0, "");
+    add_user(&bench, "alice", &["--role", "operator,publisher", "--robots", "site=lab"])
+        .await
+        .expect(0, "");
     add_user(&bench, "alice", &["--role", "viewer"]).await.expect(1, "user_exists");
     add_user(&bench, "Bob!", &["--role", "viewer"]).await.expect(2, "is not a valid user name");
     add_user(&bench, "bob", &["--role", "root"]).await.expect(2, "is not a role");
@@ -59,11 +63,18 @@ async fn a_user_is_added_signs_in_and_out() {
     let list = bench.taskd(&["user", "list"]).await.expect(0, "").stdout;
     assert!(list.contains("alice  operator,publisher  site=lab  yes"), "{list}");
     assert!(list.contains("ci     publisher           *         no"), "{list}");
-    bench.taskd(&["user", "add", "bob", "--role", "viewer"]).await.expect(2, "give --password-stdin");
+    bench
+        .taskd(&["user", "add", "bob", "--role", "viewer"])
+        .await
+        .expect(2, "give --password-stdin");
 
     away.taskd(&["whoami"]).await.expect(2, "sign in with taskd login");
-    away.told(&["wrong"], &["login", "alice", "--password-stdin"]).await.expect(4, "or the password is wrong");
-    away.told(&[PASSWORD], &["login", "alice", "--password-stdin"]).await.expect(0, "as alice until");
+    away.told(&["wrong"], &["login", "alice", "--password-stdin"])
+        .await
+        .expect(4, "or the password is wrong");
+    away.told(&[PASSWORD], &["login", "alice", "--password-stdin"])
+        .await
+        .expect(0, "as alice until");
     let kept = bench.dir.path().join("config/taskd/credentials.json");
     assert_eq!(std::fs::metadata(&kept).unwrap().permissions().mode() & 0o777, 0o600);
     let me = away.taskd(&["whoami", "-o", "json"]).await.expect(0, "").json();
@@ -74,20 +85,29 @@ async fn a_user_is_added_signs_in_and_out() {
     run(anywhere).await.expect(0, "");
     away.taskd(&["user", "list"]).await.expect(4, "alice has no permission to administer");
 
-    let token = away.taskd(&["token", "create", "--title", "ci", "--role", "publisher"]).await.expect(0, "of alice");
+    let token = away
+        .taskd(&["token", "create", "--title", "ci", "--role", "publisher"])
+        .await
+        .expect(0, "of alice");
     let token = token.stdout.trim().to_owned();
     assert!(token.starts_with("tsko_"));
-    let by_token = away.taskd(&["--token", &token, "whoami", "-o", "json"]).await.expect(0, "").json();
+    let by_token =
+        away.taskd(&["--token", &token, "whoami", "-o", "json"]).await.expect(0, "").json();
     assert_eq!(by_token["permissions"], serde_json::json!(["read", "publish"]));
     let listed = away.taskd(&["token", "list", "-o", "json"]).await.expect(0, "").json();
-    let origins: Vec<_> = listed["tokens"].as_array().unwrap().iter().map(|token| token["origin"].clone()).collect();
+    let origins: Vec<_> =
+        listed["tokens"].as_array().unwrap().iter().map(|token| token["origin"].clone()).collect();
     assert_eq!(origins, ["token", "login"]);
-    away.taskd(&["token", "revoke", by_token["token"].as_str().unwrap()]).await.expect(0, "revoked");
+    away.taskd(&["token", "revoke", by_token["token"].as_str().unwrap()])
+        .await
+        .expect(0, "revoked");
     away.taskd(&["--token", &token, "whoami"]).await.expect(4, "expired or revoked");
 
     let passwd = ["user", "passwd", "--password-stdin"];
     away.told(&["wrong", "another long one"], &passwd).await.expect(2, "old: it is wrong");
-    away.told(&[PASSWORD, "another long one"], &passwd).await.expect(0, "signed out everywhere else");
+    away.told(&[PASSWORD, "another long one"], &passwd)
+        .await
+        .expect(0, "signed out everywhere else");
     away.taskd(&["whoami"]).await.expect(0, "");
     let kept_token = |kept: &std::path::Path| {
         let kept: Value = serde_json::from_slice(&std::fs::read(kept).unwrap()).unwrap();
@@ -102,10 +122,15 @@ async fn a_user_is_added_signs_in_and_out() {
     away.taskd(&["whoami"]).await.expect(2, "no token");
     away.taskd(&["logout"]).await.expect(2, "you are not signed in");
 
-    bench.taskd(&["user", "edit", "alice", "--role", "viewer", "--robots", "*"]).await.expect(0, "");
+    bench
+        .taskd(&["user", "edit", "alice", "--role", "viewer", "--robots", "*"])
+        .await
+        .expect(0, "");
     bench.taskd(&["user", "remove", "alice"]).await.expect(2, "give --yes");
     bench.taskd(&["user", "remove", "alice", "--yes"]).await.expect(0, "removed alice");
-    away.told(&["another long one"], &["login", "alice", "--password-stdin"]).await.expect(4, "is wrong");
+    away.told(&["another long one"], &["login", "alice", "--password-stdin"])
+        .await
+        .expect(4, "is wrong");
     bench.server.unwrap().stop().await;
 }
 
@@ -150,10 +175,17 @@ async fn the_audit_is_shown_exported_and_verified() {
     bench.taskd(&["push", &package]).await.expect(0, "");
     bench.taskd(&["enroll-token", "create"]).await.expect(0, "");
     let shown = bench.taskd(&["audit"]).await.expect(0, "").stdout;
-    let acts: Vec<_> = shown.lines().skip(1).map(|line| line.split_whitespace().nth(5).unwrap()).collect();
+    let acts: Vec<_> =
+        shown.lines().skip(1).map(|line| line.split_whitespace().nth(5).unwrap()).collect();
     assert_eq!(acts, ["user.add", "manifest.push", "enrolment_token.create"], "{shown}");
-    assert!(shown.contains("operator.token") && shown.contains("127.0.0.1") && !shown.contains(PASSWORD), "{shown}");
-    let pushed = bench.taskd(&["audit", "--act", "manifest.", "-o", "json"]).await.expect(0, "").json();
+    assert!(
+        shown.contains("operator.token")
+            && shown.contains("127.0.0.1")
+            && !shown.contains(PASSWORD),
+        "{shown}"
+    );
+    let pushed =
+        bench.taskd(&["audit", "--act", "manifest.", "-o", "json"]).await.expect(0, "").json();
     assert_eq!(pushed["records"].as_array().unwrap().len(), 1);
     assert_eq!(pushed["records"][0]["entry"]["target"], "hello");
 
@@ -168,12 +200,17 @@ async fn the_audit_is_shown_exported_and_verified() {
         bench.taskd(&["audit", "--verify", "--file", file, "--expect", seen.trim()]).await
     };
     assert_eq!(verify(export.clone()).await.expect(0, "all 3 entries hold").stdout, seen);
-    verify(export.replace("\"hello\"", "\"other\"")).await.expect(1, "the audit does not hold: entry 2");
+    verify(export.replace("\"hello\"", "\"other\""))
+        .await
+        .expect(1, "the audit does not hold: entry 2");
     let shorter: String = export.lines().take(2).map(|line| format!("{line}\n")).collect();
     verify(shorter).await.expect(1, "entry 3 was seen before, and now the last is 2");
     verify("nonsense\n".to_owned()).await.expect(2, "line 1: it is no record");
     let other = format!("2:{}", seen.trim().split_once(':').unwrap().1);
-    bench.taskd(&["audit", "--verify", "--expect", &other]).await.expect(1, "not the one that was seen before");
+    bench
+        .taskd(&["audit", "--verify", "--expect", &other])
+        .await
+        .expect(1, "not the one that was seen before");
     bench.taskd(&["audit", "--verify", "--expect", "x"]).await.expect(2, "what --verify prints");
 
     // A robot is found by its name, whatever the entries call it by.

@@ -1,5 +1,6 @@
-//! What the commands print, held against the files in `tests/commands`, which read like a session at a terminal; and what
-//! they leave beside the program: man pages, exported packages. `TRYCMD=overwrite` writes the files anew.
+//! What the commands print, held against the files in `tests/commands`, which read like a session
+//! at a terminal; and what they leave beside the program: man pages, exported packages.
+//! `TRYCMD=overwrite` writes the files anew.
 
 use std::os::unix::fs::{PermissionsExt as _, symlink};
 use std::path::{Path, PathBuf};
@@ -13,7 +14,8 @@ use task_proto::envelope::SigningKey;
 use crate::answering::{Answering, publish_log_and_go};
 use crate::cli::{Bench, Ran, closed_pipe, command, run};
 
-/// A fleet of two, a package in two versions, and a deployment that one robot has followed and the other could not.
+/// A fleet of two, a package in two versions, and a deployment that one robot has followed and the
+/// other could not.
 pub struct Lab {
     pub bench: Bench,
     ids: Vec<(&'static str, String)>,
@@ -29,7 +31,10 @@ impl Lab {
         bench.report(&robots[0], &deployment, "running").await;
         bench.report(&robots[1], &deployment, "failed").await;
         bench
-            .bring_back(&robots[0], &[("maps/lab.pgm", b"P5 1 1 255 x"), ("maps/lab.yaml", b"resolution: 0.05\n")])
+            .bring_back(
+                &robots[0],
+                &[("maps/lab.pgm", b"P5 1 1 255 x"), ("maps/lab.yaml", b"resolution: 0.05\n")],
+            )
             .await;
         let packages = bench.taskd(&["package", "list", "-o", "json"]).await.expect(0, "").json();
         let mut ids = vec![
@@ -38,7 +43,10 @@ impl Lab {
             ("[DEPLOYMENT]", deployment["id"].as_str().unwrap().to_owned()),
         ];
         for (short, long, view) in [("[NEW]", "[NEWER]", 0), ("[OLD]", "[OLDER]", 1)] {
-            let digest = packages["packages"][view]["package"]["manifest"]["digest"].as_str().unwrap().to_owned();
+            let digest = packages["packages"][view]["package"]["manifest"]["digest"]
+                .as_str()
+                .unwrap()
+                .to_owned();
             ids.push((short, digest["sha256:".len()..][..12].to_owned()));
             ids.push((long, digest));
         }
@@ -55,8 +63,8 @@ impl Lab {
         &self.ids[2].1
     }
 
-    /// A fleet of three: one that can be asked, one that said something and went, one that never came. Beside the commands
-    /// lie Ada's key, and Ben's, which others may read.
+    /// A fleet of three: one that can be asked, one that said something and went, one that never
+    /// came. Beside the commands lie Ada's key, and Ben's, which others may read.
     async fn to_be_asked() -> (Self, Answering) {
         let bench = Bench::start().await;
         let robots = [bench.enroll(1).await, bench.enroll(2).await, bench.enroll(3).await];
@@ -70,16 +78,21 @@ impl Lab {
         {
             let key = SigningKey::from_bytes([seed; 32]);
             let private = directory.join(format!("{name}.key"));
-            std::fs::write(&private, format!("taskd-private-key ed25519 {}\n", hex(&[seed; 32]))).unwrap();
+            std::fs::write(&private, format!("taskd-private-key ed25519 {}\n", hex(&[seed; 32])))
+                .unwrap();
             std::fs::set_permissions(&private, std::fs::Permissions::from_mode(mode)).unwrap();
-            std::fs::write(directory.join(format!("{name}.key.pub")), format!("{}\n", key.public_key())).unwrap();
+            std::fs::write(
+                directory.join(format!("{name}.key.pub")),
+                format!("{}\n", key.public_key()),
+            )
+            .unwrap();
             ids.extend([(short, key.public_key().id()), (long, key.public_key().to_string())]);
         }
         (Self { bench, ids }, answering)
     }
 
-    /// Holds the commands of one file against what it says they print. What they write they write beside it, not into the
-    /// sources.
+    /// Holds the commands of one file against what it says they print. What they write they write
+    /// beside it, not into the sources.
     async fn holds(&self, file: &str) {
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/commands");
         let path = self.bench.dir.path().join(file);
@@ -89,7 +102,9 @@ impl Lab {
         let held = tokio::task::spawn_blocking(move || {
             let cases = trycmd::TestCases::new();
             cases.register_bin("taskd", Path::new(env!("CARGO_BIN_EXE_taskd")));
-            cases.env("TASKD_DATA", data.display().to_string()).env("XDG_CONFIG_HOME", "/nonexistent");
+            cases
+                .env("TASKD_DATA", data.display().to_string())
+                .env("XDG_CONFIG_HOME", "/nonexistent");
             // The long ones first: a short one is a part of one of them.
             for (name, id) in ids.into_iter().rev() {
                 cases.insert_var(name, id).unwrap();
@@ -103,9 +118,14 @@ impl Lab {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_commands_print_is_what_their_files_say() {
     let lab = Lab::new().await;
-    for file in
-        ["robots.trycmd", "packages.trycmd", "deployments.trycmd", "outputs.trycmd", "people.trycmd", "help.trycmd"]
-    {
+    for file in [
+        "robots.trycmd",
+        "packages.trycmd",
+        "deployments.trycmd",
+        "outputs.trycmd",
+        "people.trycmd",
+        "help.trycmd",
+    ] {
         lab.holds(file).await;
     }
     lab.bench.server.unwrap().stop().await;
@@ -146,25 +166,39 @@ async fn every_command_has_a_man_page() {
     run(command(&["man", pages.to_str().unwrap()])).await.expect(0, "read them with: man ");
     let read = |page: &str| std::fs::read_to_string(pages.join(page)).unwrap();
     assert!(read("taskd.1").contains("Exit codes: 0 done"), "{}", read("taskd.1"));
-    for page in
-        ["taskd-push.1", "taskd-robot-label.1", "taskd-deploy-retry.1", "taskd-package-export.1", "taskd-doctor.1"]
-    {
+    for page in [
+        "taskd-push.1",
+        "taskd-robot-label.1",
+        "taskd-deploy-retry.1",
+        "taskd-package-export.1",
+        "taskd-doctor.1",
+    ] {
         assert!(read(page).contains(".SH SYNOPSIS"), "{page}");
     }
     assert!(read("taskd-push.1").contains("\\-\\-max\\-failures"));
     // Where there is somebody who reads them, they are read without a complaint.
     if let Some(rendered) = rendered(&pages.join("taskd-push.1")).await {
-        assert!(rendered.stdout.contains("--max-failures") && rendered.stderr.is_empty(), "{}", rendered.stderr);
+        assert!(
+            rendered.stdout.contains("--max-failures") && rendered.stderr.is_empty(),
+            "{}",
+            rendered.stderr
+        );
     }
 }
 
 #[expect(clippy::disallowed_methods, reason = "the test needs the program that reads man pages")]
 async fn rendered(page: &Path) -> Option<Ran> {
     let mut man = std::process::Command::new("man");
-    man.arg("-l").arg(page).env("MANPAGER", "cat").env("LC_ALL", "C.UTF-8").env("MANWIDTH", "100").stdin(Stdio::null());
+    man.arg("-l")
+        .arg(page)
+        .env("MANPAGER", "cat")
+        .env("LC_ALL", "C.UTF-8")
+        .env("MANWIDTH", "100")
+        .stdin(Stdio::null());
     let ran = tokio::task::spawn_blocking(move || man.output()).await.unwrap().ok()?;
     // A system that was made small has a `man` that only says so.
-    (ran.status.success() && String::from_utf8_lossy(&ran.stdout).contains("SYNOPSIS")).then(|| ran.into())
+    (ran.status.success() && String::from_utf8_lossy(&ran.stdout).contains("SYNOPSIS"))
+        .then(|| ran.into())
 }
 
 /// What is in a directory: paths, and of files their bytes.
@@ -176,7 +210,10 @@ fn tree(dir: &Path) -> Vec<(String, Option<Vec<u8>>)> {
             let entry = entry.unwrap();
             let path = below.join(entry.file_name());
             let is_dir = entry.file_type().unwrap().is_dir();
-            found.push((path.display().to_string(), (!is_dir).then(|| std::fs::read(entry.path()).unwrap())));
+            found.push((
+                path.display().to_string(),
+                (!is_dir).then(|| std::fs::read(entry.path()).unwrap()),
+            ));
             if is_dir {
                 left.push(path);
             }
@@ -196,15 +233,24 @@ async fn a_package_comes_out_of_the_store_as_it_went_in() {
     let to = |file: &str| bench.dir.path().join(file).to_str().unwrap().to_owned();
     bench.taskd(&["package", "export", name, &to("out")]).await.expect(0, "is in");
     assert_eq!(tree(Path::new(&to("out"))), tree(&plain));
-    bench.taskd(&["package", "export", name, &to("out")]).await.expect(2, "is there already and is not empty");
+    bench
+        .taskd(&["package", "export", name, &to("out")])
+        .await
+        .expect(2, "is there already and is not empty");
     // What comes out can be pushed again, and is the same.
     bench.taskd(&["push", &to("out")]).await.expect(0, "nothing to upload");
     bench.taskd(&["package", "export", name, &to("a.tar")]).await.expect(0, "is in");
     bench.taskd(&["package", "export", name, &to("a.tar.zst")]).await.expect(0, "is in");
     let plain = zstd::decode_all(std::fs::File::open(to("a.tar.zst")).unwrap()).unwrap();
     assert_eq!(std::fs::read(to("a.tar")).unwrap(), plain);
-    bench.taskd(&["package", "export", "nothing", &to("b")]).await.expect(2, "the server has no package nothing");
-    bench.taskd(&["package", "export", &format!("{name}:9.9.9"), &to("b")]).await.expect(2, "has no package");
+    bench
+        .taskd(&["package", "export", "nothing", &to("b")])
+        .await
+        .expect(2, "the server has no package nothing");
+    bench
+        .taskd(&["package", "export", &format!("{name}:9.9.9"), &to("b")])
+        .await
+        .expect(2, "has no package");
     bench.taskd(&["package", "export", "a/b", &to("b")]).await.expect(2, "a/b");
     bench.server.unwrap().stop().await;
 }
@@ -216,9 +262,12 @@ fn ros_package(bench: &Bench) -> PathBuf {
     let xml = "<package format=\"3\"><name>say</name><version>1.0.0</version><description>d</description>\
         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>\
         <export><build_type>ament_python</build_type></export></package>";
-    for (file, text) in
-        [("package.xml", xml), ("setup.py", ""), ("launch/say.launch.py", ""), ("launch/two.launch.py", "")]
-    {
+    for (file, text) in [
+        ("package.xml", xml),
+        ("setup.py", ""),
+        ("launch/say.launch.py", ""),
+        ("launch/two.launch.py", ""),
+    ] {
         std::fs::write(dir.join(file), text).unwrap();
     }
     dir
@@ -229,7 +278,11 @@ async fn runs(bench: &Bench) -> Vec<(String, Value, Value)> {
     let views = packages["packages"].as_array().unwrap().clone();
     let run = |view: &Value| {
         let run = &view["manifest"]["run"];
-        (view["package"]["manifest"]["digest"].as_str().unwrap().to_owned(), run["launch"].clone(), run["args"].clone())
+        (
+            view["package"]["manifest"]["digest"].as_str().unwrap().to_owned(),
+            run["launch"].clone(),
+            run["args"].clone(),
+        )
     };
     views.iter().map(run).collect()
 }
@@ -247,9 +300,13 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
     assert_eq!(pushed.len(), 1);
     assert_eq!(pushed[0].1, serde_json::json!(["say", "say.launch.py"]));
     assert_eq!(pushed[0].2, serde_json::json!({ "rate": "5" }));
-    assert_eq!(deployment["package"]["manifest"]["digest"], pushed[0].0, "the digest pins the arguments");
+    assert_eq!(
+        deployment["package"]["manifest"]["digest"], pushed[0].0,
+        "the digest pins the arguments"
+    );
 
-    // The same of what is stored by now: nothing new for the same arguments, another digest for others.
+    // The same of what is stored by now: nothing new for the same arguments, another digest for
+    // others.
     let stored = ["run", "robot-1", "say:1.0.0", "say.launch.py", "rate:=5", "--detach"];
     bench.taskd(&stored).await.expect(0, "nothing to upload");
     assert_eq!(runs(&bench).await.len(), 1);
@@ -274,9 +331,18 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
 async fn a_deployment_is_watched_until_it_has_settled() {
     let lab = Lab::new().await;
     let deployment = lab.deployment();
-    let watched = lab.bench.taskd(&["deploy", "watch", deployment]).await.expect(3, "1 of 2 succeeded");
-    assert!(watched.stderr.contains("robot-2: failed (process_exited: exit code 3)"), "{}", watched.stderr);
-    assert!(watched.stderr.contains(&format!("taskd deploy retry {deployment}")), "{}", watched.stderr);
+    let watched =
+        lab.bench.taskd(&["deploy", "watch", deployment]).await.expect(3, "1 of 2 succeeded");
+    assert!(
+        watched.stderr.contains("robot-2: failed (process_exited: exit code 3)"),
+        "{}",
+        watched.stderr
+    );
+    assert!(
+        watched.stderr.contains(&format!("taskd deploy retry {deployment}")),
+        "{}",
+        watched.stderr
+    );
     lab.bench.server.unwrap().stop().await;
 }
 
@@ -286,10 +352,13 @@ async fn many_robots_are_labelled_and_removed_at_once() {
     for number in 1..=3 {
         bench.enroll(number).await;
     }
-    let labelled = bench.taskd(&["robot", "label", "!robot-3", "site=lab", "arm=ur5", "-o", "name"]).await;
+    let labelled =
+        bench.taskd(&["robot", "label", "!robot-3", "site=lab", "arm=ur5", "-o", "name"]).await;
     assert_eq!(labelled.expect(0, "labelled 2 robots").stdout, "robot-1\nrobot-2\n");
     bench.taskd(&["robot", "label", "robot-1", "arm-"]).await.expect(0, "labelled 1 robot");
-    let of = async |selector: &str| bench.taskd(&["robot", "list", selector, "-o", "name"]).await.expect(0, "").stdout;
+    let of = async |selector: &str| {
+        bench.taskd(&["robot", "list", selector, "-o", "name"]).await.expect(0, "").stdout
+    };
     assert_eq!(of("site=lab,!arm=ur5").await, "robot-1\n");
     bench.taskd(&["robot", "rm", "site=lab", "--yes"]).await.expect(0, "removed robot-2");
     assert_eq!(of("*").await, "robot-3\n");
@@ -297,7 +366,10 @@ async fn many_robots_are_labelled_and_removed_at_once() {
         bench.enroll(number).await;
     }
     bench.taskd(&["robot", "label", "*", "site=lab"]).await.expect(2, "give --yes");
-    bench.taskd(&["robot", "label", "*", "site=lab", "--yes"]).await.expect(0, "labelled 12 robots");
+    bench
+        .taskd(&["robot", "label", "*", "site=lab", "--yes"])
+        .await
+        .expect(0, "labelled 12 robots");
     bench.server.unwrap().stop().await;
 }
 
@@ -313,22 +385,32 @@ async fn what_failed_is_tried_again_and_what_ran_before_comes_back() {
     bench.report(&one, &first, "running").await;
     bench.report(&two, &first, "failed").await;
     let id = first["id"].as_str().unwrap();
-    let meant = bench.taskd(&["deploy", "retry", id, "--dry-run", "-o", "name"]).await.expect(0, "");
+    let meant =
+        bench.taskd(&["deploy", "retry", id, "--dry-run", "-o", "name"]).await.expect(0, "");
     assert_eq!(meant.stdout, "robot-2\n");
-    bench.taskd(&["deploy", "retry", id, "--code", "build_failed"]).await.expect(2, "failed on no robot that is meant");
-    let again = bench.taskd(&["deploy", "retry", id, "--code", "process_exited", "-o", "json"]).await;
+    bench
+        .taskd(&["deploy", "retry", id, "--code", "build_failed"])
+        .await
+        .expect(2, "failed on no robot that is meant");
+    let again =
+        bench.taskd(&["deploy", "retry", id, "--code", "process_exited", "-o", "json"]).await;
     let again = again.expect(0, "hello 1 to 1 robot").json();
     bench.report(&two, &again, "failed").await;
 
-    bench.taskd(&["rollback", "hello", "--on", "*"]).await.expect(2, "no robot that * selects has an earlier version");
+    bench
+        .taskd(&["rollback", "hello", "--on", "*"])
+        .await
+        .expect(2, "no robot that * selects has an earlier version");
     let second = push("2").await;
     bench.report(&one, &second, "running").await;
     let back = bench.taskd(&["rollback", "hello", "--on", "*", "-o", "json"]).await;
     let back = back.expect(0, "no earlier version ran on robot-2").json();
     assert_eq!(back["deployments"][0]["package"]["version"], "1");
     assert_eq!(back["robots"][0]["name"], "robot-1");
-    let restarted =
-        bench.taskd(&["restart", "hello", "--on", "robot-1", "-o", "name"]).await.expect(0, "ordered: restart");
+    let restarted = bench
+        .taskd(&["restart", "hello", "--on", "robot-1", "-o", "name"])
+        .await
+        .expect(0, "ordered: restart");
     assert_eq!(restarted.stdout, "robot-1\n");
     bench.server.unwrap().stop().await;
 }
@@ -350,9 +432,16 @@ async fn a_package_is_looked_into_compared_and_deleted() {
         "new.txt\ntask.toml\n"
     );
     for to in ["2", "hello:2"] {
-        let diff = bench.taskd(&["package", "diff", "hello:1", to]).await.expect(0, "1 added, 1 removed, 1 changed");
-        let changes: Vec<_> =
-            diff.stdout.lines().skip(1).map(|line| line.split_whitespace().take(2).collect::<Vec<_>>()).collect();
+        let diff = bench
+            .taskd(&["package", "diff", "hello:1", to])
+            .await
+            .expect(0, "1 added, 1 removed, 1 changed");
+        let changes: Vec<_> = diff
+            .stdout
+            .lines()
+            .skip(1)
+            .map(|line| line.split_whitespace().take(2).collect::<Vec<_>>())
+            .collect();
         assert_eq!(
             changes,
             [["added", "new.txt"], ["removed", "old.txt"], ["changed", "task.toml"]],
@@ -366,9 +455,15 @@ async fn a_package_is_looked_into_compared_and_deleted() {
         ["ROBOTS", "1", "0"]
     );
     let info = bench.taskd(&["package", "info", "hello:2"]).await.expect(0, "").stdout;
-    assert!(info.contains("ordered for 1 robot\n") && info.contains("run         true\n"), "{info}");
+    assert!(
+        info.contains("ordered for 1 robot\n") && info.contains("run         true\n"),
+        "{info}"
+    );
     bench.taskd(&["package", "rm", "hello:2", "--yes"]).await.expect(1, "robot-1");
     bench.taskd(&["package", "rm", "hello:1", "--yes"]).await.expect(0, "deleted hello:1");
-    bench.taskd(&["package", "files", "hello:1"]).await.expect(2, "the server has no package hello:1");
+    bench
+        .taskd(&["package", "files", "hello:1"])
+        .await
+        .expect(2, "the server has no package hello:1");
     bench.server.unwrap().stop().await;
 }

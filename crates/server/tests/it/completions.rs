@@ -1,4 +1,5 @@
-//! What shells complete, each by the script that `taskd completions` prints for it. A shell that is missing is a failure.
+//! What shells complete, each by the script that `taskd completions` prints for it. A shell that is
+//! missing is a failure.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -16,8 +17,9 @@ const BASH: &str = r#"source <(taskd completions bash) || exit 9
 const FISH: &str = r#"taskd completions fish | source; or exit 9
     complete -C $argv[1]"#;
 
-/// What zsh completes of the line `$1` where somebody types it: a zsh in a terminal of its own writes into the file `$2`
-/// what it is given to offer. A call of `compadd` with -O, -A or -D only looks which words fit.
+/// What zsh completes of the line `$1` where somebody types it: a zsh in a terminal of its own
+/// writes into the file `$2` what it is given to offer. A call of `compadd` with -O, -A or -D only
+/// looks which words fit.
 const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
     zpty -w terminal "PROMPT= && autoload -U compinit && compinit -u -D && source <(taskd completions zsh)"
     zpty -w terminal "compadd() {
@@ -47,8 +49,13 @@ async fn shell(environment: &[(&str, String)], program: &[&str]) -> Ran {
         command.env(directory, home.path());
     }
     command.env("TERM", "dumb").envs(environment.iter().cloned());
-    let ran: Ran = tokio::task::spawn_blocking(move || command.output()).await.unwrap().unwrap().into();
-    assert_eq!((ran.code, ran.stderr.as_str()), (0, ""), "{program:?} (scripts/need debian zsh=zsh fish=fish)");
+    let ran: Ran =
+        tokio::task::spawn_blocking(move || command.output()).await.unwrap().unwrap().into();
+    assert_eq!(
+        (ran.code, ran.stderr.as_str()),
+        (0, ""),
+        "{program:?} (scripts/need debian zsh=zsh fish=fish)"
+    );
     ran
 }
 
@@ -56,7 +63,8 @@ fn lines(text: &str) -> Vec<String> {
     text.lines().filter(|line| !line.is_empty()).map(str::to_owned).collect()
 }
 
-/// What is offered, asked for again while it is nothing but options: a server that takes longer than a moment offers nothing.
+/// What is offered, asked for again while it is nothing but options: a server that takes longer
+/// than a moment offers nothing.
 async fn offered(ask: impl AsyncFn() -> Vec<String>) -> Vec<String> {
     for _ in 0..4 {
         let found = ask().await;
@@ -73,7 +81,10 @@ async fn bash(environment: &[(&str, String)], words: &[&str]) -> Vec<String> {
 }
 
 async fn fish(environment: &[(&str, String)], line: &str) -> Vec<String> {
-    offered(async || lines(&shell(environment, &["fish", "--no-config", "-c", FISH, line]).await.stdout)).await
+    offered(async || {
+        lines(&shell(environment, &["fish", "--no-config", "-c", FISH, line]).await.stdout)
+    })
+    .await
 }
 
 async fn zsh(environment: &[(&str, String)], line: &str) -> Vec<String> {
@@ -108,14 +119,18 @@ async fn bash_completes_what_the_server_knows_now() {
     lab.bench.enroll(3).await;
     assert_eq!(bash(&here, &["taskd", "robot", "info", "robot-3"]).await, ["robot-3"]);
 
-    // The line itself may say which server is meant; one that hangs or is away costs a moment and no word.
+    // The line itself may say which server is meant; one that hangs or is away costs a moment and
+    // no word.
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let silent = format!("http://{}", listener.local_addr().unwrap());
     for server in [silent.as_str(), "http://127.0.0.1:1"] {
         let words = ["taskd", "--server", server, "robot", "info", "ro"];
         assert_eq!(bash(&here, &words).await, [""; 0], "{server}");
     }
-    assert_eq!(bash(&[("TASKD_TOKEN", "nonsense".to_owned())], &["taskd", "robot", "info", "ro"]).await, [""; 0]);
+    assert_eq!(
+        bash(&[("TASKD_TOKEN", "nonsense".to_owned())], &["taskd", "robot", "info", "ro"]).await,
+        [""; 0]
+    );
     assert_eq!(bash(&[], &["taskd", "rob"]).await, ["robot"]);
     lab.bench.server.unwrap().stop().await;
 }

@@ -1,4 +1,5 @@
-//! Robots that misbehave: slowed on their own connection, cut off, kept away, shown, and forgiven. Nobody else notices.
+//! Robots that misbehave: slowed on their own connection, cut off, kept away, shown, and forgiven.
+//! Nobody else notices.
 
 use std::time::Duration;
 
@@ -49,8 +50,10 @@ async fn what_none_of_ours_would_send_cuts_its_robot_off() {
     let limits = ConductLimits { backoff: HOUR, ..ConductLimits::default() };
     let broker = TestBroker::with_conduct(|_| {}, limits).await;
     let other = topic(&RobotId::random(), RobotTopic::Report);
-    let refused: Vec<(String, u8)> = (0..17).map(|number| (format!("taskd/v1/r/{number}/#"), 0)).collect();
-    let refused: Vec<(&str, u8)> = refused.iter().map(|(filter, qos)| (filter.as_str(), *qos)).collect();
+    let refused: Vec<(String, u8)> =
+        (0..17).map(|number| (format!("taskd/v1/r/{number}/#"), 0)).collect();
+    let refused: Vec<(&str, u8)> =
+        refused.iter().map(|(filter, qos)| (filter.as_str(), *qos)).collect();
     let cases = [
         (publish(&other, 1, 1, b"{}"), "publishes where it may not"),
         (framed(0x30, &vec![0; 2_000_000]), "packet of 2000000 bytes"),
@@ -79,7 +82,8 @@ async fn what_none_of_ours_would_send_cuts_its_robot_off() {
 }
 
 async fn server(limits: ConductLimits) -> TestServer {
-    TestServer::start_in(TempDir::new().expect("a directory"), |config| config.robots = limits).await
+    TestServer::start_in(TempDir::new().expect("a directory"), |config| config.robots = limits)
+        .await
 }
 
 /// Reports until it is told to wait for longer than it would be held up; gives that answer.
@@ -107,7 +111,8 @@ async fn who_reports_too_often_is_cut_off_and_still_told_what_to_do() {
     let server = server(limits).await;
     let (mut atlas, mut boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
     let refused = report_until_refused(&server, &mut atlas).await;
-    let wait_s: u64 = refused.headers()["retry-after"].to_str().expect("text").parse().expect("seconds");
+    let wait_s: u64 =
+        refused.headers()["retry-after"].to_str().expect("text").parse().expect("seconds");
     assert!((3000..=3601).contains(&wait_s), "{wait_s}");
     let view: RobotView = server.robot(&atlas).await;
     let condition = &view.conditions[0];
@@ -137,7 +142,10 @@ async fn who_pushes_too_often_is_held_up_and_may_still_report() {
         assert_eq!(push().await.expect("an answer").status(), 404);
     }
     let many = futures_util::future::join_all((0..600).map(|_| push())).await;
-    let refused = many.into_iter().map(|answer| answer.expect("an answer")).find(|answer| answer.status() == 429);
+    let refused = many
+        .into_iter()
+        .map(|answer| answer.expect("an answer"))
+        .find(|answer| answer.status() == 429);
     let refused = refused.expect("it may push as often as it likes");
     assert!(refused.headers().contains_key("retry-after"));
     assert!(refused.text().await.expect("text").contains("TOOMANYREQUESTS"));
@@ -164,9 +172,13 @@ async fn who_behaves_again_is_forgiven_by_itself() {
     let forgiven = timeout(PATIENCE, async {
         loop {
             match timeout(Duration::from_secs(1), events.chunk()).await {
-                Ok(chunk) => heard.push_str(&String::from_utf8_lossy(&chunk.expect("a stream").expect("goes on"))),
+                Ok(chunk) => heard.push_str(&String::from_utf8_lossy(
+                    &chunk.expect("a stream").expect("goes on"),
+                )),
                 // Forgiven before anybody saw it.
-                Err(_) if !heard.contains("misbehaves") => drop(report_until_refused(&server, &mut atlas).await),
+                Err(_) if !heard.contains("misbehaves") => {
+                    drop(report_until_refused(&server, &mut atlas).await)
+                }
                 Err(_) => {}
             }
             let last = heard.rfind("misbehaves");

@@ -1,4 +1,5 @@
-//! A SQLite file with damaged pages: refused at start, noticed while it is served, never written to.
+//! A SQLite file with damaged pages: refused at start, noticed while it is served, never written
+//! to.
 
 #![expect(clippy::disallowed_methods, reason = "which pages hold what is asked of SQLite")]
 
@@ -31,9 +32,11 @@ fn database(data: &Path) -> PathBuf {
 async fn root_page(data: &Path, name: &str) -> (u64, usize) {
     sqlx::any::install_default_drivers();
     let mut connection = sqlx::AnyConnection::connect(&sqlite_url(&database(data))).await.unwrap();
-    let root = sqlx::query_scalar::<_, i64>("SELECT rootpage FROM sqlite_schema WHERE name = $1").bind(name);
+    let root = sqlx::query_scalar::<_, i64>("SELECT rootpage FROM sqlite_schema WHERE name = $1")
+        .bind(name);
     let root: u64 = root.fetch_one(&mut connection).await.unwrap().try_into().unwrap();
-    let size: i64 = sqlx::query_scalar("PRAGMA page_size").fetch_one(&mut connection).await.unwrap();
+    let size: i64 =
+        sqlx::query_scalar("PRAGMA page_size").fetch_one(&mut connection).await.unwrap();
     connection.close().await.unwrap();
     let size: usize = size.try_into().unwrap();
     ((root - 1) * size as u64, size)
@@ -54,12 +57,16 @@ fn flip_head((at, _): (u64, usize), data: &Path) {
 fn flip_text((at, size): (u64, usize), data: &Path, text: &str) {
     let mut page = vec![0; size];
     file(data).read_exact_at(&mut page, at).unwrap();
-    let place = page.windows(text.len()).position(|bytes| bytes == text.as_bytes()).expect("the text is in the page");
+    let place = page
+        .windows(text.len())
+        .position(|bytes| bytes == text.as_bytes())
+        .expect("the text is in the page");
     let last = place + text.len() - 1;
     file(data).write_all_at(&[page[last] ^ 1], at + last as u64).unwrap();
 }
 
-/// A stopped server's directory, all of whose data is in the database's file, and a robot that it knows.
+/// A stopped server's directory, all of whose data is in the database's file, and a robot that it
+/// knows.
 async fn stopped() -> (TempDir, TestRobot) {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
@@ -84,7 +91,10 @@ async fn assert_nothing_is_changed(server: &TestServer, robot: &mut TestRobot) {
     let corrupt = (503, "database_corrupt".to_owned());
     let order = json!({ "selector": "*" });
     assert_eq!(refusal(server.order("/api/v1/tasks/talker/stop", "key-2", &order)).await, corrupt);
-    assert_eq!(refusal(server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}))).await, corrupt);
+    assert_eq!(
+        refusal(server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}))).await,
+        corrupt
+    );
     let state = server.desired(robot).await;
     assert_eq!(state.tasks.len(), 1, "nothing was stopped");
     let response = server.report(robot, &state, Phase::Running).await;
@@ -133,12 +143,17 @@ async fn damaged_index_is_found_while_serving_and_orders_are_refused() {
     let (directory, mut robot) = stopped().await;
     let data = directory.path().join("data");
     let index = root_page(&data, "robots_by_name").await;
-    let check_often = |config: &mut Config| config.database_check_interval = Duration::from_millis(100);
+    let check_often =
+        |config: &mut Config| config.database_check_interval = Duration::from_millis(100);
     let server = TestServer::start_in(directory, check_often).await;
-    eventually("a full check is done", async || status(&server).await.database.fully_checked_at_ms.is_some()).await;
+    eventually("a full check is done", async || {
+        status(&server).await.database.fully_checked_at_ms.is_some()
+    })
+    .await;
     assert_eq!(status(&server).await.database.problem, None);
     flip_text(index, &data, "atlas");
-    eventually("the damage is found", async || status(&server).await.database.problem.is_some()).await;
+    eventually("the damage is found", async || status(&server).await.database.problem.is_some())
+        .await;
     let problem = status(&server).await.database.problem.unwrap();
     assert!(problem.contains("it is corrupt") && problem.contains("robots_by_name"), "{problem}");
     assert_nothing_is_changed(&server, &mut robot).await;
@@ -154,7 +169,8 @@ async fn damaged_index_at_rest_is_found_soon_after_start() {
     let data = directory.path().join("data");
     flip_text(root_page(&data, "robots_by_name").await, &data, "atlas");
     let server = TestServer::start_in(directory, |_| {}).await;
-    eventually("the damage is found", async || status(&server).await.database.problem.is_some()).await;
+    eventually("the damage is found", async || status(&server).await.database.problem.is_some())
+        .await;
     assert_nothing_is_changed(&server, &mut robot).await;
 }
 
@@ -164,7 +180,10 @@ async fn damage_that_a_request_meets_ends_all_orders() {
     let data = directory.path().join("data");
     let table = root_page(&data, "audit").await;
     let server = TestServer::start_in(directory, |_| {}).await;
-    eventually("a full check is done", async || status(&server).await.database.fully_checked_at_ms.is_some()).await;
+    eventually("a full check is done", async || {
+        status(&server).await.database.fully_checked_at_ms.is_some()
+    })
+    .await;
     flip_head(table, &data);
     let met = refusal(server.request(Method::GET, "/api/v1/audit")).await;
     assert_eq!(met, (503, "database_corrupt".to_owned()));

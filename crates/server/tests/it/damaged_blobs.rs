@@ -1,5 +1,5 @@
-//! Blobs whose files lose their bytes while they are served, as by a failing disk: a truncated file's mapped pages raise the
-//! same signal as a sector that cannot be read.
+//! Blobs whose files lose their bytes while they are served, as by a failing disk: a truncated
+//! file's mapped pages raise the same signal as a sector that cannot be read.
 
 use std::fs;
 
@@ -14,18 +14,22 @@ use crate::harness::TestServer;
 const BLOB_BYTES: usize = 64 * 1024 * 1024;
 
 async fn push(server: &TestServer, digest: &Digest, bytes: Vec<u8>) {
-    let begun = server.request(Method::POST, "/v2/worn/blobs/uploads/").send().await.expect("an answer");
+    let begun =
+        server.request(Method::POST, "/v2/worn/blobs/uploads/").send().await.expect("an answer");
     assert_eq!(begun.status(), StatusCode::ACCEPTED);
     let upload = begun.headers()["location"].to_str().expect("text").to_owned();
-    let put = server.request(Method::PUT, &upload).query(&[("digest", digest.to_string())]).body(bytes);
+    let put =
+        server.request(Method::PUT, &upload).query(&[("digest", digest.to_string())]).body(bytes);
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::CREATED);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_can_be_pushed_again() {
+async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_can_be_pushed_again()
+{
     for encrypts in [false, true] {
         let directory = TempDir::new().expect("a directory");
-        let server = TestServer::start_in(directory, |config| config.tls.private_ca = Some(encrypts)).await;
+        let server =
+            TestServer::start_in(directory, |config| config.tls.private_ca = Some(encrypts)).await;
         let bytes = vec![b'x'; BLOB_BYTES];
         let digest = Digest::of(&bytes);
         push(&server, &digest, bytes.clone()).await;
@@ -35,7 +39,12 @@ async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_ca
         let mut answer = server.request(Method::GET, &path).send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::OK);
         let mut came = answer.chunk().await.expect("begun").expect("some").len();
-        fs::File::options().write(true).open(&file).expect("the blob's file").set_len(0).expect("truncated");
+        fs::File::options()
+            .write(true)
+            .open(&file)
+            .expect("the blob's file")
+            .set_len(0)
+            .expect("truncated");
         let broken_off = loop {
             match answer.chunk().await {
                 Ok(Some(chunk)) => came += chunk.len(),
@@ -45,7 +54,8 @@ async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_ca
         };
         assert!(broken_off && came < BLOB_BYTES, "{came} bytes came, encrypted: {encrypts}");
 
-        // The server lives. The first request that reads the file again has it checked; then the blob counts as absent.
+        // The server lives. The first request that reads the file again has it checked; then the
+        // blob counts as absent.
         eventually("the blob to be absent", async || {
             let answer = server.request(Method::GET, &path).send().await;
             answer.is_ok_and(|answer| answer.status() == StatusCode::NOT_FOUND)

@@ -18,7 +18,11 @@ pub struct TestDatabase {
 pub async fn sqlite() -> TestDatabase {
     let directory = tempfile::tempdir().expect("temporary directory");
     let url = sqlite_url(&directory.path().join("taskd.db"));
-    TestDatabase { store: Store::open(&url).await.expect("opens"), url, _directory: Some(directory) }
+    TestDatabase {
+        store: Store::open(&url).await.expect("opens"),
+        url,
+        _directory: Some(directory),
+    }
 }
 
 pub async fn postgres() -> TestDatabase {
@@ -30,8 +34,9 @@ pub async fn postgres() -> TestDatabase {
     };
     let name = format!("taskd_test_{:016x}", rand::random::<u64>());
     sqlx::any::install_default_drivers();
-    let mut connection =
-        sqlx::AnyConnection::connect(&format!("{server}/postgres")).await.expect("the test server answers");
+    let mut connection = sqlx::AnyConnection::connect(&format!("{server}/postgres"))
+        .await
+        .expect("the test server answers");
     let create = sqlx::AssertSqlSafe(format!("CREATE DATABASE {name}"));
     sqlx::query(create).execute(&mut connection).await.expect("may create databases");
     connection.close().await.expect("closes");
@@ -43,7 +48,9 @@ impl TestDatabase {
     /// What was known when it was decided how a deployment travels to a robot, JSON.
     pub async fn inputs(&self, deployment: &DeploymentId, robot: &RobotId) -> String {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
-        let query = sqlx::query_scalar("SELECT inputs FROM assignments WHERE deployment_id = $1 AND robot_id = $2");
+        let query = sqlx::query_scalar(
+            "SELECT inputs FROM assignments WHERE deployment_id = $1 AND robot_id = $2",
+        );
         let query = query.bind(deployment.as_str()).bind(robot.as_str());
         query.fetch_one(&mut connection).await.expect("decided")
     }
@@ -51,8 +58,10 @@ impl TestDatabase {
     /// Changes an entry of the audit behind its back.
     pub async fn forge_audit(&self, number: i64, from: &str, to: &str) {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
-        let forge = sqlx::query("UPDATE audit SET entry = REPLACE(entry, $2, $3) WHERE number = $1");
-        let forged = forge.bind(number).bind(from).bind(to).execute(&mut connection).await.expect("forges");
+        let forge =
+            sqlx::query("UPDATE audit SET entry = REPLACE(entry, $2, $3) WHERE number = $1");
+        let forged =
+            forge.bind(number).bind(from).bind(to).execute(&mut connection).await.expect("forges");
         assert_eq!(forged.rows_affected(), 1);
     }
 
@@ -80,7 +89,8 @@ impl TestDatabase {
     /// Makes all assignments such as they were before decisions were kept.
     pub async fn forget_decisions(&self) {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
-        let forget = "UPDATE assignments SET mechanism = NULL, rule = NULL, because = NULL, inputs = NULL";
+        let forget =
+            "UPDATE assignments SET mechanism = NULL, rule = NULL, because = NULL, inputs = NULL";
         sqlx::query(forget).execute(&mut connection).await.expect("forgets");
     }
 }
@@ -115,7 +125,10 @@ pub async fn contents(url: &str) -> Vec<String> {
         for row in sqlx::query(select).fetch_all(&mut connection).await.expect("reads") {
             let value = |at| match row.try_get::<Option<i64>, _>(at) {
                 Ok(number) => format!("{number:?}"),
-                Err(_) => format!("{:?}", row.try_get::<Option<String>, _>(at).expect("a number or a text")),
+                Err(_) => format!(
+                    "{:?}",
+                    row.try_get::<Option<String>, _>(at).expect("a number or a text")
+                ),
             };
             let values: Vec<String> = (0..row.len()).map(value).collect();
             lines.push(format!("{table}: {}", values.join(" ")));

@@ -1,4 +1,5 @@
-//! How bytes travel to each robot, told on every database: what is known decides, and the decision is kept and shown.
+//! How bytes travel to each robot, told on every database: what is known decides, and the decision
+//! is kept and shown.
 
 use std::net::SocketAddr;
 
@@ -28,7 +29,9 @@ on_both_databases! {
 /// A rule with one condition, named like it.
 fn rule(key: &str, value: u64, mechanism: Delivery) -> Rule {
     let condition = match Condition::by_key(key).expect(key) {
-        ConditionKey::Measure(quantity, comparison) => Condition::Measure(quantity, comparison, value),
+        ConditionKey::Measure(quantity, comparison) => {
+            Condition::Measure(quantity, comparison, value)
+        }
         ConditionKey::Flag(flag) => Condition::Flag(flag, value == 1),
     };
     Rule { name: format!("own {key}"), conditions: vec![condition], mechanism }
@@ -42,13 +45,20 @@ async fn label(fleet: &Fleet, robot: &Robot, key: &str, value: &str) {
     let labels = [(key.parse().expect("a key"), value.parse().expect("a value"))].into();
     fleet
         .actions
-        .edit_robot(&fleet.operator, &robot.id, &EditRobot { labels: Some(labels), ..EditRobot::default() })
+        .edit_robot(
+            &fleet.operator,
+            &robot.id,
+            &EditRobot { labels: Some(labels), ..EditRobot::default() },
+        )
         .await
         .expect("edited");
 }
 
 /// The decisions of a deployment by robot, shortly.
-async fn decisions(fleet: &Fleet, id: &task_proto::DeploymentId) -> Vec<Option<(Delivery, String, String)>> {
+async fn decisions(
+    fleet: &Fleet,
+    id: &task_proto::DeploymentId,
+) -> Vec<Option<(Delivery, String, String)>> {
     let assignments = fleet.deployment(id).await.assignments.expect("asked for");
     let short = |DeliveryDecision { mechanism, rule, because }| (mechanism, rule, because);
     assignments.into_iter().map(|assignment| assignment.delivery.map(short)).collect()
@@ -76,7 +86,8 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
     robots.iter().for_each(|robot| fleet.go_offline(&robot.id));
     label(&fleet, &robots[0], "metered", "true").await;
     robots[1].battery_percent = Some(15);
-    robots[2].link = Some(LinkFacts { throughput_bytes_per_s: Some(512 << 10), ..LinkFacts::default() });
+    robots[2].link =
+        Some(LinkFacts { throughput_bytes_per_s: Some(512 << 10), ..LinkFacts::default() });
     robots[3].link = Some(LinkFacts { reconnects: 4, rtt_ms: Some(30), ..LinkFacts::default() });
     for robot in &mut robots[1..4] {
         fleet.report(robot).await;
@@ -107,13 +118,18 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
 }
 
 async fn robots_on_a_site_are_counted(database: TestDatabase) {
-    let fleet =
-        Fleet::with_delivery(database, &settings(vec![rule("same_site_at_least", 2, Delivery::DirectPush)])).await;
+    let fleet = Fleet::with_delivery(
+        database,
+        &settings(vec![rule("same_site_at_least", 2, Delivery::DirectPush)]),
+    )
+    .await;
     let robots = fleet.enroll(6).await;
     label(&fleet, &robots[0], "site", "hall").await;
     label(&fleet, &robots[1], "site", "hall").await;
     // The label wins over the network, which the two in it without a label share.
-    for (robot, address) in [(1, "10.0.7.1:5"), (2, "10.0.7.2:5"), (3, "10.0.7.3:5"), (4, "10.0.8.1:5")] {
+    for (robot, address) in
+        [(1, "10.0.7.1:5"), (2, "10.0.7.2:5"), (3, "10.0.7.3:5"), (4, "10.0.8.1:5")]
+    {
         let address: SocketAddr = address.parse().expect("an address");
         fleet.presence.seen(&robots[robot].id, address, fleet.clock.now_ms());
     }
@@ -129,7 +145,9 @@ async fn robots_on_a_site_are_counted(database: TestDatabase) {
 }
 
 async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
-    let fleet = Fleet::with_delivery(database, &settings(vec![rule("losses_above", 2, Delivery::Poll)])).await;
+    let fleet =
+        Fleet::with_delivery(database, &settings(vec![rule("losses_above", 2, Delivery::Poll)]))
+            .await;
     let mut robots = fleet.enroll(2).await;
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
     let tiny = decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB");
@@ -139,14 +157,22 @@ async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
     // What was decided stays, whatever is measured later.
     robots[0].link = Some(LinkFacts { losses: 9, ..LinkFacts::default() });
     fleet.follow(&mut robots[0], Phase::Running).await;
-    assert_eq!(decisions(&fleet, &id).await, [tiny, decision(Delivery::Poll, "own losses_above", "losses 5 > 2")]);
+    assert_eq!(
+        decisions(&fleet, &id).await,
+        [tiny, decision(Delivery::Poll, "own losses_above", "losses 5 > 2")]
+    );
 }
 
 async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
-    let fleet = Fleet::with_delivery(database, &settings(vec![rule("lacking_at_most", 0, Delivery::Poll)])).await;
+    let fleet =
+        Fleet::with_delivery(database, &settings(vec![rule("lacking_at_most", 0, Delivery::Poll)]))
+            .await;
     let mut robots = fleet.enroll(3).await;
     let id = fleet.deploy("1", |_| ()).await;
-    assert_eq!(decisions(&fleet, &id).await, vec![decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB"); 3]);
+    assert_eq!(
+        decisions(&fleet, &id).await,
+        vec![decision(Delivery::Inline, "tiny", "size 2 B ≤ 32 KB"); 3]
+    );
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Fetching).await;
     let again = fleet.deploy("1", |order| order.restart = true).await;
@@ -159,9 +185,11 @@ async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
 async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
-    for (version, choice) in
-        [("1", DeliveryChoice::DirectPush), ("2", DeliveryChoice::Poll), ("3", DeliveryChoice::Inline)]
-    {
+    for (version, choice) in [
+        ("1", DeliveryChoice::DirectPush),
+        ("2", DeliveryChoice::Poll),
+        ("3", DeliveryChoice::Inline),
+    ] {
         let id = fleet.deploy(version, |order| {
             order.delivery = choice;
             order.priority = 7;
@@ -180,7 +208,12 @@ async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatab
         order.priority = priority;
         let refused = fleet
             .actions
-            .create_deployment(&fleet.operator, &random_key(), &order, &package("4", TaskKind::Service))
+            .create_deployment(
+                &fleet.operator,
+                &random_key(),
+                &order,
+                &package("4", TaskKind::Service),
+            )
             .await;
         let error = refused.expect_err("refused");
         assert_eq!(error.to_string(), format!("priority: expected -100 to 100, not {priority}"));
@@ -194,17 +227,23 @@ async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
     large.package.content.size = 10_171_187;
     let mut order = order_of(&large);
     order.delivery = DeliveryChoice::Inline;
-    let refused = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
+    let refused =
+        fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
     let error = refused.expect_err("refused");
     assert_eq!(error.to_string(), "delivery: talker 1 has 9.7 MB, inline carries at most 32 KB");
     assert_eq!(error.code(), "package_too_large");
     // One byte too many, which the config brings.
     large.package.content.size = 32 << 10;
-    let refused = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
+    let refused =
+        fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
     let message = refused.expect_err("refused").to_string();
     assert_eq!(message, "delivery: talker 1 has 32769 B, inline carries at most 32768 B");
     order.delivery = DeliveryChoice::Adaptive;
-    let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await.expect("ordered");
+    let id = fleet
+        .actions
+        .create_deployment(&fleet.operator, &random_key(), &order, &large)
+        .await
+        .expect("ordered");
     let because = "size 32769 B > 32768 B";
     assert_eq!(decisions(&fleet, &id).await, [decision(Delivery::PushPull, "otherwise", because)]);
 }
@@ -221,7 +260,8 @@ async fn a_decision_of_an_older_version_is_the_orders(database: TestDatabase) {
 async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
-    let riding = async |robot: &Robot| fleet.actions.desired(&robot.id).await.expect("a state").along;
+    let riding =
+        async |robot: &Robot| fleet.actions.desired(&robot.id).await.expect("a state").along;
     let package = |version| package(version, TaskKind::Service).package;
     for (version, choice, expected) in [
         ("1", DeliveryChoice::Inline, vec![package("1").config, package("1").content]),
@@ -241,12 +281,16 @@ async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
 async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
-    let link = LinkFacts { throughput_bytes_per_s: Some(9), rtt_ms: Some(2), reconnects: 1, losses: 0 };
+    let link =
+        LinkFacts { throughput_bytes_per_s: Some(9), rtt_ms: Some(2), reconnects: 1, losses: 0 };
     robots[0].link = Some(link);
     robots[0].battery_percent = Some(50);
     fleet.report(&mut robots[0]).await;
     let view = fleet.view(&robots[0]).await;
-    assert_eq!((view.link, view.host.and_then(|host| host.battery_percent)), (Some(link), Some(50)));
+    assert_eq!(
+        (view.link, view.host.and_then(|host| host.battery_percent)),
+        (Some(link), Some(50))
+    );
     // The agent starts again and has measured nothing yet.
     robots[0].link = None;
     fleet.report(&mut robots[0]).await;
@@ -278,5 +322,8 @@ async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestD
     let told = decision(Delivery::PushPull, "fell behind", "it held up the others");
     let ordered = decision(Delivery::DirectPush, "ordered", "the order says direct-push");
     assert_eq!(decisions(&fleet, &id).await, [ordered, told]);
-    assert_eq!((waiting().await, store.direct_pushes().await.expect("read").len()), (Vec::new(), 0));
+    assert_eq!(
+        (waiting().await, store.direct_pushes().await.expect("read").len()),
+        (Vec::new(), 0)
+    );
 }

@@ -1,5 +1,5 @@
-//! Packages inside MQTT messages, from the operator's order to the robots' last byte: robots that stall, miss parts, come
-//! late or lose their right, and a server that restarts.
+//! Packages inside MQTT messages, from the operator's order to the robots' last byte: robots that
+//! stall, miss parts, come late or lose their right, and a server that restarts.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -29,7 +29,12 @@ fn content() -> Vec<u8> {
     archive_with(&bytes)
 }
 
-async fn deploy(server: &TestServer, package: &PackageRef, selector: &str, key: &str) -> DeploymentView {
+async fn deploy(
+    server: &TestServer,
+    package: &PackageRef,
+    selector: &str,
+    key: &str,
+) -> DeploymentView {
     let body = json!({
         "package": package.name, "manifest": package.manifest.digest, "selector": selector, "delivery": "direct-push"
     });
@@ -53,11 +58,23 @@ struct Hearer {
 
 impl Hearer {
     fn connect(server: &TestServer, robot: TestRobot, package: &PackageRef) -> Self {
-        let address: std::net::SocketAddr = server.server.addresses().mqtt.parse().expect("an address");
-        let mut options = MqttOptions::new(robot.id.as_str(), address.ip().to_string(), address.port());
-        options.set_credentials(robot.id.as_str(), &robot.token).set_max_packet_size(512 << 20, 1 << 20);
+        let address: std::net::SocketAddr =
+            server.server.addresses().mqtt.parse().expect("an address");
+        let mut options =
+            MqttOptions::new(robot.id.as_str(), address.ip().to_string(), address.port());
+        options
+            .set_credentials(robot.id.as_str(), &robot.token)
+            .set_max_packet_size(512 << 20, 1 << 20);
         let (client, events) = AsyncClient::new(options, 10);
-        Self { robot, client, events, package: package.clone(), got: BTreeMap::new(), count: u32::MAX, messages: 0 }
+        Self {
+            robot,
+            client,
+            events,
+            package: package.clone(),
+            got: BTreeMap::new(),
+            count: u32::MAX,
+            messages: 0,
+        }
     }
 
     /// Asks to hear the parts, and says whether it may.
@@ -65,7 +82,9 @@ impl Hearer {
         let topic = TopicPrefix::default().format(&Topic::Package(self.package.content.digest));
         self.client.subscribe(topic, qos).await.expect("queued");
         loop {
-            if let Event::Incoming(Packet::SubAck(ack)) = self.events.poll().await.expect("a session") {
+            if let Event::Incoming(Packet::SubAck(ack)) =
+                self.events.poll().await.expect("a session")
+            {
                 return ack.return_codes == [SubscribeReasonCode::Success(qos)];
             }
         }
@@ -83,7 +102,8 @@ impl Hearer {
         loop {
             match timeout(QUIET, self.events.poll()).await.ok()?.expect("a session") {
                 Event::Incoming(Packet::Publish(message)) => {
-                    let part = Part::decode(&message.payload, self.package.content.size).expect("a part");
+                    let part =
+                        Part::decode(&message.payload, self.package.content.size).expect("a part");
                     self.count = part.count;
                     self.messages += 1;
                     self.got.insert(part.index, part.bytes.to_vec());
@@ -99,7 +119,8 @@ impl Hearer {
         while self.got.len() < self.count as usize {
             if self.hear().await.is_none() {
                 let all = if self.count == u32::MAX { 1 << 16 } else { self.count };
-                let missing = PartRange::runs((0..all).filter(|index| !self.got.contains_key(index)));
+                let missing =
+                    PartRange::runs((0..all).filter(|index| !self.got.contains_key(index)));
                 self.report(server, Phase::Fetching, Some(missing)).await;
             }
         }
@@ -113,7 +134,8 @@ impl Hearer {
         let mut report = self.robot.next_report(&state, phase);
         report.tasks.iter_mut().for_each(|task| task.missing_parts = missing.clone());
         let path = format!("/api/v1/robots/{}/report", self.robot.id);
-        let request = server.bare(reqwest::Method::POST, &path).bearer_auth(&self.robot.token).json(&report);
+        let request =
+            server.bare(reqwest::Method::POST, &path).bearer_auth(&self.robot.token).json(&report);
         assert_eq!(request.send().await.expect("an answer").status(), StatusCode::OK);
     }
 }
@@ -135,7 +157,11 @@ async fn the_stalled_are_told_to_pull_while_others_finish_also_who_misses_parts_
     let [mut quick, mut lossy, mut late, mut stalled] = hearers.try_into().ok().expect("four");
     assert_eq!(server.desired(&quick.robot).await.tasks[0].delivery, Delivery::DirectPush);
     let all = async {
-        tokio::join!(quick.listen(QoS::AtLeastOnce), lossy.listen(QoS::AtLeastOnce), stalled.listen(QoS::AtLeastOnce));
+        tokio::join!(
+            quick.listen(QoS::AtLeastOnce),
+            lossy.listen(QoS::AtLeastOnce),
+            stalled.listen(QoS::AtLeastOnce)
+        );
         // From here on the last one reads nothing, and acknowledges nothing.
         while quick.hear().await.is_none() {}
         tokio::join!(
@@ -155,7 +181,9 @@ async fn the_stalled_are_told_to_pull_while_others_finish_also_who_misses_parts_
         loop {
             let view = deployment(&server, &ordered).await;
             let assignments = view.assignments.expect("asked for");
-            let of = |name: &str| assignments.iter().find(|one| one.name.as_str() == name).expect("there").clone();
+            let of = |name: &str| {
+                assignments.iter().find(|one| one.name.as_str() == name).expect("there").clone()
+            };
             let decision = of("stalled").delivery.expect("decided");
             if decision.mechanism == Delivery::PushPull {
                 assert_eq!(
@@ -189,12 +217,17 @@ async fn only_those_it_is_meant_for_hear_it_and_only_as_long() {
         meant.listen(QoS::AtLeastOnce).await;
         assert!(!other.subscribe(QoS::AtLeastOnce).await);
         while meant.hear().await.is_none() {}
-        let cancelled = server.order(&format!("/api/v1/deployments/{}/cancel", ordered.id), "key-2", &json!({}));
+        let cancelled = server.order(
+            &format!("/api/v1/deployments/{}/cancel", ordered.id),
+            "key-2",
+            &json!({}),
+        );
         assert!(cancelled.send().await.expect("an answer").status().is_success());
         while meant.subscribe(QoS::AtLeastOnce).await {
             tokio::task::yield_now().await;
         }
-        // What was under way before has been heard; more does not come, and it is not asked for in vain.
+        // What was under way before has been heard; more does not come, and it is not asked for in
+        // vain.
         meant.report(&server, Phase::Fetching, Some(vec![PartRange { from: 0, to: 9 }])).await;
         assert_eq!(meant.hear().await, None);
         assert_eq!((other.hear().await, other.messages), (None, 0));
@@ -260,7 +293,10 @@ async fn a_robot_that_never_listens_is_told_to_pull() {
             }
         }
     };
-    assert_eq!(timeout(PATIENCE, told).await.expect("it should be told"), "it did not listen for 10 s");
+    assert_eq!(
+        timeout(PATIENCE, told).await.expect("it should be told"),
+        "it did not listen for 10 s"
+    );
     let after = server.desired(&robot).await;
     assert!(after.generation > before.generation && after.tasks[0].delivery == Delivery::PushPull);
 }

@@ -50,14 +50,21 @@ async fn a_healthy_server_has_all_its_checks() {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_stands_between_is_named() {
     let bench = Bench::start().await;
-    let at = async |server: &str| bench.taskd(&["doctor", "-o", "json", "--server", server]).await.expect(1, "");
+    let at = async |server: &str| {
+        bench.taskd(&["doctor", "-o", "json", "--server", server]).await.expect(1, "")
+    };
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     assert_found(&at(&format!("http://{nobody}")).await, "http", "bad", "refused");
     assert_found(&at("http://nowhere.invalid:8080").await, "name", "bad", "nowhere.invalid");
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let portal = listener.local_addr().unwrap();
     tokio::spawn(async move { axum::serve(listener, Router::<()>::new()).await });
-    assert_found(&at(&format!("http://{portal}")).await, "http", "bad", "is not taskd (status 404)");
+    assert_found(
+        &at(&format!("http://{portal}")).await,
+        "http",
+        "bad",
+        "is not taskd (status 404)",
+    );
     bench.taskd(&["doctor", "--server", "nonsense"]).await.expect(2, "--server");
 
     let other = task_proto::token::Token::random(task_proto::token::TokenKind::Operator).reveal();
@@ -65,7 +72,11 @@ async fn what_stands_between_is_named() {
     assert_found(&ran, "token", "bad", "");
     assert_found(&ran, "http", "good", "answers");
     bench.taskd(&["user", "add", "eve", "--role", "viewer", "--no-password"]).await.expect(0, "");
-    let viewer = bench.taskd(&["token", "create", "--user", "eve", "--ttl", "7d"]).await.expect(0, "").stdout;
+    let viewer = bench
+        .taskd(&["token", "create", "--user", "eve", "--ttl", "7d"])
+        .await
+        .expect(0, "")
+        .stdout;
     let ran = bench.taskd(&["doctor", "-o", "json", "--token", viewer.trim()]).await.expect(0, "");
     assert_found(&ran, "token", "notice", "may read; it ends");
     bench.server.unwrap().stop().await;
@@ -82,9 +93,15 @@ async fn a_clock_that_is_wrong_is_noticed() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_certificate_is_looked_at() {
-    let bench = Bench::start_with(|config| config.tls.private_ca = Some(true), Clock::system()).await;
+    let bench =
+        Bench::start_with(|config| config.tls.private_ca = Some(true), Clock::system()).await;
     let ran = bench.taskd(&["doctor", "-o", "json"]).await.expect(0, "");
-    assert_found(&ran, "tls", "good", "vouched for by the pinned authority, the certificate ends 2");
+    assert_found(
+        &ran,
+        "tls",
+        "good",
+        "vouched for by the pinned authority, the certificate ends 2",
+    );
     assert_found(&ran, "mqtt", "good", "answers");
     assert_found(&ran, "websocket", "good", "answers");
     let url = format!("https://{}", bench.server().addresses().http);

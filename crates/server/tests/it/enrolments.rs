@@ -1,10 +1,11 @@
-//! Enrolment tokens are listed and revoked, and so are robots: who was put out is out at once, is told so, and comes back only
-//! by an administrator's token made for it.
+//! Enrolment tokens are listed and revoked, and so are robots: who was put out is out at once, is
+//! told so, and comes back only by an administrator's token made for it.
 
 use reqwest::Method;
 use serde_json::{Value, json};
 use task_proto::api::{
-    AuditPage, EnrollResponse, EnrollmentToken, EnrollmentTokenList, ReportReply, RobotToken, RobotView,
+    AuditPage, EnrollResponse, EnrollmentToken, EnrollmentTokenList, ReportReply, RobotToken,
+    RobotView,
 };
 use task_proto::report::Phase;
 use taskd::store::{Store, sqlite_url};
@@ -28,8 +29,15 @@ async fn listed(server: &TestServer) -> Vec<String> {
 /// What the audit tells of `act`, as target and detail.
 async fn audited(server: &TestServer, act: &str) -> Vec<(String, Value)> {
     let page: AuditPage = server.get(&format!("/api/v1/audit?act={act}")).await;
-    let entries = page.records.iter().map(|record| serde_json::from_str::<Value>(record.entry.get()).expect("json"));
-    entries.map(|entry| (entry["target"].as_str().expect("a target").to_owned(), entry["detail"].clone())).collect()
+    let entries = page
+        .records
+        .iter()
+        .map(|record| serde_json::from_str::<Value>(record.entry.get()).expect("json"));
+    entries
+        .map(|entry| {
+            (entry["target"].as_str().expect("a target").to_owned(), entry["detail"].clone())
+        })
+        .collect()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -42,13 +50,28 @@ async fn enrolment_tokens_are_listed_and_revoked_at_once() {
     let shown = &list.tokens[..2];
     assert_eq!((shown[0].id.as_str(), shown[0].uses_left), (one.id.as_str(), Some(1)));
     assert_eq!(shown[0].robot.as_ref().map(|name| name.as_str()), Some("atlas"));
-    assert_eq!((shown[1].id.as_str(), shown[1].uses_left, shown[1].labels.len()), (all.id.as_str(), Some(100), 1));
-    assert!(!serde_json::to_string(&list).expect("json").contains(&all.token[18..40]), "a secret is listed");
+    assert_eq!(
+        (shown[1].id.as_str(), shown[1].uses_left, shown[1].labels.len()),
+        (all.id.as_str(), Some(100), 1)
+    );
+    assert!(
+        !serde_json::to_string(&list).expect("json").contains(&all.token[18..40]),
+        "a secret is listed"
+    );
 
     let came: EnrollResponse = answer(enrol(&server, &all.token, "02:00:00:00:00:01")).await;
     let path = format!("/api/v1/enrollment-tokens/{}", all.id);
-    server.request(Method::DELETE, &path).send().await.expect("an answer").error_for_status().expect("revoked");
-    assert_eq!(refusal(enrol(&server, &all.token, "02:00:00:00:00:02")).await, (401, "unauthorized".to_owned()));
+    server
+        .request(Method::DELETE, &path)
+        .send()
+        .await
+        .expect("an answer")
+        .error_for_status()
+        .expect("revoked");
+    assert_eq!(
+        refusal(enrol(&server, &all.token, "02:00:00:00:00:02")).await,
+        (401, "unauthorized".to_owned())
+    );
     // Not even the answer that may have been lost is given again.
     assert_eq!(refusal(enrol(&server, &all.token, "02:00:00:00:00:01")).await.0, 401);
     assert!(!listed(&server).await.contains(&all.id));
@@ -74,7 +97,8 @@ pub async fn connack(server: &TestServer, robot: &str, token: &str) -> u8 {
         keep_alive_s: 0,
         will: None,
     };
-    let stream = tokio::net::TcpStream::connect(&server.server.addresses().mqtt).await.expect("listens");
+    let stream =
+        tokio::net::TcpStream::connect(&server.server.addresses().mqtt).await.expect("listens");
     let mut raw = Raw { stream };
     raw.send(&connect.packet()).await;
     let answer = raw.read(4).await.expect("a CONNACK");
@@ -95,16 +119,28 @@ async fn a_revoked_robot_is_told_so_and_comes_back_only_by_a_token_made_for_it()
         server.bare(Method::POST, &format!("/api/v1/robots/{}/{path}", atlas.id)).bearer_auth(token)
     };
     let next: RobotToken = answer(own("token", &atlas.token)).await;
-    let (early, general) = (token(&server, json!({ "robot": "atlas" })).await, token(&server, json!({})).await);
+    let (early, general) =
+        (token(&server, json!({ "robot": "atlas" })).await, token(&server, json!({})).await);
 
     let revoke = format!("/api/v1/robots/{}/revoke", atlas.id);
     for _ in 0..2 {
-        server.request(Method::POST, &revoke).send().await.expect("an answer").error_for_status().expect("revoked");
+        server
+            .request(Method::POST, &revoke)
+            .send()
+            .await
+            .expect("an answer")
+            .error_for_status()
+            .expect("revoked");
     }
     assert_eq!(audited(&server, "robot.revoke").await.len(), 1, "doing it twice is one act");
     let view: RobotView = server.robot(&atlas).await;
-    assert_eq!((view.conditions[0].code.as_str(), view.tasks.len()), ("revoked", 1), "what is ordered stays");
-    // Both of its tokens have ended, also once ended tokens have been cleared away, and it is told why.
+    assert_eq!(
+        (view.conditions[0].code.as_str(), view.tasks.len()),
+        ("revoked", 1),
+        "what is ordered stays"
+    );
+    // Both of its tokens have ended, also once ended tokens have been cleared away, and it is told
+    // why.
     let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
     let mut write = store.begin().await.expect("begins");
     write.forget_ended_tokens(NOW_MS + 1).await.expect("forgotten");
@@ -125,7 +161,8 @@ async fn a_revoked_robot_is_told_so_and_comes_back_only_by_a_token_made_for_it()
     }
     let mut back = TestRobot::new(back.robot_id, back.token);
     assert_eq!(server.desired(&back).await.tasks.len(), 1);
-    let reply: ReportReply = server.report(&mut back, &state, Phase::Running).await.json().await.expect("stored");
+    let reply: ReportReply =
+        server.report(&mut back, &state, Phase::Running).await.json().await.expect("stored");
     assert_eq!(reply.generation, state.generation);
     assert!(server.robot(&back).await.conditions.is_empty());
 }
@@ -139,15 +176,22 @@ async fn a_token_is_for_so_many_unless_somebody_wants_it_for_more() {
     let common = token(&server, json!({})).await;
     assert_eq!(common.uses_left, Some(2));
     for number in 1..=2 {
-        let _: EnrollResponse = answer(enrol(&server, &common.token, &format!("02:00:00:00:01:0{number}"))).await;
+        let _: EnrollResponse =
+            answer(enrol(&server, &common.token, &format!("02:00:00:00:01:0{number}"))).await;
     }
-    assert_eq!(refusal(enrol(&server, &common.token, "02:00:00:00:01:03")).await, (401, "unauthorized".to_owned()));
+    assert_eq!(
+        refusal(enrol(&server, &common.token, "02:00:00:00:01:03")).await,
+        (401, "unauthorized".to_owned())
+    );
     let unlimited = token(&server, json!({ "unlimited": true })).await;
     assert_eq!(unlimited.uses_left, None);
     for number in 1..=5 {
-        let _: EnrollResponse = answer(enrol(&server, &unlimited.token, &format!("02:00:00:00:02:0{number}"))).await;
+        let _: EnrollResponse =
+            answer(enrol(&server, &unlimited.token, &format!("02:00:00:00:02:0{number}"))).await;
     }
-    let both = server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({ "uses": 1, "unlimited": true }));
+    let both = server
+        .request(Method::POST, "/api/v1/enrollment-tokens")
+        .json(&json!({ "uses": 1, "unlimited": true }));
     assert_eq!(refusal(both).await, (400, "invalid_request".to_owned()));
 }
 
@@ -165,19 +209,22 @@ async fn robots_enrol_at_a_rate_and_one_token_takes_half_of_it() {
         let mut came = 0;
         loop {
             number += 1;
-            let refused = enrol(&server, &token.token, &format!("02:00:00:00:03:{number:02}")).send().await;
+            let refused =
+                enrol(&server, &token.token, &format!("02:00:00:00:03:{number:02}")).send().await;
             let refused = refused.expect("an answer");
             if refused.status().is_success() {
                 came += 1;
                 continue;
             }
             assert_eq!(refused.status().as_u16(), 429);
-            let wait: u64 = refused.headers()["retry-after"].to_str().expect("text").parse().expect("a number");
+            let wait: u64 =
+                refused.headers()["retry-after"].to_str().expect("text").parse().expect("a number");
             assert!((1..=5).contains(&wait), "{wait}");
             return came;
         }
     };
-    // Ten seconds' worth at once: two of the four are left to others. A machine that is slow has a few more.
+    // Ten seconds' worth at once: two of the four are left to others. A machine that is slow has a
+    // few more.
     let (by_leaked, by_other) = (came_by(&leaked).await, came_by(&other).await);
     assert!((2..=6).contains(&by_leaked) && by_other >= 2, "{by_leaked}, {by_other}");
     // However many tokens there are, together they have the whole rate.

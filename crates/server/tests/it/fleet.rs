@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use task_proto::api::{
-    AddUser, CreateDeployment, CreateEnrollmentToken, CreateToken, DeploymentView, EnrollRequest, PackageView,
-    RobotView,
+    AddUser, CreateDeployment, CreateEnrollmentToken, CreateToken, DeploymentView, EnrollRequest,
+    PackageView, RobotView,
 };
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
@@ -64,7 +64,12 @@ impl Fleet {
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
         let presence = Arc::new(Presence::new(90_000, clock.now_ms()));
         let chooser = Chooser::new(settings, presence.clone(), load.clone());
-        let (writer, _) = ReportWriter::start(database.store.clone(), clock.clone(), changes.clone(), chooser.clone());
+        let (writer, _) = ReportWriter::start(
+            database.store.clone(),
+            clock.clone(),
+            changes.clone(),
+            chooser.clone(),
+        );
         let key = SigningKey::from_bytes(SEED);
         let actions = Actions::new(
             database.store.clone(),
@@ -84,7 +89,8 @@ impl Fleet {
     pub async fn limited(&self, name: &str, scope: &str) -> Person {
         let user: UserName = name.parse().expect("a name");
         let scope = Some(scope.parse().expect("a selector"));
-        let order = AddUser { name: user.clone(), roles: Roles::one(Role::Admin), scope, password: None };
+        let order =
+            AddUser { name: user.clone(), roles: Roles::one(Role::Admin), scope, password: None };
         self.actions.add_user(&self.operator, &order).await.expect("added");
         let order = CreateToken { user: Some(user), ..CreateToken::default() };
         let made = self.actions.create_token(&self.operator, &order).await.expect("made");
@@ -96,7 +102,8 @@ impl Fleet {
     }
 
     pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {
-        let made = self.actions.create_enrollment_token(&self.operator, &order).await.expect("a token");
+        let made =
+            self.actions.create_enrollment_token(&self.operator, &order).await.expect("a token");
         made.token.parse().expect("a token")
     }
 
@@ -107,7 +114,13 @@ impl Fleet {
         name: Option<&str>,
     ) -> Result<Enrolled, ActionError> {
         let name = name.map(|name| name.parse().expect("a name"));
-        self.actions.enroll(token, &EnrollRequest { mac, name, labels: BTreeMap::new(), client_key: None }, None).await
+        self.actions
+            .enroll(
+                token,
+                &EnrollRequest { mac, name, labels: BTreeMap::new(), client_key: None },
+                None,
+            )
+            .await
     }
 
     /// The robot's MQTT session begins.
@@ -122,21 +135,33 @@ impl Fleet {
 
     /// Registers `count` robots named `r0`, `r1`, … that are online.
     pub async fn enroll(&self, count: u32) -> Vec<Robot> {
-        let token = self.enrolment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() }).await;
+        let token = self
+            .enrolment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() })
+            .await;
         let mut robots = Vec::new();
         for number in 0..count {
-            let enrolled = self.try_enroll(&token, mac(number), Some(&format!("r{number}"))).await.expect("enrols");
+            let enrolled = self
+                .try_enroll(&token, mac(number), Some(&format!("r{number}")))
+                .await
+                .expect("enrols");
             self.come_online(&enrolled.robot_id);
             robots.push(Robot::new(enrolled.robot_id));
         }
         robots
     }
 
-    pub async fn deploy(&self, version: &str, order: impl FnOnce(&mut CreateDeployment)) -> DeploymentId {
+    pub async fn deploy(
+        &self,
+        version: &str,
+        order: impl FnOnce(&mut CreateDeployment),
+    ) -> DeploymentId {
         let package = package(version, TaskKind::Service);
         let mut request = order_of(&package);
         order(&mut request);
-        self.actions.create_deployment(&self.operator, &random_key(), &request, &package).await.expect("ordered")
+        self.actions
+            .create_deployment(&self.operator, &random_key(), &request, &package)
+            .await
+            .expect("ordered")
     }
 
     pub async fn deployment(&self, id: &DeploymentId) -> DeploymentView {
@@ -156,17 +181,23 @@ impl Fleet {
     /// The phases of a deployment's assignments, by robot name.
     pub async fn phases(&self, id: &DeploymentId) -> Vec<Phase> {
         let view = self.deployment(id).await;
-        view.assignments.expect("asked for").into_iter().map(|assignment| assignment.phase).collect()
+        view.assignments
+            .expect("asked for")
+            .into_iter()
+            .map(|assignment| assignment.phase)
+            .collect()
     }
 
     pub async fn desired(&self, robot: &Robot) -> Result<DesiredState, ActionError> {
         let desired = self.actions.desired(&robot.id).await?;
         let key = SigningKey::from_bytes(SEED).public_key();
-        let payload = desired.envelope.open(DESIRED_STATE_TYPE, &key).expect("signed by the server");
+        let payload =
+            desired.envelope.open(DESIRED_STATE_TYPE, &key).expect("signed by the server");
         Ok(serde_json::from_slice(&payload).expect("a desired state"))
     }
 
-    /// The robot takes its desired state, brings every task into `phase`, drops what is not desired, and reports.
+    /// The robot takes its desired state, brings every task into `phase`, drops what is not
+    /// desired, and reports.
     pub async fn follow(&self, robot: &mut Robot, phase: Phase) {
         let desired = self.desired(robot).await.expect("not withheld");
         robot.accept(&desired, phase);
@@ -226,7 +257,10 @@ pub fn random_key() -> IdempotencyKey {
 }
 
 pub fn package(version: &str, kind: TaskKind) -> PackageView {
-    let blob = |what: &str| BlobRef { digest: Digest::of(format!("{what} {version}").as_bytes()), size: 1 };
+    let blob = |what: &str| BlobRef {
+        digest: Digest::of(format!("{what} {version}").as_bytes()),
+        size: 1,
+    };
     let manifest: TaskManifest = serde_json::from_value(serde_json::json!({
         "name": "talker", "version": version, "run": { "exec": ["true"], "kind": kind },
         "content": { "tar_digest": blob("tar").digest, "tar_size": 1, "entries": 1 },
@@ -247,5 +281,9 @@ pub fn package(version: &str, kind: TaskKind) -> PackageView {
 
 pub fn order_of(package: &PackageView) -> CreateDeployment {
     let package = &package.package;
-    CreateDeployment::new(package.name.clone(), package.manifest.digest, "*".parse().expect("a selector"))
+    CreateDeployment::new(
+        package.name.clone(),
+        package.manifest.digest,
+        "*".parse().expect("a selector"),
+    )
 }

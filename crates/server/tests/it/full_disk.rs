@@ -1,4 +1,5 @@
-//! A server whose disk is full: what needs room is refused as such, everything else goes on, also over a restart.
+//! A server whose disk is full: what needs room is refused as such, everything else goes on, also
+//! over a restart.
 
 use std::fs::File;
 use std::io::Write as _;
@@ -21,8 +22,20 @@ use crate::harness::{TestRobot, TestServer, answer};
 fn on_small_disk(size: &str, test: impl AsyncFnOnce(TempDir) + Send) {
     let enter = |path: &Path| {
         unshare(CloneFlags::CLONE_NEWNS)?;
-        mount(None::<&str>, "/", None::<&str>, MsFlags::MS_REC | MsFlags::MS_PRIVATE, None::<&str>)?;
-        mount(Some("tmpfs"), path, Some("tmpfs"), MsFlags::empty(), Some(format!("size={size}").as_str()))
+        mount(
+            None::<&str>,
+            "/",
+            None::<&str>,
+            MsFlags::MS_REC | MsFlags::MS_PRIVATE,
+            None::<&str>,
+        )?;
+        mount(
+            Some("tmpfs"),
+            path,
+            Some("tmpfs"),
+            MsFlags::empty(),
+            Some(format!("size={size}").as_str()),
+        )
     };
     // What is mounted on it is gone with the threads that see it.
     let place = TempDir::new().expect("a directory");
@@ -30,7 +43,10 @@ fn on_small_disk(size: &str, test: impl AsyncFnOnce(TempDir) + Send) {
         let running = scope.spawn(|| {
             enter(place.path()).expect("root, who can have mounts of its own");
             let directory = TempDir::new_in(place.path()).expect("a directory");
-            let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().expect("a runtime");
+            let runtime = tokio::runtime::Builder::new_multi_thread()
+                .enable_all()
+                .build()
+                .expect("a runtime");
             runtime.block_on(test(directory));
         });
         running.join().expect("the test passes");
@@ -58,7 +74,9 @@ async fn use_up(server: &TestServer) {
         let labels = json!({ "labels": { "number": number.to_string() } });
         match status_of(server.request(Method::PATCH, "/api/v1/robots/atlas").json(&labels)).await {
             (StatusCode::OK, _) => {}
-            (StatusCode::INSUFFICIENT_STORAGE, body) => return assert_eq!(body["error"]["code"], "disk_full"),
+            (StatusCode::INSUFFICIENT_STORAGE, body) => {
+                return assert_eq!(body["error"]["code"], "disk_full");
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -72,22 +90,43 @@ async fn assert_reads_only(server: &TestServer, robot: &mut TestRobot) {
     let request = |method: Method, path: &str| server.request(method, path);
     for (what, request) in [
         ("order", server.order("/api/v1/tasks/talker/stop", "key-2", &json!({ "selector": "*" }))),
-        ("labels", request(Method::PATCH, "/api/v1/robots/atlas").json(&json!({ "labels": { "site": "a" } }))),
+        (
+            "labels",
+            request(Method::PATCH, "/api/v1/robots/atlas")
+                .json(&json!({ "labels": { "site": "a" } })),
+        ),
         ("token", request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}))),
-        ("sign-in", server.bare(Method::POST, "/api/v1/login").json(&json!({ "user": "eve", "password": PASSWORD }))),
-        ("session", server.bare(Method::POST, "/api/v1/session").json(&json!({ "user": "eve", "password": PASSWORD }))),
+        (
+            "sign-in",
+            server
+                .bare(Method::POST, "/api/v1/login")
+                .json(&json!({ "user": "eve", "password": PASSWORD })),
+        ),
+        (
+            "session",
+            server
+                .bare(Method::POST, "/api/v1/session")
+                .json(&json!({ "user": "eve", "password": PASSWORD })),
+        ),
         ("revoke", request(Method::POST, "/api/v1/robots/atlas/revoke")),
     ] {
         let (status, body) = status_of(request).await;
-        assert_eq!((status.as_u16(), &body["error"]["code"]), (507, &json!("disk_full")), "{what}: {body}");
+        assert_eq!(
+            (status.as_u16(), &body["error"]["code"]),
+            (507, &json!("disk_full")),
+            "{what}: {body}"
+        );
     }
-    let upload = request(Method::POST, &format!("/v2/talker/blobs/uploads/?digest={digest}")).body(content);
+    let upload =
+        request(Method::POST, &format!("/v2/talker/blobs/uploads/?digest={digest}")).body(content);
     let (status, body) = status_of(upload.header("content-type", "application/octet-stream")).await;
     assert_eq!((status.as_u16(), &body["errors"][0]["code"]), (507, &json!("DENIED")), "{body}");
     let state = server.desired(robot).await;
     let response = server.report(robot, &state, Phase::Running).await;
     assert_eq!(response.status(), 507, "a report that is not stored is not acknowledged");
-    for path in ["/api/v1/robots", "/api/v1/deployments", "/api/v1/packages", "/api/v1/server/status"] {
+    for path in
+        ["/api/v1/robots", "/api/v1/deployments", "/api/v1/packages", "/api/v1/server/status"]
+    {
         answer::<Value>(request(Method::GET, path)).await;
     }
     let (status, body) = status_of(server.bare(Method::GET, "/readyz")).await;
@@ -106,7 +145,8 @@ async fn furnished(directory: TempDir) -> (TestServer, TestRobot) {
     // Its first use of the token is written.
     server.desired(&robot).await;
     let user = json!({ "name": "eve", "roles": ["operator"], "password": PASSWORD });
-    let added = server.request(Method::POST, "/api/v1/users").json(&user).send().await.expect("an answer");
+    let added =
+        server.request(Method::POST, "/api/v1/users").json(&user).send().await.expect("an answer");
     assert!(added.status().is_success(), "{}", added.text().await.unwrap_or_default());
     (server, robot)
 }
@@ -133,7 +173,10 @@ fn full_disk_refuses_writes_and_serves_reads() {
         assert_reads_only(&server, &mut robot).await;
         std::fs::remove_file(filler).expect("removed");
         let state = server.desired(&robot).await;
-        assert_eq!(server.report(&mut robot, &state, Phase::Running).await.status(), StatusCode::OK);
+        assert_eq!(
+            server.report(&mut robot, &state, Phase::Running).await.status(),
+            StatusCode::OK
+        );
         server.stop().await;
     });
 }
@@ -148,7 +191,10 @@ fn server_starts_on_a_full_disk_and_serves_reads() {
         assert_reads_only(&server, &mut robot).await;
         std::fs::remove_file(filler).expect("removed");
         let state = server.desired(&robot).await;
-        assert_eq!(server.report(&mut robot, &state, Phase::Running).await.status(), StatusCode::OK);
+        assert_eq!(
+            server.report(&mut robot, &state, Phase::Running).await.status(),
+            StatusCode::OK
+        );
         let directory = server.stop().await;
         // The next start is one as any other: other programs may read the database again.
         let server = TestServer::start_in(directory, |_| {}).await;
@@ -164,7 +210,11 @@ fn first_start_on_a_full_disk_says_what_it_needs() {
         let mut config = Config::with_data(directory.path().join("data"));
         config.http.set_port(0);
         config.mqtt.set_port(0);
-        let refused = Server::start(config, Clock::system()).await.err().expect("refused").to_string();
-        assert!(refused.contains("/data/") && refused.contains("make at least 16 MB free"), "{refused}");
+        let refused =
+            Server::start(config, Clock::system()).await.err().expect("refused").to_string();
+        assert!(
+            refused.contains("/data/") && refused.contains("make at least 16 MB free"),
+            "{refused}"
+        );
     });
 }

@@ -1,4 +1,5 @@
-//! A whole server in this process, on free ports and in a directory of its own, and the few things every test says to it.
+//! A whole server in this process, on free ports and in a directory of its own, and the few things
+//! every test says to it.
 
 use std::path::Path;
 
@@ -6,7 +7,9 @@ use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
-use task_proto::api::{DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView, ServerInfo};
+use task_proto::api::{
+    DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView, ServerInfo,
+};
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
 use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
 use task_proto::manifest::{ContentFacts, TaskKind};
@@ -104,15 +107,28 @@ impl TestServer {
     pub async fn enroll(&self, name: &str) -> TestRobot {
         let token: EnrollmentToken = self.post("/api/v1/enrollment-tokens", &json!({})).await;
         let mac = Digest::of(name.as_bytes()).hex();
-        let mac = format!("02:{}:{}:{}:{}:{}", &mac[..2], &mac[2..4], &mac[4..6], &mac[6..8], &mac[8..10]);
+        let mac = format!(
+            "02:{}:{}:{}:{}:{}",
+            &mac[..2],
+            &mac[2..4],
+            &mac[4..6],
+            &mac[6..8],
+            &mac[8..10]
+        );
         let request = self.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token);
-        let enrolled: EnrollResponse = answer(request.json(&json!({ "mac": mac, "name": name }))).await;
+        let enrolled: EnrollResponse =
+            answer(request.json(&json!({ "mac": mac, "name": name }))).await;
         TestRobot::new(enrolled.robot_id, enrolled.token)
     }
 
     /// Pushes a package of one small file.
     pub async fn push(&self, name: &str, version: &str) -> PackageRef {
-        self.push_content(name, version, archive_with(format!("content of {name} {version}").as_bytes())).await
+        self.push_content(
+            name,
+            version,
+            archive_with(format!("content of {name} {version}").as_bytes()),
+        )
+        .await
     }
 
     /// The same with the content that [`archive_with`] or [`archive_of`] made.
@@ -129,14 +145,30 @@ impl TestServer {
         let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
         for (blob, bytes) in [(config_ref, config), (content_ref, content)] {
             let path = format!("/v2/{name}/blobs/uploads/?digest={}", blob.digest);
-            let request = self.request(Method::POST, &path).header("content-type", "application/octet-stream");
-            assert_eq!(request.body(bytes).send().await.expect("an answer").status(), StatusCode::CREATED);
+            let request = self
+                .request(Method::POST, &path)
+                .header("content-type", "application/octet-stream");
+            assert_eq!(
+                request.body(bytes).send().await.expect("an answer").status(),
+                StatusCode::CREATED
+            );
         }
-        let manifest = serde_json::to_vec(&ImageManifest::package(config_ref, content_ref)).expect("json");
+        let manifest =
+            serde_json::to_vec(&ImageManifest::package(config_ref, content_ref)).expect("json");
         let manifest_ref = BlobRef { digest: Digest::of(&manifest), size: manifest.len() as u64 };
         let request = self.request(Method::PUT, &format!("/v2/{name}/manifests/{version}"));
-        let response = request.header("content-type", MANIFEST_TYPE).body(manifest).send().await.expect("an answer");
-        assert_eq!(response.status(), StatusCode::CREATED, "{}", response.text().await.unwrap_or_default());
+        let response = request
+            .header("content-type", MANIFEST_TYPE)
+            .body(manifest)
+            .send()
+            .await
+            .expect("an answer");
+        assert_eq!(
+            response.status(),
+            StatusCode::CREATED,
+            "{}",
+            response.text().await.unwrap_or_default()
+        );
         PackageRef {
             name: name.parse().expect("a name"),
             version: version.parse().expect("a version"),
@@ -164,13 +196,23 @@ impl TestServer {
     /// The robot's desired state, its signature verified.
     pub async fn desired(&self, robot: &TestRobot) -> DesiredState {
         let response = self.ask_desired(robot).await;
-        assert_eq!(response.status(), StatusCode::OK, "{}", response.text().await.unwrap_or_default());
+        assert_eq!(
+            response.status(),
+            StatusCode::OK,
+            "{}",
+            response.text().await.unwrap_or_default()
+        );
         let envelope: Envelope = response.json().await.expect("an envelope");
         opened(self, &envelope).await
     }
 
     /// The robot reports that it accepted `state` and that all of its tasks stand in `phase`.
-    pub async fn report(&self, robot: &mut TestRobot, state: &DesiredState, phase: Phase) -> Response {
+    pub async fn report(
+        &self,
+        robot: &mut TestRobot,
+        state: &DesiredState,
+        phase: Phase,
+    ) -> Response {
         let report = robot.next_report(state, phase);
         self.send_report(robot, &report).await
     }
@@ -208,7 +250,8 @@ impl TestRobot {
     }
 }
 
-/// A package's content: an archive of one file, and `bytes` in a skippable zstd frame, so that they travel as they are.
+/// A package's content: an archive of one file, and `bytes` in a skippable zstd frame, so that they
+/// travel as they are.
 pub fn archive_with(bytes: &[u8]) -> Vec<u8> {
     let mut content = zstd::encode_all(&*archive(), 1).expect("in memory");
     content.extend(0x184D_2A50_u32.to_le_bytes());
@@ -240,7 +283,8 @@ fn archive() -> Vec<u8> {
 
 /// An HTTP client that trusts them.
 pub fn client(trust: Trust) -> Client {
-    // For clients that a test makes itself. A second install is refused because the first is in place.
+    // For clients that a test makes itself. A second install is refused because the first is in
+    // place.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let tls = trust.client_config(Clock::for_certificates());
     Client::builder().tls_backend_preconfigured(tls).build().expect("a client")

@@ -1,5 +1,5 @@
-//! What every answer tells a browser, whatever it answers: nothing of the server is ever framed, sniffed, kept or run, but for the
-//! page's own files.
+//! What every answer tells a browser, whatever it answers: nothing of the server is ever framed,
+//! sniffed, kept or run, but for the page's own files.
 
 use reqwest::{Method, Response};
 use serde_json::{Value, json};
@@ -14,15 +14,20 @@ const EVERYWHERE: [(&str, &str); 5] = [
     ("cross-origin-opener-policy", "same-origin"),
     ("cross-origin-resource-policy", "same-origin"),
 ];
-const ANSWER: &str = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
+const ANSWER: &str =
+    "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
 const PAGE: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
                     connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
                     frame-ancestors 'none'";
 
 fn check(response: &Response, policy: &str, what: &str) {
     let text = |name: &str| {
-        let values: Vec<_> =
-            response.headers().get_all(name).iter().map(|value| value.to_str().expect("text")).collect();
+        let values: Vec<_> = response
+            .headers()
+            .get_all(name)
+            .iter()
+            .map(|value| value.to_str().expect("text"))
+            .collect();
         values.join(" | ")
     };
     for (name, value) in EVERYWHERE {
@@ -30,7 +35,11 @@ fn check(response: &Response, policy: &str, what: &str) {
     }
     assert_eq!(text("content-security-policy"), policy, "{what}");
     let is_page = policy == PAGE;
-    assert!(is_page || !text("content-type").contains("html"), "{what} is {}", text("content-type"));
+    assert!(
+        is_page || !text("content-type").contains("html"),
+        "{what} is {}",
+        text("content-type")
+    );
     assert!(!text("cache-control").is_empty(), "{what}");
     assert_eq!(text("access-control-allow-origin"), "", "{what}");
 }
@@ -43,11 +52,23 @@ async fn every_answer_says_that_it_is_not_a_page() {
     let deployment = server.deploy(&package, "*", "first").await;
     let mut looked_at = 0;
     // Whoever asks: with rights, without, and a robot.
-    let comers = [Some(server.operator.reveal()), None, Some("tsko_nonsense".to_owned()), Some(robot.token.clone())];
-    let methods = [Method::GET, Method::HEAD, Method::OPTIONS, Method::POST, Method::PUT, Method::PATCH];
+    let comers = [
+        Some(server.operator.reveal()),
+        None,
+        Some("tsko_nonsense".to_owned()),
+        Some(robot.token.clone()),
+    ];
+    let methods =
+        [Method::GET, Method::HEAD, Method::OPTIONS, Method::POST, Method::PUT, Method::PATCH];
     for route in routes() {
-        let path = route.path.replace("{robot}", robot.id.as_str()).replace("{deployment}", deployment.id.as_str());
-        let path = path.replace("{task}", "talker").replace("{user}", "alice").replace("{token}", "0123456789ab");
+        let path = route
+            .path
+            .replace("{robot}", robot.id.as_str())
+            .replace("{deployment}", deployment.id.as_str());
+        let path = path
+            .replace("{task}", "talker")
+            .replace("{user}", "alice")
+            .replace("{token}", "0123456789ab");
         let path = path.replace("{*file}", "app.js").replace("{*path}", "talker/tags/list");
         let is_page = path == "/" || path == "/api/docs" || path.starts_with("/ui/");
         for comer in &comers {
@@ -89,11 +110,16 @@ async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
         check(&response, ANSWER, &path);
     }
     // A type that would make it one is refused.
-    let manifest = get(&format!("/v2/talker/manifests/{}", package.manifest.digest)).send().await.expect("an answer");
+    let manifest = get(&format!("/v2/talker/manifests/{}", package.manifest.digest))
+        .send()
+        .await
+        .expect("an answer");
     let mut manifest: Value = manifest.json().await.expect("JSON");
     // What it says itself would contradict.
     manifest.as_object_mut().expect("an object").remove("mediaType").expect("it has one");
-    let put = server.request(Method::PUT, "/v2/talker/manifests/2.0.0").header("content-type", "text/html");
+    let put = server
+        .request(Method::PUT, "/v2/talker/manifests/2.0.0")
+        .header("content-type", "text/html");
     let refused = put.body(manifest.to_string()).send().await.expect("an answer");
     assert_eq!(refused.status(), 400);
     check(&refused, ANSWER, "a manifest that is said to be HTML");
@@ -101,11 +127,13 @@ async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
     assert_eq!(answer["errors"][0]["code"], "MANIFEST_INVALID");
     let message = answer["errors"][0]["message"].as_str().expect("text");
     assert!(message.contains("text/html"), "{message}");
-    let too_large = server.request(Method::POST, "/api/v1/users").json(&json!({ "name": "x".repeat(100_000) }));
+    let too_large =
+        server.request(Method::POST, "/api/v1/users").json(&json!({ "name": "x".repeat(100_000) }));
     check(&too_large.send().await.expect("an answer"), ANSWER, "a body that is too large");
     let page = server.bare(Method::GET, "/").send().await.expect("an answer");
     let tag = page.headers()["etag"].clone();
-    let known = server.bare(Method::GET, "/").header("if-none-match", tag).send().await.expect("an answer");
+    let known =
+        server.bare(Method::GET, "/").header("if-none-match", tag).send().await.expect("an answer");
     assert_eq!(known.status(), 304);
     check(&known, PAGE, "the page that has not changed");
 }

@@ -45,7 +45,10 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
     fleet.report(&mut robot).await;
     fleet.clock.advance_ms(1000);
     // Progress alone is no step.
-    robot.tasks.values_mut().for_each(|task| task.progress = Some(task_proto::report::Progress { done: 1, total: 2 }));
+    robot
+        .tasks
+        .values_mut()
+        .for_each(|task| task.progress = Some(task_proto::report::Progress { done: 1, total: 2 }));
     fleet.report(&mut robot).await;
     fleet.follow(&mut robot, Phase::Running).await;
     let at = |seconds: u64| began_ms + seconds * 1000;
@@ -57,7 +60,10 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
     ];
     let running = newest(&fleet, &robot).await;
     assert_eq!(steps(&running), so_far);
-    assert_eq!((running.deployment.clone(), running.created_at_ms, running.attempts), (first.clone(), began_ms, 1));
+    assert_eq!(
+        (running.deployment.clone(), running.created_at_ms, running.attempts),
+        (first.clone(), began_ms, 1)
+    );
     assert!(running.wanted.is_some() && running.released && running.superseded_by.is_none());
     let shown = fleet.deployment(&first).await.assignments.expect("asked for").remove(0);
     assert_eq!(shown.timeline, Some(running.timeline.clone()));
@@ -66,7 +72,10 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
     let second = fleet.deploy("2.0.0", |_| {}).await;
     let all = HistoryQuery { task: None, before: None, limit: 10 };
     let mut past = history(&fleet, &robot, all).await.assignments;
-    assert_eq!(past.iter().map(|past| past.deployment.clone()).collect::<Vec<_>>(), [second.clone(), first]);
+    assert_eq!(
+        past.iter().map(|past| past.deployment.clone()).collect::<Vec<_>>(),
+        [second.clone(), first]
+    );
     let replaced = past.remove(1);
     assert_eq!(steps(&replaced)[4..], [(Phase::Superseded, at(4), 0)]);
     assert_eq!((replaced.superseded_by, replaced.wanted), (Some(second.clone()), None));
@@ -81,12 +90,18 @@ async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
     fleet.follow(&mut robot, Phase::Running).await;
-    // Of the orders up to this one the database knows nothing; with the next it takes over what the robot has.
+    // Of the orders up to this one the database knows nothing; with the next it takes over what the
+    // robot has.
     robot.observed = Generation(7);
     fleet.report(&mut robot).await;
     let (task, all) = ("talker".parse().expect("a name"), "*".parse().expect("a selector"));
-    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &all).await.expect("ordered");
-    let phases: Vec<Phase> = newest(&fleet, &robot).await.timeline.iter().map(|entry| entry.phase).collect();
+    fleet
+        .actions
+        .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &all)
+        .await
+        .expect("ordered");
+    let phases: Vec<Phase> =
+        newest(&fleet, &robot).await.timeline.iter().map(|entry| entry.phase).collect();
     assert_eq!(phases, [Phase::Assigned, Phase::Running, Phase::Stopped, Phase::Running]);
 }
 
@@ -101,7 +116,8 @@ async fn a_long_timeline_keeps_its_beginning_and_its_end(database: TestDatabase)
             fleet.follow(&mut robot, phase).await;
         }
     }
-    let at: Vec<u64> = newest(&fleet, &robot).await.timeline.iter().map(|entry| entry.at_ms - began_ms).collect();
+    let at: Vec<u64> =
+        newest(&fleet, &robot).await.timeline.iter().map(|entry| entry.at_ms - began_ms).collect();
     let half = MAX_TIMELINE as u64 / 2;
     assert_eq!(at, (0..half).chain(101 - half..101).collect::<Vec<_>>());
 }
@@ -113,21 +129,35 @@ async fn a_robots_history_is_read_in_pages(database: TestDatabase) {
     for version in ["1.0.0", "1.1.0", "1.2.0"] {
         ordered.insert(0, fleet.deploy(version, |_| {}).await);
     }
-    let ids = |page: &HistoryPage| page.assignments.iter().map(|past| past.deployment.clone()).collect::<Vec<_>>();
-    let page = history(&fleet, &robots[0], HistoryQuery { task: None, before: None, limit: 2 }).await;
+    let ids = |page: &HistoryPage| {
+        page.assignments.iter().map(|past| past.deployment.clone()).collect::<Vec<_>>()
+    };
+    let page =
+        history(&fleet, &robots[0], HistoryQuery { task: None, before: None, limit: 2 }).await;
     assert_eq!((ids(&page), page.next.as_ref()), (ordered[..2].to_vec(), Some(&ordered[1])));
-    let page = history(&fleet, &robots[0], HistoryQuery { task: None, before: page.next.as_ref(), limit: 2 }).await;
+    let page = history(
+        &fleet,
+        &robots[0],
+        HistoryQuery { task: None, before: page.next.as_ref(), limit: 2 },
+    )
+    .await;
     assert_eq!((ids(&page), page.next.as_ref()), (ordered[2..].to_vec(), None));
     let task = page.assignments[0].package.name.clone();
     let of = |task| HistoryQuery { task: Some(task), before: None, limit: 9 };
     assert_eq!(history(&fleet, &robots[1], of(&task)).await.assignments.len(), 3);
-    assert_eq!(history(&fleet, &robots[1], of(&"other".parse().expect("a name"))).await.assignments.len(), 0);
+    assert_eq!(
+        history(&fleet, &robots[1], of(&"other".parse().expect("a name"))).await.assignments.len(),
+        0
+    );
     let unknown = task_proto::DeploymentId::random();
     let before = HistoryQuery { task: None, before: Some(&unknown), limit: 9 };
-    assert!(fleet.database.store.task_history(&robots[0].id, before).await.expect("read").is_none());
+    assert!(
+        fleet.database.store.task_history(&robots[0].id, before).await.expect("read").is_none()
+    );
     let selector = robots[0].id.as_str().parse().expect("a selector");
     let key = random_key();
-    let order = fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Remove, &task, &selector);
+    let order =
+        fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Remove, &task, &selector);
     order.await.expect("removed");
     assert_eq!(newest(&fleet, &robots[0]).await.wanted, None);
 }
@@ -138,7 +168,8 @@ async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
     let before = fleet.desired(&robots[0]).await.expect("a state");
     assert!(before.settings.is_empty());
     let set = async |settings: serde_json::Value| {
-        let edit: EditRobot = serde_json::from_value(json!({ "settings": settings })).expect("parses");
+        let edit: EditRobot =
+            serde_json::from_value(json!({ "settings": settings })).expect("parses");
         fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &edit).await
     };
     let wanted = json!({ "workspace": "/home/robot/it's ws", "ros_domain_id": 7, "limits": { "task_memory_mb": 512 } });
@@ -149,9 +180,14 @@ async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
     assert_eq!(fleet.changes.take_rings().await.robots, [robots[0].id.clone()].into());
     assert_eq!(fleet.view(&robots[0]).await.settings, Some(wanted.clone()));
     set(serde_json::to_value(&wanted).expect("json")).await.expect("the same");
-    assert_eq!(fleet.desired(&robots[0]).await.expect("a state").generation, state.generation, "nothing is new");
+    assert_eq!(
+        fleet.desired(&robots[0]).await.expect("a state").generation,
+        state.generation,
+        "nothing is new"
+    );
     assert!(set(json!({ "limits": { "parallel_tasks": 0 } })).await.is_err());
-    let renamed = EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
+    let renamed =
+        EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
     fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &renamed).await.expect("renamed");
     assert_eq!(fleet.desired(&robots[0]).await.expect("a state").settings, wanted, "absent stays");
     set(serde_json::Value::Null).await.expect("cleared");

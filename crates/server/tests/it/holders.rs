@@ -1,4 +1,5 @@
-//! One person or one robot that takes as much of HTTP as it can get, by ordinary tokens: others still get their turn.
+//! One person or one robot that takes as much of HTTP as it can get, by ordinary tokens: others
+//! still get their turn.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -28,7 +29,9 @@ impl TestServer {
     pub async fn sign_in_as(&self, name: &str, role: &str) -> String {
         let user = json!({ "name": name, "roles": [role], "password": PASSWORD });
         let _: Value = self.post("/api/v1/users", &user).await;
-        let request = self.bare(Method::POST, "/api/v1/login").json(&json!({ "user": name, "password": PASSWORD }));
+        let request = self
+            .bare(Method::POST, "/api/v1/login")
+            .json(&json!({ "user": name, "password": PASSWORD }));
         answer::<AccessToken>(request).await.token
     }
 
@@ -59,7 +62,8 @@ impl Flood {
         let (answered, progress) = (Arc::<AtomicUsize>::default(), Arc::<Notify>::default());
         let mut tasks = JoinSet::new();
         for _ in 0..CONNECTIONS + 10 {
-            let (address, request) = (server.server.addresses().http.parse().expect("an address"), request.to_owned());
+            let (address, request) =
+                (server.server.addresses().http.parse().expect("an address"), request.to_owned());
             let (answered, progress) = (answered.clone(), progress.clone());
             tasks.spawn(async move {
                 loop {
@@ -67,7 +71,9 @@ impl Flood {
                     // What is not read soon blocks the server.
                     socket.set_recv_buffer_size(4096).expect("set");
                     let Ok(mut stream) = socket.connect(address).await else { continue };
-                    if stream.write_all(request.as_bytes()).await.is_err() || stream.read_u8().await.is_err() {
+                    if stream.write_all(request.as_bytes()).await.is_err()
+                        || stream.read_u8().await.is_err()
+                    {
                         continue;
                     }
                     answered.fetch_add(1, Ordering::SeqCst);
@@ -95,7 +101,8 @@ impl Flood {
 
 async fn crowded_server() -> (TestServer, TestRobot, String) {
     let directory = tempfile::tempdir().expect("a directory");
-    let server = TestServer::start_in(directory, |config| config.max_http_connections = CONNECTIONS).await;
+    let server =
+        TestServer::start_in(directory, |config| config.max_http_connections = CONNECTIONS).await;
     let robot = server.enroll("atlas").await;
     // More than the buffers between server and client hold.
     let package = server.push_content("talker", "1.0.0", archive_of(32 << 20, 7)).await;
@@ -107,12 +114,20 @@ async fn crowded_server() -> (TestServer, TestRobot, String) {
 /// An operator stops the task, and the robot hears of it, by connections that have to be made now.
 async fn is_stopped_soon(server: &TestServer, robot: &TestRobot) {
     let (operator, agent) = (server.fresh_client(), server.fresh_client());
-    let stop = operator.post(server.url("/api/v1/tasks/talker/stop")).bearer_auth(server.operator.reveal());
+    let stop = operator
+        .post(server.url("/api/v1/tasks/talker/stop"))
+        .bearer_auth(server.operator.reveal());
     let stop = stop.header(IDEMPOTENCY_KEY, "stop").json(&json!({ "selector": "atlas" }));
-    let stopped = timeout(SOON, stop.send()).await.expect("the operator gets a connection").expect("an answer");
+    let stopped = timeout(SOON, stop.send())
+        .await
+        .expect("the operator gets a connection")
+        .expect("an answer");
     assert_eq!(stopped.status(), StatusCode::OK, "{}", stopped.text().await.unwrap_or_default());
-    let ask = agent.get(server.url(&format!("/api/v1/robots/{}/desired", robot.id))).bearer_auth(&robot.token);
-    let told = timeout(SOON, ask.send()).await.expect("the robot gets a connection").expect("an answer");
+    let ask = agent
+        .get(server.url(&format!("/api/v1/robots/{}/desired", robot.id)))
+        .bearer_auth(&robot.token);
+    let told =
+        timeout(SOON, ask.send()).await.expect("the robot gets a connection").expect("an answer");
     assert_eq!(told.status(), StatusCode::OK);
 }
 
@@ -120,7 +135,8 @@ async fn is_stopped_soon(server: &TestServer, robot: &TestRobot) {
 async fn viewer_that_takes_every_connection_does_not_keep_a_robot_from_being_stopped() {
     let (server, robot, blob) = crowded_server().await;
     let viewer = server.sign_in_as("mallory", "viewer").await;
-    let request = format!("GET {blob} HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {viewer}\r\n\r\n");
+    let request =
+        format!("GET {blob} HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {viewer}\r\n\r\n");
     let flood = Flood::start(&server, &request, Afterwards::ReadsNothing);
     flood.reached(CONNECTIONS).await;
     is_stopped_soon(&server, &robot).await;
@@ -148,9 +164,12 @@ struct Answers {
     refused: AtomicUsize,
 }
 
-/// Sends the request `times` on one connection and counts what comes back, until the server ends it.
+/// Sends the request `times` on one connection and counts what comes back, until the server ends
+/// it.
 async fn pipeline(server: &TestServer, request: &str, times: usize, answers: &Answers) {
-    let stream = tokio::net::TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
+    let stream = tokio::net::TcpStream::connect(&server.server.addresses().http)
+        .await
+        .expect("a connection");
     let (mut read, mut write) = stream.into_split();
     let last = request.replace("\r\n\r\n", "\r\nconnection: close\r\n\r\n");
     let requests = [request.repeat(times - 1), last].concat();
@@ -160,7 +179,9 @@ async fn pipeline(server: &TestServer, request: &str, times: usize, answers: &An
         loop {
             let length = read.read(&mut buffer).await.expect("read");
             seen.extend_from_slice(&buffer[..length]);
-            for (status, count) in [(b"HTTP/1.1 200 ", &answers.served), (b"HTTP/1.1 429 ", &answers.refused)] {
+            for (status, count) in
+                [(b"HTTP/1.1 200 ", &answers.served), (b"HTTP/1.1 429 ", &answers.refused)]
+            {
                 let found = seen.windows(status.len()).filter(|window| window == status).count();
                 count.fetch_add(found, Ordering::SeqCst);
             }
@@ -184,7 +205,8 @@ async fn eight_thousand_lists_of_one_viewer_do_not_delay_a_robot() {
         server.enroll(&format!("robot{n}")).await;
     }
     let viewer = server.sign_in_as("mallory", "viewer").await;
-    let request = format!("GET /api/v1/robots HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {viewer}\r\n\r\n");
+    let request =
+        format!("GET /api/v1/robots HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {viewer}\r\n\r\n");
     let answers = Answers::default();
     let flood = async {
         let connections = (0..200).map(|_| pipeline(&server, &request, 40, &answers));
@@ -202,7 +224,10 @@ async fn eight_thousand_lists_of_one_viewer_do_not_delay_a_robot() {
         }
         overtaken.sort_unstable();
         let [median, most] = [overtaken[10], overtaken[19]];
-        assert!(median < 40 && most < 120, "lists that were served while the robot waited: {overtaken:?}");
+        assert!(
+            median < 40 && most < 120,
+            "lists that were served while the robot waited: {overtaken:?}"
+        );
     };
     // The last connections of the flood are slowed, not refused, so it takes long to end.
     let most_refused = async {
@@ -227,13 +252,19 @@ async fn person_over_the_rate_is_told_when_to_come_again_and_may_still_order() {
     let package = server.push("talker", "1.0.0").await;
     let refused = async || loop {
         let asked = (0..30).map(|_| server.request(Method::GET, "/api/v1/me").send());
-        let answers = futures_util::future::join_all(asked).await.into_iter().map(|answer| answer.expect("an answer"));
-        if let Some(refused) = answers.into_iter().find(|answer| answer.status() == StatusCode::TOO_MANY_REQUESTS) {
+        let answers = futures_util::future::join_all(asked)
+            .await
+            .into_iter()
+            .map(|answer| answer.expect("an answer"));
+        if let Some(refused) =
+            answers.into_iter().find(|answer| answer.status() == StatusCode::TOO_MANY_REQUESTS)
+        {
             return refused;
         }
     };
     let refused = timeout(PATIENCE, refused()).await.expect("refused");
-    let seconds: u64 = refused.headers()["retry-after"].to_str().expect("text").parse().expect("seconds");
+    let seconds: u64 =
+        refused.headers()["retry-after"].to_str().expect("text").parse().expect("seconds");
     assert!((1..=11).contains(&seconds), "{seconds}");
     assert!(refused.text().await.expect("a body").contains("too many requests"));
     server.deploy(&package, "atlas", "order").await;
@@ -247,7 +278,11 @@ async fn person_has_one_upload_at_a_time() {
         let request = server.bare(Method::POST, "/api/v1/packages").bearer_auth(token);
         request.header("content-type", "application/x-tar").body(body)
     };
-    let endless = || reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
+    let endless = || {
+        reqwest::Body::wrap_stream(
+            futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>(),
+        )
+    };
     // The other upload may have the place for a moment.
     let first = async { while refusal(upload(&publisher, endless())).await.0 == 429 {} };
     let second = async { while refusal(upload(&publisher, "hello".into())).await.0 != 429 {} };
@@ -256,5 +291,9 @@ async fn person_has_one_upload_at_a_time() {
         refused = timeout(PATIENCE, second) => refused.expect("no second one"),
     }
     let operator = server.operator.reveal();
-    assert_eq!(refusal(upload(&operator, "hello".into())).await.0, 422, "another person has a place");
+    assert_eq!(
+        refusal(upload(&operator, "hello".into())).await.0,
+        422,
+        "another person has a place"
+    );
 }

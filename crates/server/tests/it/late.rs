@@ -1,5 +1,5 @@
-//! Orders that come too late, or for robots about which the database knows too little: nothing is taken away by them, and
-//! nothing moves again that somebody stopped.
+//! Orders that come too late, or for robots about which the database knows too little: nothing is
+//! taken away by them, and nothing moves again that somebody stopped.
 
 use task_proto::Generation;
 use task_proto::api::DeploymentState;
@@ -25,13 +25,18 @@ on_both_databases! {
     a_robot_that_obeys_another_state_of_the_same_generation_has_diverged,
 }
 
-/// What is ordered of a task that has run, and does not reach its robot in time, takes nothing away from it.
+/// What is ordered of a task that has run, and does not reach its robot in time, takes nothing away
+/// from it.
 async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let order = async |order| {
-        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered");
+        fleet
+            .actions
+            .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
+            .await
+            .expect("ordered");
     };
     fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -54,7 +59,11 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
         fleet.actions.expire().await.expect("done");
         for robot in &robots {
             let desired = fleet.desired(robot).await.expect("state").tasks.remove(0);
-            assert_eq!((desired.deployment, desired.wanted, desired.run), (new.clone(), wanted, 1), "{late:?}");
+            assert_eq!(
+                (desired.deployment, desired.wanted, desired.run),
+                (new.clone(), wanted, 1),
+                "{late:?}"
+            );
         }
         assert_eq!(fleet.phases(&new).await, [phase; 2], "{late:?}");
     }
@@ -64,10 +73,15 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
     for robot in &robots {
         assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, new);
     }
-    // The robot may have begun one of those runs without saying so: it would take the next for the same one, and not run it.
-    // Who has heard of a restart, and did not come to it, does not come to it later.
+    // The robot may have begun one of those runs without saying so: it would take the next for the
+    // same one, and not run it. Who has heard of a restart, and did not come to it, does not come
+    // to it later.
     order(TaskOrder::Restart).await;
-    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].run, 5, "2, 3 and 4 were taken back");
+    assert_eq!(
+        fleet.desired(&robots[0]).await.expect("state").tasks[0].run,
+        5,
+        "2, 3 and 4 were taken back"
+    );
     fleet.follow(&mut robots[0], Phase::Staged).await;
     fleet.clock.advance_ms(8 * 24 * 3_600_000);
     fleet.actions.expire().await.expect("done");
@@ -80,7 +94,11 @@ async fn what_was_stopped_stays_so(database: TestDatabase) {
     let mut robots = fleet.enroll(2).await;
     let order = async |order| {
         let (task, of) = ("talker".parse().expect("valid"), "r1".parse().expect("valid"));
-        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &of).await.expect("ordered");
+        fleet
+            .actions
+            .order_task(&fleet.operator, &random_key(), order, &task, &of)
+            .await
+            .expect("ordered");
     };
     let old = fleet.deploy("1", |_| ()).await;
     for robot in &mut robots {
@@ -106,7 +124,8 @@ async fn what_was_stopped_stays_so(database: TestDatabase) {
 async fn a_silent_robot_holds_up_its_batch_and_no_later_one(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
-    let id = fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
+    let id =
+        fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
     fleet.clock.advance_ms(60_000);
     fleet.actions.expire().await.expect("done");
     assert_eq!(fleet.phases(&id).await, [Phase::Expired, Phase::Assigned, Phase::Assigned]);
@@ -126,7 +145,8 @@ async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase
     let other = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
     fleet.actions.cancel_deployment(&fleet.operator, &other).await.expect("cancelled");
     assert_eq!(fleet.phases(&first).await[0], Phase::Assigned);
-    let has_it = async |robot: &Robot| fleet.desired(robot).await.is_ok_and(|state| !state.tasks.is_empty());
+    let has_it =
+        async |robot: &Robot| fleet.desired(robot).await.is_ok_and(|state| !state.tasks.is_empty());
     assert!(has_it(&robots[1]).await && !has_it(&robots[2]).await);
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert!(has_it(&robots[2]).await);
@@ -153,7 +173,10 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
     let newer = fleet.deploy("2", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Running).await;
-    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &id).await), "nothing_to_cancel");
+    assert_eq!(
+        code(fleet.actions.cancel_deployment(&fleet.operator, &id).await),
+        "nothing_to_cancel"
+    );
     // Where it failed, the version before comes back.
     let broken = fleet.deploy("3", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -181,7 +204,8 @@ async fn nobody_takes_over_robots_that_are_not_theirs(database: TestDatabase) {
     let (fleet, robots) = restored(database, 2).await;
     let alice = fleet.limited("alice", "r0").await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let meant = fleet.actions.order_task(&alice, &random_key(), TaskOrder::Stop, &task, &everyone).await;
+    let meant =
+        fleet.actions.order_task(&alice, &random_key(), TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(meant.expect("ordered").len(), 1);
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(2));
     assert_eq!(fleet.view(&robots[1]).await.generation, Generation(0));
@@ -191,11 +215,20 @@ async fn nobody_takes_over_robots_that_are_not_theirs(database: TestDatabase) {
 async fn a_robots_word_opens_no_blob(database: TestDatabase) {
     let (fleet, robots) = restored(database, 1).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await.expect("ordered");
+    fleet
+        .actions
+        .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
+        .await
+        .expect("ordered");
     let named = package("1", TaskKind::Service).package;
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].package, named);
     let may = async || {
-        let order = fleet.database.store.fetched_by(&robots[0].id, &named.content.digest).await.expect("reads");
+        let order = fleet
+            .database
+            .store
+            .fetched_by(&robots[0].id, &named.content.digest)
+            .await
+            .expect("reads");
         order.is_some()
     };
     assert!(!may().await, "it may have made it up");
@@ -212,7 +245,11 @@ async fn what_was_taken_over_can_be_rolled_back_to(database: TestDatabase) {
     fleet.follow(&mut robots[0], Phase::Failed).await;
     assert_eq!(fleet.phases(&two).await, [Phase::Failed]);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let back = fleet.actions.roll_back(&fleet.operator, &random_key(), &task, &everyone).await.expect("there is one");
+    let back = fleet
+        .actions
+        .roll_back(&fleet.operator, &random_key(), &task, &everyone)
+        .await
+        .expect("there is one");
     assert_eq!(back.robots.len(), 1);
     assert_eq!(fleet.version(&robots[0]).await, "1");
 }
@@ -230,7 +267,9 @@ async fn an_order_for_a_robot_that_diverged_since_expires(database: TestDatabase
     assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
 }
 
-async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(database: TestDatabase) {
+async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(
+    database: TestDatabase,
+) {
     let (fleet, mut robots) = restored(database, 1).await;
     // As if it had not reported yet. One order was lost, and one is made before it does.
     let robot = &mut robots[0];
@@ -241,7 +280,10 @@ async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(da
     (robot.tasks, robot.observed) = (tasks, Generation(1));
     fleet.report(robot).await;
     assert_eq!(fleet.version(robot).await, "2");
-    let contradicted = Condition { code: Report::STATE_CONTRADICTED.to_owned(), text: "it is not the same".to_owned() };
+    let contradicted = Condition {
+        code: Report::STATE_CONTRADICTED.to_owned(),
+        text: "it is not the same".to_owned(),
+    };
     let report = Report { conditions: vec![contradicted], ..robot.next_report() };
     fleet.writer.submit(report, 0).await.expect("stored");
     let view = fleet.view(robot).await;
@@ -249,7 +291,11 @@ async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(da
     assert_eq!(code(fleet.desired(robot).await), "diverged");
     // The next order starts from what it has.
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await.expect("ordered");
+    fleet
+        .actions
+        .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
+        .await
+        .expect("ordered");
     let desired = fleet.desired(robot).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks[0].wanted), (Generation(3), Wanted::Stopped));
     assert_eq!(desired.tasks[0].package.version.as_str(), "1");

@@ -21,10 +21,16 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
     fleet.enroll(12).await;
     // The order is that of the bytes, on every database: capitals come first, r10 before r2.
     let everything = Scope::everything();
-    let page = async |scope: &Scope, selector: Option<&str>, after: Option<&RobotName>, limit: usize| {
-        let selector = selector.map(|selector| selector.parse().expect("a selector"));
-        fleet.database.store.robots_page(scope, selector.as_ref(), after, limit).await.expect("reads")
-    };
+    let page =
+        async |scope: &Scope, selector: Option<&str>, after: Option<&RobotName>, limit: usize| {
+            let selector = selector.map(|selector| selector.parse().expect("a selector"));
+            fleet
+                .database
+                .store
+                .robots_page(scope, selector.as_ref(), after, limit)
+                .await
+                .expect("reads")
+        };
     let (mut names, mut after) = (Vec::new(), None);
     loop {
         let page = page(&everything, None, after.as_ref(), 5).await;
@@ -38,9 +44,13 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
     }
     assert_eq!(names, ["r0", "r1", "r10", "r11", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9"]);
     let some = page(&everything, Some("!r10,!r4"), Some(&"r1".parse().expect("a name")), 3).await;
-    assert_eq!(some.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["r11", "r2", "r3"]);
+    assert_eq!(
+        some.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        ["r11", "r2", "r3"]
+    );
     assert_eq!((some.total, some.next), (10, Some("r3".parse().expect("a name"))));
-    // A page that holds all that is left is the last one; whoever is gone can still be gone on from.
+    // A page that holds all that is left is the last one; whoever is gone can still be gone on
+    // from.
     let scope = Scope::of(["r2,r3,r9".parse().expect("a selector")]);
     let last = page(&scope, None, Some(&"r2x".parse().expect("a name")), 2).await;
     assert_eq!((last.robots.len(), last.total, last.next), (2, 3, None));
@@ -53,15 +63,25 @@ async fn pages_of_deployments_have_each_once(database: TestDatabase) {
     for version in 0..7 {
         let selector = if version % 3 == 0 { "*" } else { "r0" };
         ordered.push(
-            fleet.deploy(&version.to_string(), |order| order.selector = selector.parse().expect("a selector")).await,
+            fleet
+                .deploy(&version.to_string(), |order| {
+                    order.selector = selector.parse().expect("a selector")
+                })
+                .await,
         );
     }
     ordered.reverse();
     let pages = async |robots: Option<&[Robot]>| {
-        let robots: Option<Vec<_>> = robots.map(|robots| robots.iter().map(|robot| robot.id.clone()).collect());
+        let robots: Option<Vec<_>> =
+            robots.map(|robots| robots.iter().map(|robot| robot.id.clone()).collect());
         let (mut found, mut before) = (Vec::new(), None);
         loop {
-            let page = fleet.database.store.deployments(robots.as_deref(), before.as_ref(), 3).await.expect("reads");
+            let page = fleet
+                .database
+                .store
+                .deployments(robots.as_deref(), before.as_ref(), 3)
+                .await
+                .expect("reads");
             let page = page.expect("it is there");
             found.push(page.deployments);
             before = page.next;
@@ -80,8 +100,17 @@ async fn pages_of_deployments_have_each_once(database: TestDatabase) {
     // Of those that concern only others nothing is shown, yet the pages go on.
     let some = pages(Some(&robots[1..])).await;
     assert_eq!(some.iter().map(Vec::len).collect::<Vec<_>>(), [1, 1, 1]);
-    assert!(some.iter().flatten().all(|view| view.counts.iter().map(|count| count.count).sum::<u64>() == 1));
-    let unknown = fleet.database.store.deployments(None, Some(&DeploymentId::random()), 3).await.expect("reads");
+    assert!(
+        some.iter()
+            .flatten()
+            .all(|view| view.counts.iter().map(|count| count.count).sum::<u64>() == 1)
+    );
+    let unknown = fleet
+        .database
+        .store
+        .deployments(None, Some(&DeploymentId::random()), 3)
+        .await
+        .expect("reads");
     assert!(unknown.is_none());
 }
 
@@ -94,8 +123,14 @@ async fn lists_come_in_pages() {
     let whole: BTreeMap<String, serde_json::Value> = server.get("/api/v1/robots").await;
     assert_eq!(whole.keys().collect::<Vec<_>>(), ["robots"], "without a limit nothing is new");
     let first: RobotList = server.get("/api/v1/robots?limit=2").await;
-    assert_eq!(first.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["atlas", "boreas"]);
-    assert_eq!((first.next.as_ref().map(RobotName::as_str), first.total), (Some("boreas"), Some(3)));
+    assert_eq!(
+        first.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        ["atlas", "boreas"]
+    );
+    assert_eq!(
+        (first.next.as_ref().map(RobotName::as_str), first.total),
+        (Some("boreas"), Some(3))
+    );
     let last: RobotList = server.get("/api/v1/robots?limit=2&after=boreas&selector=!atlas").await;
     assert_eq!(last.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["ceto"]);
     assert_eq!((last.next, last.total), (None, Some(2)));
@@ -105,7 +140,8 @@ async fn lists_come_in_pages() {
     let new = server.deploy(&package, "atlas", "two").await;
     let first: DeploymentList = server.get("/api/v1/deployments?limit=1").await;
     assert_eq!((&first.deployments[0].id, first.next.as_ref()), (&new.id, Some(&new.id)));
-    let last: DeploymentList = server.get(&format!("/api/v1/deployments?limit=1&before={}", new.id)).await;
+    let last: DeploymentList =
+        server.get(&format!("/api/v1/deployments?limit=1&before={}", new.id)).await;
     assert_eq!((&last.deployments[0].id, last.next), (&old.id, None));
 
     let get = |path: &str| server.request(reqwest::Method::GET, path);
@@ -124,7 +160,11 @@ async fn lists_come_in_pages() {
     let unknown = format!("/api/v1/deployments?before={}", DeploymentId::random());
     assert_eq!(refusal(get(&unknown)).await, (404, "not_found".to_owned()));
     // What was removed is passed over.
-    let gone = server.request(reqwest::Method::DELETE, "/api/v1/robots/boreas").send().await.expect("an answer");
+    let gone = server
+        .request(reqwest::Method::DELETE, "/api/v1/robots/boreas")
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(gone.status(), 204);
     let last: RobotList = answer(get("/api/v1/robots?limit=2&after=boreas")).await;
     assert_eq!((last.robots.len(), last.total), (1, Some(2)));

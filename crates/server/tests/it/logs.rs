@@ -1,4 +1,5 @@
-//! Log lines that robots publish: remembered, shown when the robot can't be asked, streamed to whoever follows.
+//! Log lines that robots publish: remembered, shown when the robot can't be asked, streamed to
+//! whoever follows.
 
 use std::time::Duration;
 
@@ -14,7 +15,9 @@ const PATIENCE: Duration = Duration::from_secs(10);
 
 fn batch(robot: &TestRobot, level: &str, text: &str) -> Vec<u8> {
     let line = json!({ "at_ms": 1_000, "level": level, "source": "stderr", "task": "talker", "text": text });
-    json!({ "robot_id": robot.id, "now_ms": 2_000, "lines": [line], "suppressed": 3 }).to_string().into_bytes()
+    json!({ "robot_id": robot.id, "now_ms": 2_000, "lines": [line], "suppressed": 3 })
+        .to_string()
+        .into_bytes()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -28,8 +31,11 @@ async fn what_a_robot_published_is_shown_when_it_is_away() {
     session.publish("log", b"{".to_vec()).await;
     drop(session);
     server.clock.advance_ms(5_000);
-    let shown = async |query: &str| -> LogsView { server.get(&format!("/api/v1/robots/atlas/logs{query}")).await };
-    let texts = |view: &LogsView| view.lines.iter().map(|line| line.text.clone()).collect::<Vec<_>>();
+    let shown = async |query: &str| -> LogsView {
+        server.get(&format!("/api/v1/robots/atlas/logs{query}")).await
+    };
+    let texts =
+        |view: &LogsView| view.lines.iter().map(|line| line.text.clone()).collect::<Vec<_>>();
     let view = shown("").await;
     assert_eq!((view.from, view.age_ms, view.suppressed), (LogsFrom::Server, 5_000, 6));
     assert!(view.reason.as_ref().is_some_and(|reason| !reason.is_empty()));
@@ -37,7 +43,11 @@ async fn what_a_robot_published_is_shown_when_it_is_away() {
     assert_eq!(texts(&shown("?level=error").await), ["empty"]);
     assert_eq!(texts(&shown("?task=other").await), Vec::<String>::new());
     assert_eq!(texts(&shown("?since_s=7&max_lines=1").await), ["empty"]);
-    assert_eq!(texts(&shown("?since_s=5").await), Vec::<String>::new(), "by the robot's clock they are 6 s old");
+    assert_eq!(
+        texts(&shown("?since_s=5").await),
+        Vec::<String>::new(),
+        "by the robot's clock they are 6 s old"
+    );
     let other: LogsView = server.get("/api/v1/robots/boreas/logs").await;
     assert_eq!((other.from, other.lines.len()), (LogsFrom::Server, 0));
     let wrong = refusal(server.request(Method::GET, "/api/v1/robots/atlas/logs?level=loud")).await;
@@ -46,7 +56,9 @@ async fn what_a_robot_published_is_shown_when_it_is_away() {
 }
 
 /// The data of the next event.
-async fn next_event(events: &mut (impl futures_util::Stream<Item = reqwest::Result<bytes::Bytes>> + Unpin)) -> Value {
+async fn next_event(
+    events: &mut (impl futures_util::Stream<Item = reqwest::Result<bytes::Bytes>> + Unpin),
+) -> Value {
     let next = async {
         loop {
             let chunk = events.next().await.expect("goes on").expect("readable");
@@ -68,8 +80,12 @@ async fn followers_are_told_where_the_robot_is_and_what_it_says() {
     assert_eq!(next_event(&mut events).await["type"], "away");
     let mut session = Session::open(&server, &robot).await;
     let asked = session.asked().await;
-    assert_eq!((&asked["ask"]["type"], &asked["ask"]["level"]), (&json!("follow"), &json!("error")));
-    let reply = json!({ "robot_id": robot.id, "id": asked["id"], "answer": { "type": "following" } });
+    assert_eq!(
+        (&asked["ask"]["type"], &asked["ask"]["level"]),
+        (&json!("follow"), &json!("error"))
+    );
+    let reply =
+        json!({ "robot_id": robot.id, "id": asked["id"], "answer": { "type": "following" } });
     session.publish("reply", reply.to_string().into_bytes()).await;
     while next_event(&mut events).await["type"] != "following" {}
     session.publish("log", batch(&robot, "warn", "not wanted")).await;

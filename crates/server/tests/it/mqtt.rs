@@ -1,4 +1,5 @@
-//! What clients of the broker may rely on, over real TCP: admission, access, delivery, takeover, wills, time limits.
+//! What clients of the broker may rely on, over real TCP: admission, access, delivery, takeover,
+//! wills, time limits.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -10,7 +11,9 @@ use task_proto::api::Traffic;
 use task_proto::topic::RobotTopic;
 use tokio::time::timeout;
 
-use crate::mqtt_harness::{Connect, PATIENCE, Seen, TestBroker, publish, subscribe, topic, unsubscribe};
+use crate::mqtt_harness::{
+    Connect, PATIENCE, Seen, TestBroker, publish, subscribe, topic, unsubscribe,
+};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn logins_get_the_right_answer() {
@@ -47,7 +50,11 @@ async fn logins_get_the_right_answer() {
         } else {
             raw.expect_close().await
         }
-        assert_eq!(broker.broker.connected_count(), usize::from(*code == 0 && index < 2), "case {index}");
+        assert_eq!(
+            broker.broker.connected_count(),
+            usize::from(*code == 0 && index < 2),
+            "case {index}"
+        );
         raw.send(&[0xe0, 0]).await;
         raw.expect_close().await;
     }
@@ -58,7 +65,8 @@ fn retained_will(robot: &RobotId, payload: &[u8]) -> Vec<u8> {
     let will = Some((topic(robot, RobotTopic::Status), payload.to_vec()));
     let mut packet = Connect { will, ..Connect::robot(robot) }.packet();
     // The flags follow the fixed header, the protocol name and its level.
-    let flags = packet.windows(5).position(|bytes| bytes == b"MQTT\x04").expect("a protocol name") + 5;
+    let flags =
+        packet.windows(5).position(|bytes| bytes == b"MQTT\x04").expect("a protocol name") + 5;
     packet[flags] |= 0x20;
     packet
 }
@@ -76,7 +84,8 @@ async fn message_to_be_retained_ends_the_session_unless_it_is_empty() {
             packet[0] |= 1;
             packet
         };
-        // It asks to forget what is retained, which is nothing, and is passed on as any other message.
+        // It asks to forget what is retained, which is nothing, and is passed on as any other
+        // message.
         client.send(&retained(b"")).await;
         match qos {
             1 => client.expect(&[0x40, 2, 0, 9]).await,
@@ -114,7 +123,8 @@ async fn an_independent_client_listens_and_speaks() {
     let (operator, mut from_operator) = client("somebody", "x", "operator");
     operator.subscribe("taskd/v1/r/+/report", QoS::ExactlyOnce).await.unwrap();
     operator.subscribe("#", QoS::AtLeastOnce).await.unwrap();
-    let (speaker, mut from_speaker) = client(robot.as_str(), robot.as_str(), &format!("pw-{robot}"));
+    let (speaker, mut from_speaker) =
+        client(robot.as_str(), robot.as_str(), &format!("pw-{robot}"));
     speaker.subscribe(topic(&robot, RobotTopic::Desired), QoS::AtLeastOnce).await.unwrap();
 
     let mut codes = Vec::new();
@@ -137,17 +147,27 @@ async fn an_independent_client_listens_and_speaks() {
                 Event::Incoming(Packet::SubAck(_)) => {
                     broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
                 }
-                Event::Incoming(Packet::Publish(message)) if message.topic.ends_with("desired") => rung = Some(message),
-                Event::Incoming(Packet::Publish(message)) => heard.push((message.qos, message.retain)),
+                Event::Incoming(Packet::Publish(message)) if message.topic.ends_with("desired") => {
+                    rung = Some(message)
+                }
+                Event::Incoming(Packet::Publish(message)) => {
+                    heard.push((message.qos, message.retain))
+                }
                 _ => {}
             }
         }
     })
     .await
     .expect("all should arrive");
-    assert_eq!(codes, [SubscribeReasonCode::Success(QoS::ExactlyOnce), SubscribeReasonCode::Failure]);
+    assert_eq!(
+        codes,
+        [SubscribeReasonCode::Success(QoS::ExactlyOnce), SubscribeReasonCode::Failure]
+    );
     assert_eq!(rung.unwrap().payload, "ding");
-    assert_eq!(heard, [(QoS::AtMostOnce, false), (QoS::AtLeastOnce, false), (QoS::ExactlyOnce, false)]);
+    assert_eq!(
+        heard,
+        [(QoS::AtMostOnce, false), (QoS::AtLeastOnce, false), (QoS::ExactlyOnce, false)]
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -156,7 +176,11 @@ async fn denied_subscriptions_are_refused_one_by_one() {
     let (robot, other) = (RobotId::random(), RobotId::random());
     let (own, foreign) = (topic(&robot, RobotTopic::Desired), topic(&other, RobotTopic::Desired));
     let mut raw = broker.robot(&robot).await;
-    raw.send(&subscribe(3, &[(&foreign, 1), (&own, 2), ("#", 0), ("taskd/v1/#", 0), ("$SYS/#", 0)])).await;
+    raw.send(&subscribe(
+        3,
+        &[(&foreign, 1), (&own, 2), ("#", 0), ("taskd/v1/#", 0), ("$SYS/#", 0)],
+    ))
+    .await;
     raw.expect(&[0x90, 7, 0, 3, 0x80, 2, 0x80, 0x80, 0x80]).await;
     let _other = broker.robot(&other).await;
     broker.broker.ring(&other, Bytes::from_static(b"secret")).unwrap();
@@ -172,7 +196,9 @@ async fn denied_subscriptions_are_refused_one_by_one() {
 async fn publishing_elsewhere_ends_the_connection() {
     let broker = TestBroker::start().await;
     let (robot, other) = (RobotId::random(), RobotId::random());
-    for name in [topic(&other, RobotTopic::Report), topic(&robot, RobotTopic::Desired), "x".to_owned()] {
+    for name in
+        [topic(&other, RobotTopic::Report), topic(&robot, RobotTopic::Desired), "x".to_owned()]
+    {
         let mut raw = broker.robot(&robot).await;
         raw.send(&publish(&name, 1, 1, b"forged")).await;
         raw.expect_close().await;
@@ -222,7 +248,10 @@ async fn qos_2_arrives_exactly_once() {
     raw.send(&publish(&topic(&robot, RobotTopic::Report), 2, 5, b"twice")).await;
     raw.expect(&[0x50, 2, 0, 5]).await;
     for payload in ["once", "twice"] {
-        assert_eq!(broker.next_of(&robot).await, Seen::Received(robot.clone(), RobotTopic::Report, payload.into()));
+        assert_eq!(
+            broker.next_of(&robot).await,
+            Seen::Received(robot.clone(), RobotTopic::Report, payload.into())
+        );
     }
 }
 
@@ -284,7 +313,9 @@ async fn the_old_session_has_ended_before_the_new_one_lives() {
             assert_eq!(broker.next_of(&robot).await, gone, "round {round}");
             assert_eq!(broker.next_of(&robot).await, Seen::Disconnected(robot.clone(), number));
         }
-        let Seen::Connected(_, number) = broker.next_of(&robot).await else { panic!("connected should come") };
+        let Seen::Connected(_, number) = broker.next_of(&robot).await else {
+            panic!("connected should come")
+        };
         last = Some((raw, number));
     }
     assert_eq!(broker.broker.connected_count(), 1);
@@ -332,7 +363,11 @@ async fn silence_beyond_the_keepalive_ends_the_session() {
     let mut raw = broker.raw_with(&connect.packet()).await;
     raw.expect(&[0x20, 2, 0, 0]).await;
     raw.expect_close().await;
-    assert!((Duration::from_millis(1500)..Duration::from_secs(5)).contains(&begin.elapsed()), "{:?}", begin.elapsed());
+    assert!(
+        (Duration::from_millis(1500)..Duration::from_secs(5)).contains(&begin.elapsed()),
+        "{:?}",
+        begin.elapsed()
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -343,11 +378,20 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
     assert_eq!(broker.broker.traffic_of(&robot), None);
     let mut raw = broker.robot(&robot).await;
     let connect = Connect::robot(&robot).packet().len() as u64;
-    let mut expected = Traffic { bytes_in: connect, bytes_out: 4, packets_in: 1, packets_out: 1, ..Traffic::default() };
+    let mut expected = Traffic {
+        bytes_in: connect,
+        bytes_out: 4,
+        packets_in: 1,
+        packets_out: 1,
+        ..Traffic::default()
+    };
     assert_eq!(broker.broker.traffic_of(&robot), Some(expected));
 
-    let (listen, say, told) =
-        (subscribe(3, &[(&desired, 1)]), publish(&report, 1, 1, b"report"), publish(&desired, 1, 1, b"ding"));
+    let (listen, say, told) = (
+        subscribe(3, &[(&desired, 1)]),
+        publish(&report, 1, 1, b"report"),
+        publish(&desired, 1, 1, b"ding"),
+    );
     raw.send(&listen).await;
     raw.expect(&[0x90, 3, 0, 3, 1]).await;
     raw.send(&say).await;
@@ -359,13 +403,18 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
     expected.bytes_in += (listen.len() + say.len() + 4 + 2) as u64;
     expected.bytes_out += (5 + 4 + told.len() + 2) as u64;
     (expected.packets_in, expected.packets_out) = (5, 5);
-    (expected.messages_in, expected.messages_out, expected.acks_in, expected.acks_out) = (1, 1, 1, 1);
+    (expected.messages_in, expected.messages_out, expected.acks_in, expected.acks_out) =
+        (1, 1, 1, 1);
     assert_eq!(broker.broker.traffic_of(&robot), Some(expected));
     let all = broker.broker.traffic();
-    assert_eq!((all.robots_connected, all.connections_accepted, all.connections_refused), (1, 1, 0));
+    assert_eq!(
+        (all.robots_connected, all.connections_accepted, all.connections_refused),
+        (1, 1, 0)
+    );
     assert_eq!((all.messages_refused, all.messages_dropped, all.all), (0, 0, expected));
 
-    // Others count for themselves and for all: one whose password is wrong, one that says what it may not.
+    // Others count for themselves and for all: one whose password is wrong, one that says what it
+    // may not.
     let wrong = Connect { password: Some("wrong".to_owned()), ..Connect::robot(&other) }.packet();
     let mut refused = broker.raw_with(&wrong).await;
     refused.expect(&[0x20, 2, 0, 4]).await;
@@ -374,9 +423,15 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
     forger.send(&forged).await;
     forger.expect_close().await;
     let all = broker.broker.traffic();
-    assert_eq!((all.connections_accepted, all.connections_refused, all.messages_refused), (2, 1, 1));
+    assert_eq!(
+        (all.connections_accepted, all.connections_refused, all.messages_refused),
+        (2, 1, 1)
+    );
     assert_eq!(all.all.messages_in, 2);
-    assert_eq!(all.all.bytes_in, expected.bytes_in + (wrong.len() + connect as usize + forged.len()) as u64);
+    assert_eq!(
+        all.all.bytes_in,
+        expected.bytes_in + (wrong.len() + connect as usize + forged.len()) as u64
+    );
     assert_eq!(broker.broker.traffic_of(&robot), Some(expected), "the others' are not this one's");
 }
 
@@ -426,7 +481,8 @@ async fn a_new_token_ends_the_old_session_though_its_guest_is_given_up_on() {
 async fn who_sends_a_large_packet_slowly_is_not_silent_unless_it_trickles() {
     let broker = TestBroker::with(|limits| limits.connect_timeout = Duration::from_secs(5)).await;
     let (slow, trickling) = (RobotId::random(), RobotId::random());
-    // A client that says nothing is hung up on after five seconds; the others may be silent for seven and a half.
+    // A client that says nothing is hung up on after five seconds; the others may be silent for
+    // seven and a half.
     let mut five_seconds = broker.raw().await;
     let mut clients = Vec::new();
     for (robot, bytes) in [(&slow, 2048), (&trickling, 100)] {

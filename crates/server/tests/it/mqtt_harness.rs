@@ -1,4 +1,5 @@
-//! A broker with an in-memory gatekeeper and inbox, and a client that sends any bytes it is told to.
+//! A broker with an in-memory gatekeeper and inbox, and a client that sends any bytes it is told
+//! to.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -10,7 +11,8 @@ use futures_util::future::BoxFuture;
 use task_proto::RobotId;
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use taskd::broker::{
-    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal, RobotMessage,
+    Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
+    RobotMessage,
 };
 use taskd::config::TlsSettings;
 use taskd::limits::conduct::{Conduct, ConductLimits};
@@ -25,11 +27,13 @@ use tokio::time::timeout;
 /// More than anything here takes, unless it hangs.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Lets robots in with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some passwords meet other ends.
+/// Lets robots in with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some
+/// passwords meet other ends.
 #[derive(Default)]
 pub struct Door {
-    /// Says that somebody with `once-<robot id>` is being let in, for the first time, which [`Door::go_on`] ends. The second
-    /// time they are not. Somebody with `new-<robot id>` waits for that as well, and is a new token's first use.
+    /// Says that somebody with `once-<robot id>` is being let in, for the first time, which
+    /// [`Door::go_on`] ends. The second time they are not. Somebody with `new-<robot id>` waits for
+    /// that as well, and is a new token's first use.
     pub asked: Notify,
     pub go_on: Notify,
     was_asked: AtomicBool,
@@ -109,7 +113,12 @@ impl Inbox for Letterbox {
 
 /// Nobody is slowed or kept away.
 fn lenient() -> ConductLimits {
-    ConductLimits { messages_per_s: 1 << 40, bytes_per_s: 1 << 40, backoff: Duration::ZERO, ..ConductLimits::default() }
+    ConductLimits {
+        messages_per_s: 1 << 40,
+        bytes_per_s: 1 << 40,
+        backoff: Duration::ZERO,
+        ..ConductLimits::default()
+    }
 }
 
 /// A running broker.
@@ -143,7 +152,11 @@ impl TestBroker {
         Self::start_with(Some(tls), change, lenient()).await
     }
 
-    async fn start_with(tls: Option<Tls>, change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
+    async fn start_with(
+        tls: Option<Tls>,
+        change: impl FnOnce(&mut Limits),
+        conduct: ConductLimits,
+    ) -> Self {
         let conduct = Conduct::new(conduct);
         let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
         change(&mut limits);
@@ -172,7 +185,9 @@ impl TestBroker {
         timeout(PATIENCE, async {
             loop {
                 let next = seen.recv().await.unwrap();
-                let (Seen::Connected(who, _) | Seen::Disconnected(who, _) | Seen::Received(who, ..)) = &next;
+                let (Seen::Connected(who, _)
+                | Seen::Disconnected(who, _)
+                | Seen::Received(who, ..)) = &next;
                 if who == robot {
                     return next;
                 }
@@ -183,7 +198,9 @@ impl TestBroker {
     }
 
     pub async fn raw(&self) -> Raw {
-        Raw { stream: timeout(PATIENCE, TcpStream::connect(self.address())).await.unwrap().unwrap() }
+        Raw {
+            stream: timeout(PATIENCE, TcpStream::connect(self.address())).await.unwrap().unwrap(),
+        }
     }
 
     /// A client that has sent `packet` first.
@@ -364,7 +381,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Raw<S> {
     /// The same for a packet that is too long to be shown.
     pub async fn expect_large(&mut self, packet: &[u8]) {
         let mut got = vec![0; packet.len()];
-        let read = timeout(PATIENCE, self.stream.read_exact(&mut got)).await.expect("the packet should come");
+        let read = timeout(PATIENCE, self.stream.read_exact(&mut got))
+            .await
+            .expect("the packet should come");
         read.expect("the packet should come whole");
         assert!(got == packet, "another packet came");
     }
@@ -373,7 +392,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Raw<S> {
     pub async fn expect_close(&mut self) {
         let mut rest = Vec::new();
         // A reset is a close as well.
-        let _ = timeout(PATIENCE, self.stream.read_to_end(&mut rest)).await.expect("the broker should close");
+        let _ = timeout(PATIENCE, self.stream.read_to_end(&mut rest))
+            .await
+            .expect("the broker should close");
         assert_eq!(rest, b"", "nothing should come before the end");
     }
 

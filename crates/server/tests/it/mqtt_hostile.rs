@@ -1,5 +1,5 @@
-//! What clients may not do to the broker: malformed, oversized, endless, rude and random bytes. After each case a
-//! healthy robot and a healthy operator still get through.
+//! What clients may not do to the broker: malformed, oversized, endless, rude and random bytes.
+//! After each case a healthy robot and a healthy operator still get through.
 
 use std::time::Duration;
 
@@ -12,7 +12,8 @@ use tokio::io::AsyncReadExt;
 use tokio::time::timeout;
 
 use crate::mqtt_harness::{
-    Connect, PATIENCE, Raw, TestBroker, binary, framed, publish, subscribe, text, topic, unsubscribe,
+    Connect, PATIENCE, Raw, TestBroker, binary, framed, publish, subscribe, text, topic,
+    unsubscribe,
 };
 
 /// CONNECT with any protocol name, level and flags.
@@ -121,7 +122,9 @@ fn violations(robot: &RobotId) -> Vec<Vec<u8>> {
         with_first(0xa0, unsubscribe(1, &[&own])),
         framed(0xa2, &[&[0, 1][..], &text(&own), &[0]].concat()),
     ];
-    for name in ["", "é", "ü/x", "$SYS/x", "$", "a/+", "#", "a\0b", "/", "\u{feff}", "router canary"] {
+    for name in
+        ["", "é", "ü/x", "$SYS/x", "$", "a/+", "#", "a\0b", "/", "\u{feff}", "router canary"]
+    {
         cases.push(publish(name, 0, 0, b"x"));
         cases.push(publish(name, 2, 1, b"x"));
     }
@@ -150,7 +153,8 @@ async fn violations_end_the_session_and_nothing_else() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_and_slow_clients_hold_up_nobody() {
-    let broker = TestBroker::with(|limits| limits.connect_timeout = Duration::from_millis(300)).await;
+    let broker =
+        TestBroker::with(|limits| limits.connect_timeout = Duration::from_millis(300)).await;
     let mut silent = Vec::new();
     for _ in 0..50 {
         silent.push(broker.raw().await);
@@ -178,8 +182,11 @@ async fn silent_and_slow_clients_hold_up_nobody() {
 async fn a_client_that_comes_byte_by_byte_but_in_time_is_served() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
-    let bytes =
-        [Connect::robot(&robot).packet(), publish(&topic(&robot, RobotTopic::Report), 1, 300, b"slow")].concat();
+    let bytes = [
+        Connect::robot(&robot).packet(),
+        publish(&topic(&robot, RobotTopic::Report), 1, 300, b"slow"),
+    ]
+    .concat();
     let mut raw = broker.raw().await;
     raw.stream.set_nodelay(true).unwrap();
     for byte in bytes {
@@ -232,7 +239,9 @@ async fn a_burst_and_a_goodbye_do_no_harm() {
         burst.extend([0xe0, 0]);
         let mut raw = broker.raw_with(&burst).await;
         let mut answers = Vec::new();
-        let _ = timeout(PATIENCE, raw.stream.read_to_end(&mut answers)).await.expect("the broker should close");
+        let _ = timeout(PATIENCE, raw.stream.read_to_end(&mut answers))
+            .await
+            .expect("the broker should close");
         assert_eq!(answers.len(), 4 + if qos == 1 { 4 * 3000 } else { 0 });
     }
     for operator in operators {
@@ -258,7 +267,8 @@ async fn floods_are_capped() {
         many.expect(&[0x90, 3, (id >> 8) as u8, id as u8, code]).await;
     }
 
-    // Pings without end by someone who reads no answer: shown out by the write timeout, or cut off in sending.
+    // Pings without end by someone who reads no answer: shown out by the write timeout, or cut off
+    // in sending.
     let mut deaf = broker.robot(&robot).await;
     let pings = vec![[0xc0, 0]; 32 * 1024].concat();
     let flood = async {
@@ -281,7 +291,9 @@ async fn an_operator_who_does_not_acknowledge_is_shown_out() {
         raw.send(&publish(&report, 1, id, b"x")).await;
     }
     let mut heard = Vec::new();
-    let _ = timeout(PATIENCE, operator.stream.read_to_end(&mut heard)).await.expect("the broker should close");
+    let _ = timeout(PATIENCE, operator.stream.read_to_end(&mut heard))
+        .await
+        .expect("the broker should close");
     assert_eq!(heard.len(), 32 * publish(&report, 1, 1, b"x").len(), "no more than the window");
     broker.assert_serves().await;
 }
@@ -300,8 +312,10 @@ async fn an_idle_client_is_not_taken_for_deaf_when_it_speaks_again() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn there_are_as_many_places_as_configured() {
-    let broker = TestBroker::with(|limits| (limits.max_connections, limits.max_operators) = (6, 2)).await;
-    let (first, second) = (broker.operator("taskd/v1/#", 0).await, broker.operator("taskd/v1/#", 0).await);
+    let broker =
+        TestBroker::with(|limits| (limits.max_connections, limits.max_operators) = (6, 2)).await;
+    let (first, second) =
+        (broker.operator("taskd/v1/#", 0).await, broker.operator("taskd/v1/#", 0).await);
     let mut third = broker.raw_with(&Connect::operator("").packet()).await;
     third.expect(&[0x20, 2, 0, 3]).await;
     third.expect_close().await;
@@ -351,7 +365,9 @@ const HOUR: Duration = Duration::from_secs(3600);
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_connections_give_way_when_all_places_are_taken() {
-    let broker = TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (2, HOUR)).await;
+    let broker =
+        TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (2, HOUR))
+            .await;
     let mut spoken = broker.robot(&RobotId::random()).await;
     let mut silent = broker.raw().await;
     // Nobody has to leave in its first seconds: until then newcomers are turned away.
@@ -374,7 +390,9 @@ async fn silent_connections_give_way_when_all_places_are_taken() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_silence_of_one_address_fills_a_quarter_of_the_places() {
-    let broker = TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (400, HOUR)).await;
+    let broker =
+        TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (400, HOUR))
+            .await;
     let mut oldest = broker.raw().await;
     let mut crowd = Vec::new();
     for _ in 0..100 {
@@ -408,8 +426,15 @@ fn random_bytes_and_mutated_packets_break_nothing() {
     ];
     let connects = [Connect::robot(&robot).packet(), Connect::operator("fuzz").packet()];
     let valid = valid.concat();
-    let mutations = proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>(), 0..3_u8), 1..6);
-    let script = (0..2_usize, any::<bool>(), any::<bool>(), mutations, proptest::collection::vec(any::<u8>(), 0..200));
+    let mutations =
+        proptest::collection::vec((any::<prop::sample::Index>(), any::<u8>(), 0..3_u8), 1..6);
+    let script = (
+        0..2_usize,
+        any::<bool>(),
+        any::<bool>(),
+        mutations,
+        proptest::collection::vec(any::<u8>(), 0..200),
+    );
     let config = Config { cases: 400, failure_persistence: None, ..Config::default() };
     TestRunner::new(config)
         .run(&script, |(who, intact, random, mutations, noise)| {

@@ -1,4 +1,5 @@
-//! A package's parts, fanned out over real TCP: to whom they are granted, as long as they are, no faster than they listen.
+//! A package's parts, fanned out over real TCP: to whom they are granted, as long as they are, no
+//! faster than they listen.
 
 use bytes::Bytes;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
@@ -40,7 +41,10 @@ fn begin(broker: &TestBroker, digest: Digest, robots: &[RobotId]) -> Result<FanO
 
 fn part(text: &str) -> Part {
     let (header, bytes) = text.split_at(text.len() / 2);
-    Part { header: Bytes::copy_from_slice(header.as_bytes()), bytes: Bytes::copy_from_slice(bytes.as_bytes()) }
+    Part {
+        header: Bytes::copy_from_slice(header.as_bytes()),
+        bytes: Bytes::copy_from_slice(bytes.as_bytes()),
+    }
 }
 
 async fn send(fan_out: &mut FanOut, part: &str) {
@@ -53,14 +57,18 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
     let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
     let (digest, other) = (Digest::of(b"package"), Digest::of(b"other"));
     let mut operator = broker.operator("taskd/v1/#", 1).await;
-    let (mut one, mut two, mut three) =
-        (broker.robot(&robots[0]).await, broker.robot(&robots[1]).await, broker.robot(&robots[2]).await);
+    let (mut one, mut two, mut three) = (
+        broker.robot(&robots[0]).await,
+        broker.robot(&robots[1]).await,
+        broker.robot(&robots[2]).await,
+    );
     listen(&mut one, digest, 0x80).await;
 
     let mut fan_out = begin(&broker, digest, &robots[..2]).expect("room");
     let again = begin(&broker, digest, &[]).err();
     assert_eq!(again, Some(FanOutError::UnderWay(digest)));
-    let too_large = Part { header: Bytes::from_static(b"h"), bytes: vec![0; MAX_PART_BYTES].into() };
+    let too_large =
+        Part { header: Bytes::from_static(b"h"), bytes: vec![0; MAX_PART_BYTES].into() };
     assert_eq!(fan_out.publish(too_large).await, Err(FanOutError::TooLarge(MAX_PART_BYTES + 1)));
     send(&mut fan_out, "unheard").await;
     listen(&mut one, digest, 1).await;
@@ -100,7 +108,8 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
         raw.expect_nothing().await;
     }
     drop(three);
-    let fan_outs: Vec<_> = (0u8..).map_while(|n| begin(&broker, Digest::of(&[n]), &[]).ok()).collect();
+    let fan_outs: Vec<_> =
+        (0u8..).map_while(|n| begin(&broker, Digest::of(&[n]), &[]).ok()).collect();
     assert_eq!(fan_outs.len(), 3, "four at a time");
     broker.assert_serves().await;
 }
@@ -181,8 +190,10 @@ async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded(
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
     let digest = Digest::of(b"package");
-    let mut fan_out =
-        broker.broker.fan_out(digest, settings(PART_BYTES, PartQos::AtLeastOnce), robots.clone()).expect("room");
+    let mut fan_out = broker
+        .broker
+        .fan_out(digest, settings(PART_BYTES, PartQos::AtLeastOnce), robots.clone())
+        .expect("room");
     let mut raws = Vec::new();
     for robot in &robots {
         raws.push(broker.robot(robot).await);
@@ -196,7 +207,13 @@ async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded(
         .map(|mut raw| {
             tokio::spawn(async move {
                 for number in 1..=200 {
-                    raw.expect_large(&publish(&name_of(digest), 1, number.into(), &vec![number; PART_BYTES])).await;
+                    raw.expect_large(&publish(
+                        &name_of(digest),
+                        1,
+                        number.into(),
+                        &vec![number; PART_BYTES],
+                    ))
+                    .await;
                     acknowledge(&mut raw, number).await;
                 }
                 raw
@@ -226,8 +243,11 @@ async fn parts_come_with_the_lower_of_both_qualities_of_service() {
     let robot = RobotId::random();
     let digest = Digest::of(b"package");
     let (unsure, sure, exact) = (PartQos::AtMostOnce, PartQos::AtLeastOnce, PartQos::ExactlyOnce);
-    for (ours, its, expected) in [(unsure, 2, 0), (sure, 0, 0), (sure, 2, 1), (exact, 1, 1), (exact, 2, 2)] {
-        let mut fan_out = broker.broker.fan_out(digest, settings(16, ours), vec![robot.clone()]).expect("room");
+    for (ours, its, expected) in
+        [(unsure, 2, 0), (sure, 0, 0), (sure, 2, 1), (exact, 1, 1), (exact, 2, 2)]
+    {
+        let mut fan_out =
+            broker.broker.fan_out(digest, settings(16, ours), vec![robot.clone()]).expect("room");
         let mut raw = broker.robot(&robot).await;
         raw.send(&subscribe(9, &[(&name_of(digest), its)])).await;
         raw.expect(&[0x90, 3, 0, 9, its]).await;
@@ -260,7 +280,8 @@ async fn a_whole_package_is_one_message_that_nobody_copies() {
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..4).map(|_| RobotId::random()).collect();
     let digest = Digest::of(b"package");
-    let bytes: Bytes = (0..48 * 1024 * 1024_u32).map(|at| (at % 251) as u8).collect::<Vec<u8>>().into();
+    let bytes: Bytes =
+        (0..48 * 1024 * 1024_u32).map(|at| (at % 251) as u8).collect::<Vec<u8>>().into();
     let settings = settings(bytes.len() + 1, PartQos::AtLeastOnce);
     let mut fan_out = broker.broker.fan_out(digest, settings, robots.clone()).expect("room");
     let mut hearing = Vec::new();
@@ -274,7 +295,10 @@ async fn a_whole_package_is_one_message_that_nobody_copies() {
             raw
         }));
     }
-    fan_out.publish(Part { header: Bytes::from_static(b"h"), bytes: bytes.clone() }).await.expect("sent");
+    fan_out
+        .publish(Part { header: Bytes::from_static(b"h"), bytes: bytes.clone() })
+        .await
+        .expect("sent");
     assert_eq!(broker.broker.queued_part_bytes(), bytes.len() + 1, "once, for all");
     fan_out.settle(PATIENCE).await;
     for hearing in hearing {
@@ -292,7 +316,8 @@ async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of
         (PartQos::ExactlyOnce, QoS::ExactlyOnce),
     ] {
         let (robot, digest) = (RobotId::random(), Digest::of(b"package"));
-        let mut fan_out = broker.broker.fan_out(digest, settings(8192, ours), vec![robot.clone()]).expect("room");
+        let mut fan_out =
+            broker.broker.fan_out(digest, settings(8192, ours), vec![robot.clone()]).expect("room");
         let mut options = MqttOptions::new(robot.as_str(), "127.0.0.1", broker.address().port());
         options.set_credentials(robot.as_str(), format!("pw-{robot}"));
         let (client, mut events) = AsyncClient::new(options, 10);
@@ -320,6 +345,8 @@ async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of
                 fan_out.publish(Part { header, bytes: vec![0; 8000].into() }).await.expect("sent");
             }
         };
-        timeout(PATIENCE, async { tokio::join!(hearing, publishing) }).await.expect("all should arrive");
+        timeout(PATIENCE, async { tokio::join!(hearing, publishing) })
+            .await
+            .expect("all should arrive");
     }
 }

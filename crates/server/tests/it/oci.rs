@@ -22,14 +22,20 @@ async fn nobody_is_let_in_without_a_token() {
     let registry = TestRegistry::start_with(BlobSettings::default(), None).await;
     for path in ["/v2/", "/v2/a/tags/list", "/v2/a/manifests/x", "/v2/nonsense"] {
         let answer = registry.get(path).await;
-        assert_eq!(header(&answer, "www-authenticate"), "Basic realm=\"taskd\", charset=\"UTF-8\"", "{path}");
+        assert_eq!(
+            header(&answer, "www-authenticate"),
+            "Basic realm=\"taskd\", charset=\"UTF-8\"",
+            "{path}"
+        );
         assert_eq!(refusal(answer).await, refused(401, "UNAUTHORIZED"), "{path}");
     }
 }
 
 #[tokio::test]
 async fn a_robot_reads_no_blob_that_is_not_assigned_to_it() {
-    let robot = TestRegistry::start_with(BlobSettings::default(), Some(Caller::Robot(RobotId::random()))).await;
+    let robot =
+        TestRegistry::start_with(BlobSettings::default(), Some(Caller::Robot(RobotId::random())))
+            .await;
     assert_eq!(robot.status(Method::GET, "/v2/").await, StatusCode::OK);
     let blob = format!("/v2/a/blobs/{}", Digest::of(b"x"));
     for (method, path) in [
@@ -41,7 +47,11 @@ async fn a_robot_reads_no_blob_that_is_not_assigned_to_it() {
         (Method::PUT, "/v2/a/manifests/latest"),
         (Method::POST, "/v2/a/blobs/uploads/"),
     ] {
-        assert_eq!(robot.status(method.clone(), path).await, StatusCode::FORBIDDEN, "{method} {path}");
+        assert_eq!(
+            robot.status(method.clone(), path).await,
+            StatusCode::FORBIDDEN,
+            "{method} {path}"
+        );
     }
 }
 
@@ -54,7 +64,8 @@ async fn a_blob_is_read_whole_and_in_parts_from_either_kind_of_store() {
         let blob = registry.push_blob("a/b/c", &bytes).await;
         let path = format!("/v2/a/b/c/blobs/{}", blob.digest);
 
-        let answer = registry.ask(Method::GET, &path).bearer_auth("x").send().await.expect("an answer");
+        let answer =
+            registry.ask(Method::GET, &path).bearer_auth("x").send().await.expect("an answer");
         let etag = format!("\"{}\"", blob.digest);
         assert_eq!(header(&answer, "etag"), etag);
         assert_eq!(header(&answer, "docker-content-digest"), blob.digest.to_string());
@@ -63,25 +74,42 @@ async fn a_blob_is_read_whole_and_in_parts_from_either_kind_of_store() {
         assert!(answer.bytes().await.expect("a body") == bytes);
 
         let head = registry.ask(Method::HEAD, &path).send().await.expect("an answer");
-        assert_eq!((head.status(), header(&head, "content-length")), (StatusCode::OK, bytes.len().to_string()));
+        assert_eq!(
+            (head.status(), header(&head, "content-length")),
+            (StatusCode::OK, bytes.len().to_string())
+        );
 
-        let part = registry.ask(Method::GET, &path).header("range", "bytes=300001-3000000").send().await.expect("it");
+        let part = registry
+            .ask(Method::GET, &path)
+            .header("range", "bytes=300001-3000000")
+            .send()
+            .await
+            .expect("it");
         assert_eq!(part.status(), StatusCode::PARTIAL_CONTENT);
         assert_eq!(header(&part, "content-range"), "bytes 300001-3000000/4000000");
         assert!(part.bytes().await.expect("a body") == bytes[300_001..=3_000_000]);
 
         for range in ["bytes=4000000-", "bytes=500-0"] {
-            let beyond = registry.ask(Method::GET, &path).header("range", range).send().await.expect("it");
+            let beyond =
+                registry.ask(Method::GET, &path).header("range", range).send().await.expect("it");
             assert_eq!(header(&beyond, "content-range"), "bytes */4000000", "{range}");
             assert_eq!(refusal(beyond).await, refused(416, "RANGE_INVALID"), "{range}");
         }
 
-        let known = registry.ask(Method::GET, &path).header("if-none-match", etag).send().await.expect("it");
+        let known = registry
+            .ask(Method::GET, &path)
+            .header("if-none-match", etag)
+            .send()
+            .await
+            .expect("it");
         assert_eq!(known.status(), StatusCode::NOT_MODIFIED);
 
         let empty = registry.push_blob("a/b/c", b"").await;
         let answer = registry.get(&format!("/v2/a/b/c/blobs/{}", empty.digest)).await;
-        assert_eq!((answer.status(), header(&answer, "content-length")), (StatusCode::OK, "0".to_owned()));
+        assert_eq!(
+            (answer.status(), header(&answer, "content-length")),
+            (StatusCode::OK, "0".to_owned())
+        );
     }
 }
 
@@ -94,7 +122,8 @@ async fn nothing_here_has_a_digest_of_another_algorithm() {
         let path = format!("/v2/a/{kind}/{digest}");
         assert_eq!(refusal(registry.get(&path).await).await, refused(404, code));
         assert_eq!(registry.status(Method::HEAD, &path).await, StatusCode::NOT_FOUND);
-        let delete = async |path: &str| registry.ask(Method::DELETE, path).send().await.expect("an answer");
+        let delete =
+            async |path: &str| registry.ask(Method::DELETE, path).send().await.expect("an answer");
         assert_eq!(refusal(delete(&path).await).await, refused(404, code));
         let cut = format!("/v2/a/{kind}/sha512:00");
         assert_eq!(refusal(delete(&cut).await).await, refused(400, "DIGEST_INVALID"));
@@ -106,7 +135,8 @@ async fn nothing_here_has_a_digest_of_another_algorithm() {
         let answer = push.send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::BAD_REQUEST);
         let body: Value = answer.json().await.expect("JSON");
-        let error = json!({ "code": "DIGEST_INVALID", "message": "only sha256 and sha512 are supported" });
+        let error =
+            json!({ "code": "DIGEST_INVALID", "message": "only sha256 and sha512 are supported" });
         assert_eq!(body["errors"], json!([error]));
     }
 }
@@ -114,13 +144,18 @@ async fn nothing_here_has_a_digest_of_another_algorithm() {
 #[tokio::test]
 async fn what_is_pushed_by_sha512_has_that_name() {
     let registry = TestRegistry::start().await;
-    let [config, layer] = [&b"{}"[..], &vec![7; 3_000_000]]
-        .map(|bytes| (BlobRef { digest: Algorithm::Sha512.digest(bytes), size: bytes.len() as u64 }, bytes.to_vec()));
+    let [config, layer] = [&b"{}"[..], &vec![7; 3_000_000]].map(|bytes| {
+        (
+            BlobRef { digest: Algorithm::Sha512.digest(bytes), size: bytes.len() as u64 },
+            bytes.to_vec(),
+        )
+    });
     let push = async |begin: &str, (blob, bytes): (BlobRef, Vec<u8>)| {
         let answer = registry.ask(Method::POST, begin).send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::ACCEPTED);
         let finish = format!("{}?digest={}", header(&answer, "location"), blob.digest);
-        let answer = registry.ask(Method::PUT, &finish).body(bytes).send().await.expect("an answer");
+        let answer =
+            registry.ask(Method::PUT, &finish).body(bytes).send().await.expect("an answer");
         let is_created = answer.status() == StatusCode::CREATED;
         if is_created {
             assert_eq!(header(&answer, "docker-content-digest"), blob.digest.to_string());
@@ -130,7 +165,10 @@ async fn what_is_pushed_by_sha512_has_that_name() {
     let begin = "/v2/a/blobs/uploads/?digest-algorithm=sha512";
     assert!(!push(begin, (layer.0, b"other".to_vec())).await, "bytes that hash to something else");
     assert!(push(begin, layer.clone()).await);
-    assert!(push("/v2/a/blobs/uploads/", config.clone()).await, "the algorithm may be said at the end alone");
+    assert!(
+        push("/v2/a/blobs/uploads/", config.clone()).await,
+        "the algorithm may be said at the end alone"
+    );
     let answer = registry.get(&format!("/v2/a/blobs/{}", layer.0.digest)).await;
     assert_eq!(header(&answer, "docker-content-digest"), layer.0.digest.to_string());
     assert!(answer.bytes().await.expect("a body") == layer.1);
@@ -140,7 +178,10 @@ async fn what_is_pushed_by_sha512_has_that_name() {
     let image = image(config.0, layer.0);
     let digest = Algorithm::Sha512.digest(&serde_json::to_vec(&image).expect("JSON"));
     let path = format!("/v2/a/manifests/{digest}");
-    assert_eq!(registry.put_manifest(&path, MANIFEST_TYPE, &image).await.status(), StatusCode::CREATED);
+    assert_eq!(
+        registry.put_manifest(&path, MANIFEST_TYPE, &image).await.status(),
+        StatusCode::CREATED
+    );
     let answer = registry.get(&path).await;
     assert_eq!(header(&answer, "docker-content-digest"), digest.to_string());
     assert_eq!(Algorithm::Sha512.digest(&answer.bytes().await.expect("a body")), digest);
@@ -170,7 +211,8 @@ async fn chunks_come_in_order_or_not_at_all() {
     let registry = TestRegistry::start().await;
     let upload = registry.begin("a").await;
     let patch = async |range: &str, body: &'static str| {
-        let request = registry.ask(Method::PATCH, &upload).header("content-range", range).body(body);
+        let request =
+            registry.ask(Method::PATCH, &upload).header("content-range", range).body(body);
         request.send().await.expect("an answer")
     };
     assert_eq!(patch("2-3", "xx").await.status(), StatusCode::RANGE_NOT_SATISFIABLE);
@@ -178,18 +220,32 @@ async fn chunks_come_in_order_or_not_at_all() {
     assert_eq!((first.status(), header(&first, "range")), (StatusCode::ACCEPTED, "0-4".to_owned()));
     assert_eq!(patch("0-4", "hello").await.status(), StatusCode::RANGE_NOT_SATISFIABLE);
     assert_eq!(refusal(patch("5-9", "abc").await).await, refused(400, "SIZE_INVALID"));
-    assert_eq!(refusal(patch("bytes 5-9/10", "abcde").await).await, refused(400, "BLOB_UPLOAD_INVALID"));
+    assert_eq!(
+        refusal(patch("bytes 5-9/10", "abcde").await).await,
+        refused(400, "BLOB_UPLOAD_INVALID")
+    );
 
     let status = registry.get(&upload).await;
-    assert_eq!((status.status(), header(&status, "range")), (StatusCode::NO_CONTENT, "0-4".to_owned()));
+    assert_eq!(
+        (status.status(), header(&status, "range")),
+        (StatusCode::NO_CONTENT, "0-4".to_owned())
+    );
     let elsewhere = upload.replace("/v2/a/", "/v2/b/");
     assert_eq!(refusal(registry.get(&elsewhere).await).await, refused(404, "BLOB_UPLOAD_UNKNOWN"));
 
     let digest = Digest::of(b"hello world");
-    let last = registry.ask(Method::PUT, &format!("{upload}?digest={digest}")).header("content-range", "5-10");
+    let last = registry
+        .ask(Method::PUT, &format!("{upload}?digest={digest}"))
+        .header("content-range", "5-10");
     let answer = last.body(" world").send().await.expect("an answer");
-    assert_eq!((answer.status(), header(&answer, "docker-content-digest")), (StatusCode::CREATED, digest.to_string()));
-    assert_eq!(registry.get(&header(&answer, "location")).await.text().await.expect("text"), "hello world");
+    assert_eq!(
+        (answer.status(), header(&answer, "docker-content-digest")),
+        (StatusCode::CREATED, digest.to_string())
+    );
+    assert_eq!(
+        registry.get(&header(&answer, "location")).await.text().await.expect("text"),
+        "hello world"
+    );
     assert_eq!(registry.status(Method::GET, &upload).await, StatusCode::NOT_FOUND);
 }
 
@@ -200,10 +256,15 @@ async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
     let path = format!("/v2/a/blobs/uploads/?digest={digest}");
     let answer = registry.ask(Method::POST, &path).body("sent").send().await.expect("an answer");
     assert_eq!(refusal(answer).await, refused(400, "DIGEST_INVALID"));
-    assert_eq!(registry.status(Method::HEAD, &format!("/v2/a/blobs/{digest}")).await, StatusCode::NOT_FOUND);
+    assert_eq!(
+        registry.status(Method::HEAD, &format!("/v2/a/blobs/{digest}")).await,
+        StatusCode::NOT_FOUND
+    );
 
     let upload = registry.begin("a").await;
-    for bad in [upload.clone(), format!("{upload}?digest=sha512:00"), format!("{upload}?digest=sha256:00")] {
+    for bad in
+        [upload.clone(), format!("{upload}?digest=sha512:00"), format!("{upload}?digest=sha256:00")]
+    {
         let answer = registry.ask(Method::PUT, &bad).body("x").send().await.expect("an answer");
         assert_eq!(refusal(answer).await, refused(400, "DIGEST_INVALID"), "{bad}");
     }
@@ -220,7 +281,11 @@ async fn limits_are_told_and_held() {
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
     let left = registry.begin("a").await;
     let upload = registry.begin("a").await;
-    assert_eq!(refusal(registry.get(&left).await).await, refused(404, "BLOB_UPLOAD_UNKNOWN"), "it gave way");
+    assert_eq!(
+        refusal(registry.get(&left).await).await,
+        refused(404, "BLOB_UPLOAD_UNKNOWN"),
+        "it gave way"
+    );
     let (sender, chunks) = tokio::sync::mpsc::channel::<Result<Vec<u8>, std::io::Error>>(1);
     let body = reqwest::Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(chunks));
     let writing = tokio::spawn(registry.ask(Method::PATCH, &upload).body(body).send());
@@ -228,19 +293,34 @@ async fn limits_are_told_and_held() {
     while registry.status(Method::GET, &upload).await != StatusCode::CONFLICT {
         tokio::task::yield_now().await;
     }
-    let second = registry.ask(Method::POST, "/v2/a/blobs/uploads/").send().await.expect("an answer");
-    assert_eq!(refusal(second).await, refused(429, "TOOMANYREQUESTS"), "the only one is written to");
+    let second =
+        registry.ask(Method::POST, "/v2/a/blobs/uploads/").send().await.expect("an answer");
+    assert_eq!(
+        refusal(second).await,
+        refused(429, "TOOMANYREQUESTS"),
+        "the only one is written to"
+    );
     drop(sender);
     assert_eq!(writing.await.expect("no panic").expect("an answer").status(), StatusCode::ACCEPTED);
 
-    let announced = registry.ask(Method::PATCH, &upload).body(vec![0; 1001]).send().await.expect("an answer");
+    let announced =
+        registry.ask(Method::PATCH, &upload).body(vec![0; 1001]).send().await.expect("an answer");
     assert_eq!(refusal(announced).await, refused(413, "SIZE_INVALID"));
-    let pieces = futures_util::stream::iter((0..11).map(|_| Ok::<_, std::io::Error>(vec![0_u8; 100])));
+    let pieces =
+        futures_util::stream::iter((0..11).map(|_| Ok::<_, std::io::Error>(vec![0_u8; 100])));
     let streamed = registry.ask(Method::PATCH, &upload).body(reqwest::Body::wrap_stream(pieces));
-    assert_eq!(refusal(streamed.send().await.expect("an answer")).await, refused(413, "SIZE_INVALID"));
-    assert_eq!(registry.status(Method::GET, &upload).await, StatusCode::NOT_FOUND, "nothing of it is kept");
+    assert_eq!(
+        refusal(streamed.send().await.expect("an answer")).await,
+        refused(413, "SIZE_INVALID")
+    );
+    assert_eq!(
+        registry.status(Method::GET, &upload).await,
+        StatusCode::NOT_FOUND,
+        "nothing of it is kept"
+    );
 
-    let large = registry.ask(Method::PUT, "/v2/a/manifests/x").body(vec![b' '; 4 * 1024 * 1024 + 1]);
+    let large =
+        registry.ask(Method::PUT, "/v2/a/manifests/x").body(vec![b' '; 4 * 1024 * 1024 + 1]);
     assert_eq!(refusal(large.send().await.expect("an answer")).await, refused(413, "SIZE_INVALID"));
 }
 
@@ -258,16 +338,31 @@ async fn one_blob_pushed_by_many_at_once_is_one_blob() {
 async fn a_blob_is_mounted_or_asked_for() {
     let registry = TestRegistry::start().await;
     let digest = registry.push_blob("from", b"x").await.digest;
-    let mount = async |query: &str| registry.status(Method::POST, &format!("/v2/to/blobs/uploads/?{query}")).await;
+    let mount = async |query: &str| {
+        registry.status(Method::POST, &format!("/v2/to/blobs/uploads/?{query}")).await
+    };
     assert_eq!(mount(&format!("mount={digest}&from=other")).await, StatusCode::ACCEPTED);
-    assert_eq!(registry.status(Method::HEAD, &format!("/v2/to/blobs/{digest}")).await, StatusCode::NOT_FOUND);
+    assert_eq!(
+        registry.status(Method::HEAD, &format!("/v2/to/blobs/{digest}")).await,
+        StatusCode::NOT_FOUND
+    );
     assert_eq!(mount(&format!("mount={digest}&from=from")).await, StatusCode::CREATED);
-    assert_eq!(registry.status(Method::HEAD, &format!("/v2/to/blobs/{digest}")).await, StatusCode::OK);
+    assert_eq!(
+        registry.status(Method::HEAD, &format!("/v2/to/blobs/{digest}")).await,
+        StatusCode::OK
+    );
 
-    let delete =
-        async |repository: &str| registry.status(Method::DELETE, &format!("/v2/{repository}/blobs/{digest}")).await;
-    assert_eq!((delete("to").await, delete("to").await), (StatusCode::ACCEPTED, StatusCode::NOT_FOUND));
-    assert_eq!(registry.status(Method::GET, &format!("/v2/from/blobs/{digest}")).await, StatusCode::OK);
+    let delete = async |repository: &str| {
+        registry.status(Method::DELETE, &format!("/v2/{repository}/blobs/{digest}")).await
+    };
+    assert_eq!(
+        (delete("to").await, delete("to").await),
+        (StatusCode::ACCEPTED, StatusCode::NOT_FOUND)
+    );
+    assert_eq!(
+        registry.status(Method::GET, &format!("/v2/from/blobs/{digest}")).await,
+        StatusCode::OK
+    );
 }
 
 #[tokio::test]
@@ -287,7 +382,11 @@ async fn a_manifest_is_kept_byte_for_byte_under_digest_and_tag() {
     let by_digest = format!("/v2/a/b/manifests/{digest}");
     assert_eq!(registry.status(Method::DELETE, &by_digest).await, StatusCode::ACCEPTED);
     for path in [by_digest.as_str(), "/v2/a/b/manifests/v1", "/v2/a/b/manifests/.not-a-tag"] {
-        assert_eq!(refusal(registry.get(path).await).await, refused(404, "MANIFEST_UNKNOWN"), "{path}");
+        assert_eq!(
+            refusal(registry.get(path).await).await,
+            refused(404, "MANIFEST_UNKNOWN"),
+            "{path}"
+        );
     }
 }
 
@@ -298,11 +397,22 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
     let missing = BlobRef { digest: Digest::of(b"missing"), size: 7 };
     let good = image(config, config);
     let put = async |reference: &str, media_type: &str, manifest: &Value| {
-        refusal(registry.put_manifest(&format!("/v2/a/manifests/{reference}"), media_type, manifest).await).await
+        refusal(
+            registry
+                .put_manifest(&format!("/v2/a/manifests/{reference}"), media_type, manifest)
+                .await,
+        )
+        .await
     };
     let invalid = refused(400, "MANIFEST_INVALID");
-    assert_eq!(put("v1", MANIFEST_TYPE, &image(config, missing)).await, refused(400, "MANIFEST_BLOB_UNKNOWN"));
-    assert_eq!(put(&missing.digest.to_string(), MANIFEST_TYPE, &good).await, refused(400, "DIGEST_INVALID"));
+    assert_eq!(
+        put("v1", MANIFEST_TYPE, &image(config, missing)).await,
+        refused(400, "MANIFEST_BLOB_UNKNOWN")
+    );
+    assert_eq!(
+        put(&missing.digest.to_string(), MANIFEST_TYPE, &good).await,
+        refused(400, "DIGEST_INVALID")
+    );
     assert_eq!(put("-x", MANIFEST_TYPE, &good).await, refused(400, "TAG_INVALID"));
     assert_eq!(put("v1", INDEX_TYPE, &good).await, invalid);
     assert_eq!(put("v1", MANIFEST_TYPE, &json!({ "schemaVersion": 2 })).await, invalid);
@@ -321,7 +431,9 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
     let name = registry.put_manifest("/v2/A/manifests/v1", MANIFEST_TYPE, &good).await;
     assert_eq!(refusal(name).await, refused(400, "NAME_INVALID"));
     // What is not understood is kept all the same.
-    let foreign = registry.put_manifest("/v2/a/manifests/v1", "application/x-foreign+json", &json!({ "x": 1 })).await;
+    let foreign = registry
+        .put_manifest("/v2/a/manifests/v1", "application/x-foreign+json", &json!({ "x": 1 }))
+        .await;
     assert_eq!(foreign.status(), StatusCode::CREATED);
 }
 
@@ -332,7 +444,11 @@ async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
     let page = "<script>fetch('/api/v1/users')</script>";
     let digest = blobs.put(Algorithm::Sha256, page.into()).await.expect("stored");
     let new = NewManifest {
-        manifest: StoredManifest { digest, size: page.len() as u64, media_type: "text/html".to_owned() },
+        manifest: StoredManifest {
+            digest,
+            size: page.len() as u64,
+            media_type: "text/html".to_owned(),
+        },
         artifact_type: None,
         annotations: Default::default(),
         subject: None,
@@ -354,11 +470,16 @@ async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
 async fn of_two_manifests_for_one_tag_one_wins() {
     let registry = TestRegistry::start().await;
     let images = [registry.push_image("a", "one").await, registry.push_image("a", "two").await];
-    let bodies = [registry.get("/v2/a/manifests/one").await, registry.get("/v2/a/manifests/two").await];
+    let bodies =
+        [registry.get("/v2/a/manifests/one").await, registry.get("/v2/a/manifests/two").await];
     let bodies = futures_util::future::join_all(bodies.map(Response::bytes)).await;
     let pushes = (0..20).map(|at| {
         let body = bodies[at % 2].as_ref().expect("a body").clone();
-        registry.ask(Method::PUT, "/v2/a/manifests/latest").header("content-type", MANIFEST_TYPE).body(body).send()
+        registry
+            .ask(Method::PUT, "/v2/a/manifests/latest")
+            .header("content-type", MANIFEST_TYPE)
+            .body(body)
+            .send()
     });
     for answer in futures_util::future::join_all(pushes).await {
         assert_eq!(answer.expect("an answer").status(), StatusCode::CREATED);
@@ -399,20 +520,26 @@ async fn tags_are_listed_in_pages() {
     assert_eq!(seen, ["B", "C", "a", "b", "c_1"]);
     let none: Value = registry.get("/v2/a/tags/list?n=0").await.json().await.expect("JSON");
     assert_eq!(none["tags"], json!([]));
-    assert_eq!(refusal(registry.get("/v2/a/tags/list?n=-1").await).await, refused(400, "UNSUPPORTED"));
+    assert_eq!(
+        refusal(registry.get("/v2/a/tags/list?n=-1").await).await,
+        refused(400, "UNSUPPORTED")
+    );
 }
 
 #[tokio::test]
 async fn referrers_are_found_by_subject_and_filtered_by_type() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
-    let subject = json!({ "mediaType": MANIFEST_TYPE, "digest": Digest::of(b"not here"), "size": 8 });
+    let subject =
+        json!({ "mediaType": MANIFEST_TYPE, "digest": Digest::of(b"not here"), "size": 8 });
     for kind in ["application/x-one", "application/x-two"] {
         let mut manifest = image(blob, blob);
         manifest["subject"] = subject.clone();
         manifest["artifactType"] = json!(kind);
         manifest["annotations"] = json!({ "kind": kind });
-        let answer = registry.put_manifest(&format!("/v2/a/manifests/{}", &kind[14..]), MANIFEST_TYPE, &manifest).await;
+        let answer = registry
+            .put_manifest(&format!("/v2/a/manifests/{}", &kind[14..]), MANIFEST_TYPE, &manifest)
+            .await;
         assert_eq!(header(&answer, "oci-subject"), subject["digest"].as_str().expect("text"));
     }
     let path = format!("/v2/a/referrers/{}", subject["digest"].as_str().expect("text"));
@@ -424,13 +551,23 @@ async fn referrers_are_found_by_subject_and_filtered_by_type() {
     let filtered: Value = filtered.json().await.expect("JSON");
     let one = &filtered["manifests"].as_array().expect("a list")[..];
     assert_eq!((one.len(), &one[0]["annotations"]["kind"]), (1, &json!("application/x-one")));
-    let nothing: Value = registry.get(&format!("/v2/b/referrers/{}", blob.digest)).await.json().await.expect("JSON");
+    let nothing: Value =
+        registry.get(&format!("/v2/b/referrers/{}", blob.digest)).await.json().await.expect("JSON");
     assert_eq!(nothing["manifests"], json!([]));
-    assert_eq!(refusal(registry.get("/v2/a/referrers/x").await).await, refused(400, "DIGEST_INVALID"));
+    assert_eq!(
+        refusal(registry.get("/v2/a/referrers/x").await).await,
+        refused(400, "DIGEST_INVALID")
+    );
 }
 
 /// Stores a manifest that refers to `subject` as it was possible before there was a limit.
-async fn put_referrer(registry: &TestRegistry, number: usize, kind: &str, subject: Digest, annotation: String) {
+async fn put_referrer(
+    registry: &TestRegistry,
+    number: usize,
+    kind: &str,
+    subject: Digest,
+    annotation: String,
+) {
     let digest = Digest::of(format!("referrer {number}").as_bytes());
     let new = NewManifest {
         manifest: StoredManifest { digest, size: 1, media_type: MANIFEST_TYPE.to_owned() },
@@ -452,14 +589,16 @@ async fn put_referrer(registry: &TestRegistry, number: usize, kind: &str, subjec
 async fn referrers_come_in_pages(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
-    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     let (many, large) = (Digest::of(b"many"), Digest::of(b"large"));
     for number in 0..90 {
         let kind = if number < 80 { "application/x-one+json" } else { "application/x-two" };
         put_referrer(&registry, number, kind, many, "x".repeat(60_000)).await;
     }
     for number in 90..92 {
-        put_referrer(&registry, number, "application/x-one+json", large, "x".repeat(5_000_000)).await;
+        put_referrer(&registry, number, "application/x-one+json", large, "x".repeat(5_000_000))
+            .await;
     }
     for (subject, filter, pages) in [
         (many, "", vec![69, 21]),
@@ -472,20 +611,32 @@ async fn referrers_come_in_pages(database: TestDatabase) {
         while let Some(path) = next {
             let answer = registry.get(&path).await;
             next = following(&answer);
-            assert_eq!(answer.headers().contains_key("oci-filters-applied"), !filter.is_empty(), "{path}");
+            assert_eq!(
+                answer.headers().contains_key("oci-filters-applied"),
+                !filter.is_empty(),
+                "{path}"
+            );
             let body = answer.text().await.expect("text");
             assert!(body.len() < 6 << 20, "{path}: {} bytes", body.len());
             let index: Value = serde_json::from_str(&body).expect("JSON");
             let manifests = index["manifests"].as_array().expect("a list");
             counts.push(manifests.len());
-            seen.extend(manifests.iter().map(|manifest| manifest["digest"].as_str().expect("text").to_owned()));
+            seen.extend(
+                manifests
+                    .iter()
+                    .map(|manifest| manifest["digest"].as_str().expect("text").to_owned()),
+            );
         }
         assert_eq!(counts, pages, "{filter}");
         assert!(seen.is_sorted_by(|one, next| one < next), "each once");
     }
     for nonsense in ["last=x", "artifactType=%00"] {
         let path = format!("/v2/a/referrers/{many}?{nonsense}");
-        assert_eq!(registry.status(Method::GET, &path).await, StatusCode::BAD_REQUEST, "{nonsense}");
+        assert_eq!(
+            registry.status(Method::GET, &path).await,
+            StatusCode::BAD_REQUEST,
+            "{nonsense}"
+        );
     }
 }
 
@@ -497,7 +648,8 @@ async fn what_lists_of_referrers_repeat_is_bounded() {
     manifest["annotations"] = json!({ "note": "x".repeat(64 * 1024 - 3) });
     let alone = registry.put_manifest("/v2/a/manifests/alone", MANIFEST_TYPE, &manifest).await;
     assert_eq!(alone.status(), StatusCode::CREATED, "nothing repeats them");
-    manifest["subject"] = json!({ "mediaType": MANIFEST_TYPE, "digest": blob.digest, "size": blob.size });
+    manifest["subject"] =
+        json!({ "mediaType": MANIFEST_TYPE, "digest": blob.digest, "size": blob.size });
     let answer = registry.put_manifest("/v2/a/manifests/long", MANIFEST_TYPE, &manifest).await;
     assert_eq!(answer.status(), StatusCode::BAD_REQUEST);
     let body: Value = answer.json().await.expect("an error body");

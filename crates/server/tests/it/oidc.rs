@@ -16,8 +16,8 @@ use crate::harness::{TestServer, answer, refusal};
 use crate::people::PASSWORD;
 use crate::provider::{CLIENT_ID, Provider, SECRET};
 
-/// What a provider and a server know of each other. The server is found by its address only when it listens, so its port is
-/// chosen before.
+/// What a provider and a server know of each other. The server is found by its address only when it
+/// listens, so its port is chosen before.
 fn settings(issuer: &str, directory: &TempDir, port: u16) -> OidcSettings {
     let secret = directory.path().join("oidc.secret");
     std::fs::write(&secret, format!("{SECRET}\n")).expect("written");
@@ -40,11 +40,16 @@ fn settings(issuer: &str, directory: &TempDir, port: u16) -> OidcSettings {
 
 /// A port that nobody listens on now.
 fn free_port() -> u16 {
-    std::net::TcpListener::bind(("127.0.0.1", 0)).expect("binds").local_addr().expect("an address").port()
+    std::net::TcpListener::bind(("127.0.0.1", 0))
+        .expect("binds")
+        .local_addr()
+        .expect("an address")
+        .port()
 }
 
 async fn town() -> (TestServer, Provider) {
-    let (provider, directory, port) = (Provider::start().await, TempDir::new().expect("a directory"), free_port());
+    let (provider, directory, port) =
+        (Provider::start().await, TempDir::new().expect("a directory"), free_port());
     let oidc = settings(&provider.issuer, &directory, port);
     let configure = |config: &mut Config| {
         config.http.set_port(port);
@@ -62,18 +67,27 @@ struct Visitor<'a> {
 
 impl<'a> Visitor<'a> {
     fn new(server: &'a TestServer) -> Self {
-        let client = Client::builder().redirect(reqwest::redirect::Policy::none()).build().expect("a client");
+        let client = Client::builder()
+            .redirect(reqwest::redirect::Policy::none())
+            .build()
+            .expect("a client");
         Self { server, client, cookies: Vec::new() }
     }
 
     fn cookie(&self) -> String {
-        self.cookies.iter().map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join("; ")
+        self.cookies
+            .iter()
+            .map(|(name, value)| format!("{name}={value}"))
+            .collect::<Vec<_>>()
+            .join("; ")
     }
 
     async fn get(&mut self, url: &str) -> Response {
-        let response = self.client.get(url).header("cookie", self.cookie()).send().await.expect("an answer");
+        let response =
+            self.client.get(url).header("cookie", self.cookie()).send().await.expect("an answer");
         for cookie in response.headers().get_all("set-cookie") {
-            let (pair, attributes) = cookie.to_str().expect("text").split_once(';').expect("attributes");
+            let (pair, attributes) =
+                cookie.to_str().expect("text").split_once(';').expect("attributes");
             let (name, value) = pair.split_once('=').expect("a pair");
             self.cookies.retain(|(kept, _)| kept != name);
             if !attributes.contains("Max-Age=0") {
@@ -134,21 +148,37 @@ async fn somebody_comes_in_and_may_what_the_rules_say() {
     let (server, provider) = town().await;
     let view: SessionView = answer(server.bare(Method::GET, "/api/v1/session")).await;
     let way_in = view.provider.expect("there is one");
-    assert_eq!((way_in.title.as_str(), way_in.url), ("the lab", server.url("/api/v1/oidc/sign-in")));
+    assert_eq!(
+        (way_in.title.as_str(), way_in.url),
+        ("the lab", server.url("/api/v1/oidc/sign-in"))
+    );
     let mut visitor = Visitor::new(&server);
     let sent = visitor.get(&server.url("/api/v1/oidc/sign-in")).await;
     let cookie = sent.headers()["set-cookie"].to_str().expect("text").to_owned();
-    assert!(cookie.ends_with("; HttpOnly; SameSite=Lax; Path=/api/v1/oidc; Max-Age=600"), "{cookie}");
+    assert!(
+        cookie.ends_with("; HttpOnly; SameSite=Lax; Path=/api/v1/oidc; Max-Age=600"),
+        "{cookie}"
+    );
     let url = Url::parse(&location(&sent)).expect("a URL");
     let kept = visitor.cookies[0].1.clone();
     assert!(!url.as_str().contains(&kept), "only the browser has it");
     let sent_back = visitor.get(url.as_str()).await;
     let ended = visitor.get(&location(&sent_back)).await;
     assert_eq!((ended.status(), location(&ended).as_str()), (StatusCode::SEE_OTHER, "/"));
-    let cookies: Vec<&str> =
-        ended.headers().get_all("set-cookie").iter().map(|cookie| cookie.to_str().expect("text")).collect();
-    assert!(cookies[0].starts_with("taskd_sign_in=;") && cookies[0].ends_with("Max-Age=0"), "{cookies:?}");
-    assert!(cookies[1].contains("; HttpOnly; SameSite=Strict; Path=/; Max-Age=43200"), "{cookies:?}");
+    let cookies: Vec<&str> = ended
+        .headers()
+        .get_all("set-cookie")
+        .iter()
+        .map(|cookie| cookie.to_str().expect("text"))
+        .collect();
+    assert!(
+        cookies[0].starts_with("taskd_sign_in=;") && cookies[0].ends_with("Max-Age=0"),
+        "{cookies:?}"
+    );
+    assert!(
+        cookies[1].contains("; HttpOnly; SameSite=Strict; Path=/; Max-Age=43200"),
+        "{cookies:?}"
+    );
 
     let me = visitor.me().await;
     assert_eq!((me.name.as_str(), me.roles.to_string().as_str()), ("alice", "operator"));
@@ -175,7 +205,10 @@ async fn coming_in_again_ends_the_session_that_the_browser_had() {
     let former = visitor.cookie();
     assert_eq!(visitor.sign_in().await, "/");
     assert_eq!(visitor.me().await.name.as_str(), "alice");
-    assert_eq!(refusal(server.bare(Method::GET, "/api/v1/me").header("cookie", former)).await.0, 401);
+    assert_eq!(
+        refusal(server.bare(Method::GET, "/api/v1/me").header("cookie", former)).await.0,
+        401
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -191,7 +224,8 @@ async fn without_a_provider_there_is_no_such_way_in() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_answer_is_good_once_and_in_one_browser() {
     let (server, provider) = town().await;
-    let (mut mine, mut theirs, mut nobody) = (Visitor::new(&server), Visitor::new(&server), Visitor::new(&server));
+    let (mut mine, mut theirs, mut nobody) =
+        (Visitor::new(&server), Visitor::new(&server), Visitor::new(&server));
     let back = mine.go_to_provider().await;
     theirs.go_to_provider().await;
     // Somebody who is sent my answer is not signed in as me, whether they were on their way or not.
@@ -201,7 +235,11 @@ async fn an_answer_is_good_once_and_in_one_browser() {
     assert_eq!(location(&mine.get(&back).await), "/");
     assert_eq!(location(&mine.get(&back).await), "/#problem=expired");
     nobody.cookies = kept;
-    assert_eq!(location(&nobody.get(&back).await), "/#problem=failed", "the provider takes a code once");
+    assert_eq!(
+        location(&nobody.get(&back).await),
+        "/#problem=failed",
+        "the provider takes a code once"
+    );
     assert!(!theirs.is_signed_in() && !nobody.is_signed_in());
 
     // The code without the verifier that belongs to it, as whoever saw it on its way has it.
@@ -266,7 +304,11 @@ async fn without_a_rule_nobody_comes_in_and_who_was_in_is_out() {
     assert_eq!(visitor.me().await.scope, []);
     provider.says(json!({ "groups": ["staff"] }));
     assert_eq!(again.sign_in().await, "/#problem=no_role");
-    assert_eq!(refusal(visitor.asks(Method::GET, "/api/v1/me")).await.0, 401, "what they were signed in to has ended");
+    assert_eq!(
+        refusal(visitor.asks(Method::GET, "/api/v1/me")).await.0,
+        401,
+        "what they were signed in to has ended"
+    );
     let expected = [
         act("server", "user.add"),
         act("alice", "sign_in"),
@@ -286,14 +328,16 @@ async fn a_name_is_no_proof_of_who_somebody_is() {
     let server_name = json!({ "preferred_username": "operator.token" });
     provider.says(server_name);
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=name_taken");
-    for bad in [json!("Alice Smith"), json!("a\nb"), json!(7), json!("x".repeat(100)), json!(null)] {
+    for bad in [json!("Alice Smith"), json!("a\nb"), json!(7), json!("x".repeat(100)), json!(null)]
+    {
         provider.says(json!({ "preferred_username": bad }));
         assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=no_name", "{bad}");
     }
     provider.says(json!({ "preferred_username": "bob" }));
     let mut bob = Visitor::new(&server);
     assert_eq!(bob.sign_in().await, "/");
-    // Whoever has his name at the provider next is somebody else, and he stays who he is by another.
+    // Whoever has his name at the provider next is somebody else, and he stays who he is by
+    // another.
     provider.says(json!({ "sub": "other" }));
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=name_taken");
     provider.says(json!({ "sub": "248289761001", "preferred_username": "robert" }));
@@ -307,17 +351,25 @@ async fn what_the_provider_decides_is_not_changed_by_hand() {
     let mut alice = Visitor::new(&server);
     assert_eq!(alice.sign_in().await, "/");
     let of_provider = (409, "of_provider".to_owned());
-    let edit = server.request(Method::PATCH, "/api/v1/users/alice").json(&json!({ "roles": ["admin"] }));
+    let edit =
+        server.request(Method::PATCH, "/api/v1/users/alice").json(&json!({ "roles": ["admin"] }));
     assert_eq!(refusal(edit).await, of_provider);
-    let password = server.request(Method::PUT, "/api/v1/users/alice/password").json(&json!({ "password": PASSWORD }));
+    let password = server
+        .request(Method::PUT, "/api/v1/users/alice/password")
+        .json(&json!({ "password": PASSWORD }));
     assert_eq!(refusal(password).await, of_provider);
-    let log_in = server.bare(Method::POST, "/api/v1/login").json(&json!({ "user": "alice", "password": PASSWORD }));
+    let log_in = server
+        .bare(Method::POST, "/api/v1/login")
+        .json(&json!({ "user": "alice", "password": PASSWORD }));
     assert_eq!(refusal(log_in).await.0, 401);
-    // A token of their own making would outlast what the provider says of them; an administrator may make one.
+    // A token of their own making would outlast what the provider says of them; an administrator
+    // may make one.
     let token = alice.asks(Method::POST, "/api/v1/tokens").json(&json!({}));
     assert_eq!(refusal(token).await, (403, "forbidden".to_owned()));
     let made: Value = server.post("/api/v1/tokens", &json!({ "user": "alice" })).await;
-    let me = server.bare(Method::GET, "/api/v1/me").bearer_auth(made["token"].as_str().expect("a token"));
+    let me = server
+        .bare(Method::GET, "/api/v1/me")
+        .bearer_auth(made["token"].as_str().expect("a token"));
     assert_eq!(answer::<Me>(me).await.name.as_str(), "alice");
 }
 
@@ -336,12 +388,21 @@ async fn a_new_key_is_found_and_a_provider_in_trouble_is_left_in_peace() {
     for _ in 0..3 {
         assert_eq!(sign_in().await, "/#problem=failed");
     }
-    assert_eq!((provider.asked("discovery"), provider.asked("keys")), (1, 2), "asked once each time");
+    assert_eq!(
+        (provider.asked("discovery"), provider.asked("keys")),
+        (1, 2),
+        "asked once each time"
+    );
 
     server.clock.advance_ms(60 * 60 * 1000);
-    provider.lies(json!({}), json!({ "iat": server.clock.now_ms() / 1000, "exp": server.clock.now_ms() / 1000 + 60 }));
+    provider.lies(
+        json!({}),
+        json!({ "iat": server.clock.now_ms() / 1000, "exp": server.clock.now_ms() / 1000 + 60 }),
+    );
     provider.breaks(true);
-    let begin = || async { location(&Visitor::new(&server).get(&server.url("/api/v1/oidc/sign-in")).await) };
+    let begin = || async {
+        location(&Visitor::new(&server).get(&server.url("/api/v1/oidc/sign-in")).await)
+    };
     for _ in 0..3 {
         assert_eq!(begin().await, "/#problem=failed");
     }
@@ -363,7 +424,10 @@ async fn failed_sign_ins_by_the_provider_are_counted_by_address() {
     for _ in 0..50 {
         let mut visitor = Visitor::new(&server);
         let back = visitor.go_to_provider().await;
-        assert_eq!(location(&visitor.get(&back.replace("code=", "code=x")).await), "/#problem=failed");
+        assert_eq!(
+            location(&visitor.get(&back.replace("code=", "code=x")).await),
+            "/#problem=failed"
+        );
     }
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=blocked");
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=blocked");
@@ -390,13 +454,25 @@ impl Foreign {
                 "TASKD_TEST_OIDC is not set: run ./scripts/test, or set it to the directory that scripts/need oidc prints"
             );
         };
-        let alice = json!({ "sub": "1", "preferred_username": "alice", "groups": ["robotics"] }).to_string();
+        let alice = json!({ "sub": "1", "preferred_username": "alice", "groups": ["robotics"] })
+            .to_string();
         let mut command = Command::new(format!("{environment}/bin/python"));
-        command.args(["-m", "oidc_provider_mock", "--port", "0", "--require-nonce", "true", "--user-claims", &alice]);
+        command.args([
+            "-m",
+            "oidc_provider_mock",
+            "--port",
+            "0",
+            "--require-nonce",
+            "true",
+            "--user-claims",
+            &alice,
+        ]);
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
         let mut child = command.spawn().expect("the provider starts");
-        let mut lines = BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
-        let issuer = lines.find_map(|line| Some(line.split_once("running on ")?.1.split_once(' ')?.0.to_owned()));
+        let mut lines =
+            BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
+        let issuer = lines
+            .find_map(|line| Some(line.split_once("running on ")?.1.split_once(' ')?.0.to_owned()));
         // Nobody reads the rest, and a full pipe would stop it.
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, issuer: issuer.expect("the provider says where it is") }
@@ -426,7 +502,8 @@ async fn a_provider_that_others_made_lets_people_in() {
     let mut visitor = Visitor::new(&server);
     let sent = visitor.get(&server.url("/api/v1/oidc/sign-in")).await;
     // The form that a person would fill in.
-    let chosen = visitor.client.post(location(&sent)).form(&[("sub", "1")]).send().await.expect("an answer");
+    let chosen =
+        visitor.client.post(location(&sent)).form(&[("sub", "1")]).send().await.expect("an answer");
     let ended = visitor.get(&location(&chosen)).await;
     assert_eq!(location(&ended), "/");
     let me = visitor.me().await;

@@ -29,8 +29,12 @@ fn tool(name: &str) -> Command {
 
 /// Runs it to its end, which has to be a good one.
 async fn run(mut command: Command) {
-    let output = tokio::time::timeout(PATIENCE, command.output()).await.expect("it ends").expect("it starts");
-    let said = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+    let output = tokio::time::timeout(PATIENCE, command.output())
+        .await
+        .expect("it ends")
+        .expect("it starts");
+    let said =
+        [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
     assert!(output.status.success(), "{}", said.join("\n"));
 }
 
@@ -44,7 +48,8 @@ async fn the_description_is_openapi() {
     let mut validator = tool("openapi-spec-validator");
     validator.arg("--schema").arg("3.1").arg(&document);
     run(validator).await;
-    let known = server.bare(Method::GET, "/api/openapi.json").header("if-none-match", tag).send().await;
+    let known =
+        server.bare(Method::GET, "/api/openapi.json").header("if-none-match", tag).send().await;
     assert_eq!(known.expect("an answer").status(), 304);
 }
 
@@ -60,7 +65,14 @@ async fn whatever_is_asked_is_answered_as_described() {
     let mut schemathesis = tool("schemathesis");
     // What it writes down of a run stays with the server's files.
     schemathesis.current_dir(server.directory.path());
-    schemathesis.args(["run", &server.url("/api/openapi.json"), "--seed", "1", "--max-examples", "10"]);
+    schemathesis.args([
+        "run",
+        &server.url("/api/openapi.json"),
+        "--seed",
+        "1",
+        "--max-examples",
+        "10",
+    ]);
     schemathesis.arg("--header").arg(format!("Authorization: Bearer {}", server.operator.reveal()));
     schemathesis.args([
         "--phases",
@@ -73,8 +85,9 @@ async fn whatever_is_asked_is_answered_as_described() {
         "--no-shrink",
         "--warnings",
         "off",
-        // The registry is the OCI specification's, whose conformance other tests look at; the second is no HTTP beyond its
-        // handshake; the third, and logs that are followed, stream without end.
+        // The registry is the OCI specification's, whose conformance other tests look at; the
+        // second is no HTTP beyond its handshake; the third, and logs that are followed, stream
+        // without end.
         "--exclude-path-regex",
         "^/v2|^/mqtt$|^/api/v1/events$|/logs$",
         // It would end the token that all other calls are made with.

@@ -1,4 +1,5 @@
-//! Files that come back from robots: pushed by the robot into its own repository, listed and read by operators.
+//! Files that come back from robots: pushed by the robot into its own repository, listed and read
+//! by operators.
 
 use std::time::Duration;
 
@@ -37,7 +38,8 @@ impl Push {
 
     pub async fn blob(&self, bytes: &[u8]) -> BlobRef {
         let digest = Digest::of(bytes);
-        let request = self.ask(Method::POST, &format!("blobs/uploads/?digest={digest}")).body(bytes.to_vec());
+        let request =
+            self.ask(Method::POST, &format!("blobs/uploads/?digest={digest}")).body(bytes.to_vec());
         assert_eq!(request.send().await.expect("an answer").status(), StatusCode::CREATED);
         BlobRef { digest, size: bytes.len() as u64 }
     }
@@ -46,7 +48,9 @@ impl Push {
         let config = self.blob(&serde_json::to_vec(output).expect("json")).await;
         let manifest = serde_json::to_vec(&output.manifest(config)).expect("json");
         let tag = output.tag().expect("a tag");
-        let put = self.ask(Method::PUT, &format!("manifests/{tag}")).header("content-type", MANIFEST_TYPE);
+        let put = self
+            .ask(Method::PUT, &format!("manifests/{tag}"))
+            .header("content-type", MANIFEST_TYPE);
         put.body(manifest).send().await.expect("an answer").status()
     }
 }
@@ -76,20 +80,32 @@ async fn a_robot_brings_files_back_and_operators_read_them() {
         let set = output(&robot.id, run, vec![file("maps/corridor.pgm", map)]);
         server.clock.advance_ms(1000);
         assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}");
-        assert_eq!(push.output(&set).await, StatusCode::CREATED, "run {run}, whose answer was lost");
+        assert_eq!(
+            push.output(&set).await,
+            StatusCode::CREATED,
+            "run {run}, whose answer was lost"
+        );
     }
     let corrected = output(&robot.id, 12, vec![file("maps/other.pgm", map)]);
     assert_eq!(push.output(&corrected).await, StatusCode::CREATED);
 
     let list: OutputList = server.get("/api/v1/outputs?robot=atlas&task=mapping").await;
     assert_eq!(list.outputs.len(), 10, "the newest runs are kept, each once: {list:?}");
-    assert!(list.outputs.iter().any(|view| view.output == corrected && view.robot_name.as_str() == "atlas"));
+    assert!(
+        list.outputs
+            .iter()
+            .any(|view| view.output == corrected && view.robot_name.as_str() == "atlas")
+    );
     assert!(list.outputs.iter().all(|view| view.output.run > 2), "the oldest went: {list:?}");
     let other: OutputList = server.get("/api/v1/outputs?task=other").await;
     assert!(other.outputs.is_empty());
 
-    let bytes = server.request(Method::GET, &format!("/v2/outputs/{}/mapping/blobs/{}", robot.id, map.digest));
-    assert_eq!(bytes.send().await.expect("an answer").bytes().await.expect("a body"), &b"P5 1 1 255 x"[..]);
+    let bytes = server
+        .request(Method::GET, &format!("/v2/outputs/{}/mapping/blobs/{}", robot.id, map.digest));
+    assert_eq!(
+        bytes.send().await.expect("an answer").bytes().await.expect("a body"),
+        &b"P5 1 1 255 x"[..]
+    );
 }
 
 #[tokio::test]
@@ -105,14 +121,20 @@ async fn what_is_kept_of_a_robot_is_bounded_whatever_its_tasks_are_called() {
         let push = Push::new(&server, &robot, format!("outputs/{}/{task}", robot.id));
         push.blob(b"x").await;
         for run in 1..=10 {
-            let set = OutputSet { task: task.parse().expect("valid"), ..output(&robot.id, run, vec![file("a", map)]) };
+            let set = OutputSet {
+                task: task.parse().expect("valid"),
+                ..output(&robot.id, run, vec![file("a", map)])
+            };
             server.clock.advance_ms(1);
             assert_eq!(push.output(&set).await, StatusCode::CREATED, "{task} {run}");
         }
     }
     let list: OutputList = server.get("/api/v1/outputs?robot=atlas").await;
     assert_eq!(list.outputs.len(), 200);
-    assert!(list.outputs.iter().all(|view| view.output.task.as_str() != "task1"), "the oldest went: {list:?}");
+    assert!(
+        list.outputs.iter().all(|view| view.output.task.as_str() != "task1"),
+        "the oldest went: {list:?}"
+    );
     let others: OutputList = server.get("/api/v1/outputs?robot=husky").await;
     assert_eq!(others.outputs.len(), 1, "another robot's stay");
 }
@@ -123,7 +145,8 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
     let secret = server.push("secret", "1.0.0").await;
     let own = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
-    let foreign = [format!("outputs/{}/mapping", other.id), "secret".to_owned(), "outputs".to_owned()];
+    let foreign =
+        [format!("outputs/{}/mapping", other.id), "secret".to_owned(), "outputs".to_owned()];
     for repository in foreign {
         let push = Push::new(&server, &robot, repository);
         for (method, rest) in [
@@ -136,27 +159,49 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
         }
     }
     // What another repository holds is neither shown nor mounted.
-    let mount = own.ask(Method::POST, &format!("blobs/uploads/?mount={}&from=secret", secret.content.digest));
-    assert_eq!(mount.send().await.expect("an answer").status(), StatusCode::ACCEPTED, "an upload was begun instead");
+    let mount = own
+        .ask(Method::POST, &format!("blobs/uploads/?mount={}&from=secret", secret.content.digest));
+    assert_eq!(
+        mount.send().await.expect("an answer").status(),
+        StatusCode::ACCEPTED,
+        "an upload was begun instead"
+    );
     let head = own.ask(Method::HEAD, &format!("blobs/{}", secret.content.digest));
     assert_eq!(head.send().await.expect("an answer").status(), StatusCode::NOT_FOUND);
 
     let map = own.blob(b"x").await;
     let package = task_proto::oci::ImageManifest::package(map, map);
-    let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&package);
+    let put = own
+        .ask(Method::PUT, "manifests/latest")
+        .header("content-type", MANIFEST_TYPE)
+        .json(&package);
     assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "no package");
     let set = output(&robot.id, 1, vec![file("a", map)]);
     let config = own.blob(&serde_json::to_vec(&set).expect("json")).await;
-    let put =
-        own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&set.manifest(config));
-    assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "another tag than the run's");
+    let put = own
+        .ask(Method::PUT, "manifests/latest")
+        .header("content-type", MANIFEST_TYPE)
+        .json(&set.manifest(config));
+    assert_eq!(
+        put.send().await.expect("an answer").status(),
+        StatusCode::FORBIDDEN,
+        "another tag than the run's"
+    );
     // Who says no type of its own has its config's.
     let mut disguised = serde_json::to_value(set.manifest(config)).expect("json");
     disguised.as_object_mut().expect("an object").remove("artifactType");
     disguised["config"]["mediaType"] = json!(OUTPUT_TYPE);
-    let put = own.ask(Method::PUT, "manifests/latest").header("content-type", MANIFEST_TYPE).json(&disguised);
-    assert_eq!(put.send().await.expect("an answer").status(), StatusCode::FORBIDDEN, "what looks like one");
-    let lie = OutputSet { robot_id: other.id.clone(), ..output(&robot.id, 1, vec![file("a", map)]) };
+    let put = own
+        .ask(Method::PUT, "manifests/latest")
+        .header("content-type", MANIFEST_TYPE)
+        .json(&disguised);
+    assert_eq!(
+        put.send().await.expect("an answer").status(),
+        StatusCode::FORBIDDEN,
+        "what looks like one"
+    );
+    let lie =
+        OutputSet { robot_id: other.id.clone(), ..output(&robot.id, 1, vec![file("a", map)]) };
     assert_eq!(own.output(&lie).await, StatusCode::BAD_REQUEST, "another robot's");
     let larger = BlobRef { size: 2, ..map };
     assert_eq!(
@@ -183,41 +228,64 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     const KB: u64 = 1024;
     let data = tempfile::tempdir().expect("a directory");
     let settings = BlobSettings { max_robot_bytes: 512 * KB, ..BlobSettings::default() };
-    let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
     let [first, second, other] =
         ["a1/mapping", "a1/survey", "a2/mapping"].map(|of| format!("outputs/r00000000000000{of}"));
     let push = async |repository: &str, byte: u8, bytes: u64| {
         let bytes = vec![byte; usize::try_from(bytes).expect("small")];
         let path = format!("/v2/{repository}/blobs/uploads/?digest={}", Digest::of(&bytes));
-        let pieces = bytes.chunks(1000).map(|piece| Ok::<_, std::io::Error>(piece.to_vec())).collect::<Vec<_>>();
-        let [announced, streamed] = [bytes.into(), Body::wrap_stream(futures_util::stream::iter(pieces))];
+        let pieces = bytes
+            .chunks(1000)
+            .map(|piece| Ok::<_, std::io::Error>(piece.to_vec()))
+            .collect::<Vec<_>>();
+        let [announced, streamed] =
+            [bytes.into(), Body::wrap_stream(futures_util::stream::iter(pieces))];
         let mut statuses = Vec::new();
         // What is not announced is found out on the way.
         for body in [streamed, announced] {
-            let answer = registry.ask(Method::POST, &path).body(body).send().await.expect("an answer");
+            let answer =
+                registry.ask(Method::POST, &path).body(body).send().await.expect("an answer");
             statuses.push(answer.status());
             if answer.status() == StatusCode::CREATED {
                 break;
             }
             let waits = answer.headers().contains_key("retry-after");
-            assert_eq!(waits, answer.status() == StatusCode::TOO_MANY_REQUESTS, "robots wait for what passes only");
+            assert_eq!(
+                waits,
+                answer.status() == StatusCode::TOO_MANY_REQUESTS,
+                "robots wait for what passes only"
+            );
         }
         statuses.dedup();
         let [status] = statuses[..] else { panic!("{statuses:?}") };
         status
     };
     let full = StatusCode::TOO_MANY_REQUESTS;
-    assert_eq!(push(&first, 1, 513 * KB).await, StatusCode::PAYLOAD_TOO_LARGE, "it could never be kept");
+    assert_eq!(
+        push(&first, 1, 513 * KB).await,
+        StatusCode::PAYLOAD_TOO_LARGE,
+        "it could never be kept"
+    );
     assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
     assert_eq!(push(&first, 1, 500 * KB).await, StatusCode::CREATED);
-    assert_eq!(push(&second, 2, 400 * KB).await, StatusCode::CREATED, "what came twice counts once");
+    assert_eq!(
+        push(&second, 2, 400 * KB).await,
+        StatusCode::CREATED,
+        "what came twice counts once"
+    );
     assert_eq!(push(&first, 3, 125 * KB).await, full, "all its tasks count together");
     assert_eq!(push(&other, 3, 500 * KB).await, StatusCode::CREATED, "another robot's has room");
     assert_eq!(push("talker", 4, 2000 * KB).await, StatusCode::CREATED, "and so has a package");
 
     // What is on its way counts as well, and what there is no room for is not kept.
     let upload = registry.begin(&first).await;
-    let sent = registry.ask(Method::PATCH, &upload).body(vec![5; 100 * 1024]).send().await.expect("an answer");
+    let sent = registry
+        .ask(Method::PATCH, &upload)
+        .body(vec![5; 100 * 1024])
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(sent.status(), StatusCode::ACCEPTED);
     assert_eq!(push(&second, 6, 64 * KB).await, full);
     assert_eq!(registry.status(Method::DELETE, &upload).await, StatusCode::NO_CONTENT);
@@ -235,16 +303,22 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     assert_eq!(push(&first, 3, 125 * KB).await, StatusCode::CREATED);
 }
 
-async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(database: TestDatabase) {
+async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(
+    database: TestDatabase,
+) {
     const HOUR_MS: u64 = 3_600_000;
     let data = tempfile::tempdir().expect("a directory");
     // A run takes twice 400 KB and twice 64 KB.
     let settings = BlobSettings { max_robot_bytes: 2048 * 1024, ..BlobSettings::default() };
-    let registry = TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(database.store.clone(), data, settings, Some(operator())).await;
     let robot = RobotId::random();
     let repository = format!("/v2/outputs/{robot}/mapping");
-    let push =
-        Push { client: registry.client.clone(), url: format!("{}{repository}", registry.base), token: String::new() };
+    let push = Push {
+        client: registry.client.clone(),
+        url: format!("{}{repository}", registry.base),
+        token: String::new(),
+    };
     let mut statuses = Vec::new();
     let mut maps = Vec::new();
     for run in 1..=3 {
@@ -256,30 +330,51 @@ async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(da
         maps.extend([map, picture]);
     }
     assert_eq!(statuses, [201; 3]);
-    let tags: Value = registry.get(&format!("{repository}/tags/list")).await.json().await.expect("JSON");
-    assert_eq!(tags["tags"], json!(["d00000000000000b2-2", "d00000000000000b2-3"]), "three are too many");
+    let tags: Value =
+        registry.get(&format!("{repository}/tags/list")).await.json().await.expect("JSON");
+    assert_eq!(
+        tags["tags"],
+        json!(["d00000000000000b2-2", "d00000000000000b2-3"]),
+        "three are too many"
+    );
 
     // Far sooner than what somebody may be about to list.
     registry.push_blob("talker", &vec![10; 400 * 1024]).await;
     let collect = async |now_ms: u64| {
         let Registry { store, blobs, .. } = &registry.registry;
-        collector::collect(store, blobs, now_ms, Duration::from_hours(24)).await.expect("collected").blobs
+        collector::collect(store, blobs, now_ms, Duration::from_hours(24))
+            .await
+            .expect("collected")
+            .blobs
     };
     let now_ms = registry.registry.clock.now_ms();
     assert_eq!(collect(now_ms + HOUR_MS / 2).await, 0);
     assert_eq!(collect(now_ms + HOUR_MS + 1).await, 3, "the map, the config and the manifest");
     let mut there = Vec::new();
     for map in &maps {
-        there.push(registry.status(Method::HEAD, &format!("{repository}/blobs/{}", map.digest)).await.as_u16());
+        there.push(
+            registry
+                .status(Method::HEAD, &format!("{repository}/blobs/{}", map.digest))
+                .await
+                .as_u16(),
+        );
     }
-    assert_eq!(there, [404, 200, 200, 200, 200, 200], "the first picture is part of a package that is being pushed");
+    assert_eq!(
+        there,
+        [404, 200, 200, 200, 200, 200],
+        "the first picture is part of a package that is being pushed"
+    );
 
     assert_eq!(collect(now_ms + 25 * HOUR_MS).await, 1, "but nobody listed it");
     let mut files = Vec::new();
     for (byte, path) in [(4, "a"), (5, "b"), (6, "c")] {
         files.push(file(path, push.blob(&vec![byte; 660 * 1024]).await));
     }
-    assert_eq!(push.output(&output(&robot, 4, files)).await, StatusCode::PAYLOAD_TOO_LARGE, "not even alone");
+    assert_eq!(
+        push.output(&output(&robot, 4, files)).await,
+        StatusCode::PAYLOAD_TOO_LARGE,
+        "not even alone"
+    );
 }
 
 on_both_databases!(
@@ -302,13 +397,15 @@ async fn a_robots_manifests_and_links_count() {
         let mut manifest = image(blob, blob);
         manifest["annotations"] = json!({ "number": number.to_string() });
         let path = format!("/v2/{repository}/manifests/same");
-        statuses.push(registry.put_manifest(&path, MANIFEST_TYPE, &manifest).await.status().as_u16());
+        statuses
+            .push(registry.put_manifest(&path, MANIFEST_TYPE, &manifest).await.status().as_u16());
     }
     assert_eq!((statuses, kept().await), (vec![201; 4], 5 * 64));
     // One blob in many repositories is one on the disk, and many rows.
     let mut statuses = Vec::new();
     for number in 0..7 {
-        let path = format!("/v2/outputs/{robot}/task{number}/blobs/uploads/?digest={}", blob.digest);
+        let path =
+            format!("/v2/outputs/{robot}/task{number}/blobs/uploads/?digest={}", blob.digest);
         let answer = registry.ask(Method::POST, &path).body("{}").send().await.expect("an answer");
         statuses.push(answer.status().as_u16());
     }

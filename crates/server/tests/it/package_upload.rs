@@ -1,4 +1,5 @@
-//! A directory that the page brings: packed like the command packs it, and whatever else it is, refused without a trace.
+//! A directory that the page brings: packed like the command packs it, and whatever else it is,
+//! refused without a trace.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -42,7 +43,9 @@ fn lone(path: &str, mode: u32, content: &[u8]) -> Vec<u8> {
 
 impl TestServer {
     fn upload(&self, content_type: &str, body: Vec<u8>) -> reqwest::RequestBuilder {
-        self.request(Method::POST, "/api/v1/packages").header("content-type", content_type).body(body)
+        self.request(Method::POST, "/api/v1/packages")
+            .header("content-type", content_type)
+            .body(body)
     }
 
     fn is_clean(&self) -> bool {
@@ -53,13 +56,17 @@ impl TestServer {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_people_bring_leaves_the_reserve_of_the_disk() {
     let directory_of_server = tempfile::TempDir::new().expect("a directory");
-    let server = TestServer::start_in(directory_of_server, |config| config.disk_reserve = Some(1 << 50)).await;
+    let server =
+        TestServer::start_in(directory_of_server, |config| config.disk_reserve = Some(1 << 50))
+            .await;
     let dir = directory("1.0.0", &[("main.sh", "true")]);
     let upload = server.upload("application/x-tar", archive(dir.path(), ""));
     assert_eq!(refusal(upload).await, (507, "disk_full".to_owned()));
     assert!(server.is_clean());
     let digest = task_proto::Digest::of(b"blob");
-    let push = server.request(Method::POST, &format!("/v2/mapper/blobs/uploads/?digest={digest}")).body("blob");
+    let push = server
+        .request(Method::POST, &format!("/v2/mapper/blobs/uploads/?digest={digest}"))
+        .body("blob");
     let refused = push.send().await.expect("an answer");
     assert_eq!(refused.status(), StatusCode::INSUFFICIENT_STORAGE);
     let said = refused.text().await.expect("text");
@@ -69,17 +76,22 @@ async fn what_people_bring_leaves_the_reserve_of_the_disk() {
 #[tokio::test(flavor = "multi_thread")]
 async fn an_uploaded_directory_is_the_package_that_the_command_makes() {
     let server = TestServer::start().await;
-    let dir =
-        directory("1.0.0", &[("main.sh", "true"), ("data/a", "a"), ("data/b.bag", "b"), (".taskdignore", "*.bag")]);
-    std::fs::set_permissions(dir.path().join("main.sh"), PermissionsExt::from_mode(0o755)).expect("set");
+    let dir = directory(
+        "1.0.0",
+        &[("main.sh", "true"), ("data/a", "a"), ("data/b.bag", "b"), (".taskdignore", "*.bag")],
+    );
+    std::fs::set_permissions(dir.path().join("main.sh"), PermissionsExt::from_mode(0o755))
+        .expect("set");
     std::os::unix::fs::symlink("data/a", dir.path().join("link")).expect("linked");
     std::fs::hard_link(dir.path().join("data/a"), dir.path().join("second")).expect("linked");
     let packed = pack(dir.path()).expect("a package");
     let (bare, named) = (archive(dir.path(), ""), archive(dir.path(), "mapper"));
     let compressed = zstd::encode_all(&named[..], 3).expect("compressed");
-    for (content_type, body) in
-        [("application/x-tar", bare), ("application/x-tar", named), ("application/zstd", compressed)]
-    {
+    for (content_type, body) in [
+        ("application/x-tar", bare),
+        ("application/x-tar", named),
+        ("application/zstd", compressed),
+    ] {
         let response = server.upload(content_type, body).send().await.expect("an answer");
         let status = response.status();
         let text = response.text().await.expect("text");
@@ -158,7 +170,8 @@ async fn what_is_no_package_is_refused_and_leaves_nothing() {
 
 /// Sends a request without a token, with `rest` after its head, and reads all that is answered.
 async fn refused_bytes(server: &TestServer, header: &str, rest: &[u8]) -> String {
-    let mut stream = TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
+    let mut stream =
+        TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
     let head = format!(
         "POST /api/v1/packages HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\
          content-type: application/x-tar\r\ncontent-length: {REFUSED_BYTES}\r\n{header}\r\n"
@@ -174,13 +187,20 @@ async fn refused_bytes(server: &TestServer, header: &str, rest: &[u8]) -> String
 #[tokio::test(flavor = "multi_thread")]
 async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
     let server = TestServer::start().await;
-    let publishers = [server.sign_in_as("alice", "publisher").await, server.sign_in_as("bob", "publisher").await];
+    let publishers = [
+        server.sign_in_as("alice", "publisher").await,
+        server.sign_in_as("bob", "publisher").await,
+    ];
     let upload_by = |token: &str, body: reqwest::Body| {
         let request = server.bare(Method::POST, "/api/v1/packages").bearer_auth(token);
         request.header("content-type", "application/x-tar").body(body)
     };
     let upload = |body| upload_by(&server.operator.reveal(), body);
-    let body = || reqwest::Body::wrap_stream(futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>());
+    let body = || {
+        reqwest::Body::wrap_stream(
+            futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>(),
+        )
+    };
     // Whoever finds the place taken by what asks below asks again.
     let endless = async |token: &str| while refusal(upload_by(token, body())).await.0 == 429 {};
     let until = async |status: u16| while refusal(upload("hello".into())).await.0 != status {};
@@ -194,8 +214,12 @@ async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_bomb_is_refused_before_it_is_unpacked_whole() {
     let server = TestServer::start().await;
-    let bomb = zstd::encode_all(&lone("zeros", 0o644, &vec![0; 65 << 20])[..], 3).expect("compressed");
-    assert_eq!(refusal(server.upload("application/zstd", bomb)).await, (413, "too_large".to_owned()));
+    let bomb =
+        zstd::encode_all(&lone("zeros", 0o644, &vec![0; 65 << 20])[..], 3).expect("compressed");
+    assert_eq!(
+        refusal(server.upload("application/zstd", bomb)).await,
+        (413, "too_large".to_owned())
+    );
     assert!(server.is_clean());
 }
 

@@ -38,30 +38,44 @@ async fn a_task_package_is_checked_and_listed() {
     let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let mut no_command = task("talker");
     no_command["run"] = json!({});
-    for (config, reason) in [(no_command, "run: give either"), (json!({ "name": "talker" }), "missing field")] {
+    for (config, reason) in
+        [(no_command, "run: give either"), (json!({ "name": "talker" }), "missing field")]
+    {
         let config = registry.push_blob("talker", config.to_string().as_bytes()).await;
         let package = ImageManifest::package(config, content);
-        let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+        let answer =
+            registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
         let body: Value = answer.json().await.expect("an error body");
         assert_eq!(body["errors"][0]["code"], "MANIFEST_INVALID");
-        assert!(body["errors"][0]["message"].as_str().expect("text").contains(reason), "{body} for {reason}");
+        assert!(
+            body["errors"][0]["message"].as_str().expect("text").contains(reason),
+            "{body} for {reason}"
+        );
     }
     let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
     let package = ImageManifest::package(config, content);
     let name = Algorithm::Sha512.digest(&serde_json::to_vec(&package).expect("JSON"));
-    let answer = registry.put_manifest(&format!("/v2/talker/manifests/{name}"), MANIFEST_TYPE, &package).await;
-    assert_eq!(refusal(answer).await, refused(400, "MANIFEST_INVALID"), "no robot knows it by that name");
+    let answer = registry
+        .put_manifest(&format!("/v2/talker/manifests/{name}"), MANIFEST_TYPE, &package)
+        .await;
+    assert_eq!(
+        refusal(answer).await,
+        refused(400, "MANIFEST_INVALID"),
+        "no robot knows it by that name"
+    );
     assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
 
     for _ in 0..2 {
-        let answer = registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
+        let answer =
+            registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
         assert_eq!(answer.status(), StatusCode::CREATED);
     }
     let packages = registry.registry.store.packages().await.expect("packages");
     let [view] = &packages[..] else { panic!("{packages:?}") };
     assert_eq!((view.package.config, view.package.content), (config, content));
     assert_eq!((view.pushed_at_ms, view.package.version.as_str()), (NOW_MS, "1.0.0"));
-    let found = registry.registry.store.package(&view.package.name, &view.package.manifest.digest).await;
+    let found =
+        registry.registry.store.package(&view.package.name, &view.package.manifest.digest).await;
     assert_eq!(found.expect("a package").as_ref(), Some(view));
 
     let manifest = format!("/v2/talker/manifests/{}", view.package.manifest.digest);
@@ -86,30 +100,48 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
             (StatusCode::OK, own.to_string())
         );
         let signature = registry.push_signature(mirror, own).await;
-        let referrers: Value =
-            registry.get(&format!("/v2/{mirror}/referrers/{own}")).await.json().await.expect("a list");
+        let referrers: Value = registry
+            .get(&format!("/v2/{mirror}/referrers/{own}"))
+            .await
+            .json()
+            .await
+            .expect("a list");
         assert_eq!(referrers["manifests"][0]["digest"], signature.to_string(), "{referrers}");
     }
     // It is ordered by its own name and listed once.
     let packages = store.packages().await.expect("packages");
-    assert_eq!(packages.iter().map(|view| view.package.name.as_str()).collect::<Vec<_>>(), ["talker"]);
+    assert_eq!(
+        packages.iter().map(|view| view.package.name.as_str()).collect::<Vec<_>>(),
+        ["talker"]
+    );
     // What is wrong with it is refused there as well, and some repositories are for other things.
     let content = registry.push_blob("mirror/x", b"no archive").await;
     let config = registry.push_blob("mirror/x", task("talker").to_string().as_bytes()).await;
     let damaged = ImageManifest::package(config, content);
-    let answer = registry.put_manifest("/v2/mirror/x/manifests/1.0.0", MANIFEST_TYPE, &damaged).await;
+    let answer =
+        registry.put_manifest("/v2/mirror/x/manifests/1.0.0", MANIFEST_TYPE, &damaged).await;
     assert_eq!(refusal(answer).await, refused(400, "MANIFEST_INVALID"));
     let answer = registry.try_push_package("outputs/r00000000000000a1/talker", "talker").await;
     let body: Value = answer.json().await.expect("an error body");
     let message = body["errors"][0]["message"].as_str().expect("text");
-    assert!(message.contains("talker can't be stored in outputs/r00000000000000a1/talker"), "{message}");
+    assert!(
+        message.contains("talker can't be stored in outputs/r00000000000000a1/talker"),
+        "{message}"
+    );
 
     // A copy that is deleted takes nothing with it, and one that stays is no package.
     let status = registry.status(Method::DELETE, &format!("/v2/walker/manifests/{own}")).await;
-    assert_eq!((status, store.packages().await.expect("packages").len()), (StatusCode::ACCEPTED, 1));
+    assert_eq!(
+        (status, store.packages().await.expect("packages").len()),
+        (StatusCode::ACCEPTED, 1)
+    );
     let status = registry.status(Method::DELETE, &format!("/v2/talker/manifests/{own}")).await;
-    assert_eq!((status, store.packages().await.expect("packages").len()), (StatusCode::ACCEPTED, 0));
-    let copy = registry.status(Method::GET, &format!("/v2/mirror/team/talker/manifests/{own}")).await;
+    assert_eq!(
+        (status, store.packages().await.expect("packages").len()),
+        (StatusCode::ACCEPTED, 0)
+    );
+    let copy =
+        registry.status(Method::GET, &format!("/v2/mirror/team/talker/manifests/{own}")).await;
     assert_eq!(copy, StatusCode::OK);
 }
 
@@ -125,20 +157,31 @@ impl TestRegistry {
         let content = self.push_blob(repository, &archive_with(b"")).await;
         let config = self.push_blob(repository, task(name).to_string().as_bytes()).await;
         let package = ImageManifest::package(config, content);
-        self.put_manifest(&format!("/v2/{repository}/manifests/1.0.0"), MANIFEST_TYPE, &package).await
+        self.put_manifest(&format!("/v2/{repository}/manifests/1.0.0"), MANIFEST_TYPE, &package)
+            .await
     }
 
     /// Pushes a signature of the package with this manifest beside its copy.
     async fn push_signature(&self, repository: &str, manifest: Digest) -> Digest {
-        let package = self.registry.store.package(&"talker".parse().expect("a name"), &manifest).await;
+        let package =
+            self.registry.store.package(&"talker".parse().expect("a name"), &manifest).await;
         let package = package.expect("read").expect("there").package;
-        let envelope = PackageStatement { package: package.clone() }.seal(&SigningKey::from_bytes([7; 32]));
+        let envelope =
+            PackageStatement { package: package.clone() }.seal(&SigningKey::from_bytes([7; 32]));
         let layer = self.push_blob(repository, &serde_json::to_vec(&envelope).expect("JSON")).await;
         self.push_blob(repository, EMPTY).await;
-        let document = ImageManifest::signed_document(SIGNATURE_ARTIFACT, layer, Some(package.manifest));
+        let document =
+            ImageManifest::signed_document(SIGNATURE_ARTIFACT, layer, Some(package.manifest));
         let digest = Digest::of(&serde_json::to_vec(&document).expect("JSON"));
-        let answer = self.put_manifest(&format!("/v2/{repository}/manifests/{digest}"), MANIFEST_TYPE, &document).await;
-        assert_eq!(answer.status(), StatusCode::CREATED, "{}", answer.text().await.unwrap_or_default());
+        let answer = self
+            .put_manifest(&format!("/v2/{repository}/manifests/{digest}"), MANIFEST_TYPE, &document)
+            .await;
+        assert_eq!(
+            answer.status(),
+            StatusCode::CREATED,
+            "{}",
+            answer.text().await.unwrap_or_default()
+        );
         digest
     }
 }
@@ -146,7 +189,8 @@ impl TestRegistry {
 async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
-    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
     let mut packages = Vec::new();
     for content in [archive_with(b"first"), archive_with(b"other")] {
@@ -158,15 +202,25 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
     let digest = |package: &ImageManifest| Digest::of(&serde_json::to_vec(package).expect("JSON"));
     let [first, second] = &packages[..] else { panic!("{packages:?}") };
     for tag in ["1.0.0", "1.0.0", "stable"] {
-        assert_eq!(put(tag, first).await.status(), StatusCode::CREATED, "the same is the same under each name");
+        assert_eq!(
+            put(tag, first).await.status(),
+            StatusCode::CREATED,
+            "the same is the same under each name"
+        );
     }
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
     let order = order_of(&ordered);
-    let id = fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &ordered).await.expect("ordered");
+    let id = fleet
+        .actions
+        .create_deployment(&fleet.operator, &random_key(), &order, &ordered)
+        .await
+        .expect("ordered");
     fleet.follow(&mut robots[0], Phase::Running).await;
-    let is_outdated = async || (fleet.view(&robots[0]).await.tasks[0].outdated, fleet.deployment(&id).await.outdated);
+    let is_outdated = async || {
+        (fleet.view(&robots[0]).await.tasks[0].outdated, fleet.deployment(&id).await.outdated)
+    };
 
     for tag in ["1.0.0", "stable", "latest"] {
         let refused = put(tag, second).await;
@@ -185,12 +239,16 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
     assert_eq!(put("1.0.0?force=true", first).await.status(), StatusCode::CREATED, "and back");
     assert_eq!(is_outdated().await, (false, false));
     // A tag that was taken away is free.
-    assert_eq!(registry.status(Method::DELETE, "/v2/talker/manifests/1.0.0").await, StatusCode::ACCEPTED);
+    assert_eq!(
+        registry.status(Method::DELETE, "/v2/talker/manifests/1.0.0").await,
+        StatusCode::ACCEPTED
+    );
     assert_eq!(put("1.0.0", second).await.status(), StatusCode::CREATED);
     // A version that means something else than a package, and what is no package, move as ever.
     for layer in [&b"one"[..], b"two"] {
         let image = image(config, registry.push_blob("talker", layer).await);
-        let answer = registry.put_manifest("/v2/talker/manifests/2.0.0", MANIFEST_TYPE, &image).await;
+        let answer =
+            registry.put_manifest("/v2/talker/manifests/2.0.0", MANIFEST_TYPE, &image).await;
         assert_eq!(answer.status(), StatusCode::CREATED);
     }
 }
@@ -198,7 +256,8 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
 async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
-    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     let config = registry.push_blob("talker", task("talker").to_string().as_bytes()).await;
     let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let package = ImageManifest::package(config, content);
@@ -233,21 +292,30 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
         (loose, StatusCode::FORBIDDEN),
     ] {
         let path = format!("/v2/talker/blobs/{digest}");
-        assert_eq!(registry.status(Method::GET, &format!("{robot}{path}")).await, expected, "{digest}");
-        assert_eq!(registry.status(Method::GET, &format!("{stranger}{path}")).await, StatusCode::FORBIDDEN);
+        assert_eq!(
+            registry.status(Method::GET, &format!("{robot}{path}")).await,
+            expected,
+            "{digest}"
+        );
+        assert_eq!(
+            registry.status(Method::GET, &format!("{stranger}{path}")).await,
+            StatusCode::FORBIDDEN
+        );
     }
 }
 
 async fn what_is_needed_holds_no_push_back_and_is_no_write(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
-    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let registry =
+        TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     registry.push_image("a", "v1").await;
     // A write that is not committed leaves the number as it was.
     let turn = async || database.store.begin_keeping_rights().await.expect("begins").turn();
     let before = turn().await;
     let _push = registry.registry.blobs.hold_collection().await;
-    let collected = tokio::time::timeout(Duration::from_secs(30), registry.collect(NOW_MS + YEAR_MS)).await;
+    let collected =
+        tokio::time::timeout(Duration::from_secs(30), registry.collect(NOW_MS + YEAR_MS)).await;
     assert_eq!(collected.expect("it waits for no push"), Collected::default());
     assert_eq!(turn().await, before);
 }
@@ -255,20 +323,28 @@ async fn what_is_needed_holds_no_push_back_and_is_no_write(database: TestDatabas
 async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
-    let registry = TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
-    let (part, loose) = (registry.push_blob("a", b"part").await, registry.push_blob("a", b"loose").await);
+    let registry =
+        TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
+    let (part, loose) =
+        (registry.push_blob("a", b"part").await, registry.push_blob("a", b"loose").await);
     let (store, blobs) = (database.store.clone(), registry.registry.blobs.clone());
     let push = blobs.hold_collection().await;
     let collecting = tokio::spawn({
         let (store, blobs) = (store.clone(), blobs.clone());
-        async move { collector::collect(&store, &blobs, NOW_MS + YEAR_MS, GRACE).await.expect("collected") }
+        async move {
+            collector::collect(&store, &blobs, NOW_MS + YEAR_MS, GRACE).await.expect("collected")
+        }
     });
     // Once the collector waits for this push, the next one waits for the collector.
     while !collecting.is_finished() && blobs.hold_collection().now_or_never().is_some() {
         tokio::task::yield_now().await;
     }
     let new = NewManifest {
-        manifest: StoredManifest { digest: Digest::of(b"manifest"), size: 8, media_type: MANIFEST_TYPE.to_owned() },
+        manifest: StoredManifest {
+            digest: Digest::of(b"manifest"),
+            size: 8,
+            media_type: MANIFEST_TYPE.to_owned(),
+        },
         artifact_type: None,
         annotations: Default::default(),
         subject: None,
@@ -284,7 +360,8 @@ async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) 
     assert_eq!(put.expect("writes"), PutManifest::Stored);
     drop(push);
     assert_eq!(collecting.await.expect("it ends").blobs, 1);
-    for (digest, expected) in [(part.digest, StatusCode::OK), (loose.digest, StatusCode::NOT_FOUND)] {
+    for (digest, expected) in [(part.digest, StatusCode::OK), (loose.digest, StatusCode::NOT_FOUND)]
+    {
         assert_eq!(registry.status(Method::GET, &format!("/v2/a/blobs/{digest}")).await, expected);
     }
 }
@@ -325,7 +402,10 @@ async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
     let registry = TestRegistry::start().await;
     let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
     let robot = RobotId::random();
-    let viewer = Person { roles: Roles::one(Role::Viewer), ..Person::first("0123456789ab".parse().expect("an id")) };
+    let viewer = Person {
+        roles: Roles::one(Role::Viewer),
+        ..Person::first("0123456789ab".parse().expect("an id"))
+    };
     let to_viewer = serve(registry.registry.clone(), Some(Caller::Person(viewer))).await;
     let to_robot = serve(registry.registry.clone(), Some(Caller::Robot(robot.clone()))).await;
     let outputs: &str = &format!("outputs/{robot}/mapping");
@@ -333,7 +413,10 @@ async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
     let deleted = registry.push_blob("a", b"deleted").await.digest;
     let pushed = registry.push_blob("a", b"pushed again").await.digest;
     let brought = registry.push_blob(outputs, b"brought back").await.digest;
-    assert_eq!(registry.status(Method::DELETE, &format!("/v2/a/blobs/{deleted}")).await, StatusCode::ACCEPTED);
+    assert_eq!(
+        registry.status(Method::DELETE, &format!("/v2/a/blobs/{deleted}")).await,
+        StatusCode::ACCEPTED
+    );
 
     registry.registry.clock.advance_ms(grace_ms);
     for (server, repository, digest, expected) in [
@@ -345,10 +428,16 @@ async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
         let path = format!("{server}/v2/{repository}/blobs/{digest}");
         assert_eq!(registry.status(Method::HEAD, &path).await, expected, "{path}");
     }
-    assert_eq!(registry.collect(NOW_MS + grace_ms + 1).await.blobs, 2, "what was only read, and what was deleted");
-    for (repository, digest, expected) in
-        [("a", read, StatusCode::NOT_FOUND), ("a", pushed, StatusCode::OK), (outputs, brought, StatusCode::OK)]
-    {
+    assert_eq!(
+        registry.collect(NOW_MS + grace_ms + 1).await.blobs,
+        2,
+        "what was only read, and what was deleted"
+    );
+    for (repository, digest, expected) in [
+        ("a", read, StatusCode::NOT_FOUND),
+        ("a", pushed, StatusCode::OK),
+        (outputs, brought, StatusCode::OK),
+    ] {
         let path = format!("/v2/{repository}/blobs/{digest}");
         assert_eq!(registry.status(Method::GET, &path).await, expected, "{path}");
     }

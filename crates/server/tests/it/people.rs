@@ -1,9 +1,11 @@
-//! The story of people, told on every database: who may what, their tokens, their passwords, and the audit of it all.
+//! The story of people, told on every database: who may what, their tokens, their passwords, and
+//! the audit of it all.
 
 use std::net::IpAddr;
 
 use task_proto::api::{
-    AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditRobot, EditUser, LogIn, TokenOrigin,
+    AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditRobot, EditUser, LogIn,
+    TokenOrigin,
 };
 use task_proto::audit::{AuditEntry, Link};
 use task_proto::manifest::TaskKind;
@@ -86,7 +88,8 @@ impl Fleet {
 
     async fn label(&self, robot: &crate::fleet::Robot, labels: &str) {
         let labels = labels.split_once('=').expect("a label");
-        let labels = [(labels.0.parse().expect("a key"), labels.1.parse().expect("a value"))].into();
+        let labels =
+            [(labels.0.parse().expect("a key"), labels.1.parse().expect("a value"))].into();
         let edit = EditRobot { labels: Some(labels), ..EditRobot::default() };
         self.actions.edit_robot(&self.operator, &robot.id, &edit).await.expect("edited");
     }
@@ -117,7 +120,9 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator,publisher", Some("site=lab")).await;
     let alice = fleet.signed_in("alice").await;
-    let allowed = |person: &Person| Permission::ALL.into_iter().filter(|&p| person.may(p)).collect::<Vec<_>>();
+    let allowed = |person: &Person| {
+        Permission::ALL.into_iter().filter(|&p| person.may(p)).collect::<Vec<_>>()
+    };
     assert_eq!(allowed(&alice), [Permission::Read, Permission::Operate, Permission::Publish]);
     assert_eq!((alice.name.as_str(), alice.scope.to_string()), ("alice", "site=lab".to_owned()));
 
@@ -134,20 +139,35 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     assert_eq!(allowed(&dashboard), [Permission::Read, Permission::Publish]);
     assert_eq!(dashboard.scope.to_string(), "site=lab and r1,r2");
     assert_eq!(made.expires_at_ms, fleet.clock.now_ms() + 3_600_000);
-    // It makes no others, for it would never end; and nobody makes one that allows more than they may.
-    assert_eq!(code(fleet.actions.create_token(&dashboard, &CreateToken::default()).await), "forbidden");
+    // It makes no others, for it would never end; and nobody makes one that allows more than they
+    // may.
+    assert_eq!(
+        code(fleet.actions.create_token(&dashboard, &CreateToken::default()).await),
+        "forbidden"
+    );
     let wide = CreateToken { roles: Some(roles("admin")), ..CreateToken::default() };
     assert_eq!(code(fleet.actions.create_token(&alice, &wide).await), "invalid_request");
     let for_bob = CreateToken { user: Some(name("bob")), ..CreateToken::default() };
     assert_eq!(code(fleet.actions.create_token(&alice, &for_bob).await), "forbidden");
     assert_eq!(code(fleet.actions.create_token(&fleet.operator, &for_bob).await), "not_found");
-    assert_eq!(code(fleet.actions.create_token(&fleet.operator, &CreateToken::default()).await), "invalid_request");
+    assert_eq!(
+        code(fleet.actions.create_token(&fleet.operator, &CreateToken::default()).await),
+        "invalid_request"
+    );
 
     // What the user loses, the token loses; what is left to neither is no token.
     let edit = |may: &str| EditUser { roles: Some(roles(may)), scope: Some(selector("*")) };
-    fleet.actions.edit_user(&fleet.operator, &name("alice"), &edit("publisher")).await.expect("edited");
+    fleet
+        .actions
+        .edit_user(&fleet.operator, &name("alice"), &edit("publisher"))
+        .await
+        .expect("edited");
     assert_eq!(fleet.person(&token).await.expect("good").scope.to_string(), "r1,r2");
-    fleet.actions.edit_user(&fleet.operator, &name("alice"), &edit("viewer")).await.expect("edited");
+    fleet
+        .actions
+        .edit_user(&fleet.operator, &name("alice"), &edit("viewer"))
+        .await
+        .expect("edited");
     assert_eq!(fleet.person(&token).await, None);
     // An administrator with a scope does not administer what concerns everybody.
     fleet.add("boss", "admin", Some("site=lab")).await;
@@ -163,20 +183,27 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     fleet.add("alice", "operator", Some("site=lab")).await;
     let alice = fleet.signed_in("alice").await;
     let (bundle, before) = (package("1", TaskKind::Service), fleet.audit().await.len());
-    let order = |to: &str| task_proto::api::CreateDeployment { selector: selector(to), ..order_of(&bundle) };
+    let order = |to: &str| task_proto::api::CreateDeployment {
+        selector: selector(to),
+        ..order_of(&bundle)
+    };
     let ordered = |to: &'static str| {
         let (fleet, alice, order, bundle) = (&fleet, &alice, order(to), &bundle);
         async move { fleet.actions.create_deployment(alice, &random_key(), &order, bundle).await }
     };
     let refused = ordered("*").await.expect_err("refused");
-    let expected = "1 of the 3 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
+    let expected =
+        "1 of the 3 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
     assert_eq!((refused.code(), refused.to_string().as_str()), ("out_of_scope", expected));
     assert_eq!(code(ordered("r2").await), "unknown_robots");
     assert_eq!(code(ordered("r0,r2").await), "unknown_robots");
     assert_eq!(code(fleet.actions.matching_robots(&alice, &selector("*")).await), "out_of_scope");
     assert_eq!(code(ordered("site=mars").await), "no_robots_match");
     assert_eq!(fleet.acts_since(before).await, []);
-    assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty(), "not even those that are hers");
+    assert!(
+        fleet.desired(&robots[0]).await.expect("state").tasks.is_empty(),
+        "not even those that are hers"
+    );
     let own = ordered("site=lab").await.expect("ordered");
 
     // What is there already counts like what is asked for.
@@ -187,13 +214,20 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     let (task, key) = ("talker".parse().expect("a name"), random_key());
     let stop = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &selector("*")).await;
     assert_eq!(code(stop), "out_of_scope");
-    assert_eq!(code(fleet.actions.robots_with_task(&alice, &task, &selector("*")).await), "out_of_scope");
+    assert_eq!(
+        code(fleet.actions.robots_with_task(&alice, &task, &selector("*")).await),
+        "out_of_scope"
+    );
     assert_eq!(code(fleet.actions.cancel_deployment(&alice, &everywhere).await), "out_of_scope");
     assert_eq!(code(fleet.actions.resume_deployment(&alice, &everywhere).await), "out_of_scope");
     let over = fleet.actions.cancel_deployment(&alice, &own).await;
     assert_eq!(code(over), "nothing_to_cancel", "all of it is hers, and over");
     let lab = selector("site=lab");
-    let stopped = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &lab).await.expect("ordered");
+    let stopped = fleet
+        .actions
+        .order_task(&alice, &key, TaskOrder::Stop, &task, &lab)
+        .await
+        .expect("ordered");
     assert_eq!(stopped.len(), 2);
     assert_eq!(fleet.phases(&everywhere).await[2], Phase::Running);
 
@@ -205,7 +239,9 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
         page.expect("no other was named").deployments
     };
     let (none, parts) = (parts(&[]).await, parts(&mine).await);
-    let counted = parts.iter().map(|part| (part.id.clone(), part.counts.iter().map(|count| count.count).sum::<u64>()));
+    let counted = parts
+        .iter()
+        .map(|part| (part.id.clone(), part.counts.iter().map(|count| count.count).sum::<u64>()));
     assert_eq!(counted.collect::<Vec<_>>(), [(everywhere, 2), (own, 2)]);
     assert_eq!(none, []);
 }
@@ -221,9 +257,13 @@ async fn a_robot_stays_in_its_editors_scope(database: TestDatabase) {
     assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[0].id, &out).await), "out_of_scope");
     let lab = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
     let pulled_in = EditRobot { labels: Some(lab), ..EditRobot::default() };
-    assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[1].id, &pulled_in).await), "out_of_scope");
+    assert_eq!(
+        code(fleet.actions.edit_robot(&boss, &robots[1].id, &pulled_in).await),
+        "out_of_scope"
+    );
     assert_eq!(code(fleet.actions.remove_robot(&boss, &robots[1].id).await), "out_of_scope");
-    let renamed = EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
+    let renamed =
+        EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
     fleet.actions.edit_robot(&boss, &robots[0].id, &renamed).await.expect("it is his");
     fleet.actions.remove_robot(&boss, &robots[0].id).await.expect("it is his");
 }
@@ -234,28 +274,45 @@ async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
     for (who, password) in [("alice", "wrong"), ("bob", PASSWORD), ("operator.token", PASSWORD)] {
         assert_eq!(code(fleet.sign_in(who, password, HERE).await), "unauthorized", "{who}");
     }
-    let (token, other) = (fleet.sign_in("alice", PASSWORD, HERE).await, fleet.sign_in("alice", PASSWORD, HERE).await);
+    let (token, other) = (
+        fleet.sign_in("alice", PASSWORD, HERE).await,
+        fleet.sign_in("alice", PASSWORD, HERE).await,
+    );
     let (token, other) = (token.expect("signed in"), other.expect("signed in"));
     let alice = fleet.person(&token).await.expect("good");
     let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
     let change = |old: &str, new: &str| ChangePassword { old: old.to_owned(), new: new.to_owned() };
     let changed = fleet.actions.change_password(&alice, &change("wrong", "another long one")).await;
     assert_eq!(changed.expect_err("refused").to_string(), "old: it is wrong");
-    assert_eq!(code(fleet.actions.change_password(&alice, &change(PASSWORD, "short")).await), "invalid_request");
-    fleet.actions.change_password(&alice, &change(PASSWORD, "another long one")).await.expect("changed");
+    assert_eq!(
+        code(fleet.actions.change_password(&alice, &change(PASSWORD, "short")).await),
+        "invalid_request"
+    );
+    fleet
+        .actions
+        .change_password(&alice, &change(PASSWORD, "another long one"))
+        .await
+        .expect("changed");
     assert_eq!(code(fleet.sign_in("alice", PASSWORD, HERE).await), "unauthorized");
     fleet.sign_in("alice", "another long one", HERE).await.expect("signed in");
     assert!(fleet.person(&token).await.is_some(), "the one who changed it");
     assert_eq!(fleet.person(&other).await, None);
-    assert!(fleet.person(&made.token.parse().expect("a token")).await.is_some(), "what was made on purpose");
+    assert!(
+        fleet.person(&made.token.parse().expect("a token")).await.is_some(),
+        "what was made on purpose"
+    );
     // An administrator who sets it signs everybody out.
     fleet.actions.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
     assert_eq!(fleet.person(&token).await, None);
-    assert_eq!(code(fleet.actions.set_password(&fleet.operator, &name("bob"), PASSWORD).await), "not_found");
+    assert_eq!(
+        code(fleet.actions.set_password(&fleet.operator, &name("bob"), PASSWORD).await),
+        "not_found"
+    );
     let first = fleet.actions.change_password(&fleet.operator, &change(PASSWORD, PASSWORD)).await;
     assert_eq!(code(first), "forbidden");
     // Without a password nobody comes in by one.
-    let order = AddUser { name: name("ci"), roles: roles("publisher"), scope: None, password: None };
+    let order =
+        AddUser { name: name("ci"), roles: roles("publisher"), scope: None, password: None };
     assert!(!fleet.actions.add_user(&fleet.operator, &order).await.expect("added").has_password);
     assert_eq!(code(fleet.sign_in("ci", "", HERE).await), "unauthorized");
     assert_eq!(code(fleet.actions.add_user(&fleet.operator, &order).await), "user_exists");
@@ -273,14 +330,20 @@ async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDat
     }
     let before = fleet.audit().await.len();
     for n in 10..13 {
-        let refused = fleet.sign_in("alice", PASSWORD, stranger(n)).await.expect_err("not even the right one");
+        let refused = fleet
+            .sign_in("alice", PASSWORD, stranger(n))
+            .await
+            .expect_err("not even the right one");
         assert_eq!(refused.code(), "too_many_requests");
         assert_eq!(refused.to_string(), "too many wrong passwords; try again in 900 s");
     }
     assert_eq!(fleet.acts_since(before).await, [act("server", "sign_in.blocked", "alice")], "once");
     fleet.sign_in("alice", PASSWORD, HERE).await.expect("from where she came before she still can");
     for n in 0..50 {
-        assert_eq!(code(fleet.sign_in(&format!("nobody{n}"), "wrong", stranger(99)).await), "unauthorized");
+        assert_eq!(
+            code(fleet.sign_in(&format!("nobody{n}"), "wrong", stranger(99)).await),
+            "unauthorized"
+        );
     }
     fleet.add("bob", "viewer", None).await;
     assert_eq!(code(fleet.sign_in("bob", PASSWORD, stranger(99)).await), "too_many_requests");
@@ -290,13 +353,15 @@ async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDat
     fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("likewise");
 }
 
-/// Who is known at an address signs in there whatever its neighbours do, and is told no more than they are if they fail.
+/// Who is known at an address signs in there whatever its neighbours do, and is told no more than
+/// they are if they fail.
 async fn neighbours_of_a_failing_address(fleet: &Fleet) {
     for n in 0..51 {
         let _ = fleet.sign_in(&format!("neighbour{n}"), "wrong", HERE).await;
     }
     let [known, unknown] = ["alice", "ghost"].map(|name| fleet.sign_in(name, "wrong", HERE));
-    let [known, unknown] = [known.await, unknown.await].map(|refused| refused.expect_err("refused").to_string());
+    let [known, unknown] =
+        [known.await, unknown.await].map(|refused| refused.expect_err("refused").to_string());
     assert_eq!(known, "too many wrong passwords; try again in 900 s");
     assert_eq!(known, unknown);
     fleet.sign_in("alice", PASSWORD, HERE).await.expect("she is known here");
@@ -310,9 +375,12 @@ async fn the_last_way_in_stays_open(database: TestDatabase) {
     let by = fleet.person(&first).await.expect("good");
     assert!(by.is_first());
     let revoked = fleet.actions.revoke_token(&by, &first_id).await;
-    let said = "operator.token is the last administrator with a way in; give another one a password first";
+    let said =
+        "operator.token is the last administrator with a way in; give another one a password first";
     assert_eq!(revoked.expect_err("refused").to_string(), said);
-    for (who, may, scope) in [("boss", "admin", None), ("other", "admin", Some("site=lab")), ("op", "operator", None)] {
+    for (who, may, scope) in
+        [("boss", "admin", None), ("other", "admin", Some("site=lab")), ("op", "operator", None)]
+    {
         fleet.add(who, may, scope).await;
     }
     let boss = fleet.signed_in("boss").await;
@@ -322,8 +390,14 @@ async fn the_last_way_in_stays_open(database: TestDatabase) {
     assert_eq!(fleet.person(&first).await, None);
     let demoted = EditUser { roles: Some(roles("viewer")), scope: None };
     let limited = EditUser { roles: None, scope: Some(selector("site=lab")) };
-    assert_eq!(code(fleet.actions.edit_user(&boss, &name("boss"), &demoted).await), "last_administrator");
-    assert_eq!(code(fleet.actions.edit_user(&boss, &name("boss"), &limited).await), "last_administrator");
+    assert_eq!(
+        code(fleet.actions.edit_user(&boss, &name("boss"), &demoted).await),
+        "last_administrator"
+    );
+    assert_eq!(
+        code(fleet.actions.edit_user(&boss, &name("boss"), &limited).await),
+        "last_administrator"
+    );
     assert_eq!(code(fleet.actions.remove_user(&boss, &name("boss")).await), "last_administrator");
     // The token in the data directory does not come back to life.
     fleet.actions.expire().await.expect("done");
@@ -375,7 +449,8 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     fleet.add("alice", "admin", None).await;
     let alice = fleet.signed_in("alice").await;
     let entries = fleet.audit().await;
-    let said: Vec<_> = entries.iter().map(|entry| (entry.who.as_str(), entry.act.as_str())).collect();
+    let said: Vec<_> =
+        entries.iter().map(|entry| (entry.who.as_str(), entry.act.as_str())).collect();
     let expected = [
         ("operator.token", "enrolment_token.create"),
         ("enrolment", "robot.enroll"),
@@ -391,8 +466,16 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     let (task, all) = ("talker".parse().expect("a name"), selector("*"));
     let bundle = package("1", TaskKind::Service);
     let key = random_key();
-    let id = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
-    fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("the same again");
+    let id = fleet
+        .actions
+        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .await
+        .expect("ordered");
+    fleet
+        .actions
+        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .await
+        .expect("the same again");
     // Robots' reports are not people's acts.
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.actions.expire().await.expect("nobody's business");
@@ -427,8 +510,14 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     let by = |who: &str| AuditQuery { who: Some(who.to_owned()), ..AuditQuery::default() };
     assert_eq!(found(by("enrolment")).await, [2]);
     assert_eq!(found(AuditQuery { act: Some("task.".to_owned()), ..by("alice") }).await, [8, 7, 6]);
-    assert_eq!(found(AuditQuery { target: Some(id.to_string()), ..AuditQuery::default() }).await, [9, 5]);
-    assert_eq!(found(AuditQuery { before: Some(4), limit: Some(2), ..AuditQuery::default() }).await, [3, 2]);
+    assert_eq!(
+        found(AuditQuery { target: Some(id.to_string()), ..AuditQuery::default() }).await,
+        [9, 5]
+    );
+    assert_eq!(
+        found(AuditQuery { before: Some(4), limit: Some(2), ..AuditQuery::default() }).await,
+        [3, 2]
+    );
     assert_eq!(found(AuditQuery { after: Some(10), ..AuditQuery::default() }).await, [11, 12]);
 }
 
@@ -437,13 +526,21 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     let robots = fleet.enroll(2).await;
     let before = fleet.audit().await.len();
     let taken = EditRobot { name: Some("r1".parse().expect("a name")), ..EditRobot::default() };
-    assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &taken).await), "name_taken");
+    assert_eq!(
+        code(fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &taken).await),
+        "name_taken"
+    );
     let repository = "talker".parse().expect("a name");
-    let deed = taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);
+    let deed =
+        taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);
     let store = &fleet.database.store;
-    let missing = store.delete_manifest(&repository, &Digest::of(b"x"), &deed, 1).await.expect("reads");
+    let missing =
+        store.delete_manifest(&repository, &Digest::of(b"x"), &deed, 1).await.expect("reads");
     assert_eq!(missing, Deletion::Unknown);
-    let missing = store.delete_tag(&repository, &"latest".parse().expect("a tag"), &deed, 1).await.expect("reads");
+    let missing = store
+        .delete_tag(&repository, &"latest".parse().expect("a tag"), &deed, 1)
+        .await
+        .expect("reads");
     assert_eq!(missing, Deletion::Unknown);
     // A write that is dropped after its entry was written takes the entry with it.
     let mut write = store.begin().await.expect("begins");
@@ -453,7 +550,10 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     let mut write = store.begin().await.expect("begins");
     write.audit(&deed, 1).await.expect("written");
     write.commit().await.expect("stored");
-    assert_eq!(fleet.acts_since(before).await, [act("operator.token", "manifest.delete", "talker")]);
+    assert_eq!(
+        fleet.acts_since(before).await,
+        [act("operator.token", "manifest.delete", "talker")]
+    );
 }
 
 async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDatabase) {
@@ -485,7 +585,11 @@ async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDataba
     for _ in 0..250 {
         let task = "talker".parse().expect("a name");
         let all = "*".parse().expect("a selector");
-        fleet.actions.order_task(&ada, &random_key(), TaskOrder::Stop, &task, &all).await.expect("ordered");
+        fleet
+            .actions
+            .order_task(&ada, &random_key(), TaskOrder::Stop, &task, &all)
+            .await
+            .expect("ordered");
     }
 }
 
@@ -513,8 +617,16 @@ async fn another_persons_key_is_another_key(database: TestDatabase) {
     fleet.add("bob", "operator", None).await;
     let (alice, bob) = (fleet.signed_in("alice").await, fleet.signed_in("bob").await);
     let (key, bundle) = (random_key(), package("1", TaskKind::Service));
-    let id = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
-    let again = fleet.actions.create_deployment(&alice, &key, &order_of(&bundle), &bundle).await.expect("the same");
+    let id = fleet
+        .actions
+        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .await
+        .expect("ordered");
+    let again = fleet
+        .actions
+        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .await
+        .expect("the same");
     assert_eq!(again, id);
     let other = fleet.actions.create_deployment(&bob, &key, &order_of(&bundle), &bundle).await;
     assert_eq!(code(other), "idempotency_key_reused");

@@ -1,7 +1,8 @@
-//! Who may what, found out by trying: every HTTP route is called by everybody, every MQTT topic of a robot is spoken and heard
-//! on by everybody, and what comes of it is docs/permissions.md. After a wanted change:
-//! `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the table is tried by itself; give it a body
-//! in `body` and its parameters a value in `Town::path`, if it needs them.
+//! Who may what, found out by trying: every HTTP route is called by everybody, every MQTT topic of
+//! a robot is spoken and heard on by everybody, and what comes of it is docs/permissions.md. After
+//! a wanted change: `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the
+//! table is tried by itself; give it a body in `body` and its parameters a value in `Town::path`,
+//! if it needs them.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -86,7 +87,11 @@ impl Town {
     async fn new() -> Self {
         // With a provider that does not answer: who may go there is what counts.
         let issuer = "http://127.0.0.1:9".to_owned();
-        let oidc = OidcSettings { issuer, public_url: "http://127.0.0.1".to_owned(), ..OidcSettings::default() };
+        let oidc = OidcSettings {
+            issuer,
+            public_url: "http://127.0.0.1".to_owned(),
+            ..OidcSettings::default()
+        };
         let directory = tempfile::TempDir::new().expect("a directory");
         let configure = |config: &mut Config| {
             config.oidc = oidc;
@@ -94,9 +99,11 @@ impl Town {
             config.robots.backoff = Duration::ZERO;
         };
         let server = TestServer::start_in(directory, configure).await;
-        let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
+        let store =
+            Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
         let (robot, other_robot) = (server.enroll("atlas").await, server.enroll("boreas").await);
-        let (talker, package) = (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
+        let (talker, package) =
+            (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
         let deployment = server.deploy(&talker, "atlas", "talker").await;
         server.deploy(&package, "atlas", "walker").await;
         let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
@@ -139,7 +146,9 @@ impl Town {
             Comer::Itself => self.robot.token.clone(),
             Comer::OtherRobot => self.other_robot.token.clone(),
             Comer::Person(role) => self.sign_in(role.as_str(), role, None).await.reveal(),
-            Comer::Elsewhere(role) => self.sign_in(&format!("{role}2"), role, Some("boreas")).await.reveal(),
+            Comer::Elsewhere(role) => {
+                self.sign_in(&format!("{role}2"), role, Some("boreas")).await.reveal()
+            }
         })
     }
 
@@ -154,18 +163,24 @@ impl Town {
             path = path.replace("{robot}", robot.as_str());
         }
         if path.contains("{enrollment}") {
-            let token: EnrollmentToken = self.server.post("/api/v1/enrollment-tokens", &json!({})).await;
+            let token: EnrollmentToken =
+                self.server.post("/api/v1/enrollment-tokens", &json!({})).await;
             path = path.replace("{enrollment}", &token.id);
         }
         if path.contains("{user}") || path.contains("{token}") {
             let token = self.sign_in("bob", Role::Viewer, None).await;
             path = path.replace("{user}", "bob").replace("{token}", &token.id());
         }
-        path =
-            path.replace("{task}", "walker").replace("{*file}", "app.js").replace("{itself}", self.robot.id.as_str());
+        path = path
+            .replace("{task}", "walker")
+            .replace("{*file}", "app.js")
+            .replace("{itself}", self.robot.id.as_str());
         path = path.replace("{package}", "walker").replace("{version}", "1.0.0");
         path = path.replace("{blob}", &self.package.content.digest.to_string());
-        assert!(!path.contains('{'), "{path}: this test has to be told of a value for the parameter");
+        assert!(
+            !path.contains('{'),
+            "{path}: this test has to be told of a value for the parameter"
+        );
         path
     }
 
@@ -176,11 +191,17 @@ impl Town {
             request = request.bearer_auth(token);
         }
         if let Some(body) = &probe.body {
-            request = request.header("idempotency-key", format!("{:08x}", rand::random::<u32>())).json(body);
+            request = request
+                .header("idempotency-key", format!("{:08x}", rand::random::<u32>()))
+                .json(body);
         }
         let response = request.send().await.expect("an answer");
         let status = response.status();
-        assert!(!status.is_server_error() || status.as_u16() == 504, "{} by {comer:?}: {status}", probe.title);
+        assert!(
+            !status.is_server_error() || status.as_u16() == 504,
+            "{} by {comer:?}: {status}",
+            probe.title
+        );
         let is_registry = probe.path.starts_with("/v2");
         match status.as_u16() {
             refused @ (401 | 403) => refused.to_string(),
@@ -206,7 +227,9 @@ impl Town {
             keep_alive_s: 0,
             will: None,
         };
-        let stream = tokio::net::TcpStream::connect(&self.server.server.addresses().mqtt).await.expect("listens");
+        let stream = tokio::net::TcpStream::connect(&self.server.server.addresses().mqtt)
+            .await
+            .expect("listens");
         let mut raw = Raw { stream };
         raw.send(&connect.packet()).await;
         (raw.read(4).await? == [0x20, 2, 0, 0]).then_some(raw)
@@ -253,15 +276,21 @@ fn body(method: &Method, path: &str) -> Option<Value> {
             json!({ "package": "walker", "manifest": digest, "selector": "atlas", "dry_run": true })
         }
         ("POST", "/api/v1/deployments/{deployment}/retry") => json!({ "dry_run": true }),
-        ("POST", "/api/v1/bulk/labels") => json!({ "selector": "atlas", "set": { "site": "lab" }, "dry_run": true }),
+        ("POST", "/api/v1/bulk/labels") => {
+            json!({ "selector": "atlas", "set": { "site": "lab" }, "dry_run": true })
+        }
         ("POST", "/api/v1/bulk/remove") => json!({ "selector": "atlas", "dry_run": true }),
-        ("POST", path) if path.starts_with("/api/v1/tasks/") => json!({ "selector": "atlas", "dry_run": true }),
+        ("POST", path) if path.starts_with("/api/v1/tasks/") => {
+            json!({ "selector": "atlas", "dry_run": true })
+        }
         ("POST", "/api/v1/robots/{robot}/ask") => json!({ "type": "nodes" }),
         ("POST", "/api/v1/users") => {
             json!({ "name": format!("new-{:08x}", rand::random::<u32>()), "roles": ["viewer"] })
         }
         ("PUT", "/api/v1/users/{user}/password") => json!({ "password": "correct horse battery" }),
-        ("PUT", "/api/v1/password") => json!({ "old": "correct horse battery", "new": "another long password" }),
+        ("PUT", "/api/v1/password") => {
+            json!({ "old": "correct horse battery", "new": "another long password" })
+        }
         ("POST" | "PUT" | "PATCH", _) => json!({}),
         _ => return None,
     })
@@ -278,7 +307,8 @@ fn probes(route: &Route) -> Vec<Probe> {
     let mut probes = vec![probe(route.path, method, route.path, body(method, route.path))];
     match (method.as_str(), route.path) {
         ("POST", "/api/v1/robots/{robot}/ask") => {
-            let change = json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
+            let change =
+                json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
             let mut changing = probe(route.path, method, route.path, Some(change));
             changing.title += " what changes something";
             probes.push(changing);
@@ -306,10 +336,26 @@ fn registry_probes(path: &str) -> Vec<Probe> {
             ("PUT", "/v2/taskd/publishers/manifests/1", "/v2/taskd/publishers/manifests/TAG"),
             ("DELETE", "/v2/taskd/publishers/manifests/none", "/v2/taskd/publishers/manifests/TAG"),
             ("GET", "/v2/outputs/{itself}/mapping/tags/list", "/v2/outputs/ROBOT/TASK/tags/list"),
-            ("GET", "/v2/outputs/{itself}/mapping/blobs/{blob}", "/v2/outputs/ROBOT/TASK/blobs/DIGEST"),
-            ("POST", "/v2/outputs/{itself}/mapping/blobs/uploads/", "/v2/outputs/ROBOT/TASK/blobs/uploads/"),
-            ("PUT", "/v2/outputs/{itself}/mapping/manifests/x", "/v2/outputs/ROBOT/TASK/manifests/TAG"),
-            ("DELETE", "/v2/outputs/{itself}/mapping/manifests/x", "/v2/outputs/ROBOT/TASK/manifests/TAG"),
+            (
+                "GET",
+                "/v2/outputs/{itself}/mapping/blobs/{blob}",
+                "/v2/outputs/ROBOT/TASK/blobs/DIGEST",
+            ),
+            (
+                "POST",
+                "/v2/outputs/{itself}/mapping/blobs/uploads/",
+                "/v2/outputs/ROBOT/TASK/blobs/uploads/",
+            ),
+            (
+                "PUT",
+                "/v2/outputs/{itself}/mapping/manifests/x",
+                "/v2/outputs/ROBOT/TASK/manifests/TAG",
+            ),
+            (
+                "DELETE",
+                "/v2/outputs/{itself}/mapping/manifests/x",
+                "/v2/outputs/ROBOT/TASK/manifests/TAG",
+            ),
         ],
         "/v2" => &[("GET", "/v2", "/v2")],
         "/v2/" => &[("GET", "/v2/", "/v2/")],
@@ -417,7 +463,8 @@ fn roles_table() -> String {
     let mut header = vec!["role".to_owned()];
     header.extend(Permission::ALL.map(|permission| permission.to_string()));
     let row = |role: Role| {
-        let is_allowed = |permission| if role.permissions().contains(&permission) { "✓" } else { "" };
+        let is_allowed =
+            |permission| if role.permissions().contains(&permission) { "✓" } else { "" };
         let mut row = vec![role.to_string()];
         row.extend(Permission::ALL.map(|permission| is_allowed(permission).to_owned()));
         row
@@ -428,19 +475,20 @@ fn roles_table() -> String {
 const HEAD: &str = "\
 # Who may what
 
-Made by the test `permissions`, which calls every route and speaks and listens on every topic as everybody; it fails when this
-page is not what comes of it. `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions` writes it anew.
+The test `permissions` makes this page. It calls every route and uses every topic with every kind of
+account, and fails when the page differs from the result.
+`UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions` writes it anew.
 
-A user has one role or several, and may do what any of them allows. Whoever is limited to some robots has `administer` for
-none of what concerns everybody, though an admin; see [people.md](people.md).
+A user has one role or several and may do what any of them allows. An account whose scope is limited
+to some robots has `administer` for nothing that concerns all of them; see [people.md](people.md).
 
 ";
 
 const HTTP: &str = "
 ## HTTP
 
-`✓`: let in, whatever comes of it then. A number: refused with that status. \"Of other robots\": limited to robots among which
-the one in question is not; they see lists without it.
+`✓`: admitted, whatever the answer is. A number: refused with that status. \"Of other robots\": limited
+to robots that do not include the one in question; their lists leave it out.
 
 ";
 
@@ -468,5 +516,9 @@ async fn permissions_are_as_the_page_has_them() {
     for (line, (is, was)) in found.lines().zip(written.lines()).enumerate() {
         assert_eq!(is, was, "docs/permissions.md, line {}", line + 1);
     }
-    assert_eq!(found.lines().count(), written.lines().count(), "docs/permissions.md has another length");
+    assert_eq!(
+        found.lines().count(),
+        written.lines().count(),
+        "docs/permissions.md has another length"
+    );
 }

@@ -1,4 +1,5 @@
-//! A Postgres that is away: the server waits for it at start, and says so to everybody while it serves.
+//! A Postgres that is away: the server waits for it at start, and says so to everybody while it
+//! serves.
 
 #![expect(clippy::disallowed_methods, reason = "the test starts and stops a database server")]
 
@@ -25,9 +26,12 @@ struct Postgres {
 
 /// The newest there is.
 fn program(name: &str) -> PathBuf {
-    let versions = std::fs::read_dir("/usr/lib/postgresql").expect("Postgres is installed: run ./scripts/test");
-    let version = |path: &PathBuf| path.file_name().and_then(|name| name.to_str()?.parse::<u32>().ok());
-    let newest = versions.flatten().map(|entry| entry.path()).max_by_key(version).expect("a version");
+    let versions = std::fs::read_dir("/usr/lib/postgresql")
+        .expect("Postgres is installed: run ./scripts/test");
+    let version =
+        |path: &PathBuf| path.file_name().and_then(|name| name.to_str()?.parse::<u32>().ok());
+    let newest =
+        versions.flatten().map(|entry| entry.path()).max_by_key(version).expect("a version");
     newest.join("bin").join(name)
 }
 
@@ -46,13 +50,17 @@ impl Postgres {
     fn create() -> Self {
         let directory = TempDir::new().expect("a directory");
         if nix::unistd::geteuid().is_root() {
-            let postgres = nix::unistd::User::from_name("postgres").expect("known").expect("Postgres has an account");
-            nix::unistd::chown(directory.path(), Some(postgres.uid), Some(postgres.gid)).expect("given away");
+            let postgres = nix::unistd::User::from_name("postgres")
+                .expect("known")
+                .expect("Postgres has an account");
+            nix::unistd::chown(directory.path(), Some(postgres.uid), Some(postgres.gid))
+                .expect("given away");
         }
         let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
         let port = listener.local_addr().expect("bound").port();
         let created = Self { directory, port };
-        let arguments = ["-D", &created.data(), "-U", "postgres", "-A", "trust", "--no-sync", "-E", "UTF8"];
+        let arguments =
+            ["-D", &created.data(), "-U", "postgres", "-A", "trust", "--no-sync", "-E", "UTF8"];
         assert!(run(&program("initdb"), &arguments), "initdb fails");
         created
     }
@@ -62,11 +70,17 @@ impl Postgres {
     }
 
     fn start(&self) {
-        let options =
-            format!("-c listen_addresses=127.0.0.1 -c port={} -c unix_socket_directories= -c fsync=off", self.port);
+        let options = format!(
+            "-c listen_addresses=127.0.0.1 -c port={} -c unix_socket_directories= -c fsync=off",
+            self.port
+        );
         let log = self.directory.path().join("log").to_str().expect("text").to_owned();
         let arguments = ["-D", &self.data(), "-s", "-w", "-l", &log, "-o", &options, "start"];
-        assert!(run(&program("pg_ctl"), &arguments), "it does not start: {}", std::fs::read_to_string(&log).unwrap());
+        assert!(
+            run(&program("pg_ctl"), &arguments),
+            "it does not start: {}",
+            std::fs::read_to_string(&log).unwrap()
+        );
     }
 
     fn stop(&self) -> bool {
@@ -110,7 +124,12 @@ async fn assert_away(server: &TestServer) {
         ("list", request(Method::GET, "/api/v1/robots")),
         ("order", server.order("/api/v1/tasks/talker/stop", "key-2", &json!({ "selector": "*" }))),
         ("status", request(Method::GET, "/api/v1/server/status")),
-        ("sign-in", server.bare(Method::POST, "/api/v1/login").json(&json!({ "user": "a", "password": "b" }))),
+        (
+            "sign-in",
+            server
+                .bare(Method::POST, "/api/v1/login")
+                .json(&json!({ "user": "a", "password": "b" })),
+        ),
         ("blob", request(Method::GET, "/v2/talker/tags/list")),
     ] {
         let response = request.send().await.expect("an answer");
@@ -137,7 +156,11 @@ async fn server_waits_for_a_database_that_is_away_at_start() {
     assert_away(&server).await;
     postgres.start();
     eventually("it serves", async || {
-        server.request(Method::GET, "/api/v1/robots").send().await.is_ok_and(|response| response.status().is_success())
+        server
+            .request(Method::GET, "/api/v1/robots")
+            .send()
+            .await
+            .is_ok_and(|response| response.status().is_success())
     })
     .await;
     server.enroll("atlas").await;
@@ -179,7 +202,9 @@ async fn database_that_is_restarted_costs_no_session_and_no_report() {
     session.expect(&[0x40, 2, 0, 9]).await;
     assert_eq!(server.robot(&robot).await.tasks[0].phase, Phase::Running);
     eventually("/readyz says so", async || database(&server).await.0 == StatusCode::OK).await;
-    let stopped: Value = answer(server.order("/api/v1/tasks/talker/stop", "key-3", &json!({ "selector": "*" }))).await;
+    let stopped: Value =
+        answer(server.order("/api/v1/tasks/talker/stop", "key-3", &json!({ "selector": "*" })))
+            .await;
     assert!(stopped.is_object());
     server.stop().await;
 }

@@ -1,5 +1,5 @@
-//! An OpenID Connect provider in this process that knows one person, keeps to the protocol as strictly as it can, and lies in
-//! its ID tokens when it is told to.
+//! An OpenID Connect provider in this process that knows one person, keeps to the protocol as
+//! strictly as it can, and lies in its ID tokens when it is told to.
 
 use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -51,15 +51,20 @@ type Shared = State<Arc<Mutex<Inner>>>;
 
 fn new_key() -> EcdsaKeyPair {
     let random = SystemRandom::new();
-    let document = EcdsaKeyPair::generate_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, &random).expect("a key");
-    EcdsaKeyPair::from_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, document.as_ref(), &random).expect("a key")
+    let document =
+        EcdsaKeyPair::generate_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, &random).expect("a key");
+    EcdsaKeyPair::from_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, document.as_ref(), &random)
+        .expect("a key")
 }
 
 impl Provider {
     /// Under a name that is not the server's, so that browsers take them for two sites.
     pub async fn start() -> Self {
-        let listener = tokio::net::TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0))).await.expect("binds");
-        let issuer = format!("http://localhost:{}", listener.local_addr().expect("an address").port());
+        let listener = tokio::net::TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+            .await
+            .expect("binds");
+        let issuer =
+            format!("http://localhost:{}", listener.local_addr().expect("an address").port());
         let inner = Arc::new(Mutex::new(Inner {
             issuer: issuer.clone(),
             key: new_key(),
@@ -78,7 +83,8 @@ impl Provider {
             .route("/token", post(token))
             .route("/keys", get(keys))
             .with_state(inner.clone());
-        let serving = tokio::spawn(async move { axum::serve(listener, router).await.expect("serves") });
+        let serving =
+            tokio::spawn(async move { axum::serve(listener, router).await.expect("serves") });
         Self { issuer, inner, _serving: tokio_util::task::AbortOnDropHandle::new(serving) }
     }
 
@@ -154,7 +160,8 @@ async fn keys(State(inner): Shared) -> Result<Json<Value>, StatusCode> {
     inner.count("keys")?;
     let point = inner.key.public_key().as_ref();
     let (x, y) = (URL_SAFE_NO_PAD.encode(&point[1..33]), URL_SAFE_NO_PAD.encode(&point[33..]));
-    let key = json!({ "kty": "EC", "crv": "P-256", "use": "sig", "kid": inner.key_id, "x": x, "y": y });
+    let key =
+        json!({ "kty": "EC", "crv": "P-256", "use": "sig", "kid": inner.key_id, "x": x, "y": y });
     Ok(Json(json!({ "keys": [key] })))
 }
 
@@ -173,22 +180,33 @@ async fn authorize(State(inner): Shared, Query(asked): Query<HashMap<String, Str
     }
     let (to, state) = (given("redirect_uri").to_owned(), given("state").to_owned());
     if !inner.is_open {
-        return Redirect::to(&format!("{to}?error=access_denied&error_description=no&state={state}")).into_response();
+        return Redirect::to(&format!(
+            "{to}?error=access_denied&error_description=no&state={state}"
+        ))
+        .into_response();
     }
     let code = format!("{:032x}", rand::random::<u128>());
     inner.codes.insert(code.clone(), asked);
     let issuer = inner.issuer.replace(':', "%3A").replace('/', "%2F");
-    Redirect::to(&format!("{to}?code={code}&state={state}&iss={issuer}&session_state=x")).into_response()
+    Redirect::to(&format!("{to}?code={code}&state={state}&iss={issuer}&session_state=x"))
+        .into_response()
 }
 
-async fn token(State(inner): Shared, headers: http::HeaderMap, body: String) -> Result<Response, StatusCode> {
+async fn token(
+    State(inner): Shared,
+    headers: http::HeaderMap,
+    body: String,
+) -> Result<Response, StatusCode> {
     let mut inner = inner.lock().expect("nobody panicked");
     inner.count("token")?;
     let query = reqwest::Url::parse(&format!("http://localhost/?{body}")).expect("a form");
     let form: HashMap<String, String> = query.query_pairs().into_owned().collect();
     let given = |name: &str| form.get(name).map(String::as_str).unwrap_or_default();
-    let refused = |error: &str| Ok((StatusCode::BAD_REQUEST, Json(json!({ "error": error }))).into_response());
-    let credentials = format!("Basic {}", STANDARD.encode(format!("{CLIENT_ID}:a+secret+%26+more")));
+    let refused = |error: &str| {
+        Ok((StatusCode::BAD_REQUEST, Json(json!({ "error": error }))).into_response())
+    };
+    let credentials =
+        format!("Basic {}", STANDARD.encode(format!("{CLIENT_ID}:a+secret+%26+more")));
     if headers.get("authorization").is_none_or(|value| value.as_bytes() != credentials.as_bytes()) {
         return refused("invalid_client");
     }
@@ -213,5 +231,6 @@ async fn token(State(inner): Shared, headers: http::HeaderMap, body: String) -> 
     let signed = format!("{}.{}", part(&header), part(&claims));
     let signature = inner.key.sign(&SystemRandom::new(), signed.as_bytes()).expect("signs");
     let id_token = format!("{signed}.{}", URL_SAFE_NO_PAD.encode(signature));
-    Ok(Json(json!({ "access_token": "x", "token_type": "Bearer", "id_token": id_token })).into_response())
+    Ok(Json(json!({ "access_token": "x", "token_type": "Bearer", "id_token": id_token }))
+        .into_response())
 }

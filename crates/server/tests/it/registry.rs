@@ -54,7 +54,12 @@ impl TestRegistry {
         Self::start_on(store, data, settings, caller).await
     }
 
-    pub async fn start_on(store: Store, data: TempDir, settings: BlobSettings, caller: Option<Caller>) -> Self {
+    pub async fn start_on(
+        store: Store,
+        data: TempDir,
+        settings: BlobSettings,
+        caller: Option<Caller>,
+    ) -> Self {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
         store.create_operator_token(&OPERATOR, NOW_MS).await.expect("stored");
         let site_label = "site".parse().expect("a label's key");
@@ -66,7 +71,8 @@ impl TestRegistry {
     }
 
     pub fn ask(&self, method: Method, path: &str) -> RequestBuilder {
-        let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
+        let url =
+            if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
         self.client.request(method, url)
     }
 
@@ -88,14 +94,25 @@ impl TestRegistry {
     pub async fn push_blob(&self, repository: &str, bytes: &[u8]) -> BlobRef {
         let digest = Digest::of(bytes);
         let path = format!("/v2/{repository}/blobs/uploads/?digest={digest}");
-        let answer = self.ask(Method::POST, &path).body(bytes.to_vec()).send().await.expect("an answer");
+        let answer =
+            self.ask(Method::POST, &path).body(bytes.to_vec()).send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::CREATED);
         BlobRef { digest, size: bytes.len() as u64 }
     }
 
-    pub async fn put_manifest(&self, path: &str, media_type: &str, manifest: &impl serde::Serialize) -> Response {
+    pub async fn put_manifest(
+        &self,
+        path: &str,
+        media_type: &str,
+        manifest: &impl serde::Serialize,
+    ) -> Response {
         let body = serde_json::to_vec(manifest).expect("JSON");
-        self.ask(Method::PUT, path).header("content-type", media_type).body(body).send().await.expect("an answer")
+        self.ask(Method::PUT, path)
+            .header("content-type", media_type)
+            .body(body)
+            .send()
+            .await
+            .expect("an answer")
     }
 
     /// Pushes an image of two small blobs, tagged `tag`.
@@ -103,13 +120,17 @@ impl TestRegistry {
         let config = self.push_blob(repository, b"{}").await;
         let layer = self.push_blob(repository, tag.as_bytes()).await;
         let image = image(config, layer);
-        let answer = self.put_manifest(&format!("/v2/{repository}/manifests/{tag}"), MANIFEST_TYPE, &image).await;
+        let answer = self
+            .put_manifest(&format!("/v2/{repository}/manifests/{tag}"), MANIFEST_TYPE, &image)
+            .await;
         assert_eq!(answer.status(), StatusCode::CREATED);
         header(&answer, "docker-content-digest").parse().expect("a digest")
     }
 
     pub async fn collect(&self, now_ms: u64) -> Collected {
-        collector::collect(&self.registry.store, &self.registry.blobs, now_ms, GRACE).await.expect("collected")
+        collector::collect(&self.registry.store, &self.registry.blobs, now_ms, GRACE)
+            .await
+            .expect("collected")
     }
 }
 
@@ -157,7 +178,13 @@ pub fn image(config: BlobRef, layer: BlobRef) -> Value {
 }
 
 pub fn header(answer: &Response, name: &str) -> String {
-    answer.headers().get(name).unwrap_or_else(|| panic!("no {name}")).to_str().expect("text").to_owned()
+    answer
+        .headers()
+        .get(name)
+        .unwrap_or_else(|| panic!("no {name}"))
+        .to_str()
+        .expect("text")
+        .to_owned()
 }
 
 /// The answer's status and its first error code.

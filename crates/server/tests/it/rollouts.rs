@@ -38,7 +38,8 @@ async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: Te
     let mut robots = fleet.enroll(4).await;
     fleet.go_offline(&robots[0].id);
     fleet.go_offline(&robots[2].id);
-    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    let id =
+        fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
     assert!(!fleet.has_begun(&robots[0]).await && fleet.has_begun(&robots[1]).await);
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert!(!fleet.has_begun(&robots[2]).await && fleet.has_begun(&robots[3]).await);
@@ -56,14 +57,18 @@ async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: Te
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
     fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
     fleet.follow(&mut robots[2], Phase::Running).await;
-    assert_eq!(fleet.phases(&id).await, [Phase::Failed, Phase::Running, Phase::Running, Phase::Running]);
+    assert_eq!(
+        fleet.phases(&id).await,
+        [Phase::Failed, Phase::Running, Phase::Running, Phase::Running]
+    );
 }
 
 async fn offline_robots_that_are_left_expire(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     fleet.go_offline(&robots[0].id);
-    let id = fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
+    let id =
+        fleet.deploy("1", |order| (order.batch, order.expires_in_s) = (Some(1), Some(60))).await;
     // Its time does not run while others have their turn.
     fleet.clock.advance_ms(59_999);
     fleet.actions.expire().await.expect("done");
@@ -78,10 +83,13 @@ async fn offline_robots_that_are_left_expire(database: TestDatabase) {
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 }
 
-async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute(database: TestDatabase) {
+async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute(
+    database: TestDatabase,
+) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
-    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    let id =
+        fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
     fleet.go_offline(&robots[0].id);
     fleet.clock.advance_ms(OFFLINE_GRACE_MS - 1);
     fleet.advance().await;
@@ -97,10 +105,13 @@ async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 }
 
-async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(database: TestDatabase) {
+async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(
+    database: TestDatabase,
+) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
-    let id = fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
+    let id =
+        fleet.deploy("1", |order| (order.batch, order.max_failures) = (Some(1), Some(0))).await;
     fleet.follow(&mut robots[0], Phase::Starting).await;
     fleet.go_offline(&robots[0].id);
     fleet.clock.advance_ms(LOST_AFTER_MS - 1);
@@ -129,10 +140,19 @@ async fn robots_that_come_back_together_begin_in_batches(database: TestDatabase)
     robots.iter().skip(5).for_each(|robot| fleet.come_online(&robot.id));
     fleet.advance().await;
     fleet.advance().await;
-    let begun: Vec<bool> =
-        fleet.deployment(&id).await.assignments.expect("there").iter().map(|one| one.released).collect();
+    let begun: Vec<bool> = fleet
+        .deployment(&id)
+        .await
+        .assignments
+        .expect("there")
+        .iter()
+        .map(|one| one.released)
+        .collect();
     assert_eq!(begun.iter().filter(|released| **released).count(), 2);
-    assert!(fleet.has_begun(&robots[10]).await && fleet.has_begun(&robots[11]).await, "by name: 10 comes before 5");
+    assert!(
+        fleet.has_begun(&robots[10]).await && fleet.has_begun(&robots[11]).await,
+        "by name: 10 comes before 5"
+    );
 }
 
 async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDatabase) {
@@ -140,7 +160,9 @@ async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDat
     let mut robots = fleet.enroll(4).await;
     fleet.go_offline(&robots[3].id);
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
-    let refused = async || fleet.actions.resume_deployment(&fleet.operator, &id).await.expect_err("not paused");
+    let refused = async || {
+        fleet.actions.resume_deployment(&fleet.operator, &id).await.expect_err("not paused")
+    };
     let (error, expected) = (
         refused().await.to_string(),
         format!(
@@ -164,8 +186,10 @@ async fn a_robot_that_comes_online_begins_at_once() {
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
     let order = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "*", "batch": 1 });
-    let ordered: DeploymentView = answer(server.order("/api/v1/deployments", "key-1", &order)).await;
-    let has_begun = |view: &DeploymentView| view.assignments.iter().flatten().all(|one| one.released);
+    let ordered: DeploymentView =
+        answer(server.order("/api/v1/deployments", "key-1", &order)).await;
+    let has_begun =
+        |view: &DeploymentView| view.assignments.iter().flatten().all(|one| one.released);
     assert!(!has_begun(&ordered), "it has not been heard yet");
     server.ask_desired(&robot).await;
     let path = format!("/api/v1/deployments/{}", ordered.id);

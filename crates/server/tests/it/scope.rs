@@ -1,5 +1,5 @@
-//! Someone who is limited to some robots, over HTTP and MQTT: what they see, what they are refused, and that nothing of what
-//! they lose goes on.
+//! Someone who is limited to some robots, over HTTP and MQTT: what they see, what they are refused,
+//! and that nothing of what they lose goes on.
 
 use std::time::Duration;
 
@@ -34,7 +34,8 @@ impl Sites {
         let (lab, field) = (server.enroll("atlas").await, server.enroll("boreas").await);
         for (robot, site) in [(&lab, "lab"), (&field, "field")] {
             let path = format!("/api/v1/robots/{}", robot.id);
-            let edit = server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": site } }));
+            let edit =
+                server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": site } }));
             let _: Value = answer(edit).await;
         }
         Self { server, lab, field }
@@ -83,18 +84,27 @@ async fn lists_and_views_have_only_ones_own_robots() {
     for robot in [&sites.lab, &sites.field] {
         let push = Push::new(&sites.server, robot, format!("outputs/{}/mapping", robot.id));
         let map = push.blob(b"a map").await;
-        assert_eq!(push.output(&output(&robot.id, 1, vec![file("map", map)])).await, StatusCode::CREATED);
+        assert_eq!(
+            push.output(&output(&robot.id, 1, vec![file("map", map)])).await,
+            StatusCode::CREATED
+        );
     }
     let state = sites.server.desired(&sites.lab).await;
     sites.server.report(&mut sites.lab, &state, Phase::Running).await;
     let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
 
     let robots: RobotList = answer(alice.ask(Method::GET, "/api/v1/robots")).await;
-    assert_eq!(robots.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    assert_eq!(
+        robots.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        ["atlas"]
+    );
     let robots: RobotList = answer(alice.ask(Method::GET, "/api/v1/robots?selector=boreas")).await;
     assert!(robots.robots.is_empty());
     let outputs: OutputList = answer(alice.ask(Method::GET, "/api/v1/outputs")).await;
-    assert_eq!(outputs.outputs.iter().map(|output| output.robot_name.as_str()).collect::<Vec<_>>(), ["atlas"]);
+    assert_eq!(
+        outputs.outputs.iter().map(|output| output.robot_name.as_str()).collect::<Vec<_>>(),
+        ["atlas"]
+    );
     let deployments: DeploymentList = answer(alice.ask(Method::GET, "/api/v1/deployments")).await;
     assert_eq!(deployments.deployments.len(), 1);
     assert_eq!(deployments.deployments[0].counts.iter().map(|count| count.count).sum::<u64>(), 1);
@@ -104,7 +114,14 @@ async fn lists_and_views_have_only_ones_own_robots() {
     assert_eq!(part.state, task_proto::api::DeploymentState::Settled, "hers runs");
     assert_eq!(part.assignments.expect("asked for").len(), 1);
     for view in ["/api/v1/deployments", path.as_str()] {
-        let text = alice.ask(Method::GET, view).send().await.expect("an answer").text().await.expect("text");
+        let text = alice
+            .ask(Method::GET, view)
+            .send()
+            .await
+            .expect("an answer")
+            .text()
+            .await
+            .expect("text");
         assert!(!text.contains("boreas") && !text.contains(before.id.as_str()), "{view}: {text}");
     }
 
@@ -123,8 +140,11 @@ async fn lists_and_views_have_only_ones_own_robots() {
     for path in foreign {
         assert_eq!(refusal(alice.ask(Method::GET, &path)).await, out_of_scope(), "{path}");
     }
-    let ask =
-        |robot: &str| alice.ask(Method::POST, &format!("/api/v1/robots/{robot}/ask")).json(&json!({ "type": "nodes" }));
+    let ask = |robot: &str| {
+        alice
+            .ask(Method::POST, &format!("/api/v1/robots/{robot}/ask"))
+            .json(&json!({ "type": "nodes" }))
+    };
     assert_eq!(refusal(ask("atlas")).await, (409, "robot_offline".to_owned()));
     assert_eq!(refusal(ask("boreas")).await, out_of_scope());
 
@@ -134,7 +154,8 @@ async fn lists_and_views_have_only_ones_own_robots() {
     assert_eq!(alice.status(Method::GET, &tags(&sites.lab)).await, 200);
     assert_eq!(alice.status(Method::GET, &tags(&sites.field)).await, 403);
     let map = task_proto::Digest::of(b"a map");
-    let mount = format!("/v2/own/blobs/uploads/?mount={map}&from=outputs/{}/mapping", sites.field.id);
+    let mount =
+        format!("/v2/own/blobs/uploads/?mount={map}&from=outputs/{}/mapping", sites.field.id);
     assert_eq!(alice.status(Method::POST, &mount).await, 403, "an operator does not push");
     sites.add("carol", &["publisher"], Some("site=lab")).await;
     let carol = Asker { server: &sites.server, token: sites.log_in("carol").await.token };
@@ -155,8 +176,12 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
     let refused = order("*", "one").send().await.expect("an answer");
     assert_eq!(refused.status(), StatusCode::FORBIDDEN);
     let body: Value = refused.json().await.expect("json");
-    let said = "1 of the 2 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
-    assert_eq!((&body["error"]["code"], &body["error"]["message"]), (&json!("out_of_scope"), &json!(said)));
+    let said =
+        "1 of the 2 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
+    assert_eq!(
+        (&body["error"]["code"], &body["error"]["message"]),
+        (&json!("out_of_scope"), &json!(said))
+    );
     // Whether a robot of that name is another's is not hers to know.
     for selector in ["boreas", "site=lab,boreas", "site=lab,!boreas", "nobody"] {
         let said = format!(
@@ -166,7 +191,10 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
         let refused = order(selector, "two").send().await.expect("an answer");
         assert_eq!(refused.status(), StatusCode::NOT_FOUND);
         let body: Value = refused.json().await.expect("json");
-        assert_eq!((&body["error"]["code"], &body["error"]["message"]), (&json!("unknown_robots"), &json!(said)));
+        assert_eq!(
+            (&body["error"]["code"], &body["error"]["message"]),
+            (&json!("unknown_robots"), &json!(said))
+        );
     }
     let ordered: DeploymentView = answer(order("site=lab", "three")).await;
     assert_eq!(ordered.assignments.expect("asked for").len(), 1);
@@ -190,31 +218,52 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
     let operator = Asker { server: &sites.server, token: sites.server.operator.reveal() };
     let (manifest, content) = (package.manifest.digest, package.content.digest);
     let envelope = Digest::of(&serde_json::to_vec(&signature).expect("json"));
-    let everybody =
-        [format!("manifests/{manifest}"), format!("blobs/{content}"), format!("blobs/{}", package.config.digest)];
-    let limited = ["manifests/1.0.0".to_owned(), format!("manifests/{signed}"), format!("blobs/{envelope}")];
+    let everybody = [
+        format!("manifests/{manifest}"),
+        format!("blobs/{content}"),
+        format!("blobs/{}", package.config.digest),
+    ];
+    let limited =
+        ["manifests/1.0.0".to_owned(), format!("manifests/{signed}"), format!("blobs/{envelope}")];
     for path in everybody.iter().chain(&limited) {
         assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 409, "{path}");
     }
     for path in &everybody {
-        assert_eq!(operator.status(Method::DELETE, &format!("/v2/talker/{path}")).await, 409, "{path}");
+        assert_eq!(
+            operator.status(Method::DELETE, &format!("/v2/talker/{path}")).await,
+            409,
+            "{path}"
+        );
     }
-    let refused = pia.ask(Method::DELETE, &format!("/v2/talker/manifests/{manifest}")).send().await.expect("an answer");
+    let refused = pia
+        .ask(Method::DELETE, &format!("/v2/talker/manifests/{manifest}"))
+        .send()
+        .await
+        .expect("an answer");
     let said = refused.text().await.expect("text");
-    assert!(said.contains("is what 2 robots should have: atlas, …") && !said.contains("boreas"), "{said}");
+    assert!(
+        said.contains("is what 2 robots should have: atlas, …") && !said.contains("boreas"),
+        "{said}"
+    );
     // The tag stays where it is as well; it may be set again to what it points to.
     let bytes = |digest| pia.ask(Method::GET, &format!("/v2/talker/manifests/{digest}")).send();
     let moved = async |by: &Asker<'_>, digest: Digest| {
         let manifest = bytes(digest).await.expect("an answer").bytes().await.expect("a manifest");
-        let put = by.ask(Method::PUT, "/v2/talker/manifests/1.0.0").header("content-type", MANIFEST_TYPE);
+        let put =
+            by.ask(Method::PUT, "/v2/talker/manifests/1.0.0").header("content-type", MANIFEST_TYPE);
         put.body(manifest).send().await.expect("an answer").status().as_u16()
     };
     assert_eq!((moved(&pia, later.manifest.digest).await, moved(&pia, manifest).await), (409, 201));
     for path in everybody.iter().chain(&limited) {
-        assert_eq!(operator.status(Method::GET, &format!("/v2/talker/{path}")).await, 200, "{path}");
+        assert_eq!(
+            operator.status(Method::GET, &format!("/v2/talker/{path}")).await,
+            200,
+            "{path}"
+        );
     }
 
-    // Where all of them are her own she may but for the package itself, and once nobody has it that goes too.
+    // Where all of them are her own she may but for the package itself, and once nobody has it that
+    // goes too.
     sites.server.deploy(&later, "boreas", "elsewhere").await;
     assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/manifests/{manifest}")).await, 409);
     for path in &limited {
@@ -236,13 +285,15 @@ async fn an_answer_that_is_given_again_names_only_robots_that_are_ones_own_now()
         let _: Value = answer(edit.json(&json!({ "labels": { "site": site } }))).await;
     };
     label(&sites.field, "lab").await;
-    let [old, new] = [sites.server.push("talker", "1.0.0").await, sites.server.push("talker", "2.0.0").await];
+    let [old, new] =
+        [sites.server.push("talker", "1.0.0").await, sites.server.push("talker", "2.0.0").await];
     for (package, key) in [(&old, "old"), (&new, "new")] {
         sites.server.deploy(package, "*", key).await;
     }
     let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
     let mia = Asker { server: &sites.server, token: sites.log_in("mia").await.token };
-    let deploy = json!({ "package": new.name, "manifest": new.manifest.digest, "selector": "site=lab" });
+    let deploy =
+        json!({ "package": new.name, "manifest": new.manifest.digest, "selector": "site=lab" });
     let all = json!({ "selector": "*" });
     let orders = [
         (&alice, "deployments", &deploy),
@@ -251,7 +302,9 @@ async fn an_answer_that_is_given_again_names_only_robots_that_are_ones_own_now()
         (&mia, "bulk/labels", &json!({ "selector": "site=lab", "set": { "hall": "2" } })),
     ];
     let said = async |(by, path, body): &(&Asker<'_>, &str, &Value)| {
-        let order = by.ask(Method::POST, &format!("/api/v1/{path}")).header("idempotency-key", path.replace('/', "-"));
+        let order = by
+            .ask(Method::POST, &format!("/api/v1/{path}"))
+            .header("idempotency-key", path.replace('/', "-"));
         let answer = order.json(body).send().await.expect("an answer");
         assert!(answer.status().is_success(), "{path}: {}", answer.status());
         answer.text().await.expect("text")
@@ -286,7 +339,8 @@ impl Events {
     /// Reads on until what came is enough.
     async fn until(&mut self, is_enough: impl Fn(&str) -> bool) -> &str {
         while !is_enough(&self.text) {
-            let chunk = tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should come");
+            let chunk =
+                tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should come");
             let chunk = chunk.expect("the stream should go on").expect("no error");
             self.text.push_str(std::str::from_utf8(&chunk).expect("text"));
         }
@@ -295,7 +349,10 @@ impl Events {
 
     /// The stream ends by itself.
     async fn ended(mut self) {
-        while let Some(Ok(_)) = tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should end") {}
+        while let Some(Ok(_)) =
+            tokio::time::timeout(PATIENCE, self.chunks.next()).await.expect("it should end")
+        {
+        }
     }
 }
 
@@ -305,7 +362,8 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
     sites.add("alice", &["viewer"], Some("site=lab")).await;
     let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
     let mut events = Events::open(&alice).await;
-    let mut all = Events::open(&Asker { server: &sites.server, token: sites.server.operator.reveal() }).await;
+    let mut all =
+        Events::open(&Asker { server: &sites.server, token: sites.server.operator.reveal() }).await;
     let package = sites.server.push("talker", "1.0.0").await;
     let elsewhere = sites.server.deploy(&package, "boreas", "elsewhere").await;
     let everywhere = sites.server.deploy(&package, "atlas,boreas", "everywhere").await;
@@ -313,7 +371,8 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
     all.until(|text| last(text) && text.contains("\"boreas\"") && text.contains("\"atlas\"")).await;
     // The feed may name it before the deployment itself comes.
     let is_counted = |text: &str| text.contains("\"counts\":");
-    let seen = events.until(|text| last(text) && is_counted(text) && text.contains("\"atlas\"")).await;
+    let seen =
+        events.until(|text| last(text) && is_counted(text) && text.contains("\"atlas\"")).await;
     for other in ["boreas", sites.field.id.as_str(), elsewhere.id.as_str()] {
         assert!(!seen.contains(other), "{other}: {seen}");
     }
@@ -326,11 +385,19 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
     let seen = events.until(|text| text.contains("robot_removed")).await;
     assert!(!seen.contains(sites.field.id.as_str()), "{seen}");
 
-    let edit = sites.server.request(Method::PATCH, "/api/v1/users/alice").json(&json!({ "scope": "site=field" }));
+    let edit = sites
+        .server
+        .request(Method::PATCH, "/api/v1/users/alice")
+        .json(&json!({ "scope": "site=field" }));
     let _: Value = answer(edit).await;
     events.ended().await;
     let again = Events::open(&alice).await;
-    let gone = sites.server.request(Method::DELETE, "/api/v1/users/alice").send().await.expect("an answer");
+    let gone = sites
+        .server
+        .request(Method::DELETE, "/api/v1/users/alice")
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(gone.status(), StatusCode::NO_CONTENT);
     again.ended().await;
     assert_eq!(alice.status(Method::GET, "/api/v1/events").await, 401);
@@ -342,7 +409,9 @@ async fn mqtt(sites: &Sites, token: &str) -> (Raw, [u8; 4]) {
     let mut raw = Raw { stream };
     raw.send(&connect.packet()).await;
     let mut answer = [0; 4];
-    let read = tokio::time::timeout(PATIENCE, raw.stream.read_exact(&mut answer)).await.expect("an answer");
+    let read = tokio::time::timeout(PATIENCE, raw.stream.read_exact(&mut answer))
+        .await
+        .expect("an answer");
     read.expect("an answer");
     (raw, answer)
 }
@@ -370,19 +439,26 @@ async fn a_token_made_for_less_ends_no_other() {
     let sites = Sites::new().await;
     sites.add("alice", &["viewer"], None).await;
     let alice = sites.log_in("alice").await;
-    let made =
-        sites.server.bare(Method::POST, "/api/v1/tokens").bearer_auth(&alice.token).json(&json!({ "title": "wall" }));
+    let made = sites
+        .server
+        .bare(Method::POST, "/api/v1/tokens")
+        .bearer_auth(&alice.token)
+        .json(&json!({ "title": "wall" }));
     let made: AccessToken = answer(made).await;
     let end = async |with: &str, id: &TokenId| {
-        let request = sites.server.bare(Method::DELETE, &format!("/api/v1/tokens/{id}")).bearer_auth(with);
+        let request =
+            sites.server.bare(Method::DELETE, &format!("/api/v1/tokens/{id}")).bearer_auth(with);
         request.send().await.expect("an answer").status()
     };
     assert_eq!(end(&made.token, &alice.id).await, StatusCode::NOT_FOUND);
     let alice_asks = sites.server.bare(Method::GET, "/api/v1/robots").bearer_auth(&alice.token);
     assert_eq!(alice_asks.send().await.expect("an answer").status(), StatusCode::OK);
     assert_eq!(end(&made.token, &made.id).await, StatusCode::NO_CONTENT, "itself");
-    let again =
-        sites.server.bare(Method::POST, "/api/v1/tokens").bearer_auth(&alice.token).json(&json!({ "title": "wall" }));
+    let again = sites
+        .server
+        .bare(Method::POST, "/api/v1/tokens")
+        .bearer_auth(&alice.token)
+        .json(&json!({ "title": "wall" }));
     let again: AccessToken = answer(again).await;
     assert_eq!(end(&alice.token, &again.id).await, StatusCode::NO_CONTENT);
 }
@@ -390,7 +466,10 @@ async fn a_token_made_for_less_ends_no_other() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_trusted_proxy_says_who_asks_and_nobody_else_does() {
     let directory = tempfile::TempDir::new().expect("a directory");
-    let server = TestServer::start_in(directory, |config| config.trusted_proxies = vec![[127, 0, 0, 1].into()]).await;
+    let server = TestServer::start_in(directory, |config| {
+        config.trusted_proxies = vec![[127, 0, 0, 1].into()]
+    })
+    .await;
     let create = server.request(Method::POST, "/api/v1/enrollment-tokens").json(&json!({}));
     let _: Value = answer(create.header("x-forwarded-for", "198.51.100.1, 192.0.2.7")).await;
     let from = |audit: &Value| audit["records"][0]["entry"]["address"].clone();
@@ -422,7 +501,9 @@ async fn a_sign_in_flood_does_not_keep_robots_waiting() {
     }
     // While it lasts, a robot is answered.
     for _ in 0..20 {
-        let asked = tokio::time::timeout(Duration::from_secs(5), sites.server.ask_desired(&sites.lab)).await;
+        let asked =
+            tokio::time::timeout(Duration::from_secs(5), sites.server.ask_desired(&sites.lab))
+                .await;
         assert_eq!(asked.expect("answered").status(), StatusCode::OK);
     }
     let answers = flood.join_all().await;
@@ -453,20 +534,32 @@ async fn who_was_removed_while_their_request_came_does_nothing_by_it() {
     let mut held = Vec::new();
     for (request, body) in bodies {
         let body = body.to_string();
-        let mut stream = TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
+        let mut stream =
+            TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
         stream.write_all(head(request, &mallory.token, body.len()).as_bytes()).await.expect("sent");
         // Who is asked for the body was let in.
         let mut asked = [0; 25];
-        tokio::time::timeout(PATIENCE, stream.read_exact(&mut asked)).await.expect("in time").expect("asked");
+        tokio::time::timeout(PATIENCE, stream.read_exact(&mut asked))
+            .await
+            .expect("in time")
+            .expect("asked");
         assert_eq!(&asked, b"HTTP/1.1 100 Continue\r\n\r\n");
         held.push((stream, body));
     }
-    let removed = sites.server.request(Method::DELETE, "/api/v1/users/mallory").send().await.expect("an answer");
+    let removed = sites
+        .server
+        .request(Method::DELETE, "/api/v1/users/mallory")
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(removed.status(), StatusCode::NO_CONTENT);
     for (mut stream, body) in held {
         stream.write_all(body.as_bytes()).await.expect("sent");
         let mut said = String::new();
-        tokio::time::timeout(PATIENCE, stream.read_to_string(&mut said)).await.expect("in time").expect("an answer");
+        tokio::time::timeout(PATIENCE, stream.read_to_string(&mut said))
+            .await
+            .expect("in time")
+            .expect("an answer");
         assert!(said.starts_with("HTTP/1.1 401 "), "{said}");
     }
     let users: Value = sites.server.get("/api/v1/users").await;
@@ -487,11 +580,14 @@ async fn a_removed_persons_session_ends_also_if_nobody_waits_for_the_answer() {
         let made: Value = sites.server.post("/api/v1/tokens", &json!({ "user": name })).await;
         let (mut session, answer) = mqtt(&sites, made["token"].as_str().expect("a token")).await;
         assert_eq!(answer, [0x20, 2, 0, 0]);
-        // Nobody knows when the caller hangs up: at once, in which case nothing happens, or after this and that.
+        // Nobody knows when the caller hangs up: at once, in which case nothing happens, or after
+        // this and that.
         let mut others = number % 4;
         while is_there(&name).await {
-            let mut stream = TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
-            let request = head(&format!("DELETE /api/v1/users/{name}"), &sites.server.operator.reveal(), 0);
+            let mut stream =
+                TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
+            let request =
+                head(&format!("DELETE /api/v1/users/{name}"), &sites.server.operator.reveal(), 0);
             stream.write_all(request.as_bytes()).await.expect("sent");
             for _ in 0..others {
                 let _: Value = sites.server.get("/api/v1/session").await;

@@ -22,11 +22,13 @@ use crate::mqtt_harness::{Connect, Raw, publish, topic};
 #[tokio::test(flavor = "multi_thread")]
 async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
     let server = TestServer::start().await;
-    let mode = |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
+    let mode =
+        |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
     assert_eq!(mode(""), 0o700);
     assert_eq!((mode("operator.token"), mode("signing.key")), (0o600, 0o600));
     let addresses = std::fs::read(server.data().join("addresses.json")).expect("published");
-    let addresses: taskd::system::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
+    let addresses: taskd::system::data_directory::Addresses =
+        serde_json::from_slice(&addresses).expect("json");
     assert_eq!(addresses, *server.server.addresses());
     for path in ["/healthz", "/readyz"] {
         let status = server.bare(Method::GET, path).send().await.expect("an answer").status();
@@ -48,7 +50,10 @@ async fn readyz_asked_often_writes_seldom() {
         let response = server.bare(Method::GET, "/readyz").send().await.expect("an answer");
         assert_eq!(response.status(), StatusCode::OK);
     }
-    assert!((1..50).contains(&written), "{written} of 100 requests found that the file was written");
+    assert!(
+        (1..50).contains(&written),
+        "{written} of 100 requests found that the file was written"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -58,7 +63,10 @@ async fn a_second_server_on_the_same_directory_is_refused() {
     config.http.set_port(0);
     config.mqtt.set_port(0);
     let second = Server::start(config, Clock::system()).await.err().expect("refused");
-    assert!(matches!(second, ServeError::Data(_)) && second.to_string().contains("another taskd serves from it"));
+    assert!(
+        matches!(second, ServeError::Data(_))
+            && second.to_string().contains("another taskd serves from it")
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -67,11 +75,13 @@ async fn when_all_places_are_taken_those_without_a_request_end() {
     let server = TestServer::start_in(directory, |config| config.max_http_connections = 2).await;
     let (mut streams, request) = (Vec::new(), b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n");
     for _ in 0..5 {
-        let mut stream = TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
+        let mut stream =
+            TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
         stream.write_all(request).await.expect("sent");
         let mut answer = [0; 12];
         // Sooner than anybody is sent away for having no request.
-        let read = tokio::time::timeout(Duration::from_secs(15), stream.read_exact(&mut answer)).await;
+        let read =
+            tokio::time::timeout(Duration::from_secs(15), stream.read_exact(&mut answer)).await;
         read.expect("a place in time").expect("an answer");
         assert_eq!(&answer, b"HTTP/1.1 200");
         // Each stays open on this side.
@@ -95,7 +105,8 @@ async fn a_restart_keeps_everything() {
     assert_eq!(server.robot(&robot).await.tasks[0].phase, Phase::Running);
     assert_eq!(server.deploy(&package, "*", "key-1").await.id, ordered.id);
     let path = format!("/v2/talker/blobs/{}", package.content.digest);
-    let blob = server.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer");
+    let blob =
+        server.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer");
     assert_eq!(blob.status(), StatusCode::OK);
 }
 
@@ -113,10 +124,13 @@ async fn a_stop_under_load_loses_no_report_that_was_answered() {
         let report = robot.next_report(&server.desired(&robot).await, Phase::Running);
         let request = server.bare(Method::POST, &format!("/api/v1/robots/{}/report", robot.id));
         let request = request.bearer_auth(&robot.token).json(&report);
-        asking.spawn(async move { (robot, request.send().await.is_ok_and(|answer| answer.status().is_success())) });
+        asking.spawn(async move {
+            (robot, request.send().await.is_ok_and(|answer| answer.status().is_success()))
+        });
     }
     // One answer is there, the others are somewhere under way.
-    let mut answered: Vec<_> = asking.join_next().await.into_iter().collect::<Result<_, _>>().expect("no panic");
+    let mut answered: Vec<_> =
+        asking.join_next().await.into_iter().collect::<Result<_, _>>().expect("no panic");
     let server = server.restart().await;
     answered.extend(asking.join_all().await);
     for (robot, was_stored) in answered {
@@ -147,7 +161,8 @@ async fn strangers_that_trickle_do_not_keep_out_who_has_a_token() {
     elsewhere.bind(([127, 0, 0, 2], 0).into()).expect("bound");
     let mut asks = elsewhere.connect(address.parse().expect("an address")).await.expect("connects");
     let token = server.operator.reveal();
-    let request = format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
+    let request =
+        format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
     asks.write_all(request.as_bytes()).await.expect("written");
     let mut first = [0; 12];
     // Sooner than a body may pause.
@@ -162,7 +177,8 @@ async fn who_has_shown_no_token_counts_against_its_address_whatever_it_sends() {
     let server = TestServer::start_in(directory, |config| config.max_silent_per_address = 1).await;
     let address = server.server.addresses().http.clone();
     let token = server.operator.reveal();
-    let request = format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
+    let request =
+        format!("GET /api/v1/server HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\r\n");
     let mut known = TcpStream::connect(&address).await.expect("connects");
     known.write_all(request.as_bytes()).await.expect("written");
     let mut oldest = trickling_login(&address).await;
@@ -183,7 +199,10 @@ async fn who_has_shown_no_token_counts_against_its_address_whatever_it_sends() {
     // A reset is an end as well.
     let _ = ended.await.expect("the connection ends");
     // The one that has shown its token is older, and stays.
-    known.write_all(request.replace("host", "connection: close\r\nhost").as_bytes()).await.expect("written");
+    known
+        .write_all(request.replace("host", "connection: close\r\nhost").as_bytes())
+        .await
+        .expect("written");
     known.read_to_end(&mut rest).await.expect("answers");
     assert_eq!(String::from_utf8_lossy(&rest).matches("HTTP/1.1 200").count(), 2);
 }
@@ -212,10 +231,12 @@ async fn idle_and_dawdling_clients_do_not_hold_up_a_stop() {
 async fn a_database_that_was_put_back_leaves_robots_alone_until_their_next_order() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
-    let (first, later) = (server.push("talker", "1.0.0").await, server.push("talker", "2.0.0").await);
+    let (first, later) =
+        (server.push("talker", "1.0.0").await, server.push("talker", "2.0.0").await);
     server.deploy(&first, "*", "key-1").await;
     let directory = server.stop().await;
-    let (database, copy) = (directory.path().join("data/taskd.sqlite"), directory.path().join("copy"));
+    let (database, copy) =
+        (directory.path().join("data/taskd.sqlite"), directory.path().join("copy"));
     std::fs::copy(&database, &copy).expect("copied");
 
     let server = TestServer::start_in(directory, |_| {}).await;
@@ -262,7 +283,9 @@ impl Program {
         let directory = tempfile::TempDir::new().expect("a directory");
         let data = directory.path().join("data");
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
-        command.args(["serve", "--http", "127.0.0.1:0", "--mqtt", "127.0.0.1:0", "--data"]).arg(&data);
+        command
+            .args(["serve", "--http", "127.0.0.1:0", "--mqtt", "127.0.0.1:0", "--data"])
+            .arg(&data);
         command.env_clear().stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
         let mut process = command.spawn().expect("it starts");
         // The first line comes when both listeners accept.
@@ -271,8 +294,12 @@ impl Program {
         BufReader::new(stdout).read_line(&mut said).expect("it says where it is");
         assert!(said.starts_with("taskd serves HTTP on http://127.0.0.1:"), "{said}");
         let addresses = std::fs::read(data.join("addresses.json")).expect("published");
-        let addresses: taskd::system::data_directory::Addresses = serde_json::from_slice(&addresses).expect("json");
-        let token = std::fs::read_to_string(data.join("operator.token")).expect("a token").trim().to_owned();
+        let addresses: taskd::system::data_directory::Addresses =
+            serde_json::from_slice(&addresses).expect("json");
+        let token = std::fs::read_to_string(data.join("operator.token"))
+            .expect("a token")
+            .trim()
+            .to_owned();
         Self { process, http: addresses.http, mqtt: addresses.mqtt, token, directory }
     }
 
@@ -311,7 +338,11 @@ impl Program {
 
     async fn exit_code(mut self) -> Option<i32> {
         let ended = tokio::task::spawn_blocking(move || self.process.wait().expect("it ends"));
-        tokio::time::timeout(Duration::from_secs(9), ended).await.expect("it ends in time").expect("no panic").code()
+        tokio::time::timeout(Duration::from_secs(9), ended)
+            .await
+            .expect("it ends in time")
+            .expect("no panic")
+            .code()
     }
 }
 
@@ -337,7 +368,11 @@ async fn a_second_signal_ends_it_at_once() {
     program.signal(Signal::SIGINT);
     let asked = std::time::Instant::now();
     assert_eq!(program.exit_code().await, Some(1));
-    assert!(asked.elapsed() < Duration::from_secs(3), "it waited {:?} for the upload", asked.elapsed());
+    assert!(
+        asked.elapsed() < Duration::from_secs(3),
+        "it waited {:?} for the upload",
+        asked.elapsed()
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -347,12 +382,19 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
     let client = crate::registry::client();
     let post = |path: &str, token: &str, body: &Value| {
-        answer::<Value>(client.post(format!("http://{}/api/v1/{path}", program.http)).bearer_auth(token).json(body))
+        answer::<Value>(
+            client
+                .post(format!("http://{}/api/v1/{path}", program.http))
+                .bearer_auth(token)
+                .json(body),
+        )
     };
     let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
     let enrolment = enrolment["token"].as_str().expect("a token");
-    let robot = post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
-    let id: task_proto::RobotId = robot["robot_id"].as_str().expect("an id").parse().expect("an id");
+    let robot =
+        post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+    let id: task_proto::RobotId =
+        robot["robot_id"].as_str().expect("an id").parse().expect("an id");
     let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
     let password = robot["token"].as_str().map(str::to_owned);
     raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
@@ -364,7 +406,8 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
     program.signal(Signal::SIGTERM);
     assert_eq!(program.exit_code().await, Some(0));
     let log = std::fs::read_to_string(&path).expect("text");
-    let line = log.lines().find(|line| line.contains("can't be read and is dropped")).expect("it is said");
+    let line =
+        log.lines().find(|line| line.contains("can't be read and is dropped")).expect("it is said");
     assert!(line.contains("ERROR forged"), "{line:?}");
     let bad = |c: char| (c.is_control() && c != '\n') || c == '\u{202e}';
     assert!(!log.contains(bad), "{log:?}");
@@ -377,25 +420,35 @@ async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_ser
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
     let client = crate::registry::client();
     let post = |path: &str, token: &str, body: &Value| {
-        answer::<Value>(client.post(format!("http://{}/api/v1/{path}", program.http)).bearer_auth(token).json(body))
+        answer::<Value>(
+            client
+                .post(format!("http://{}/api/v1/{path}", program.http))
+                .bearer_auth(token)
+                .json(body),
+        )
     };
     let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
     let enrolment = enrolment["token"].as_str().expect("a token");
-    let robot = post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
-    let id: task_proto::RobotId = robot["robot_id"].as_str().expect("an id").parse().expect("an id");
+    let robot =
+        post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+    let id: task_proto::RobotId =
+        robot["robot_id"].as_str().expect("an id").parse().expect("an id");
     let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
     let password = robot["token"].as_str().map(str::to_owned);
     raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
     raw.expect(&[0x20, 2, 0, 0]).await;
     for number in 1..=200_u8 {
-        raw.send(&publish(&topic(&id, RobotTopic::Telemetry), 1, number.into(), b"no vitals")).await;
+        raw.send(&publish(&topic(&id, RobotTopic::Telemetry), 1, number.into(), b"no vitals"))
+            .await;
         raw.expect(&[0x40, 2, 0, number]).await;
     }
     // SQLite's own files are there while it runs.
     let mut looked_at = 0;
     let mut directories = vec![program.data()];
     while let Some(directory) = directories.pop() {
-        for entry in std::fs::read_dir(directory).expect("a directory").map(|entry| entry.expect("an entry")) {
+        for entry in
+            std::fs::read_dir(directory).expect("a directory").map(|entry| entry.expect("an entry"))
+        {
             let metadata = entry.metadata().expect("there");
             assert_eq!(metadata.permissions().mode() & 0o077, 0, "{:?}", entry.path());
             looked_at += 1;
@@ -408,7 +461,10 @@ async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_ser
     program.signal(Signal::SIGTERM);
     assert_eq!(program.exit_code().await, Some(0));
     let log = std::fs::read_to_string(&path).expect("text");
-    assert_eq!(log.lines().filter(|line| line.contains("can't be read and is dropped")).count(), 10);
+    assert_eq!(
+        log.lines().filter(|line| line.contains("can't be read and is dropped")).count(),
+        10
+    );
 }
 
 #[test]
@@ -442,8 +498,15 @@ fn a_wrong_setting_is_wrong_usage_wherever_it_stands() {
 fn too_few_open_files_are_refused_with_the_number_needed() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let mut command = std::process::Command::new("/bin/sh");
-    command.args(["-c", "ulimit -n 256; exec \"$0\" serve --http 127.0.0.1:0 --mqtt 127.0.0.1:0 --data \"$1\""]);
-    command.arg(env!("CARGO_BIN_EXE_taskd")).arg(directory.path().join("data")).env_clear().stdin(Stdio::null());
+    command.args([
+        "-c",
+        "ulimit -n 256; exec \"$0\" serve --http 127.0.0.1:0 --mqtt 127.0.0.1:0 --data \"$1\"",
+    ]);
+    command
+        .arg(env!("CARGO_BIN_EXE_taskd"))
+        .arg(directory.path().join("data"))
+        .env_clear()
+        .stdin(Stdio::null());
     let ended = command.stdout(Stdio::null()).output().expect("it runs");
     let said = String::from_utf8_lossy(&ended.stderr);
     assert_eq!(ended.status.code(), Some(1), "{said}");
@@ -454,10 +517,13 @@ fn too_few_open_files_are_refused_with_the_number_needed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn chunked_push_goes_on_after_a_restart() {
     let server = TestServer::start().await;
-    let begun = server.request(Method::POST, "/v2/talker/blobs/uploads/").send().await.expect("an answer");
+    let begun =
+        server.request(Method::POST, "/v2/talker/blobs/uploads/").send().await.expect("an answer");
     let upload = begun.headers()["location"].to_str().expect("text").to_owned();
     let chunk = |server: &TestServer, range: &str, bytes: &'static str| {
-        let request = server.request(Method::PATCH, &upload).header("content-type", "application/octet-stream");
+        let request = server
+            .request(Method::PATCH, &upload)
+            .header("content-type", "application/octet-stream");
         request.header("content-range", range).body(bytes)
     };
     let sent = chunk(&server, "0-3", "some").send().await.expect("an answer");
@@ -467,12 +533,23 @@ async fn chunked_push_goes_on_after_a_restart() {
     let keep = |config: &mut Config| config.blob_grace = Duration::from_secs(1 << 32);
     let server = TestServer::start_in(server.stop().await, keep).await;
     let stands = server.request(Method::GET, &upload).send().await.expect("an answer");
-    assert_eq!((stands.status(), &stands.headers()["range"]), (StatusCode::NO_CONTENT, &"0-3".parse().expect("text")));
+    assert_eq!(
+        (stands.status(), &stands.headers()["range"]),
+        (StatusCode::NO_CONTENT, &"0-3".parse().expect("text"))
+    );
     let sent = chunk(&server, "4-7", "more").send().await.expect("an answer");
     assert_eq!(sent.status(), StatusCode::ACCEPTED);
     let digest = task_proto::Digest::of(b"somemore");
-    let done = server.request(Method::PUT, &format!("{upload}?digest={digest}")).send().await.expect("an answer");
+    let done = server
+        .request(Method::PUT, &format!("{upload}?digest={digest}"))
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(done.status(), StatusCode::CREATED);
-    let blob = server.request(Method::GET, &format!("/v2/talker/blobs/{digest}")).send().await.expect("an answer");
+    let blob = server
+        .request(Method::GET, &format!("/v2/talker/blobs/{digest}"))
+        .send()
+        .await
+        .expect("an answer");
     assert_eq!(blob.text().await.expect("a body"), "somemore");
 }

@@ -11,12 +11,15 @@ use crate::harness::{TestServer, answer, refusal};
 async fn settings_are_checked_kept_and_cleared() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
-    let edit = |body: serde_json::Value| server.request(Method::PATCH, "/api/v1/robots/atlas").json(&body);
-    let settings =
-        json!({ "underlays": ["/opt/ros/jazzy/setup.bash"], "forward_level": "error", "limits": { "task_pids": 64 } });
+    let edit =
+        |body: serde_json::Value| server.request(Method::PATCH, "/api/v1/robots/atlas").json(&body);
+    let settings = json!({ "underlays": ["/opt/ros/jazzy/setup.bash"], "forward_level": "error", "limits": { "task_pids": 64 } });
     let view: RobotView = answer(edit(json!({ "settings": settings }))).await;
     assert_eq!(serde_json::to_value(&view.settings).expect("json"), settings);
-    assert_eq!(serde_json::to_value(server.desired(&robot).await.settings).expect("json"), settings);
+    assert_eq!(
+        serde_json::to_value(server.desired(&robot).await.settings).expect("json"),
+        settings
+    );
     for (bad, named) in [
         (json!({ "workspace": "ws" }), "settings"),
         (json!({ "underlays": ["/opt/../etc/x"] }), "settings"),
@@ -45,11 +48,17 @@ async fn a_robots_history_and_timelines_are_shown_to_who_asks() {
     assert_eq!(server.report(&mut robot, &state, Phase::Running).await.status(), StatusCode::OK);
     let history: TaskHistory = server.get("/api/v1/robots/atlas/tasks").await;
     let past = &history.assignments[0];
-    assert_eq!((&past.deployment, past.phase, history.assignments.len()), (&deployment.id, Phase::Running, 1));
-    let phases = |timeline: &[task_proto::api::TimelineEntry]| timeline.iter().map(|e| e.phase).collect::<Vec<_>>();
+    assert_eq!(
+        (&past.deployment, past.phase, history.assignments.len()),
+        (&deployment.id, Phase::Running, 1)
+    );
+    let phases = |timeline: &[task_proto::api::TimelineEntry]| {
+        timeline.iter().map(|e| e.phase).collect::<Vec<_>>()
+    };
     assert_eq!(phases(&past.timeline), [Phase::Assigned, Phase::Running]);
     let show = async |query: &str| {
-        let view: DeploymentView = server.get(&format!("/api/v1/deployments/{}{query}", deployment.id)).await;
+        let view: DeploymentView =
+            server.get(&format!("/api/v1/deployments/{}{query}", deployment.id)).await;
         view.assignments.expect("asked for").remove(0).timeline
     };
     assert_eq!(show("").await, None);

@@ -1,4 +1,5 @@
-//! What publishers have signed, on its way through the server: what is turned away, who is told of it and may read it.
+//! What publishers have signed, on its way through the server: what is turned away, who is told of
+//! it and may read it.
 
 use reqwest::{Method, Response, StatusCode};
 use task_proto::api::DeploymentView;
@@ -6,8 +7,8 @@ use task_proto::desired::{BlobRef, PackageRef, SignatureRef};
 use task_proto::envelope::{Envelope, SigningKey};
 use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
 use task_proto::publisher::{
-    LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, MAX_SIGNATURES, PackageStatement, PublisherList, Role,
-    SIGNATURE_ARTIFACT,
+    LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, MAX_SIGNATURES, PackageStatement, PublisherList,
+    Role, SIGNATURE_ARTIFACT,
 };
 use tempfile::TempDir;
 
@@ -46,7 +47,8 @@ fn blob(envelope: &Envelope) -> BlobRef {
 
 async fn server(database: &TestDatabase) -> TestServer {
     let url = database.url.clone();
-    TestServer::start_in(TempDir::new().expect("a directory"), |config| config.database = Some(url)).await
+    TestServer::start_in(TempDir::new().expect("a directory"), |config| config.database = Some(url))
+        .await
 }
 
 /// Pushes a signed document as `taskd` does; `reference` is a tag, or the manifest's digest.
@@ -69,9 +71,14 @@ async fn push(
     request.header("content-type", MANIFEST_TYPE).body(manifest).send().await.expect("an answer")
 }
 
-pub async fn push_signature(server: &TestServer, package: &PackageRef, envelope: &Envelope) -> Response {
+pub async fn push_signature(
+    server: &TestServer,
+    package: &PackageRef,
+    envelope: &Envelope,
+) -> Response {
     let bytes = serde_json::to_vec(envelope).expect("json");
-    push(server, package.name.as_str(), (SIGNATURE_ARTIFACT, Some(package.manifest)), &bytes, None).await
+    push(server, package.name.as_str(), (SIGNATURE_ARTIFACT, Some(package.manifest)), &bytes, None)
+        .await
 }
 
 async fn push_list(server: &TestServer, envelope: &Envelope, tag: &str) -> Response {
@@ -91,7 +98,9 @@ async fn assert_refused(answer: Response, reason: &str) {
 }
 
 async fn may_read(server: &TestServer, robot: &TestRobot, blob: BlobRef) -> bool {
-    let request = server.bare(Method::GET, &format!("/v2/any/blobs/{}", blob.digest)).bearer_auth(&robot.token);
+    let request = server
+        .bare(Method::GET, &format!("/v2/any/blobs/{}", blob.digest))
+        .bearer_auth(&robot.token);
     request.send().await.expect("an answer").status() == StatusCode::OK
 }
 
@@ -105,39 +114,66 @@ async fn a_signature_goes_to_the_robots_that_should_have_its_package(database: T
     let tag = |answer: &Response| answer.headers()["etag"].clone();
     let tag_before = tag(&server.ask_desired(&robot).await);
 
-    let [ada, bob] = [1, 2].map(|seed| PackageStatement { package: package.clone() }.seal(&key(seed)));
+    let [ada, bob] =
+        [1, 2].map(|seed| PackageStatement { package: package.clone() }.seal(&key(seed)));
     for _ in 0..2 {
         assert_stored(&push_signature(&server, &package, &ada).await);
     }
     assert_stored(&push_signature(&server, &package, &bob).await);
     let after = server.desired(&robot).await;
-    let named =
-        [&ada, &bob].map(|envelope| SignatureRef { manifest: package.manifest.digest, envelope: blob(envelope) });
+    let named = [&ada, &bob].map(|envelope| SignatureRef {
+        manifest: package.manifest.digest,
+        envelope: blob(envelope),
+    });
     let mut found = after.evidence.signatures.clone();
     found.sort_by_key(|signature| *signature != named[0]);
     assert_eq!(found, named, "each once");
-    assert_eq!((after.generation, &after.tasks), (before.generation, &before.tasks), "nothing else was ordered");
+    assert_eq!(
+        (after.generation, &after.tasks),
+        (before.generation, &before.tasks),
+        "nothing else was ordered"
+    );
     assert_ne!(tag(&server.ask_desired(&robot).await), tag_before, "whoever asks again is told");
     assert!(server.desired(&other).await.evidence.is_empty());
-    assert!(may_read(&server, &robot, blob(&ada)).await && !may_read(&server, &other, blob(&ada)).await);
+    assert!(
+        may_read(&server, &robot, blob(&ada)).await && !may_read(&server, &other, blob(&ada)).await
+    );
 }
 
-async fn a_signature_that_says_something_else_than_its_manifest_is_turned_away(database: TestDatabase) {
+async fn a_signature_that_says_something_else_than_its_manifest_is_turned_away(
+    database: TestDatabase,
+) {
     let server = server(&database).await;
-    let (talker, other) = (server.push("talker", "1.0.0").await, server.push("other", "1.0.0").await);
+    let (talker, other) =
+        (server.push("talker", "1.0.0").await, server.push("other", "1.0.0").await);
     let of_other = PackageStatement { package: other.clone() }.seal(&key(1));
-    assert_refused(push_signature(&server, &talker, &of_other).await, "other 1.0.0 was signed, not the subject").await;
+    assert_refused(
+        push_signature(&server, &talker, &of_other).await,
+        "other 1.0.0 was signed, not the subject",
+    )
+    .await;
     let swapped = PackageRef { content: other.content, ..talker.clone() };
     let mixed = PackageStatement { package: swapped }.seal(&key(1));
     assert_refused(push_signature(&server, &talker, &mixed).await, "talker 1.0.0 was signed").await;
     let absent = PackageRef { manifest: other.manifest, ..talker.clone() };
     let of_absent = PackageStatement { package: absent.clone() }.seal(&key(1));
-    assert_refused(push_signature(&server, &absent, &of_absent).await, "there is no such package").await;
-    assert_refused(push_signature(&server, &talker, &list(1, 2).seal(&key(2))).await, "payload is").await;
+    assert_refused(push_signature(&server, &absent, &of_absent).await, "there is no such package")
+        .await;
+    assert_refused(push_signature(&server, &talker, &list(1, 2).seal(&key(2))).await, "payload is")
+        .await;
     let about = (SIGNATURE_ARTIFACT, Some(talker.manifest));
-    assert_refused(push(&server, "talker", about, b"nonsense", None).await, "not a DSSE envelope").await;
-    assert_refused(push(&server, "talker", about, &[b' '; 20_000], None).await, "16384 are possible").await;
-    assert_refused(push(&server, "talker", (SIGNATURE_ARTIFACT, None), b"{}", None).await, "subject").await;
+    assert_refused(push(&server, "talker", about, b"nonsense", None).await, "not a DSSE envelope")
+        .await;
+    assert_refused(
+        push(&server, "talker", about, &[b' '; 20_000], None).await,
+        "16384 are possible",
+    )
+    .await;
+    assert_refused(
+        push(&server, "talker", (SIGNATURE_ARTIFACT, None), b"{}", None).await,
+        "subject",
+    )
+    .await;
 }
 
 async fn more_signatures_than_anyone_looks_at_do_not_push_out_the_first(database: TestDatabase) {
@@ -156,7 +192,9 @@ async fn more_signatures_than_anyone_looks_at_do_not_push_out_the_first(database
     assert_eq!((named.len(), named[0].envelope), (MAX_SIGNATURES, blob(&first)));
 }
 
-async fn lists_follow_one_another_and_robots_are_told_what_they_need_to_follow(database: TestDatabase) {
+async fn lists_follow_one_another_and_robots_are_told_what_they_need_to_follow(
+    database: TestDatabase,
+) {
     let server = server(&database).await;
     let robot = server.enroll("atlas").await;
     let first = sealed(&list(1, 2), &[2]);
@@ -210,8 +248,10 @@ async fn what_is_deleted_is_not_told_any_more(database: TestDatabase) {
     let path = format!("/v2/{LIST_REPOSITORY}/manifests/1");
     let head = server.request(Method::HEAD, &path).send().await.expect("an answer");
     let list_manifest = head.headers()["docker-content-digest"].to_str().expect("text").to_owned();
-    for path in [format!("/v2/talker/manifests/{manifest}"), format!("/v2/{LIST_REPOSITORY}/manifests/{list_manifest}")]
-    {
+    for path in [
+        format!("/v2/talker/manifests/{manifest}"),
+        format!("/v2/{LIST_REPOSITORY}/manifests/{list_manifest}"),
+    ] {
         let answer = server.request(Method::DELETE, &path).send().await.expect("an answer");
         assert_eq!(answer.status(), StatusCode::ACCEPTED);
     }

@@ -21,19 +21,37 @@ async fn the_servers_status_has_what_it_does() {
         server.report(&mut atlas, &state, Phase::Running).await;
     }
     let body = json!({ "labels": { "site": "lab" } });
-    server.request(Method::PATCH, "/api/v1/robots/boreas").json(&body).send().await.expect("an answer");
+    server
+        .request(Method::PATCH, "/api/v1/robots/boreas")
+        .json(&body)
+        .send()
+        .await
+        .expect("an answer");
     let status: ServerStatus = server.get("/api/v1/server/status").await;
     assert_eq!((status.robots.known, status.robots.online), (2, 1));
-    let sites: Vec<_> = status.sites.iter().map(|site| (site.site.as_ref().map(|s| s.as_str()), site.robots)).collect();
+    let sites: Vec<_> = status
+        .sites
+        .iter()
+        .map(|site| (site.site.as_ref().map(|s| s.as_str()), site.robots))
+        .collect();
     assert_eq!(sites, [(None, 1), (Some("lab"), 1)]);
-    assert!(status.reports.per_s > 0.0 && status.reports.latency_ms_p50 > Some(0.0), "{:?}", status.reports);
-    assert_eq!((status.database.kind.as_str(), status.broker.kind.as_str()), ("sqlite", "embedded"));
+    assert!(
+        status.reports.per_s > 0.0 && status.reports.latency_ms_p50 > Some(0.0),
+        "{:?}",
+        status.reports
+    );
+    assert_eq!(
+        (status.database.kind.as_str(), status.broker.kind.as_str()),
+        ("sqlite", "embedded")
+    );
     assert!(status.database.size_bytes > Some(0) && status.broker.healthy);
     assert!(status.disk.packages_bytes > 0 && status.disk.total_bytes >= status.disk.free_bytes);
-    let listeners: Vec<_> = status.listeners.iter().map(|listener| listener.kind.as_str()).collect();
+    let listeners: Vec<_> =
+        status.listeners.iter().map(|listener| listener.kind.as_str()).collect();
     assert_eq!(listeners, ["http", "mqtt"]);
     let rules: ServerRules = server.get("/api/v1/server/rules").await;
-    let names: Vec<_> = rules.rules.iter().map(|rule| (rule.name.as_str(), rule.condition.as_str())).collect();
+    let names: Vec<_> =
+        rules.rules.iter().map(|rule| (rule.name.as_str(), rule.condition.as_str())).collect();
     assert_eq!(names, [("tiny", "size ≤ 32 KB"), ("otherwise", "")]);
     assert!(rules.limits.iter().any(|limit| limit.key == "transfers.max" && limit.value == "none"));
 }
@@ -46,7 +64,8 @@ async fn sessions_are_listed_with_what_they_listen_to() {
     let mut first = Session::open(&server, &atlas).await;
     let mut second = Session::open(&server, &boreas).await;
     for (session, robot) in [(&mut first, &atlas), (&mut second, &boreas)] {
-        let status = json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
+        let status =
+            json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
         session.publish("status", status.to_string().into_bytes()).await;
         assert!(server.robot(robot).await.online);
     }
@@ -54,20 +73,29 @@ async fn sessions_are_listed_with_what_they_listen_to() {
     assert_eq!((all.total, all.sessions.len(), all.next.as_ref()), (2, 2, None));
     let session = &all.sessions[0];
     assert_eq!((session.name.as_str(), &session.robot), ("atlas", &atlas.id));
-    let filters: Vec<_> = session.subscriptions.iter().map(|s| (s.topic_filter.clone(), s.qos)).collect();
+    let filters: Vec<_> =
+        session.subscriptions.iter().map(|s| (s.topic_filter.clone(), s.qos)).collect();
     assert_eq!(filters, [(format!("taskd/v1/r/{}/desired", atlas.id), 1)]);
     assert!(session.address.is_some() && session.traffic.bytes_in > 0);
     let page: SessionList = server.get("/api/v1/server/sessions?limit=1").await;
-    assert_eq!((page.total, page.sessions.len(), page.next.as_ref().map(|n| n.as_str())), (2, 1, Some("atlas")));
+    assert_eq!(
+        (page.total, page.sessions.len(), page.next.as_ref().map(|n| n.as_str())),
+        (2, 1, Some("atlas"))
+    );
     let rest: SessionList = server.get("/api/v1/server/sessions?limit=1&after=atlas").await;
     assert_eq!((rest.sessions[0].name.as_str(), rest.next), ("boreas", None));
-    assert_eq!(refusal(server.request(Method::GET, "/api/v1/server/sessions?limit=0")).await.0, 400);
+    assert_eq!(
+        refusal(server.request(Method::GET, "/api/v1/server/sessions?limit=0")).await.0,
+        400
+    );
 
     let order = json!({ "name": "carol", "roles": ["viewer"], "scope": "boreas", "password": "correct horse battery" });
-    let added = server.request(Method::POST, "/api/v1/users").json(&order).send().await.expect("an answer");
+    let added =
+        server.request(Method::POST, "/api/v1/users").json(&order).send().await.expect("an answer");
     assert!(added.status().is_success(), "{}", added.text().await.unwrap_or_default());
     let login = json!({ "user": "carol", "password": "correct horse battery" });
-    let token: serde_json::Value = answer(server.bare(Method::POST, "/api/v1/login").json(&login)).await;
+    let token: serde_json::Value =
+        answer(server.bare(Method::POST, "/api/v1/login").json(&login)).await;
     let token = token["token"].as_str().expect("a token").to_owned();
     let hers = |path: &str| server.bare(Method::GET, path).bearer_auth(&token);
     let seen: SessionList = answer(hers("/api/v1/server/sessions")).await;

@@ -56,18 +56,32 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
     let new = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("both are free");
     assert_ne!(new.robot_id, old.robot_id);
     // A name that a selector could take for another robot's id is refused.
-    let edit = EditRobot { name: Some(old.robot_id.as_str().parse().expect("a name")), ..EditRobot::default() };
-    assert_eq!(code(fleet.actions.edit_robot(&fleet.operator, &new.robot_id, &edit).await), "invalid_request");
+    let edit = EditRobot {
+        name: Some(old.robot_id.as_str().parse().expect("a name")),
+        ..EditRobot::default()
+    };
+    assert_eq!(
+        code(fleet.actions.edit_robot(&fleet.operator, &new.robot_id, &edit).await),
+        "invalid_request"
+    );
 }
 
 async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let nobody = order_of(&package("1", TaskKind::Service));
-    let nobody = task_proto::api::CreateDeployment { selector: "site=mars".parse().expect("valid"), ..nobody };
+    let nobody = task_proto::api::CreateDeployment {
+        selector: "site=mars".parse().expect("valid"),
+        ..nobody
+    };
     let refused = fleet
         .actions
-        .create_deployment(&fleet.operator, &random_key(), &nobody, &package("1", TaskKind::Service))
+        .create_deployment(
+            &fleet.operator,
+            &random_key(),
+            &nobody,
+            &package("1", TaskKind::Service),
+        )
         .await;
     assert_eq!(code(refused), "no_robots_match");
     let id = fleet.deploy("1", |order| order.selector = "r0,r2".parse().expect("valid")).await;
@@ -105,10 +119,16 @@ async fn a_name_that_no_robot_has_is_refused_by_every_order(database: TestDataba
     actions.remove_robot(by, &robots[1].id).await.expect("removed");
     let again = actions.create_deployment(by, &key, &order, &view).await;
     assert_eq!(again.expect("the same order as before"), id);
-    for (text, unknown) in [("r0,r1,r7", "r1, r7"), ("!r7", "r7"), ("*&r7,r0", "r7"), (robots[1].id.as_str(), "")] {
+    for (text, unknown) in
+        [("r0,r1,r7", "r1, r7"), ("!r7", "r7"), ("*&r7,r0", "r7"), (robots[1].id.as_str(), "")]
+    {
         let selector: task_proto::selector::Selector = text.parse().expect("valid");
-        let order = task_proto::api::CreateDeployment { selector: selector.clone(), ..order_of(&view) };
-        let retry = task_proto::api::RetryDeployment { selector: Some(selector.clone()), ..Default::default() };
+        let order =
+            task_proto::api::CreateDeployment { selector: selector.clone(), ..order_of(&view) };
+        let retry = task_proto::api::RetryDeployment {
+            selector: Some(selector.clone()),
+            ..Default::default()
+        };
         let labels = task_proto::api::BulkLabels {
             selector: selector.clone(),
             set: [("site".parse().expect("valid"), "lab".parse().expect("valid"))].into(),
@@ -141,14 +161,25 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
     fleet.enroll(1).await;
     let (key, package) = (random_key(), package("1", TaskKind::Service));
     let order = order_of(&package);
-    let first = fleet.actions.create_deployment(&fleet.operator, &key, &order, &package).await.expect("ordered");
-    let again = fleet.actions.create_deployment(&fleet.operator, &key, &order, &package).await.expect("the same");
+    let first = fleet
+        .actions
+        .create_deployment(&fleet.operator, &key, &order, &package)
+        .await
+        .expect("ordered");
+    let again = fleet
+        .actions
+        .create_deployment(&fleet.operator, &key, &order, &package)
+        .await
+        .expect("the same");
     assert_eq!(first, again);
     let other = task_proto::api::CreateDeployment { batch: Some(1), ..order };
     let refused = fleet.actions.create_deployment(&fleet.operator, &key, &other, &package).await;
     assert_eq!(code(refused), "idempotency_key_reused");
-    let before =
-        fleet.actions.deployment_ordered_before(&fleet.operator, &key, &order_of(&package)).await.expect("reads");
+    let before = fleet
+        .actions
+        .deployment_ordered_before(&fleet.operator, &key, &order_of(&package))
+        .await
+        .expect("reads");
     assert_eq!(before, Some(first));
     let never = fleet
         .actions
@@ -157,7 +188,8 @@ async fn an_idempotency_key_orders_once(database: TestDatabase) {
         .expect("reads");
     assert_eq!(never, None);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let refused = fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone).await;
+    let refused =
+        fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone).await;
     assert_eq!(code(refused), "idempotency_key_reused");
     assert_eq!(fleet.deployments().await.len(), 1);
 }
@@ -168,11 +200,18 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
     // A second server process on the same database would be as good a rival as a second operator.
     let rival = Store::open(&fleet.database.url).await.expect("opens");
     let key = task_proto::envelope::SigningKey::random();
-    let rival =
-        Actions::new(rival, fleet.clock.clone(), fleet.changes.clone(), key, Default::default(), fleet.chooser.clone());
+    let rival = Actions::new(
+        rival,
+        fleet.clock.clone(),
+        fleet.changes.clone(),
+        key,
+        Default::default(),
+        fleet.chooser.clone(),
+    );
     let mut orders = tokio::task::JoinSet::new();
     for round in 0..50u32 {
-        let (keys, versions) = ([random_key(), random_key()], [format!("1.{round}"), format!("2.{round}")]);
+        let (keys, versions) =
+            ([random_key(), random_key()], [format!("1.{round}"), format!("2.{round}")]);
         for retry in 0..2 {
             for (key, version) in keys.iter().zip(&versions) {
                 let actions = if retry == 0 { fleet.actions.clone() } else { rival.clone() };
@@ -213,7 +252,8 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     let new = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
     assert_eq!(fleet.deployment(&new).await.supersedes, std::slice::from_ref(&old));
     assert_eq!(fleet.phases(&old).await, [Phase::Superseded, Phase::Running]);
-    let superseded_by = fleet.deployment(&old).await.assignments.expect("there").remove(0).superseded_by;
+    let superseded_by =
+        fleet.deployment(&old).await.assignments.expect("there").remove(0).superseded_by;
     assert_eq!(superseded_by, Some(new.clone()));
     fleet.follow(&mut robots[0], Phase::Fetching).await;
     fleet.changes.take_rings().await;
@@ -231,7 +271,10 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert!(fleet.deployment(&new).await.supersedes.is_empty());
     // A service that runs has settled: there is nothing to interrupt.
-    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &old).await), "nothing_to_cancel");
+    assert_eq!(
+        code(fleet.actions.cancel_deployment(&fleet.operator, &old).await),
+        "nothing_to_cancel"
+    );
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let third = fleet.deploy("3", |_| ()).await;
@@ -239,7 +282,10 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let unknown = task_proto::DeploymentId::random();
     assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &unknown).await), "not_found");
-    assert_eq!(code(fleet.actions.resume_deployment(&fleet.operator, &third).await), "deployment_cancelled");
+    assert_eq!(
+        code(fleet.actions.resume_deployment(&fleet.operator, &third).await),
+        "deployment_cancelled"
+    );
 }
 
 async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
@@ -265,7 +311,8 @@ async fn a_cancel_passes_over_what_was_deleted(database: TestDatabase) {
     for version in ["1", "2", "3", "4", "5"] {
         fleet.publish(version).await;
         for (name, orders) in ["r0", "r1"].into_iter().zip(&mut orders) {
-            let id = fleet.deploy(version, |order| order.selector = name.parse().expect("valid")).await;
+            let id =
+                fleet.deploy(version, |order| order.selector = name.parse().expect("valid")).await;
             orders.push(id);
         }
     }
@@ -321,7 +368,10 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
     assert_eq!(released().await, 2);
     fleet.follow(&mut robots[1], Phase::Failed).await;
     assert_eq!(released().await, 4);
-    assert_eq!(fleet.changes.take_rings().await.robots, [robots[2].id.clone(), robots[3].id.clone()].into());
+    assert_eq!(
+        fleet.changes.take_rings().await.robots,
+        [robots[2].id.clone(), robots[3].id.clone()].into()
+    );
     fleet.follow(&mut robots[2], Phase::Failed).await;
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
     fleet.follow(&mut robots[3], Phase::Running).await;
@@ -370,7 +420,11 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     let id = fleet.deploy("1", |order| order.selector = "r0".parse().expect("valid")).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let order = async |order| {
-        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered")
+        fleet
+            .actions
+            .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
+            .await
+            .expect("ordered")
     };
     fleet.follow(&mut robots[0], Phase::Running).await;
 
@@ -403,7 +457,10 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
     assert!(fleet.view(&robots[0]).await.tasks.is_empty());
-    let refused = fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone).await;
+    let refused = fleet
+        .actions
+        .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
+        .await;
     assert_eq!(code(refused), "no_robots_match");
 }
 
@@ -474,7 +531,11 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(0));
 
     let (task, first) = ("talker".parse().expect("valid"), "r0".parse().expect("valid"));
-    fleet.actions.order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &first).await.expect("ordered");
+    fleet
+        .actions
+        .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &first)
+        .await
+        .expect("ordered");
     let desired = fleet.desired(&robots[0]).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks[0].run), (Generation(4), 4));
     assert_eq!(desired.tasks[0].package, lost.tasks[0].package);
@@ -486,7 +547,10 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     assert_eq!((desired.generation, desired.tasks.len()), (Generation(4), 1));
     assert_eq!(desired.tasks[0].deployment, next);
     fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
-    assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, lost.tasks[0].deployment);
+    assert_eq!(
+        fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment,
+        lost.tasks[0].deployment
+    );
     assert!(fleet.view(&robots[1]).await.conditions.is_empty());
 }
 
@@ -501,14 +565,19 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
     let liar = &mut robots[0];
     (liar.observed, liar.start) = (Generation(u64::MAX), u64::MAX);
     for task in liar.tasks.values_mut() {
-        (task.run, task.phase_ms, task.attempts, task.restarts) = (u64::MAX, u64::MAX, u32::MAX, u32::MAX);
+        (task.run, task.phase_ms, task.attempts, task.restarts) =
+            (u64::MAX, u64::MAX, u32::MAX, u32::MAX);
     }
     for _ in 0..2 {
         fleet.report(liar).await;
     }
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     for order in [TaskOrder::Stop, TaskOrder::Start] {
-        fleet.actions.order_task(&fleet.operator, &random_key(), order, &task, &everyone).await.expect("ordered");
+        fleet
+            .actions
+            .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
+            .await
+            .expect("ordered");
     }
     for robot in &robots {
         let desired = fleet.desired(robot).await.expect("state");

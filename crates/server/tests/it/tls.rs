@@ -1,4 +1,5 @@
-//! TLS on both ports: whom clients believe, what they are shown, and that changing it or dawdling before it bothers nobody.
+//! TLS on both ports: whom clients believe, what they are shown, and that changing it or dawdling
+//! before it bothers nobody.
 
 use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt as _;
@@ -52,7 +53,8 @@ impl Authority {
 
     /// Certificate and key, in PEM, for this machine.
     fn issue(&self) -> (String, String) {
-        let params = CertificateParams::new(vec!["localhost".to_owned(), "127.0.0.1".to_owned()]).expect("names");
+        let params = CertificateParams::new(vec!["localhost".to_owned(), "127.0.0.1".to_owned()])
+            .expect("names");
         let key = KeyPair::generate().expect("a key");
         (params.signed_by(&key, &self.issuer).expect("signed").pem(), key.serialize_pem())
     }
@@ -68,7 +70,8 @@ fn by_root(root: CertificateDer<'static>) -> Arc<ClientConfig> {
     roots.add(root).expect("an authority");
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let clock = Arc::new(task_transport::Clock { now_ms: || NOW_MS, earliest_ms: 0 });
-    let builder = ClientConfig::builder_with_details(provider, clock).with_safe_default_protocol_versions();
+    let builder =
+        ClientConfig::builder_with_details(provider, clock).with_safe_default_protocol_versions();
     Arc::new(builder.expect("suites").with_root_certificates(roots).with_no_client_auth())
 }
 
@@ -136,15 +139,23 @@ async fn one_token_is_enough_to_know_the_server() {
     assert_eq!(token.ca_pin(), Some(pin_of(&server)));
     let robot = server.enroll("atlas").await;
     assert_eq!(server.ask_desired(&robot).await.status(), StatusCode::OK);
-    let endpoint = server.bare(Method::GET, &format!("/api/v1/robots/{}/mqtt", robot.id)).bearer_auth(&robot.token);
+    let endpoint = server
+        .bare(Method::GET, &format!("/api/v1/robots/{}/mqtt", robot.id))
+        .bearer_auth(&robot.token);
     let endpoint: task_proto::api::MqttEndpoint = crate::harness::answer(endpoint).await;
     assert!(endpoint.tls);
-    let mut session = session(&route(mqtt_of(&server), Some(pinned(pin_of(&server)))), &robot).await;
+    let mut session =
+        session(&route(mqtt_of(&server), Some(pinned(pin_of(&server)))), &robot).await;
     session.expect_nothing().await;
     // Nor does the page's cookie leave in plain text.
-    let sign_in = server.bare(Method::POST, "/api/v1/session").json(&json!({ "token": server.operator.reveal() }));
+    let sign_in = server
+        .bare(Method::POST, "/api/v1/session")
+        .json(&json!({ "token": server.operator.reveal() }));
     let signed_in = sign_in.send().await.expect("an answer");
-    assert!(signed_in.headers()["set-cookie"].to_str().expect("text").ends_with("; Secure"), "{signed_in:?}");
+    assert!(
+        signed_in.headers()["set-cookie"].to_str().expect("text").ends_with("; Secure"),
+        "{signed_in:?}"
+    );
     // Nothing is said in plain text, on neither port.
     for address in [http_of(&server), mqtt_of(&server)] {
         let mut plain = TcpStream::connect(address).await.expect("connected");
@@ -197,13 +208,19 @@ async fn a_pinned_robot_refuses_another_servers_certificate() {
         }
     }
     assert_eq!(requests, *own.server.addresses());
-    assert!(asked_anew(http_of(&own), &pinned(pin_of(&own))).await.expect("an answer").starts_with("HTTP/1.1 200"));
+    assert!(
+        asked_anew(http_of(&own), &pinned(pin_of(&own)))
+            .await
+            .expect("an answer")
+            .starts_with("HTTP/1.1 200")
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_authority_is_made_once_and_can_be_imported() {
     let server = encrypted().await;
-    let mode = |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
+    let mode =
+        |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
     assert_eq!((mode("ca.key"), mode("ca.pem")), (0o600, 0o600));
     let read = |server: &TestServer| std::fs::read(server.data().join("ca.pem")).expect("there");
     let (pin, file) = (pin_of(&server), read(&server));
@@ -214,11 +231,16 @@ async fn the_authority_is_made_once_and_can_be_imported() {
     let answer = asked_anew(http_of(&server), &by_root(root)).await.expect("an answer");
     assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
     let directory = server.stop().await;
-    std::fs::write(directory.path().join("data/ca.pem"), Authority::new().issue().0).expect("written");
+    std::fs::write(directory.path().join("data/ca.pem"), Authority::new().issue().0)
+        .expect("written");
     let mut config = Config::with_data(directory.path().join("data"));
     private(&mut config);
-    let refused = taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
-    assert!(refused.to_string().contains("ca.pem does not hold the certificate of the key"), "{refused}");
+    let refused =
+        taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
+    assert!(
+        refused.to_string().contains("ca.pem does not hold the certificate of the key"),
+        "{refused}"
+    );
 }
 
 /// A server with the operator's own certificate in `directory`, looked at often.
@@ -256,13 +278,17 @@ async fn an_own_certificate_is_for_everybody_but_those_who_pinned() {
     }
     // A robot that knows the pin from before needs nothing new.
     let robot = server.enroll("atlas").await;
-    session(&route(mqtt_of(&server), Some(pinned(pin_of(&server)))), &robot).await.expect_nothing().await;
+    session(&route(mqtt_of(&server), Some(pinned(pin_of(&server)))), &robot)
+        .await
+        .expect_nothing()
+        .await;
 }
 
 /// Asks until a new connection is shown `certificate`.
 async fn until_shown(server: &TestServer, authority: &Authority, certificate: &str) {
     let wanted = CertificateDer::from_pem_slice(certificate.as_bytes()).expect("PEM");
-    let waiting = async { while shown(http_of(server), authority.client_config()).await != wanted {} };
+    let waiting =
+        async { while shown(http_of(server), authority.client_config()).await != wanted {} };
     timeout(PATIENCE, waiting).await.expect("the new certificate is shown");
 }
 
@@ -273,8 +299,10 @@ async fn a_certificate_that_changes_under_load_drops_nobody() {
     let path = directory.path().to_owned();
     let server = with_own_files(directory).await;
     let robot = server.enroll("atlas").await;
-    let mut session = session(&route(mqtt_of(&server), Some(authority.client_config())), &robot).await;
-    let mut kept = dial(&route(http_of(&server), Some(authority.client_config()))).await.expect("connected");
+    let mut session =
+        session(&route(mqtt_of(&server), Some(authority.client_config())), &robot).await;
+    let mut kept =
+        dial(&route(http_of(&server), Some(authority.client_config()))).await.expect("connected");
     let (stop, asked) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
     let load: Vec<_> = (0..4)
         .map(|_| {
@@ -341,15 +369,18 @@ async fn a_certificate_without_its_key_is_not_shown() {
     let (certificate, key) = own_files(&path);
     let mut config = Config::with_data(directory.path().join("data"));
     (config.tls.certificate, config.tls.key) = (Some(certificate), Some(key));
-    let refused = taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
+    let refused =
+        taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
     assert!(refused.to_string().contains("can't be used with the key in"), "{refused}");
 }
 
 /// Registers a robot that has a key.
 async fn enroll_with_key(server: &TestServer, key: &ClientKey) -> TestRobot {
     let token: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
-    let request = json!({ "mac": "02:00:00:00:00:77", "name": "keyed", "client_key": key.public_key() });
-    let enroll = server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token).json(&request);
+    let request =
+        json!({ "mac": "02:00:00:00:00:77", "name": "keyed", "client_key": key.public_key() });
+    let enroll =
+        server.bare(Method::POST, "/api/v1/enroll").bearer_auth(token.token).json(&request);
     let enrolled: EnrollResponse = crate::harness::answer(enroll).await;
     TestRobot::new(enrolled.robot_id, enrolled.token)
 }
@@ -360,15 +391,23 @@ async fn answers_to(server: &TestServer, robot: &TestRobot, key: Option<&ClientK
     if let Some(key) = key {
         key.show_in(&mut tls).expect("a certificate");
     }
-    let client = reqwest::Client::builder().tls_backend_preconfigured(tls.clone()).build().expect("a client");
-    let desired = client.get(server.url(&format!("/api/v1/robots/{}/desired", robot.id))).bearer_auth(&robot.token);
+    let client = reqwest::Client::builder()
+        .tls_backend_preconfigured(tls.clone())
+        .build()
+        .expect("a client");
+    let desired = client
+        .get(server.url(&format!("/api/v1/robots/{}/desired", robot.id)))
+        .bearer_auth(&robot.token);
     let status = desired.send().await.expect("an answer").status().as_u16();
     let stream = dial(&route(mqtt_of(server), Some(Arc::new(tls)))).await.expect("connected");
     let mut raw = Raw { stream };
     let connect = Connect { password: Some(robot.token.clone()), ..Connect::robot(&robot.id) };
     raw.send(&connect.packet()).await;
     let mut answer = [0; 4];
-    timeout(PATIENCE, raw.stream.read_exact(&mut answer)).await.expect("in time").expect("an answer");
+    timeout(PATIENCE, raw.stream.read_exact(&mut answer))
+        .await
+        .expect("in time")
+        .expect("an answer");
     assert_eq!(answer[..3], [0x20, 2, 0]);
     (status, answer[3])
 }
@@ -390,11 +429,15 @@ async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
     assert_eq!(answers_to(&server, &robot, None).await, (401, 4));
     assert_eq!(answers_to(&server, &keyless, None).await, (200, 0));
     assert_eq!(answers_to(&server, &keyless, Some(&other)).await, (200, 0));
-    // The next token is bound to the key as well; whoever else tries it does not end the one in use.
+    // The next token is bound to the key as well; whoever else tries it does not end the one in
+    // use.
     let mut tls = ClientConfig::clone(&pinned(pin_of(&server)));
     key.show_in(&mut tls).expect("a certificate");
-    let client = reqwest::Client::builder().tls_backend_preconfigured(tls).build().expect("a client");
-    let next = client.post(server.url(&format!("/api/v1/robots/{}/token", robot.id))).bearer_auth(&robot.token);
+    let client =
+        reqwest::Client::builder().tls_backend_preconfigured(tls).build().expect("a client");
+    let next = client
+        .post(server.url(&format!("/api/v1/robots/{}/token", robot.id)))
+        .bearer_auth(&robot.token);
     let next: RobotToken = crate::harness::answer(next).await;
     let renewed = TestRobot::new(robot.id.clone(), next.token);
     assert_eq!(answers_to(&server, &renewed, None).await, (401, 4));
@@ -402,8 +445,11 @@ async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
     assert_eq!(answers_to(&server, &renewed, Some(&key)).await, (200, 0));
     assert_eq!(answers_to(&server, &robot, Some(&key)).await, (401, 4));
     robot = renewed;
-    let removed =
-        server.request(Method::DELETE, &format!("/api/v1/robots/{}", robot.id)).send().await.expect("an answer");
+    let removed = server
+        .request(Method::DELETE, &format!("/api/v1/robots/{}", robot.id))
+        .send()
+        .await
+        .expect("an answer");
     assert!(removed.status().is_success());
     assert_eq!(answers_to(&server, &robot, Some(&key)).await, (401, 4));
 }
@@ -444,8 +490,13 @@ async fn a_thousand_half_open_connections_keep_nobody_out() {
     let arriving = async {
         for _ in 0..20 {
             let route = route(mqtt_of(&server), Some(tls.clone()));
-            timeout(IN_TIME, session(&route, &robot)).await.expect("in time").expect_nothing().await;
-            let answer = timeout(IN_TIME, asked_anew(http_of(&server), &tls)).await.expect("in time");
+            timeout(IN_TIME, session(&route, &robot))
+                .await
+                .expect("in time")
+                .expect_nothing()
+                .await;
+            let answer =
+                timeout(IN_TIME, asked_anew(http_of(&server), &tls)).await.expect("in time");
             assert!(answer.expect("an answer").starts_with("HTTP/1.1 200"));
         }
     };
@@ -472,8 +523,12 @@ async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, T
 #[tokio::test(flavor = "multi_thread")]
 async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
     const HOUR: Duration = Duration::from_secs(3600);
-    let limits =
-        Limits { max_connections: 1000, max_silent_per_address: 1, proxies: [].into(), handshake_timeout: HOUR };
+    let limits = Limits {
+        max_connections: 1000,
+        max_silent_per_address: 1,
+        proxies: [].into(),
+        handshake_timeout: HOUR,
+    };
     let (http, _stop, _directory) = listener(limits).await;
     let broker = crate::mqtt_harness::TestBroker::encrypted(|limits| {
         (limits.max_silent_per_address, limits.connect_timeout) = (1, HOUR);
@@ -483,7 +538,8 @@ async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
         let mut oldest = TcpStream::connect(address).await.expect("connected");
         oldest.write_all(&BEGUN).await.expect("written");
         let newcomers = async {
-            let (mut ticks, mut all) = (tokio::time::interval(Duration::from_millis(200)), Vec::new());
+            let (mut ticks, mut all) =
+                (tokio::time::interval(Duration::from_millis(200)), Vec::new());
             loop {
                 ticks.tick().await;
                 all.push(TcpStream::connect(address).await.expect("connected"));
@@ -517,7 +573,8 @@ async fn a_silent_socket_and_a_slow_handshake_end_by_themselves() {
     .await;
     for address in [http, broker.address()] {
         for slow in [false, true] {
-            // There is one place: whoever held it beyond its time would keep the next from being accepted.
+            // There is one place: whoever held it beyond its time would keep the next from being
+            // accepted.
             let stream = TcpStream::connect(address).await.expect("connected");
             let (mut reading, mut writing) = stream.into_split();
             let dribbling = async {

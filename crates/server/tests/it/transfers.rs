@@ -19,10 +19,12 @@ const BLOB_BYTES: usize = 8 * 1024 * 1024;
 const ROBOTS: usize = 200;
 const LIMIT: usize = 8;
 
-/// On a connection of its own: one that has carried a blob holds so much that a whole one fits it, read or not.
+/// On a connection of its own: one that has carried a blob holds so much that a whole one fits it,
+/// read or not.
 async fn get(server: &TestServer, robot: &TestRobot, blob: Digest) -> Response {
     let path = format!("/v2/anything/blobs/{blob}");
-    let request = server.bare(Method::GET, &path).bearer_auth(&robot.token).header(CONNECTION, "close");
+    let request =
+        server.bare(Method::GET, &path).bearer_auth(&robot.token).header(CONNECTION, "close");
     request.send().await.expect("an answer")
 }
 
@@ -35,9 +37,16 @@ async fn pull(server: &TestServer, robot: &TestRobot, blob: Digest) -> (Response
             return (response, sent_away);
         }
         assert_eq!(response.status(), StatusCode::TOO_MANY_REQUESTS);
-        let seconds: u64 = response.headers()["retry-after"].to_str().expect("text").parse().expect("whole seconds");
+        let seconds: u64 = response.headers()["retry-after"]
+            .to_str()
+            .expect("text")
+            .parse()
+            .expect("whole seconds");
         let body = response.text().await.expect("a body");
-        assert!(body.contains("TOOMANYREQUESTS") && (1..=90).contains(&seconds), "{seconds}: {body}");
+        assert!(
+            body.contains("TOOMANYREQUESTS") && (1..=90).contains(&seconds),
+            "{seconds}: {body}"
+        );
         tokio::time::sleep(Duration::from_secs(seconds)).await;
         sent_away += 1;
     }
@@ -90,7 +99,8 @@ async fn who_waits_is_told_when_to_come_back_and_only_robots_wait() {
     let refused = get(&server, &two, blob).await;
     assert_eq!(refused.status(), StatusCode::TOO_MANY_REQUESTS);
     let path = format!("/v2/talker/blobs/{blob}");
-    let head = server.bare(Method::HEAD, &path).bearer_auth(&two.token).send().await.expect("an answer");
+    let head =
+        server.bare(Method::HEAD, &path).bearer_auth(&two.token).send().await.expect("an answer");
     assert_eq!(head.status(), StatusCode::OK, "a size costs nothing");
     let operators = server.request(Method::GET, &path).send().await.expect("an answer");
     assert_eq!(operators.bytes().await.expect("bytes").len(), BLOB_BYTES);
@@ -120,7 +130,8 @@ async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_other
     }
     server.deploy(&calm, "*", "calm").await;
     let (package, manifest) = (&urgent.name, urgent.manifest.digest);
-    let order = json!({ "package": package, "manifest": manifest, "selector": "hurried", "priority": 1 });
+    let order =
+        json!({ "package": package, "manifest": manifest, "selector": "hurried", "priority": 1 });
     let _: DeploymentView = answer(server.order("/api/v1/deployments", "urgent", &order)).await;
     // Nobody reads it, so the one transfer there may be stays under way.
     let first = get(&server, &others[0], calm.content.digest).await;
@@ -138,7 +149,8 @@ async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_other
     assert!(hurried <= 2, "{hurried}: it came last and is next");
 }
 
-/// Two robots in the same hall get a package through `limit`, which lets all of it through in a second.
+/// Two robots in the same hall get a package through `limit`, which lets all of it through in a
+/// second.
 async fn two_pulls_take_two_seconds(limit: impl FnOnce(&mut taskd::config::Config, u64)) {
     const SMALL: usize = 256 * 1024;
     let directory = TempDir::new().expect("a directory");
@@ -148,13 +160,16 @@ async fn two_pulls_take_two_seconds(limit: impl FnOnce(&mut taskd::config::Confi
     for name in ["one", "two"] {
         let robot = server.enroll(name).await;
         let path = format!("/api/v1/robots/{}", robot.id);
-        let edit = server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": "hall" } }));
+        let edit =
+            server.request(Method::PATCH, &path).json(&json!({ "labels": { "site": "hall" } }));
         let _: RobotView = answer(edit).await;
         robots.push(robot);
     }
     server.deploy(&package, "*", "key-1").await;
     let begun = tokio::time::Instant::now();
-    let whole = async |robot| get(&server, robot, package.content.digest).await.bytes().await.expect("bytes").len();
+    let whole = async |robot| {
+        get(&server, robot, package.content.digest).await.bytes().await.expect("bytes").len()
+    };
     assert_eq!(tokio::join!(whole(&robots[0]), whole(&robots[1])), (SMALL, SMALL));
     // The last piece and the first moment aside.
     assert!(begun.elapsed() >= Duration::from_millis(1_500));

@@ -1,5 +1,5 @@
-//! A robot on MQTT: it is told of its state, its reports are stored before they are acknowledged, and the operator sees
-//! it come and go.
+//! A robot on MQTT: it is told of its state, its reports are stored before they are acknowledged,
+//! and the operator sees it come and go.
 
 use std::time::Duration;
 
@@ -34,7 +34,11 @@ impl Session {
     pub async fn open_at(address: &str, id: &str, token: &str) -> Self {
         let mut session = Self::dial_at(address, id, token);
         session.until(|packet| matches!(packet, Packet::ConnAck(_))).await;
-        session.client.subscribe(format!("{}/desired", session.topics), QoS::AtLeastOnce).await.expect("queued");
+        session
+            .client
+            .subscribe(format!("{}/desired", session.topics), QoS::AtLeastOnce)
+            .await
+            .expect("queued");
         session
     }
 
@@ -56,7 +60,8 @@ impl Session {
     }
 
     async fn hung_up(&mut self) {
-        let hung_up = tokio::time::timeout(PATIENCE, async { while self.packets.poll().await.is_ok() {} });
+        let hung_up =
+            tokio::time::timeout(PATIENCE, async { while self.packets.poll().await.is_ok() {} });
         hung_up.await.expect("the connection ends");
     }
 
@@ -85,18 +90,24 @@ impl Session {
     pub async fn asked(&mut self) -> Value {
         let topic = format!("{}/request", self.topics);
         self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
-        let question = self.until(|packet| matches!(packet, Packet::Publish(publish) if publish.topic == topic)).await;
+        let question = self
+            .until(|packet| matches!(packet, Packet::Publish(publish) if publish.topic == topic))
+            .await;
         let Packet::Publish(question) = question else { panic!("a question is published") };
         serde_json::from_slice(&question.payload).expect("json")
     }
 
-    /// Answers each question with what `reply` makes of it, for as long as what comes back is polled. When that comes
-    /// back, the robot can be asked.
-    pub async fn answer_all(mut self, reply: impl Fn(&[u8]) -> Vec<u8>) -> impl Future<Output = ()> {
+    /// Answers each question with what `reply` makes of it, for as long as what comes back is
+    /// polled. When that comes back, the robot can be asked.
+    pub async fn answer_all(
+        mut self,
+        reply: impl Fn(&[u8]) -> Vec<u8>,
+    ) -> impl Future<Output = ()> {
         let topic = format!("{}/request", self.topics);
         self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
         // The broker takes one after the other: what is acknowledged comes after the subscription.
-        let status = json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
+        let status =
+            json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
         self.publish("status", status.to_string().into_bytes()).await;
         async move {
             loop {
@@ -107,7 +118,10 @@ impl Session {
                 {
                     let reply = reply(&question.payload);
                     let topic = format!("{}/reply", self.topics);
-                    self.client.publish(topic, QoS::AtLeastOnce, false, reply).await.expect("queued");
+                    self.client
+                        .publish(topic, QoS::AtLeastOnce, false, reply)
+                        .await
+                        .expect("queued");
                 }
             }
         }
@@ -122,11 +136,14 @@ impl Session {
     /// The next state it is told of, from `generation` on.
     async fn told(&mut self, server: &TestServer, generation: u64) -> DesiredState {
         loop {
-            let Packet::Publish(publish) = self.until(|packet| matches!(packet, Packet::Publish(_))).await else {
+            let Packet::Publish(publish) =
+                self.until(|packet| matches!(packet, Packet::Publish(_))).await
+            else {
                 continue;
             };
             assert_eq!(publish.topic, format!("{}/desired", self.topics));
-            let Ok(Doorbell::State { envelope, .. }) = serde_json::from_slice(&publish.payload) else {
+            let Ok(Doorbell::State { envelope, .. }) = serde_json::from_slice(&publish.payload)
+            else {
                 panic!("the whole state fits into a message");
             };
             let state = opened(server, &envelope).await;
@@ -249,7 +266,9 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
     let mut session = Session::open(&server, &robot).await;
     let state = session.told(&server, 0).await;
     let path = format!("/api/v1/robots/{}/token", robot.id);
-    let next = async |token: &str| -> RobotToken { answer(server.bare(Method::POST, &path).bearer_auth(token)).await };
+    let next = async |token: &str| -> RobotToken {
+        answer(server.bare(Method::POST, &path).bearer_auth(token)).await
+    };
     let report = serde_json::to_vec(&robot.next_report(&state, Phase::Running)).expect("json");
     let over_http = next(&robot.token).await.token;
     session
@@ -263,7 +282,10 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
     let old = std::mem::replace(&mut robot.token, over_http);
     server.desired(&robot).await;
     session.hung_up().await;
-    assert_eq!(refusal(server.bare(Method::POST, &path).bearer_auth(&old)).await, (401, "unauthorized".to_owned()));
+    assert_eq!(
+        refusal(server.bare(Method::POST, &path).bearer_auth(&old)).await,
+        (401, "unauthorized".to_owned())
+    );
     assert!(!Session::is_let_in(&server, &robot, &old).await);
 
     // Used over MQTT: it takes over the session of the old one.
@@ -285,13 +307,17 @@ async fn a_new_token_ends_the_old_session_though_the_request_that_shows_it_first
     let mut session = Session::open(&server, &robot).await;
     session.told(&server, 0).await;
     let path = format!("/api/v1/robots/{}", robot.id);
-    let next: RobotToken = answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
+    let next: RobotToken =
+        answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
     let requests = async || server.get::<ServerInfo>("/api/v1/server").await.http.requests;
     // As long as somebody writes the token is not marked as used.
     let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
     let write = store.begin().await.expect("begins");
     let mut counted = requests().await;
-    let request = format!("GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n", next.token);
+    let request = format!(
+        "GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n",
+        next.token
+    );
     let mut line = TcpStream::connect(&server.server.addresses().http).await.expect("listens");
     line.write_all(request.as_bytes()).await.expect("sent");
     // Until it is under way there are only these questions.
@@ -335,23 +361,35 @@ async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
     let server = TestServer::start().await;
     let (mut robot, clone) = two_of_one(&server).await;
     let path = format!("/api/v1/robots/{}", robot.id);
-    let request =
-        format!("GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n", clone.token);
+    let request = format!(
+        "GET {path}/desired HTTP/1.1\r\nHost: taskd\r\nAuthorization: Bearer {}\r\n\r\n",
+        clone.token
+    );
     let mut line = TcpStream::connect(&server.server.addresses().http).await.expect("listens");
     line.write_all(request.as_bytes()).await.expect("sent");
     let mut status = [0; 12];
     line.read_exact(&mut status).await.expect("an answer");
     assert_eq!(&status, b"HTTP/1.1 409");
 
-    let next: RobotToken = answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
+    let next: RobotToken =
+        answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
     robot.token = next.token;
     let mut session = Session::open(&server, &robot).await;
     session.told(&server, 0).await;
     // A reset is an end as well.
-    let _ = tokio::time::timeout(PATIENCE, line.read_to_end(&mut Vec::new())).await.expect("the old connection is cut");
+    let _ = tokio::time::timeout(PATIENCE, line.read_to_end(&mut Vec::new()))
+        .await
+        .expect("the old connection is cut");
     assert_eq!(server.ask_desired(&clone).await.status(), 401);
     assert_eq!(server.ask_desired(&robot).await.status(), 200);
-    assert!(server.robot(&robot).await.conditions.iter().all(|condition| condition.code != "duplicate_identity"));
+    assert!(
+        server
+            .robot(&robot)
+            .await
+            .conditions
+            .iter()
+            .all(|condition| condition.code != "duplicate_identity")
+    );
     // Nobody has put the newcomer out meanwhile.
     session.publish("status", b"{}".to_vec()).await;
 }
@@ -360,9 +398,15 @@ async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
 async fn an_enrolment_token_or_another_robots_name_opens_nothing() {
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("boreas").await);
-    let token: task_proto::api::EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+    let token: task_proto::api::EnrollmentToken =
+        server.post("/api/v1/enrollment-tokens", &json!({})).await;
     for (id, token) in [(other.id.as_str(), &robot.token), (robot.id.as_str(), &token.token)] {
         let mut session = Session::dial(&server, id, token);
-        assert!(tokio::time::timeout(PATIENCE, session.packets.poll()).await.expect("an answer").is_err());
+        assert!(
+            tokio::time::timeout(PATIENCE, session.packets.poll())
+                .await
+                .expect("an answer")
+                .is_err()
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! How robots' machines do: said over MQTT or HTTP, remembered for an hour, asked for now. Nothing of it is stored.
+//! How robots' machines do: said over MQTT or HTTP, remembered for an hour, asked for now. Nothing
+//! of it is stored.
 
 use reqwest::Method;
 use serde_json::json;
@@ -22,7 +23,10 @@ async fn samples(server: &TestServer, robot: &str) -> Vec<(u64, Option<f32>)> {
 async fn what_a_robot_says_of_its_machine_is_shown_for_an_hour() {
     let server = TestServer::start().await;
     let (atlas, boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
-    assert_eq!((server.robot(&atlas).await.vitals, samples(&server, "atlas").await), (None, Vec::new()));
+    assert_eq!(
+        (server.robot(&atlas).await.vitals, samples(&server, "atlas").await),
+        (None, Vec::new())
+    );
     let mut session = Session::open(&server, &atlas).await;
     for (minute, cpu) in [(0, 10.0), (1, 20.0), (2, 30.0)] {
         server.clock.advance_ms(if minute == 0 { 0 } else { 60_000 });
@@ -31,8 +35,13 @@ async fn what_a_robot_says_of_its_machine_is_shown_for_an_hour() {
     session.publish("telemetry", said(&boreas, 99.0).to_string().into_bytes()).await;
     session.publish("telemetry", b"{".to_vec()).await;
     let newest = server.robot(&atlas).await.vitals.expect("said");
-    assert_eq!((newest.at_ms, newest.cpu_percent), (NOW_MS + 120_000, Some(30.0)), "by the server's clock");
-    let minutes = [(NOW_MS, Some(10.0)), (NOW_MS + 60_000, Some(20.0)), (NOW_MS + 120_000, Some(30.0))];
+    assert_eq!(
+        (newest.at_ms, newest.cpu_percent),
+        (NOW_MS + 120_000, Some(30.0)),
+        "by the server's clock"
+    );
+    let minutes =
+        [(NOW_MS, Some(10.0)), (NOW_MS + 60_000, Some(20.0)), (NOW_MS + 120_000, Some(30.0))];
     assert_eq!(samples(&server, "atlas").await, minutes);
     assert_eq!(samples(&server, "boreas").await, [], "in another's name");
     server.clock.advance_ms(3_600_000);
@@ -51,13 +60,18 @@ async fn a_robot_that_polls_says_it_over_http() {
     };
     assert_eq!(say(&atlas, said(&atlas, 12.5)).send().await.expect("an answer").status(), 204);
     let view: RobotView = server.robot(&atlas).await;
-    assert_eq!((view.online, view.vitals.and_then(|vitals| vitals.cpu_percent)), (true, Some(12.5)));
+    assert_eq!(
+        (view.online, view.vitals.and_then(|vitals| vitals.cpu_percent)),
+        (true, Some(12.5))
+    );
     assert_eq!(refusal(say(&atlas, said(&boreas, 1.0))).await, (400, "invalid_request".to_owned()));
     let path = format!("/api/v1/robots/{}/telemetry", boreas.id);
-    let other = server.bare(Method::POST, &path).bearer_auth(&atlas.token).json(&said(&boreas, 1.0));
+    let other =
+        server.bare(Method::POST, &path).bearer_auth(&atlas.token).json(&said(&boreas, 1.0));
     assert_eq!(refusal(other).await.0, 403);
     assert_eq!(samples(&server, "boreas").await, []);
-    let gone = server.request(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
+    let gone =
+        server.request(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
     assert_eq!(gone.status(), 204);
     assert_eq!(refusal(server.request(Method::GET, "/api/v1/robots/atlas/vitals")).await.0, 404);
 }
@@ -76,6 +90,10 @@ async fn a_robot_is_asked_how_it_does_now() {
         session.publish("reply", reply.to_string().into_bytes()).await;
     });
     let Answer::Vitals(vitals) = answered else { panic!("{answered:?}") };
-    assert_eq!((vitals.at_ms, vitals.cpu_percent), (NOW_MS, Some(100.0)), "by our clock, and what can be");
+    assert_eq!(
+        (vitals.at_ms, vitals.cpu_percent),
+        (NOW_MS, Some(100.0)),
+        "by our clock, and what can be"
+    );
     assert_eq!(server.robot(&robot).await.vitals, Some(vitals));
 }

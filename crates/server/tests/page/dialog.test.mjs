@@ -1,7 +1,16 @@
-// What closes a question and what does not, so that nobody loses what they have typed or are shown but once.
+// What closes a question and what does not, so that nobody loses what they have typed or are shown
+// but once.
 
 import { test } from 'node:test';
-import { assert, assertAccessible, assertQuiet, open, Puppet, Server, settled } from './harness.mjs';
+import {
+  assert,
+  assertAccessible,
+  assertQuiet,
+  open,
+  Puppet,
+  Server,
+  settled,
+} from './harness.mjs';
 
 /** A place beside the dialog. */
 const BESIDE = [5, 450];
@@ -31,7 +40,10 @@ test('what is shown but once stays until somebody says that they have it', async
   const server = await Server.start(t);
   const page = await open(t, server, { hash: '#/settings' });
   const dialog = page.getByRole('dialog');
-  await page.locator('section', { hasText: 'Enrolment tokens' }).getByRole('button', { name: 'New token…' }).click();
+  await page
+    .locator('section', { hasText: 'Enrolment tokens' })
+    .getByRole('button', { name: 'New token…' })
+    .click();
   await dialog.getByRole('button', { name: 'Make it' }).click();
   const secret = dialog.locator('code', { hasText: '--token' });
   await secret.waitFor();
@@ -75,6 +87,10 @@ test('an order that waits for the packages takes the place of no other question'
   await page.keyboard.press('Escape');
   await answer(await push());
   await dialog.getByRole('button', { name: 'Deploy' }).waitFor();
-  assert.equal(await page.evaluate(() => document.activeElement.id), 'order-name', 'what is to be filled in has the focus');
+  assert.equal(
+    await page.evaluate(() => document.activeElement.id),
+    'order-name',
+    'what is to be filled in has the focus',
+  );
   assertQuiet(page);
 });

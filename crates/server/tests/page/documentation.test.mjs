@@ -7,11 +7,17 @@ test('the description calls as whoever is signed in, and breaks no policy', asyn
   const server = await Server.start(t);
   const page = await open(t, server);
   await page.goto(`${server.url}/api/docs`);
-  for (const [tag, operation, status] of [['people', 'people_me', '200'], ['session', 'session_sign_out', '204']]) {
+  for (const [tag, operation, status] of [
+    ['people', 'people_me', '200'],
+    ['session', 'session_sign_out', '204'],
+  ]) {
     await page.locator(`#operations-tag-${tag}`).click();
     const block = page.locator(`#operations-${tag}-${operation}`);
-    for (const button of ['.opblock-summary-control', '.try-out__btn', '.execute']) await block.locator(button).click();
-    await block.locator('.live-responses-table .response .response-col_status', { hasText: status }).waitFor();
+    for (const button of ['.opblock-summary-control', '.try-out__btn', '.execute'])
+      await block.locator(button).click();
+    await block
+      .locator('.live-responses-table .response .response-col_status', { hasText: status })
+      .waitFor();
   }
   assertQuiet(page);
 });

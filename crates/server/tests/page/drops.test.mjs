@@ -1,11 +1,23 @@
-// Packages that are dropped on the page, and what stands in the way of them: a server that ends meanwhile, and one whose disk is full.
+// Packages that are dropped on the page, and what stands in the way of them: a server that ends
+// meanwhile, and one whose disk is full.
 
 import { spawnSync } from 'node:child_process';
 import { randomBytes } from 'node:crypto';
 import { mkdirSync, readdirSync, statSync, writeFileSync } from 'node:fs';
 import { dirname, join } from 'node:path';
 import { test } from 'node:test';
-import { assert, assertQuiet, directory, eventually, live, open, Server, smallDisk, takeComplaints, until } from './harness.mjs';
+import {
+  assert,
+  assertQuiet,
+  directory,
+  eventually,
+  live,
+  open,
+  Server,
+  smallDisk,
+  takeComplaints,
+  until,
+} from './harness.mjs';
 
 const MB = 1_000_000;
 const SCRIPT = '#!/bin/sh\nexec sleep 1000\n';
@@ -14,17 +26,30 @@ const SCRIPT = '#!/bin/sh\nexec sleep 1000\n';
 function folder(t, name, files = {}) {
   const top = join(directory(t), name);
   const manifest = `name = "${name}"\nversion = "1.0.0"\n\n[run]\nexec = ["./run.sh"]\n`;
-  for (const [path, content] of Object.entries({ 'task.toml': manifest, 'run.sh': SCRIPT, ...files })) {
+  for (const [path, content] of Object.entries({
+    'task.toml': manifest,
+    'run.sh': SCRIPT,
+    ...files,
+  })) {
     mkdirSync(dirname(join(top, path)), { recursive: true });
     writeFileSync(join(top, path), content, { mode: path.endsWith('.sh') ? 0o755 : 0o644 });
   }
   return top;
 }
 
-/** Does with the pointer what somebody does who drags these from a file manager: over the page, and lets go of them. */
+/**
+ * Does with the pointer what somebody does who drags these from a file manager: over the page, and
+ * lets go of them.
+ */
 async function drop(page, ...paths) {
   const debug = await page.context().newCDPSession(page);
-  const drag = (type) => debug.send('Input.dispatchDragEvent', { type, x: 600, y: 500, data: { items: [], files: paths, dragOperationsMask: 1 } });
+  const drag = (type) =>
+    debug.send('Input.dispatchDragEvent', {
+      type,
+      x: 600,
+      y: 500,
+      data: { items: [], files: paths, dragOperationsMask: 1 },
+    });
   await drag('dragEnter');
   await drag('dragOver');
   await page.getByText('to upload it').waitFor();
@@ -35,21 +60,36 @@ async function drop(page, ...paths) {
 
 const upload = (page, name) => page.locator('.upload', { hasText: name });
 const row = (page, name) => page.locator(`[data-package="${name}@1.0.0"]`);
-const listed = async (server) => (await server.ask('GET', '/packages')).packages.map(({ package: { name } }) => name).sort();
+const listed = async (server) =>
+  (await server.ask('GET', '/packages')).packages.map(({ package: { name } }) => name).sort();
 
 /** What the command makes of a directory is what the server has of it. */
 async function assertSame(server, path, name) {
-  const { package: { manifest } } = (await server.ask('GET', '/packages')).packages.find((one) => one.package.name === name);
-  assert.ok(server.operate('pack', path, '-o', 'json').includes(manifest.digest), `${name}: the same digest`);
+  const {
+    package: { manifest },
+  } = (await server.ask('GET', '/packages')).packages.find((one) => one.package.name === name);
+  assert.ok(
+    server.operate('pack', path, '-o', 'json').includes(manifest.digest),
+    `${name}: the same digest`,
+  );
 }
 
 test('folders and archives that are dropped become packages', async (t) => {
   const server = await Server.start(t);
   // More files than a browser tells of at once.
-  const many = Object.fromEntries(Array.from({ length: 130 }, (_, index) => [`maps/floor ${index}/größe.txt`, `${index}`]));
-  const talker = folder(t, 'talker', { ...many, '.git/HEAD': 'not this', 'lib/__pycache__/one.pyc': 'nor this' });
+  const many = Object.fromEntries(
+    Array.from({ length: 130 }, (_, index) => [`maps/floor ${index}/größe.txt`, `${index}`]),
+  );
+  const talker = folder(t, 'talker', {
+    ...many,
+    '.git/HEAD': 'not this',
+    'lib/__pycache__/one.pyc': 'nor this',
+  });
   mkdirSync(join(talker, 'empty'));
-  const [mapper, sensor] = [folder(t, 'mapper'), folder(t, 'sensor', { 'model.bin': randomBytes(100_000) })];
+  const [mapper, sensor] = [
+    folder(t, 'mapper'),
+    folder(t, 'sensor', { 'model.bin': randomBytes(100_000) }),
+  ];
   const page = await open(t, server, { hash: '#/packages' });
   await page.getByText('No package is here yet.').waitFor();
   await drop(page, talker);
@@ -57,7 +97,9 @@ test('folders and archives that are dropped become packages', async (t) => {
   await assertSame(server, talker, 'talker');
   // Several things at once, of each kind.
   const archive = join(directory(t), 'mapper.tar');
-  const tar = spawnSync('tar', ['-C', dirname(mapper), '-cf', archive, 'mapper'], { encoding: 'utf8' });
+  const tar = spawnSync('tar', ['-C', dirname(mapper), '-cf', archive, 'mapper'], {
+    encoding: 'utf8',
+  });
   assert.equal(tar.status, 0, tar.stderr);
   const zstd = join(directory(t), 'sensor.tar.zst');
   server.operate('pack', sensor, '--out', zstd);
@@ -67,7 +109,9 @@ test('folders and archives that are dropped become packages', async (t) => {
   for (const name of ['mapper', 'sensor']) await row(page, name).waitFor();
   await assertSame(server, mapper, 'mapper');
   await assertSame(server, sensor, 'sensor');
-  await upload(page, 'notes.txt').getByText('a package is a .tar.zst, a .tar or a folder').waitFor();
+  await upload(page, 'notes.txt')
+    .getByText('a package is a .tar.zst, a .tar or a folder')
+    .waitFor();
   assert.deepEqual(await listed(server), ['mapper', 'sensor', 'talker']);
   assertQuiet(page);
 });
@@ -78,12 +122,21 @@ test('an upload that a killed server breaks off is said, leaves nothing, and is 
   const page = await open(t, server, { hash: '#/packages' });
   const debug = await page.context().newCDPSession(page);
   await debug.send('Network.enable');
-  await debug.send('Network.emulateNetworkConditions', { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: 3 * MB });
+  await debug.send('Network.emulateNetworkConditions', {
+    offline: false,
+    latency: 0,
+    downloadThroughput: -1,
+    uploadThroughput: 3 * MB,
+  });
   await drop(page, path);
   await until(page, () => document.querySelector('.upload progress')?.value > 4_000_000);
   // The server has some of it, and not all.
   const incoming = join(server.data, 'incoming');
-  const inThere = () => readdirSync(incoming, { recursive: true }).map((name) => statSync(join(incoming, name))).filter((one) => one.isFile()).reduce((sum, { size }) => sum + size, 0);
+  const inThere = () =>
+    readdirSync(incoming, { recursive: true })
+      .map((name) => statSync(join(incoming, name)))
+      .filter((one) => one.isFile())
+      .reduce((sum, { size }) => sum + size, 0);
   await eventually('some of it to be there', () => inThere() > MB);
   assert.ok(inThere() < 60 * MB);
   await server.process.stop('SIGKILL');
@@ -99,7 +152,12 @@ test('an upload that a killed server breaks off is said, leaves nothing, and is 
   await page.getByRole('button', { name: 'Sign in with it' }).click();
   await live(page);
   await page.getByText('No package is here yet.').waitFor();
-  await debug.send('Network.emulateNetworkConditions', { offline: false, latency: 0, downloadThroughput: -1, uploadThroughput: -1 });
+  await debug.send('Network.emulateNetworkConditions', {
+    offline: false,
+    latency: 0,
+    downloadThroughput: -1,
+    uploadThroughput: -1,
+  });
   await drop(page, path);
   await row(page, 'mapper').waitFor();
   await assertSame(again, path, 'mapper');
@@ -109,10 +167,16 @@ test('a server whose disk is full says so, and takes what there is room for', as
   const server = await Server.start(t, { disk: await smallDisk(t, 30 * MB) });
   const page = await open(t, server, { hash: '#/packages' });
   await drop(page, folder(t, 'mapper', { 'model.bin': randomBytes(60 * MB) }));
-  await upload(page, 'mapper').locator('.problem', { hasText: 'the server\'s disk is nearly full' }).waitFor();
+  await upload(page, 'mapper')
+    .locator('.problem', { hasText: "the server's disk is nearly full" })
+    .waitFor();
   assert.match(takeComplaints(page).join(), /507/);
   assert.deepEqual(await listed(server), []);
-  assert.deepEqual(readdirSync(join(server.data, 'incoming')), [], 'what had come makes room again');
+  assert.deepEqual(
+    readdirSync(join(server.data, 'incoming')),
+    [],
+    'what had come makes room again',
+  );
   const small = folder(t, 'talker');
   await drop(page, small);
   await row(page, 'talker').waitFor();

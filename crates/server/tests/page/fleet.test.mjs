@@ -1,8 +1,19 @@
-// What an operator does with a fleet of real agents: from the first robot to a task that runs, fails, is followed and is taken back.
+// What an operator does with a fleet of real agents: from the first robot to a task that runs,
+// fails, is followed and is taken back.
 
 import { randomBytes } from 'node:crypto';
 import { test } from 'node:test';
-import { agent, assert, assertQuiet, eventually, open, PATIENCE_MS, Puppet, Server, until } from './harness.mjs';
+import {
+  agent,
+  assert,
+  assertQuiet,
+  eventually,
+  open,
+  PATIENCE_MS,
+  Puppet,
+  Server,
+  until,
+} from './harness.mjs';
 
 const row = (page, name) => page.locator('.row[data-robot]', { hasText: name });
 const phase = (page, name, text) => row(page, name).locator('.phase', { hasText: text });
@@ -20,7 +31,11 @@ test('a robot that enrols by the shown command appears by itself', async (t) => 
   await row(page, 'first').locator('.state', { hasText: 'Offline' }).waitFor();
   await agent(t, server, 'atlas');
   await row(page, 'atlas').locator('.state', { hasText: 'Online' }).waitFor();
-  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was never loaded again');
+  assert.equal(
+    await page.evaluate(() => window.isSameDocument),
+    true,
+    'the page was never loaded again',
+  );
   assertQuiet(page);
 });
 
@@ -28,7 +43,9 @@ test('two robots are chosen, get a package while it is seen to come, and run it'
   // So slow that the progress can be looked at.
   const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '250 KB' } });
   for (const name of ['atlas', 'borea', 'corvus']) await agent(t, server, name);
-  server.push('talker', '1.0.0', { files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', model: randomBytes(3_000_000) } });
+  server.push('talker', '1.0.0', {
+    files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', model: randomBytes(3_000_000) },
+  });
   const page = await open(t, server);
   for (const name of ['atlas', 'borea']) await row(page, name).getByRole('checkbox').click();
   await page.getByRole('button', { name: 'Push…' }).click();
@@ -39,29 +56,42 @@ test('two robots are chosen, get a package while it is seen to come, and run it'
   await page.getByRole('link', { name: 'Robots' }).click();
   // Two values of one robot's bar, one after the other.
   await page.getByRole('searchbox').fill('atlas');
-  const values = await page.evaluate((patience) => new Promise((resume, reject) => {
-    const seen = new Set();
-    const end = performance.now() + patience;
-    const look = () => {
-      const bar = document.querySelector('[data-task=talker] progress');
-      if (bar?.value > 0) seen.add(bar.value);
-      if (seen.size > 1) resume([...seen]);
-      else if (performance.now() > end) reject(new Error(`the bar showed no two values, but ${[...seen]}`));
-      else requestAnimationFrame(look);
-    };
-    look();
-  }), PATIENCE_MS);
+  const values = await page.evaluate(
+    (patience) =>
+      new Promise((resume, reject) => {
+        const seen = new Set();
+        const end = performance.now() + patience;
+        const look = () => {
+          const bar = document.querySelector('[data-task=talker] progress');
+          if (bar?.value > 0) seen.add(bar.value);
+          if (seen.size > 1) resume([...seen]);
+          else if (performance.now() > end)
+            reject(new Error(`the bar showed no two values, but ${[...seen]}`));
+          else requestAnimationFrame(look);
+        };
+        look();
+      }),
+    PATIENCE_MS,
+  );
   assert.ok(values[0] < values[1], `the bar grows: ${values}`);
   await page.getByRole('searchbox').fill('');
   for (const name of ['atlas', 'borea']) await phase(page, name, 'running').waitFor();
-  assert.equal(await row(page, 'corvus').locator('[data-task]').count(), 0, 'who was not chosen gets nothing');
+  assert.equal(
+    await row(page, 'corvus').locator('[data-task]').count(),
+    0,
+    'who was not chosen gets nothing',
+  );
   assertQuiet(page);
 });
 
 test('who fails is found by the counter, and says why', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await agent(t, server, name);
-  server.push('sensor', '0.1.0', { files: { 'run.sh': '#!/bin/sh\necho no such sensor >&2\nexit 3\n' }, more: 'restart = "never"\n', to: 'atlas' });
+  server.push('sensor', '0.1.0', {
+    files: { 'run.sh': '#!/bin/sh\necho no such sensor >&2\nexit 3\n' },
+    more: 'restart = "never"\n',
+    to: 'atlas',
+  });
   const page = await open(t, server);
   await phase(page, 'atlas', 'failed').waitFor();
   await row(page, 'atlas').locator('.failure').waitFor();
@@ -80,19 +110,33 @@ test('a deployment is cancelled, and the version before goes on', async (t) => {
   const page = await open(t, server);
   await phase(page, 'atlas', 'running').waitFor();
   // Not settled before it is cancelled.
-  const newest = server.push('talker', '2.0.0', { more: '\n[ready]\nhold_s = 30\ntimeout_s = 60\n', to: 'atlas' });
+  const newest = server.push('talker', '2.0.0', {
+    more: '\n[ready]\nhold_s = 30\ntimeout_s = 60\n',
+    to: 'atlas',
+  });
   await page.goto(`${server.url}/#/deployments/${newest.id}`);
   await page.getByRole('button', { name: 'Cancel…' }).click();
-  await page.getByRole('dialog').getByRole('button', { name: /^Cancel the/ }).click();
+  await page
+    .getByRole('dialog')
+    .getByRole('button', { name: /^Cancel the/ })
+    .click();
   await page.locator('.standing', { hasText: 'Cancelled' }).waitFor();
-  await eventually('the version before to be what is wanted', async () => (await server.ask('GET', '/robots/atlas')).tasks[0]?.version === '1.0.0');
+  await eventually(
+    'the version before to be what is wanted',
+    async () => (await server.ask('GET', '/robots/atlas')).tasks[0]?.version === '1.0.0',
+  );
   assertQuiet(page);
 });
 
 test('the log is followed, paused and filtered', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
-  server.push('talker', '1.0.0', { to: 'atlas', files: { 'run.sh': '#!/bin/sh\ni=0\nwhile :; do i=$((i+1)); echo "line $i"; sleep 0.2; done\n' } });
+  server.push('talker', '1.0.0', {
+    to: 'atlas',
+    files: {
+      'run.sh': '#!/bin/sh\ni=0\nwhile :; do i=$((i+1)); echo "line $i"; sleep 0.2; done\n',
+    },
+  });
   const page = await open(t, server, { hash: '#/robots/atlas/logs' });
   const lines = () => page.getByRole('log').innerText();
   await eventually('lines to come', async () => /line 3\b/.test(await lines()));
@@ -112,9 +156,15 @@ test('the log is followed, paused and filtered', async (t) => {
 
 test('the page of another robot shows nothing of the one before', async (t) => {
   const server = await Server.start(t);
-  for (const [robot, task] of [['atlas', 'talker'], ['borea', 'singer']]) {
+  for (const [robot, task] of [
+    ['atlas', 'talker'],
+    ['borea', 'singer'],
+  ]) {
     await agent(t, server, robot);
-    server.push(task, '1.0.0', { to: robot, files: { 'run.sh': `#!/bin/sh\nwhile :; do echo "${task} of ${robot}"; sleep 0.2; done\n` } });
+    server.push(task, '1.0.0', {
+      to: robot,
+      files: { 'run.sh': `#!/bin/sh\nwhile :; do echo "${task} of ${robot}"; sleep 0.2; done\n` },
+    });
   }
   const page = await open(t, server, { hash: '#/robots/atlas/logs' });
   const said = async (text) => (await page.getByRole('log').innerText()).includes(text);
@@ -137,14 +187,21 @@ test('labels are edited one by one and in bulk', async (t) => {
   await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
   await page.getByRole('textbox', { name: 'Labels' }).fill('site=lab, floor=2');
   await page.getByRole('button', { name: 'Save' }).click();
-  await eventually('the labels', async () => (await server.ask('GET', '/robots/atlas')).labels.floor === '2');
+  await eventually(
+    'the labels',
+    async () => (await server.ask('GET', '/robots/atlas')).labels.floor === '2',
+  );
   await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
   await page.getByRole('button', { name: 'Label…' }).click();
   await page.getByLabel('Labels to set').fill('site=yard');
   await page.getByRole('dialog').getByRole('checkbox', { name: 'floor' }).check();
   await page.getByRole('dialog').getByRole('button', { name: 'Label' }).click();
   for (const name of ['atlas', 'borea']) {
-    await eventually(`the labels of ${name}`, async () => JSON.stringify((await server.ask('GET', `/robots/${name}`)).labels) === '{"site":"yard"}');
+    await eventually(
+      `the labels of ${name}`,
+      async () =>
+        JSON.stringify((await server.ask('GET', `/robots/${name}`)).labels) === '{"site":"yard"}',
+    );
   }
   // Typed wrong, it is said in the dialog, and nothing is lost.
   await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
@@ -172,7 +229,11 @@ test('an order is for whoever was chosen, while the rest of the list is on its w
   await page.getByRole('dialog').getByRole('button', { name: 'Delete' }).click();
   await page.getByText('100 robots deleted.').waitFor();
   const { robots } = await server.ask('GET', '/robots');
-  assert.deepEqual(robots.map(({ labels }) => labels), [{}], 'whom the page did not know is left, and as it was');
+  assert.deepEqual(
+    robots.map(({ labels }) => labels),
+    [{}],
+    'whom the page did not know is left, and as it was',
+  );
   assertQuiet(page);
 });
 
@@ -189,7 +250,12 @@ test('who is limited to some robots gives orders to all that they see', async (t
   await page.getByRole('dialog').getByLabel('Package').selectOption('talker');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
   await page.waitForURL(/#\/deployments\/d/);
-  const { deployments: [{ counts }] } = await server.ask('GET', '/deployments');
-  assert.equal(counts.reduce((sum, { count }) => sum + count, 0), 2);
+  const {
+    deployments: [{ counts }],
+  } = await server.ask('GET', '/deployments');
+  assert.equal(
+    counts.reduce((sum, { count }) => sum + count, 0),
+    2,
+  );
   assertQuiet(page);
 });

@@ -1,10 +1,22 @@
-// Starts the real programs with directories and ports of their own, and a real browser that looks at them. Nothing is left behind.
+// Starts the real programs with directories and ports of their own, and a real browser that looks
+// at them. Nothing is left behind.
 
 import assert from 'node:assert/strict';
 import { spawn, spawnSync } from 'node:child_process';
 import { createHash, randomBytes } from 'node:crypto';
 import { createSocket } from 'node:dgram';
-import { chmodSync, existsSync, mkdirSync, mkdtempSync, openSync, readFileSync, readdirSync, rmSync, rmdirSync, writeFileSync } from 'node:fs';
+import {
+  chmodSync,
+  existsSync,
+  mkdirSync,
+  mkdtempSync,
+  openSync,
+  readFileSync,
+  readdirSync,
+  rmSync,
+  rmdirSync,
+  writeFileSync,
+} from 'node:fs';
 import { createRequire } from 'node:module';
 import { tmpdir } from 'node:os';
 import { dirname, join } from 'node:path';
@@ -16,7 +28,10 @@ export const PATIENCE_MS = 60_000;
 const TASK_USER = '65534';
 
 const packages = process.env.TASKD_TEST_PAGE;
-assert.ok(packages, 'TASKD_TEST_PAGE is not set: run ./scripts/test, or set it to the directory that scripts/need page prints');
+assert.ok(
+  packages,
+  'TASKD_TEST_PAGE is not set: run ./scripts/test, or set it to the directory that scripts/need page prints',
+);
 const require = createRequire(join(packages, 'node_modules/'));
 const { chromium } = require('playwright-core');
 const AXE = readFileSync(require.resolve('axe-core/axe.min.js'), 'utf8');
@@ -70,7 +85,10 @@ export function directory(t) {
 
 function start(t, log, path, args, environment = {}) {
   const file = openSync(log, 'a');
-  const child = spawn(path, args, { stdio: ['ignore', file, file], env: { ...process.env, ...environment } });
+  const child = spawn(path, args, {
+    stdio: ['ignore', file, file],
+    env: { ...process.env, ...environment },
+  });
   const ended = new Promise((resume) => child.once('exit', resume));
   const stop = async (signal = 'SIGTERM') => {
     child.kill(signal);
@@ -81,35 +99,82 @@ function start(t, log, path, args, environment = {}) {
 }
 
 /**
- * A disk that holds so many bytes, for a server to be started with. It is mounted for nobody but a process that does nothing
- * else, and goes with it: the server joins that one, and others look at the disk through it.
+ * A disk that holds so many bytes, for a server to be started with. It is mounted for nobody but a
+ * process that does nothing else, and goes with it: the server joins that one, and others look at
+ * the disk through it.
  */
 export async function smallDisk(t, bytes) {
   const path = directory(t);
   const isRoot = process.getuid() === 0;
   const order = `mount -t tmpfs -o size=${bytes} none "$0" && mkdir "$0/there" && exec sleep 1000000`;
-  const { child } = start(t, join(directory(t), 'disk.log'), 'unshare', [...(isRoot ? [] : ['--map-root-user']), '--mount', 'sh', '-c', order, path]);
+  const { child } = start(t, join(directory(t), 'disk.log'), 'unshare', [
+    ...(isRoot ? [] : ['--map-root-user']),
+    '--mount',
+    'sh',
+    '-c',
+    order,
+    path,
+  ]);
   const root = `/proc/${child.pid}/root`;
   await eventually('the small disk', () => existsSync(join(root, path, 'there')));
-  return { path, root, join: ['nsenter', '--target', String(child.pid), '--mount', ...(isRoot ? [] : ['--user', '--preserve-credentials'])] };
+  return {
+    path,
+    root,
+    join: [
+      'nsenter',
+      '--target',
+      String(child.pid),
+      '--mount',
+      ...(isRoot ? [] : ['--user', '--preserve-credentials']),
+    ],
+  };
 }
 
 /** A `taskd serve` with a data directory of its own. */
 export class Server {
-  /** `configuration` is what its file says, `environment` further settings, `disk` what its data is on, if not on what all is. */
-  static async start(t, { environment = {}, configuration = '', disk = null, data = join(disk?.path ?? directory(t), 'server'), http = '127.0.0.1:0' } = {}) {
+  /**
+   * `configuration` is what its file says, `environment` further settings, `disk` what its data is
+   * on, if not on what all is.
+   */
+  static async start(
+    t,
+    {
+      environment = {},
+      configuration = '',
+      disk = null,
+      data = join(disk?.path ?? directory(t), 'server'),
+      http = '127.0.0.1:0',
+    } = {},
+  ) {
     const server = new Server();
     const seen = join(disk?.root ?? '/', data);
     Object.assign(server, { t, data: seen });
     rmSync(join(seen, 'addresses.json'), { force: true });
     writeFileSync(`${seen}.toml`, configuration);
-    const [path, ...order] = [...(disk?.join ?? []), program('taskd'), 'serve', '--data', data, '--config', `${data}.toml`, '--http', http, '--mqtt', '127.0.0.1:0'];
+    const [path, ...order] = [
+      ...(disk?.join ?? []),
+      program('taskd'),
+      'serve',
+      '--data',
+      data,
+      '--config',
+      `${data}.toml`,
+      '--http',
+      http,
+      '--mqtt',
+      '127.0.0.1:0',
+    ];
     server.process = start(t, `${seen}.log`, path, order, environment);
-    const addresses = await eventually('the server to say where it is', () => JSON.parse(readFileSync(join(seen, 'addresses.json'), 'utf8')));
+    const addresses = await eventually('the server to say where it is', () =>
+      JSON.parse(readFileSync(join(seen, 'addresses.json'), 'utf8')),
+    );
     server.http = addresses.http;
     server.url = `http://${addresses.http}`;
     server.token = readFileSync(join(seen, 'operator.token'), 'utf8').trim();
-    await eventually('the server to be ready', async () => (await fetch(`${server.url}/readyz`)).ok);
+    await eventually(
+      'the server to be ready',
+      async () => (await fetch(`${server.url}/readyz`)).ok,
+    );
     return server;
   }
 
@@ -117,7 +182,11 @@ export class Server {
   async ask(method, path, body, { token = this.token, headers = {} } = {}) {
     const response = await fetch(`${this.url}/api/v1${path}`, {
       method,
-      headers: { authorization: `Bearer ${token}`, ...(body ? { 'content-type': 'application/json' } : {}), ...headers },
+      headers: {
+        authorization: `Bearer ${token}`,
+        ...(body ? { 'content-type': 'application/json' } : {}),
+        ...headers,
+      },
       body: body && JSON.stringify(body),
     });
     const text = await response.text();
@@ -128,13 +197,23 @@ export class Server {
   /** Runs an operator's command that must end well; answers what it printed. */
   operate(...args) {
     const environment = { ...process.env, TASKD_SERVER: this.url, TASKD_TOKEN: this.token };
-    const { status, stdout, stderr } = spawnSync(program('taskd'), args, { env: environment, encoding: 'utf8' });
+    const { status, stdout, stderr } = spawnSync(program('taskd'), args, {
+      env: environment,
+      encoding: 'utf8',
+    });
     assert.equal(status, 0, `taskd ${args.join(' ')}: ${stderr}${stdout}`);
     return stdout;
   }
 
-  /** Puts a package there; `files` are its files by name, `more` further lines of its manifest, `to` whom it is deployed to, `force` whether its version may be another's. Answers what was printed. */
-  push(name, version, { files = { 'run.sh': '#!/bin/sh\nexec sleep 1000\n' }, more = '', to, force = false } = {}) {
+  /**
+   * Puts a package there; `files` are its files by name, `more` further lines of its manifest, `to`
+   * whom it is deployed to, `force` whether its version may be another's. Answers what was printed.
+   */
+  push(
+    name,
+    version,
+    { files = { 'run.sh': '#!/bin/sh\nexec sleep 1000\n' }, more = '', to, force = false } = {},
+  ) {
     const path = join(directory(this.t), name);
     mkdirSync(path);
     for (const [file, content] of Object.entries(files)) {
@@ -142,8 +221,20 @@ export class Server {
       writeFileSync(join(path, file), content);
       if (String(content).startsWith('#!')) chmodSync(join(path, file), 0o755);
     }
-    writeFileSync(join(path, 'task.toml'), `name = "${name}"\nversion = "${version}"\n\n[run]\nexec = ["./run.sh"]\n${more}`);
-    return JSON.parse(this.operate('push', path, '-o', 'json', ...(force ? ['--force'] : []), ...(to ? ['--to', to, '--yes'] : [])));
+    writeFileSync(
+      join(path, 'task.toml'),
+      `name = "${name}"\nversion = "${version}"\n\n[run]\nexec = ["./run.sh"]\n${more}`,
+    );
+    return JSON.parse(
+      this.operate(
+        'push',
+        path,
+        '-o',
+        'json',
+        ...(force ? ['--force'] : []),
+        ...(to ? ['--to', to, '--yes'] : []),
+      ),
+    );
   }
 
   enrolmentToken(wanted = {}) {
@@ -162,39 +253,78 @@ export async function agent(t, server, name, environment = {}) {
   const data = join(directory(t), name);
   const { token } = await server.enrolmentToken({ uses: 1 });
   const asRoot = process.getuid() === 0 ? { TASK_AGENT_TASK_USER: TASK_USER } : {};
-  const enrolled = spawnSync(program('task-agent'), ['enroll', '--data', data, '--server', server.url, '--token', token, '--name', name, '--mac', nextMac()], { encoding: 'utf8' });
+  const enrolled = spawnSync(
+    program('task-agent'),
+    [
+      'enroll',
+      '--data',
+      data,
+      '--server',
+      server.url,
+      '--token',
+      token,
+      '--name',
+      name,
+      '--mac',
+      nextMac(),
+    ],
+    { encoding: 'utf8' },
+  );
   assert.equal(enrolled.status, 0, enrolled.stderr);
   // After the agent's end: tasks outlive it on purpose.
   atEnd(t, () => endProcessesOf(data));
-  const { stop } = start(t, `${data}.log`, program('task-agent'), ['run', '--data', data], { ...asRoot, ...environment });
+  const { stop } = start(t, `${data}.log`, program('task-agent'), ['run', '--data', data], {
+    ...asRoot,
+    ...environment,
+  });
   return { name, stop };
 }
 
-/** The settings of an agent whose tasks find ROS, in a domain that nobody else on this machine has. */
+/**
+ * The settings of an agent whose tasks find ROS, in a domain that nobody else on this machine has.
+ */
 export async function ros(t) {
   const home = process.env.TASKD_TEST_ROS;
-  assert.ok(home, 'TASKD_TEST_ROS is not set: run ./scripts/test, or set it to what `scripts/need ros` prints, without /bin/python');
-  // A port that no participant of the domain uses is the lock: 7400 + 250 n + 249 would be the 120th participant's.
+  assert.ok(
+    home,
+    'TASKD_TEST_ROS is not set: run ./scripts/test, or set it to what `scripts/need ros` prints, without /bin/python',
+  );
+  // A port that no participant of the domain uses is the lock: 7400 + 250 n + 249 would be the
+  // 120th participant's.
   for (let domain = 70; domain > 0; domain -= 1) {
     const lock = createSocket('udp4');
-    const isFree = await new Promise((resume) => lock.once('error', () => resume(false)).bind(7400 + 250 * domain + 249, '127.0.0.1', () => resume(true)));
+    const isFree = await new Promise((resume) =>
+      lock
+        .once('error', () => resume(false))
+        .bind(7400 + 250 * domain + 249, '127.0.0.1', () => resume(true)),
+    );
     if (!isFree) continue;
     atEnd(t, () => new Promise((resume) => lock.close(resume)));
     const asRoot = process.getuid() === 0 ? { TASK_AGENT_TASK_USER: 'root' } : {};
-    return { ...asRoot, TASK_AGENT_UNDERLAYS: join(home, 'bin/activate'), TASK_AGENT_ROS_DOMAIN_ID: String(domain), ROS_AUTOMATIC_DISCOVERY_RANGE: 'LOCALHOST' };
+    return {
+      ...asRoot,
+      TASK_AGENT_UNDERLAYS: join(home, 'bin/activate'),
+      TASK_AGENT_ROS_DOMAIN_ID: String(domain),
+      ROS_AUTOMATIC_DISCOVERY_RANGE: 'LOCALHOST',
+    };
   }
   throw new Error('there is no free ROS domain');
 }
 
 /** The node of the end-to-end tests, which does as its arguments say. */
-export const probe = readFileSync(join(root, 'crates/bench/tests/it/graph_probe/graph_probe/probe.py'), 'utf8');
+export const probe = readFileSync(
+  join(root, 'crates/bench/tests/it/graph_probe/graph_probe/probe.py'),
+  'utf8',
+);
 
 /** The control groups of an agent's runs. They outlive it, as its tasks do. */
 function groupsOf(data) {
   const tasks = join(data, 'tasks');
   const entries = existsSync(tasks) ? readdirSync(tasks, { recursive: true }) : [];
   const specs = entries.filter((entry) => /^[^/]+\/run\/[^/]+\/spec\.json$/.test(entry));
-  return specs.map((spec) => JSON.parse(readFileSync(join(tasks, spec), 'utf8')).cgroup).filter(Boolean);
+  return specs
+    .map((spec) => JSON.parse(readFileSync(join(tasks, spec), 'utf8')).cgroup)
+    .filter(Boolean);
 }
 
 /** Whether a control group is no longer there, or could be removed: nothing is left in it. */
@@ -207,13 +337,20 @@ function isGone(group) {
   return true;
 }
 
-/** Ends every process whose command line or environment names this directory: shims, then what they watched. */
+/**
+ * Ends every process whose command line or environment names this directory: shims, then what they
+ * watched.
+ */
 async function endProcessesOf(data) {
   const groups = groupsOf(data);
   for (let round = 0; round < 3; round += 1) {
-    for (const pid of readdirSync('/proc').filter((entry) => /^\d+$/.test(entry) && Number(entry) !== process.pid)) {
+    for (const pid of readdirSync('/proc').filter(
+      (entry) => /^\d+$/.test(entry) && Number(entry) !== process.pid,
+    )) {
       try {
-        const said = readFileSync(`/proc/${pid}/cmdline`, 'latin1') + readFileSync(`/proc/${pid}/environ`, 'latin1');
+        const said =
+          readFileSync(`/proc/${pid}/cmdline`, 'latin1') +
+          readFileSync(`/proc/${pid}/environ`, 'latin1');
         if (said.includes(data)) process.kill(Number(pid), 'SIGKILL');
       } catch {
         // It ended meanwhile, or is none of ours.
@@ -223,34 +360,68 @@ async function endProcessesOf(data) {
   for (const group of groups) await eventually(`the end of ${group}`, () => isGone(group));
 }
 
-/** A robot that says over HTTP whatever the test wants: what no real one says, or not when it is to be looked at. */
+/**
+ * A robot that says over HTTP whatever the test wants: what no real one says, or not when it is to
+ * be looked at.
+ */
 export class Puppet {
   #seq = 0;
   #instance = `i${randomBytes(8).toString('hex')}`;
 
   static async enroll(server, name, labels = {}) {
     const { token } = await server.enrolmentToken({ uses: 1 });
-    const enrolled = await server.ask('POST', '/enroll', { mac: nextMac(), name, labels }, { token });
-    return Object.assign(new Puppet(), { server, name, id: enrolled.robot_id, token: enrolled.token });
+    const enrolled = await server.ask(
+      'POST',
+      '/enroll',
+      { mac: nextMac(), name, labels },
+      { token },
+    );
+    return Object.assign(new Puppet(), {
+      server,
+      name,
+      id: enrolled.robot_id,
+      token: enrolled.token,
+    });
   }
 
   /** What it should do. */
   async desired() {
-    const { payload } = await this.server.ask('GET', `/robots/${this.id}/desired`, undefined, { token: this.token });
+    const { payload } = await this.server.ask('GET', `/robots/${this.id}/desired`, undefined, {
+      token: this.token,
+    });
     return JSON.parse(Buffer.from(payload, 'base64'));
   }
 
-  /** Says that each of its tasks is in `phase`, and what `each` adds about it, who gets what is desired of it. */
+  /**
+   * Says that each of its tasks is in `phase`, and what `each` adds about it, who gets what is
+   * desired of it.
+   */
   async report(phase, { each = () => ({}), conditions = [], host = {}, link = null } = {}) {
     const state = await this.desired();
     this.#seq += 1;
     const body = {
-      robot_id: this.id, start: 1, instance: this.#instance, boot_id: 'boot', seq: this.#seq, observed_generation: state.generation,
-      uptime_ms: 1_000, conditions, link,
+      robot_id: this.id,
+      start: 1,
+      instance: this.#instance,
+      boot_id: 'boot',
+      seq: this.#seq,
+      observed_generation: state.generation,
+      uptime_ms: 1_000,
+      conditions,
+      link,
       host: { agent_version: '0.1.0', hostname: `${this.name}.local`, arch: 'x86_64', ...host },
       tasks: state.tasks.map((one) => ({
-        task: one.task, deployment: one.deployment, package: one.package, wanted: one.wanted, run: one.run, kind: 'service',
-        phase, phase_ms: 0, attempts: 1, restarts: 0, ...each(one),
+        task: one.task,
+        deployment: one.deployment,
+        package: one.package,
+        wanted: one.wanted,
+        run: one.run,
+        kind: 'service',
+        phase,
+        phase_ms: 0,
+        attempts: 1,
+        restarts: 0,
+        ...each(one),
       })),
     };
     await this.server.ask('POST', `/robots/${this.id}/report`, body, { token: this.token });
@@ -258,32 +429,67 @@ export class Puppet {
 
   /** Says how its machine does. */
   async vitals(sample) {
-    await this.server.ask('POST', `/robots/${this.id}/telemetry`, { robot_id: this.id, vitals: sample }, { token: this.token });
+    await this.server.ask(
+      'POST',
+      `/robots/${this.id}/telemetry`,
+      { robot_id: this.id, vitals: sample },
+      { token: this.token },
+    );
   }
 
   /** Brings files back from a task, by their paths. */
   async bringBack(task, files) {
     const blobs = [];
-    for (const [path, bytes] of files) blobs.push({ path, ...(await this.#putBlob(task, Buffer.from(bytes))) });
-    const output = { robot_id: this.id, task, version: '1.0.0', deployment: 'd00000000000000b2', run: 1, files: blobs };
+    for (const [path, bytes] of files)
+      blobs.push({ path, ...(await this.#putBlob(task, Buffer.from(bytes))) });
+    const output = {
+      robot_id: this.id,
+      task,
+      version: '1.0.0',
+      deployment: 'd00000000000000b2',
+      run: 1,
+      files: blobs,
+    };
     const manifest = {
       schemaVersion: 2,
       mediaType: 'application/vnd.oci.image.manifest.v1+json',
       artifactType: 'application/vnd.taskd.output.v1',
-      config: { mediaType: 'application/vnd.taskd.output.config.v1+json', ...(await this.#putBlob(task, Buffer.from(JSON.stringify(output)))) },
-      layers: blobs.map(({ path, digest, size }) => ({ mediaType: 'application/octet-stream', digest, size, annotations: { 'org.opencontainers.image.title': path } })),
+      config: {
+        mediaType: 'application/vnd.taskd.output.config.v1+json',
+        ...(await this.#putBlob(task, Buffer.from(JSON.stringify(output)))),
+      },
+      layers: blobs.map(({ path, digest, size }) => ({
+        mediaType: 'application/octet-stream',
+        digest,
+        size,
+        annotations: { 'org.opencontainers.image.title': path },
+      })),
     };
-    await this.#put('PUT', `${task}/manifests/${output.deployment}-1`, JSON.stringify(manifest), manifest.mediaType);
+    await this.#put(
+      'PUT',
+      `${task}/manifests/${output.deployment}-1`,
+      JSON.stringify(manifest),
+      manifest.mediaType,
+    );
   }
 
   async #putBlob(task, bytes) {
     const digest = `sha256:${createHash('sha256').update(bytes).digest('hex')}`;
-    await this.#put('POST', `${task}/blobs/uploads/?digest=${digest}`, bytes, 'application/octet-stream');
+    await this.#put(
+      'POST',
+      `${task}/blobs/uploads/?digest=${digest}`,
+      bytes,
+      'application/octet-stream',
+    );
     return { digest, size: bytes.length };
   }
 
   async #put(method, path, body, type) {
-    const response = await fetch(`${this.server.url}/v2/outputs/${this.id}/${path}`, { method, headers: { authorization: `Bearer ${this.token}`, 'content-type': type }, body });
+    const response = await fetch(`${this.server.url}/v2/outputs/${this.id}/${path}`, {
+      method,
+      headers: { authorization: `Bearer ${this.token}`, 'content-type': type },
+      body,
+    });
     assert.equal(response.status, 201, `${method} ${path}`);
   }
 }
@@ -291,27 +497,48 @@ export class Puppet {
 /** Headless Chromium. */
 export async function browser(t) {
   const sandbox = process.getuid() === 0 ? ['--no-sandbox'] : [];
-  const it = await chromium.launch({ executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium', args: [...sandbox, '--disable-gpu', '--disable-dev-shm-usage'] });
+  const it = await chromium.launch({
+    executablePath: process.env.CHROMIUM ?? '/usr/bin/chromium',
+    args: [...sandbox, '--disable-gpu', '--disable-dev-shm-usage'],
+  });
   atEnd(t, () => it.close());
   return it;
 }
 
-/** What a browser says of an answer that the page expects: a robot that is not there, or knows no such thing. */
+/**
+ * What a browser says of an answer that the page expects: a robot that is not there, or knows no
+ * such thing.
+ */
 const REFUSAL = /^Failed to load resource: .* status of (409|504) /;
 /** Contexts whose pages were opened by `open`, each with what its browser complained of. */
 const complaints = new WeakMap();
 
-/** A page at `hash`, signed in with the token of a link. What it asks of other hosts, and what its console says, fails the test at its end. */
+/**
+ * A page at `hash`, signed in with the token of a link. What it asks of other hosts, and what its
+ * console says, fails the test at its end.
+ */
 export async function open(t, server, { on, hash = '', token = server.token, ...options } = {}) {
-  const context = await (on ?? (await browser(t))).newContext({ viewport: { width: 1280, height: 900 }, ...options });
+  const context = await (on ?? (await browser(t))).newContext({
+    viewport: { width: 1280, height: 900 },
+    ...options,
+  });
   context.setDefaultTimeout(PATIENCE_MS);
   const said = [];
   complaints.set(context, said);
-  await context.route((url) => !url.href.startsWith(`${server.url}/`), (route) => {
-    said.push(`asked ${route.request().url()}`);
-    return route.abort();
-  });
-  context.on('console', (message) => ['error', 'warning'].includes(message.type()) && !REFUSAL.test(message.text()) && said.push(message.text()));
+  await context.route(
+    (url) => !url.href.startsWith(`${server.url}/`),
+    (route) => {
+      said.push(`asked ${route.request().url()}`);
+      return route.abort();
+    },
+  );
+  context.on(
+    'console',
+    (message) =>
+      ['error', 'warning'].includes(message.type()) &&
+      !REFUSAL.test(message.text()) &&
+      said.push(message.text()),
+  );
   context.on('weberror', (error) => said.push(String(error.error().stack)));
   const page = await context.newPage();
   await followLink(page, server, token);
@@ -336,29 +563,45 @@ export const assertQuiet = (page) => assert.deepEqual(takeComplaints(page), []);
 export const live = (page) => page.locator('.stream', { hasText: 'Live' }).waitFor();
 
 /** Waits until the page can say yes. */
-export const until = (page, question, argument) => page.waitForFunction(question, argument, { timeout: PATIENCE_MS });
+export const until = (page, question, argument) =>
+  page.waitForFunction(question, argument, { timeout: PATIENCE_MS });
 
-/** Waits until the page has drawn what it has to say: nothing changes any more, but for what moves on each second. */
-export const settled = (page) => page.evaluate(() => new Promise((resume) => {
-  const QUIET_MS = 300;
-  let timer = setTimeout(done, QUIET_MS);
-  const observer = new MutationObserver(() => {
-    clearTimeout(timer);
-    timer = setTimeout(done, QUIET_MS);
-  });
-  function done() {
-    observer.disconnect();
-    resume();
-  }
-  observer.observe(document.getElementById('main'), { childList: true, subtree: true });
-}));
+/**
+ * Waits until the page has drawn what it has to say: nothing changes any more, but for what moves
+ * on each second.
+ */
+export const settled = (page) =>
+  page.evaluate(
+    () =>
+      new Promise((resume) => {
+        const QUIET_MS = 300;
+        let timer = setTimeout(done, QUIET_MS);
+        const observer = new MutationObserver(() => {
+          clearTimeout(timer);
+          timer = setTimeout(done, QUIET_MS);
+        });
+        function done() {
+          observer.disconnect();
+          resume();
+        }
+        observer.observe(document.getElementById('main'), { childList: true, subtree: true });
+      }),
+  );
 
 /** What axe finds wrong with the page: nothing. */
 export async function assertAccessible(page, what) {
   // The page's own policy forbids scripts of others; the debugger's are not its.
   await page.evaluate(`if (!window.axe) { ${AXE} }`);
-  const { violations } = await page.evaluate(() => globalThis.axe.run(document, { resultTypes: ['violations'] }));
-  const told = violations.map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.slice(0, 3).map(({ html }) => html).join(' | ')}`);
+  const { violations } = await page.evaluate(() =>
+    globalThis.axe.run(document, { resultTypes: ['violations'] }),
+  );
+  const told = violations.map(
+    ({ id, help, nodes }) =>
+      `${id}: ${help}: ${nodes
+        .slice(0, 3)
+        .map(({ html }) => html)
+        .join(' | ')}`,
+  );
   assert.deepEqual(told, [], what);
 }
 

@@ -1,10 +1,26 @@
-// What does not depend on agents: many tabs, signing in, what robots say, keys, and that everybody can use it.
+// What does not depend on agents: many tabs, signing in, what robots say, keys, and that everybody
+// can use it.
 
 import { test } from 'node:test';
-import { assert, assertAccessible, assertQuiet, browser, eventually, followLink, live, open, Puppet, Server, settled, takeComplaints, until } from './harness.mjs';
+import {
+  assert,
+  assertAccessible,
+  assertQuiet,
+  browser,
+  eventually,
+  followLink,
+  live,
+  open,
+  Puppet,
+  Server,
+  settled,
+  takeComplaints,
+  until,
+} from './harness.mjs';
 
 const PASSWORD = 'correct horse battery';
-const HOSTILE = '<img src=x onerror="document.title=\'owned\'"><script>document.title=\'owned\'</script>';
+const HOSTILE =
+  "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>";
 
 test('nine tabs are live at once', async (t) => {
   const server = await Server.start(t);
@@ -17,7 +33,9 @@ test('nine tabs are live at once', async (t) => {
   }
   await Promise.all(tabs.map(live));
   await Puppet.enroll(server, 'atlas');
-  await Promise.all(tabs.map((page) => page.locator('[data-robot]', { hasText: 'atlas' }).waitFor()));
+  await Promise.all(
+    tabs.map((page) => page.locator('[data-robot]', { hasText: 'atlas' }).waitFor()),
+  );
   assertQuiet(first);
 });
 
@@ -73,7 +91,10 @@ test('a wrong token is refused in words, and a restarted server is found again',
   await signIn();
   await page.getByRole('button', { name: 'Sign out' }).click();
   await page.getByLabel('Name', { exact: true }).waitFor();
-  assert.equal(await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)), 401);
+  assert.equal(
+    await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)),
+    401,
+  );
 });
 
 test('a restart that ended the session is said, and signing in leads back to the same place', async (t) => {
@@ -82,7 +103,8 @@ test('a restart that ended the session is said, and signing in leads back to the
   const place = '#/robots/atlas/logs?level=warn';
   const page = await open(t, server, { hash: place });
   await live(page);
-  const signedOut = () => page.getByRole('alert').filter({ hasText: 'The server was restarted' }).waitFor();
+  const signedOut = () =>
+    page.getByRole('alert').filter({ hasText: 'The server was restarted' }).waitFor();
   await server.process.stop();
   await Server.start(t, { data: server.data, http: server.http });
   await signedOut();
@@ -153,12 +175,21 @@ test('a link with a token signs nobody in by itself', async (t) => {
   const it = await browser(t);
   const page = await open(t, server, { on: it, hash: '#/settings' });
   const sent = [];
-  page.context().on('request', (request) => request.method() === 'POST' && sent.push(request.url()));
+  page
+    .context()
+    .on('request', (request) => request.method() === 'POST' && sent.push(request.url()));
   const isStillIn = async (one) => {
     await live(one);
     await settled(one);
     assert.equal(await one.locator('.who').innerText(), 'operator.token');
-    assert.equal(await one.evaluate(() => fetch('/api/v1/me').then((answer) => answer.json()).then(({ name }) => name)), 'operator.token');
+    assert.equal(
+      await one.evaluate(() =>
+        fetch('/api/v1/me')
+          .then((answer) => answer.json())
+          .then(({ name }) => name),
+      ),
+      'operator.token',
+    );
   };
   // Where somebody is in, they stay: in the page that is open, and in one that the link opens.
   await page.goto(link);
@@ -171,12 +202,16 @@ test('a link with a token signs nobody in by itself', async (t) => {
   assert.equal(another.url(), `${server.url}/`, 'the token has left the address bar');
   assert.deepEqual(sent, [], 'nothing was sent to sign in');
   assertQuiet(page);
-  // Where nobody is in, they are asked: by the page that the link opens, and by one that shows the way in already.
+  // Where nobody is in, they are asked: by the page that the link opens, and by one that shows the
+  // way in already.
   const stranger = await it.newPage();
   const isAsked = async () => {
     await stranger.getByText('Use it only if you know from whom it comes.').waitFor();
     await until(stranger, () => document.activeElement.matches('.by-token button'));
-    assert.equal(await stranger.evaluate(() => fetch('/api/v1/me').then(({ status }) => status)), 401);
+    assert.equal(
+      await stranger.evaluate(() => fetch('/api/v1/me').then(({ status }) => status)),
+      401,
+    );
   };
   await stranger.goto(link);
   await isAsked();
@@ -191,7 +226,12 @@ test('a link with a token signs nobody in by itself', async (t) => {
 test('who signs in hears nothing that was for who was in before', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas', { site: 'lab' });
-  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'site=lab', password: PASSWORD });
+  await server.ask('POST', '/users', {
+    name: 'alice',
+    roles: ['viewer'],
+    scope: 'site=lab',
+    password: PASSWORD,
+  });
   const context = await (await browser(t)).newContext();
   const [mine, theirs] = [await context.newPage(), await context.newPage()];
   await mine.goto(server.url);
@@ -213,7 +253,9 @@ test('who could not be signed out is told so, and stays in', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   const signOut = page.getByRole('button', { name: 'Sign out' });
-  await page.route(/\/session$/, (route) => (route.request().method() === 'DELETE' ? route.fulfill({ status: 504 }) : route.continue()));
+  await page.route(/\/session$/, (route) =>
+    route.request().method() === 'DELETE' ? route.fulfill({ status: 504 }) : route.continue(),
+  );
   await signOut.click();
   await page.getByText('Signing out failed: the server answered 504').waitFor();
   assert.ok(await signOut.isVisible(), 'the page is still in');
@@ -223,8 +265,14 @@ test('who could not be signed out is told so, and stays in', async (t) => {
   // What has ended already needs no ending.
   await followLink(page, server, server.token);
   await live(page);
-  assert.equal(await page.getByText('Signing out failed').count(), 0, 'who comes next is told nothing of it');
-  await page.route(/\/session$/, (route) => (route.request().method() === 'DELETE' ? route.fulfill({ status: 401 }) : route.continue()));
+  assert.equal(
+    await page.getByText('Signing out failed').count(),
+    0,
+    'who comes next is told nothing of it',
+  );
+  await page.route(/\/session$/, (route) =>
+    route.request().method() === 'DELETE' ? route.fulfill({ status: 401 }) : route.continue(),
+  );
   await signOut.click();
   await page.getByLabel('Name', { exact: true }).waitFor();
 });
@@ -232,7 +280,12 @@ test('who could not be signed out is told so, and stays in', async (t) => {
 test('a person sees their robots and what they may do with them', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
-  await server.ask('POST', '/users', { name: 'alice', roles: ['viewer'], scope: 'atlas', password: PASSWORD });
+  await server.ask('POST', '/users', {
+    name: 'alice',
+    roles: ['viewer'],
+    scope: 'atlas',
+    password: PASSWORD,
+  });
   const page = await (await browser(t)).newPage();
   await page.goto(server.url);
   const signIn = async (password) => {
@@ -246,7 +299,11 @@ test('a person sees their robots and what they may do with them', async (t) => {
   await live(page);
   await page.locator('.who', { hasText: 'alice' }).waitFor();
   assert.deepEqual(await page.locator('[data-robot] .name').allInnerTexts(), ['atlas']);
-  assert.deepEqual(await page.locator('[data-robot] .operations button').allInnerTexts(), ['Monitor'], 'what a viewer may do');
+  assert.deepEqual(
+    await page.locator('[data-robot] .operations button').allInnerTexts(),
+    ['Monitor'],
+    'what a viewer may do',
+  );
 });
 
 test('everything is done by keys', async (t) => {
@@ -261,7 +318,8 @@ test('everything is done by keys', async (t) => {
   await page.keyboard.press('Escape');
   await until(page, () => document.querySelectorAll('[data-robot]').length === 3);
   await page.keyboard.press('ArrowDown');
-  const current = () => page.evaluate(() => document.activeElement.querySelector('.name')?.innerText);
+  const current = () =>
+    page.evaluate(() => document.activeElement.querySelector('.name')?.innerText);
   await eventually('the first row', async () => (await current()) === 'atlas');
   await page.keyboard.press('ArrowDown');
   await eventually('the second row', async () => (await current()) === 'borea');
@@ -304,12 +362,16 @@ test('a key right after a question was left is not lost', async (t) => {
 
 test('robots are chosen one by one, as a range, and all that match', async (t) => {
   const server = await Server.start(t);
-  for (const name of ['atlas', 'borea', 'corvus', 'delphin', 'echo']) await Puppet.enroll(server, name);
+  for (const name of ['atlas', 'borea', 'corvus', 'delphin', 'echo'])
+    await Puppet.enroll(server, name);
   const page = await open(t, server);
   await until(page, () => document.querySelectorAll('[data-robot]').length === 5);
   const chosen = async (...names) => {
     await page.getByText(`${names.length} selected`).waitFor();
-    assert.deepEqual(await page.locator('[data-robot][aria-selected=true] .name').allInnerTexts(), names);
+    assert.deepEqual(
+      await page.locator('[data-robot][aria-selected=true] .name').allInnerTexts(),
+      names,
+    );
   };
   const box = (name) => page.getByRole('checkbox', { name: `Select ${name}`, exact: true });
   await box('borea').click();
@@ -319,7 +381,8 @@ test('robots are chosen one by one, as a range, and all that match', async (t) =
   await chosen('borea', 'delphin');
   await page.keyboard.press('Escape');
   await page.getByText('2 selected').waitFor({ state: 'detached' });
-  for (const key of ['ArrowUp', 'x', 'ArrowDown', 'ArrowDown', 'Shift+X']) await page.keyboard.press(key);
+  for (const key of ['ArrowUp', 'x', 'ArrowDown', 'ArrowDown', 'Shift+X'])
+    await page.keyboard.press(key);
   await chosen('borea', 'corvus', 'delphin');
   await page.getByRole('button', { name: 'Select all 5 that match' }).click();
   await chosen('atlas', 'borea', 'corvus', 'delphin', 'echo');
@@ -354,11 +417,24 @@ test('a label and a version that are searched for are meant exactly', async (t) 
   server.push('talker', '1.0.0', { to: 'atlas' });
   server.push('talker', '1.0.0-rc1', { to: 'borea' });
   const page = await open(t, server);
-  const shown = (...names) => until(page, (all) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === all, names.join());
+  const shown = (...names) =>
+    until(
+      page,
+      (all) =>
+        [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() ===
+        all,
+      names.join(),
+    );
   const search = (text) => page.getByRole('searchbox').fill(text);
   for (const [text, ...names] of [
-    ['site=lab', 'atlas', 'corvus'], ['Site=Lab2', 'borea'], ['site=', 'atlas', 'borea', 'corvus', 'delphin'], ['e=lab', 'atlas', 'borea', 'corvus'],
-    ['talker@1.0.0', 'atlas'], ['talker@1.0.0-rc1', 'borea'], ['ker@1.0.0', 'atlas', 'borea'], ['site=lab talker@1.0.0', 'atlas'],
+    ['site=lab', 'atlas', 'corvus'],
+    ['Site=Lab2', 'borea'],
+    ['site=', 'atlas', 'borea', 'corvus', 'delphin'],
+    ['e=lab', 'atlas', 'borea', 'corvus'],
+    ['talker@1.0.0', 'atlas'],
+    ['talker@1.0.0-rc1', 'borea'],
+    ['ker@1.0.0', 'atlas', 'borea'],
+    ['site=lab talker@1.0.0', 'atlas'],
   ]) {
     await search(text);
     await shown(...names);
@@ -368,12 +444,27 @@ test('a label and a version that are searched for are meant exactly', async (t) 
 
 test('robots are found by their agent, their processor and their ROS', async (t) => {
   const server = await Server.start(t);
-  const hosts = { atlas: { agent_version: '0.9.7', arch: 'x86_64', ros_distros: ['jazzy', 'kilted'] }, borea: { agent_version: '0.9.8', arch: 'aarch64' } };
-  for (const [name, host] of Object.entries(hosts)) await (await Puppet.enroll(server, name)).report('running', { host });
+  const hosts = {
+    atlas: { agent_version: '0.9.7', arch: 'x86_64', ros_distros: ['jazzy', 'kilted'] },
+    borea: { agent_version: '0.9.8', arch: 'aarch64' },
+  };
+  for (const [name, host] of Object.entries(hosts))
+    await (await Puppet.enroll(server, name)).report('running', { host });
   const page = await open(t, server);
-  for (const [text, name] of [['0.9.7', 'atlas'], ['aarch64', 'borea'], ['kilted', 'atlas'], ['0.9.8 AARCH64', 'borea']]) {
+  for (const [text, name] of [
+    ['0.9.7', 'atlas'],
+    ['aarch64', 'borea'],
+    ['kilted', 'atlas'],
+    ['0.9.8 AARCH64', 'borea'],
+  ]) {
     await page.getByRole('searchbox').fill(text);
-    await until(page, (only) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === only, name);
+    await until(
+      page,
+      (only) =>
+        [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() ===
+        only,
+      name,
+    );
   }
   assertQuiet(page);
 });
@@ -383,9 +474,22 @@ test('who is in a row by keys stays in it when it is put elsewhere', async (t) =
   const puppets = [];
   for (const name of ['atlas', 'borea', 'corvus']) puppets.push(await Puppet.enroll(server, name));
   const page = await open(t, server, { hash: '#/robots?sort=cpu' });
-  const names = (all) => until(page, (said) => [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() === said, all);
+  const names = (all) =>
+    until(
+      page,
+      (said) =>
+        [...document.querySelectorAll('[data-robot] .name')].map((one) => one.innerText).join() ===
+        said,
+      all,
+    );
   const loads = async (...all) => {
-    for (const [index, cpu_percent] of all.entries()) await puppets[index].vitals({ at_ms: 1, cpu_percent, memory_used_bytes: 3e9, memory_total_bytes: 8e9 });
+    for (const [index, cpu_percent] of all.entries())
+      await puppets[index].vitals({
+        at_ms: 1,
+        cpu_percent,
+        memory_used_bytes: 3e9,
+        memory_total_bytes: 8e9,
+      });
   };
   await loads(90, 50, 10);
   await names('atlas,borea,corvus');
@@ -412,9 +516,12 @@ test('a question asked right after another was left stays', async (t) => {
     const ask = (title) => open({ title, body: () => '' });
     ask('First');
     await frame();
-    const wasClosed = new Promise((resume) => document.getElementById('dialog').addEventListener('close', resume));
+    const wasClosed = new Promise((resume) =>
+      document.getElementById('dialog').addEventListener('close', resume),
+    );
     close();
-    // In the frame that closes the browser's dialog, after it: what the browser says of that comes later.
+    // In the frame that closes the browser's dialog, after it: what the browser says of that comes
+    // later.
     requestAnimationFrame(() => ask('Second'));
     await wasClosed;
     await frame();
@@ -429,25 +536,59 @@ test('a question asked right after another was left stays', async (t) => {
 test('every page can be used by everybody, light and dark, wide and narrow', async (t) => {
   const server = await Server.start(t);
   const robots = [];
-  for (const [name, site] of [['atlas', 'lab'], ['borea', 'lab'], ['corvus', 'yard']]) robots.push(await Puppet.enroll(server, name, { site }));
+  for (const [name, site] of [
+    ['atlas', 'lab'],
+    ['borea', 'lab'],
+    ['corvus', 'yard'],
+  ])
+    robots.push(await Puppet.enroll(server, name, { site }));
   server.push('talker', '1.0.0', { to: '*' });
   server.push('talker', '1.1.0');
   await robots[0].report('running', { host: { disk_free_bytes: 5e9, ros_distros: ['jazzy'] } });
-  await robots[1].report('failed', { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }), conditions: [{ code: 'held', text: 'a wheel is being changed' }] });
+  await robots[1].report('failed', {
+    each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }),
+    conditions: [{ code: 'held', text: 'a wheel is being changed' }],
+  });
   await robots[2].report('fetching', { each: () => ({ progress: { done: 10, total: 40 } }) });
-  const { deployments: [{ id }] } = await server.ask('GET', '/deployments');
-  const places = ['robots', 'robots?state=failed', 'robots/atlas', 'robots/atlas/ros', 'robots/borea/tasks', 'robots/atlas/logs', 'robots/atlas/outputs', 'robots/atlas/control', 'robots/atlas/edit',
-    'packages', 'packages/talker', 'deployments', `deployments/${id}`, 'server', 'settings'];
+  const {
+    deployments: [{ id }],
+  } = await server.ask('GET', '/deployments');
+  const places = [
+    'robots',
+    'robots?state=failed',
+    'robots/atlas',
+    'robots/atlas/ros',
+    'robots/borea/tasks',
+    'robots/atlas/logs',
+    'robots/atlas/outputs',
+    'robots/atlas/control',
+    'robots/atlas/edit',
+    'packages',
+    'packages/talker',
+    'deployments',
+    `deployments/${id}`,
+    'server',
+    'settings',
+  ];
   const it = await browser(t);
-  for (const [colorScheme, width] of [['light', 1280], ['dark', 375]]) {
+  for (const [colorScheme, width] of [
+    ['light', 1280],
+    ['dark', 375],
+  ]) {
     const page = await open(t, server, { on: it, colorScheme, viewport: { width, height: 900 } });
     for (const place of places) {
       await page.goto(`${server.url}/#/${place}`);
       await page.locator('main h1').first().waitFor();
       await settled(page);
       await assertAccessible(page, `${place} at ${width}, ${colorScheme}`);
-      const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
-      assert.ok(inner <= outer, `${place} at ${width} is not wider than the window: ${inner} > ${outer}`);
+      const [inner, outer] = await page.evaluate(() => [
+        document.documentElement.scrollWidth,
+        document.documentElement.clientWidth,
+      ]);
+      assert.ok(
+        inner <= outer,
+        `${place} at ${width} is not wider than the window: ${inner} > ${outer}`,
+      );
     }
     takeComplaints(page);
   }
@@ -457,9 +598,15 @@ test('a long version does not make the page of a robot wider than the window', a
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', `1.0.0-${'SNAPSHOT'.repeat(7)}`, { to: 'atlas' });
-  const page = await open(t, server, { hash: '#/robots/atlas/control', viewport: { width: 390, height: 800 } });
+  const page = await open(t, server, {
+    hash: '#/robots/atlas/control',
+    viewport: { width: 390, height: 800 },
+  });
   await page.locator('.orders', { hasText: 'SNAPSHOT' }).waitFor();
-  const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+  const [inner, outer] = await page.evaluate(() => [
+    document.documentElement.scrollWidth,
+    document.documentElement.clientWidth,
+  ]);
   assert.ok(inner <= outer, `${inner} > ${outer}`);
   assertQuiet(page);
 });
@@ -471,7 +618,10 @@ test('how machines do comes to the list by itself', async (t) => {
   await page.getByText('Columns').click();
   for (const column of ['CPU', 'Memory']) await page.getByLabel(column).check();
   const row = page.locator('[data-robot]', { hasText: 'atlas' });
-  for (const [cpu_percent, said] of [[12, '12 %'], [57.4, '57 %']]) {
+  for (const [cpu_percent, said] of [
+    [12, '12 %'],
+    [57.4, '57 %'],
+  ]) {
     await atlas.vitals({ at_ms: 1, cpu_percent, memory_used_bytes: 3e9, memory_total_bytes: 8e9 });
     await row.locator('.cpu', { hasText: said }).waitFor();
   }
@@ -501,12 +651,27 @@ test('what happens comes to the server page by the stream, not by asking', async
   page.on('request', (request) => asked.push(new URL(request.url()).pathname));
   for (const name of ['atlas', 'borea']) {
     await Puppet.enroll(server, name);
-    await page.locator('.feed .entry', { hasText: 'robot enrolled' }).filter({ has: page.getByRole('link', { name }) }).waitFor();
+    await page
+      .locator('.feed .entry', { hasText: 'robot enrolled' })
+      .filter({ has: page.getByRole('link', { name }) })
+      .waitFor();
   }
   // The figures beside it are asked for again and again: requests would have been seen.
   await eventually('the figures to be asked for', () => asked.includes('/api/v1/server/status'));
-  assert.deepEqual(asked.filter((path) => path !== '/api/v1/server/status'), [], 'nothing else was asked for');
-  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was never loaded again');
-  assert.match(await page.locator('.feed .entry').first().innerText(), /borea/, 'the newest is first');
+  assert.deepEqual(
+    asked.filter((path) => path !== '/api/v1/server/status'),
+    [],
+    'nothing else was asked for',
+  );
+  assert.equal(
+    await page.evaluate(() => window.isSameDocument),
+    true,
+    'the page was never loaded again',
+  );
+  assert.match(
+    await page.locator('.feed .entry').first().innerText(),
+    /borea/,
+    'the newest is first',
+  );
   assertQuiet(page);
 });

@@ -1,13 +1,28 @@
-// Orders are for the robots that the page has named, and for no others, whatever happens before they are sent.
+// Orders are for the robots that the page has named, and for no others, whatever happens before
+// they are sent.
 
 import { test } from 'node:test';
-import { assert, assertAccessible, assertQuiet, browser, live, open, Puppet, Server, until } from './harness.mjs';
+import {
+  assert,
+  assertAccessible,
+  assertQuiet,
+  browser,
+  live,
+  open,
+  Puppet,
+  Server,
+  until,
+} from './harness.mjs';
 
-const FAILED = { each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }) };
+const FAILED = {
+  each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }),
+};
 
-const enrolAll = (server, labels) => Promise.all(Object.entries(labels).map(([name, its]) => Puppet.enroll(server, name, its)));
+const enrolAll = (server, labels) =>
+  Promise.all(Object.entries(labels).map(([name, its]) => Puppet.enroll(server, name, its)));
 /** The names of the robots that a deployment is for. */
-const receivers = async (server, id) => (await server.ask('GET', `/deployments/${id}`)).assignments.map(({ name }) => name).sort();
+const receivers = async (server, id) =>
+  (await server.ask('GET', `/deployments/${id}`)).assignments.map(({ name }) => name).sort();
 const newest = async (server) => (await server.ask('GET', '/deployments')).deployments[0].id;
 
 test('who fails while the question is open is not retried with the others', async (t) => {
@@ -16,7 +31,10 @@ test('who fails while the question is open is not retried with the others', asyn
   const page = await open(t, server);
   const dialog = page.getByRole('dialog');
   // All that failed, and all that failed for one reason.
-  for (const [name, button] of [['talker', 'Retry 1 robot…'], ['singer', 'Retry these…']]) {
+  for (const [name, button] of [
+    ['talker', 'Retry 1 robot…'],
+    ['singer', 'Retry these…'],
+  ]) {
     const { id } = server.push(name, '1.0.0', { to: '*' });
     await atlas.report('failed', FAILED);
     await page.goto(`${server.url}/#/deployments/${id}`);
@@ -71,7 +89,14 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
   const edit = async ({ meanwhile, field, text }) => {
     await page.getByRole('button', { name: /^Edit / }).click();
     await server.ask('PATCH', `/robots/${id}`, { labels: meanwhile });
-    await page.locator('.cell.labels', { hasText: Object.entries(meanwhile).sort().map((pair) => pair.join('=')).join(', ') }).waitFor();
+    await page
+      .locator('.cell.labels', {
+        hasText: Object.entries(meanwhile)
+          .sort()
+          .map((pair) => pair.join('='))
+          .join(', '),
+      })
+      .waitFor();
     await dialog.getByLabel(field).fill(text);
     await dialog.getByRole('button', { name: 'Save' }).click();
     await page.getByText('is changed.').waitFor();
@@ -81,7 +106,11 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
   const first = { cart: 'one', floor: '3', site: 'lab' };
   assert.deepEqual(await edit({ meanwhile: first, field: 'Name', text: 'atlas-2' }), first);
   // And those that were edited are changed.
-  const labels = await edit({ meanwhile: { cart: 'one', floor: '4', site: 'lab', spare: 'yes' }, field: 'Labels', text: 'floor=3, site=yard' });
+  const labels = await edit({
+    meanwhile: { cart: 'one', floor: '4', site: 'lab', spare: 'yes' },
+    field: 'Labels',
+    text: 'floor=3, site=yard',
+  });
   assert.deepEqual(labels, { floor: '4', site: 'yard', spare: 'yes' });
   assertQuiet(page);
 });
@@ -95,7 +124,11 @@ test('labels that somebody else changes while a robot’s page is edited stay', 
   await page.getByRole('list', { name: 'Labels' }).getByText('quarantine=yes').waitFor();
   await page.getByRole('button', { name: 'Save' }).click();
   await page.getByText('is changed.').waitFor();
-  assert.deepEqual((await server.ask('GET', `/robots/${id}`)).labels, { floor: '3', quarantine: 'yes', site: 'lab' });
+  assert.deepEqual((await server.ask('GET', `/robots/${id}`)).labels, {
+    floor: '3',
+    quarantine: 'yes',
+    site: 'lab',
+  });
   assertQuiet(page);
 });
 
@@ -144,7 +177,10 @@ test('what is typed outlives an upgrade of the server, and the page is loaded an
 function stallStream() {
   delete window.SharedWorker;
   const { fetch } = window;
-  window.fetch = (url, options) => (url === '/api/v1/events' ? Promise.resolve(new Response(new ReadableStream())) : fetch(url, options));
+  window.fetch = (url, options) =>
+    url === '/api/v1/events'
+      ? Promise.resolve(new Response(new ReadableStream()))
+      : fetch(url, options);
 }
 
 test('who comes unseen gets nothing of what is ordered for all', async (t) => {
@@ -180,11 +216,22 @@ test('who comes unseen gets nothing of what is ordered for all', async (t) => {
 
 test('an order needs a package, robots that there are, and a word of its own for many', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(server, Object.fromEntries(Array.from({ length: 12 }, (_, number) => [`r${number}`, { half: number % 2 ? 'odd' : 'even' }])));
+  await enrolAll(
+    server,
+    Object.fromEntries(
+      Array.from({ length: 12 }, (_, number) => [
+        `r${number}`,
+        { half: number % 2 ? 'odd' : 'even' },
+      ]),
+    ),
+  );
   server.push('talker', '1.0.0');
   const page = await open(t, server, { hash: '#/deployments' });
   const dialog = page.getByRole('dialog');
-  const [robots, deploy] = [dialog.getByLabel('Robots', { exact: true }), dialog.getByRole('button', { name: 'Deploy' })];
+  const [robots, deploy] = [
+    dialog.getByLabel('Robots', { exact: true }),
+    dialog.getByRole('button', { name: 'Deploy' }),
+  ];
   const ordered = async () => (await server.ask('GET', '/deployments')).deployments.length;
   const isRefusedAt = async (id) => {
     await until(page, (field) => document.activeElement.id === field, id);
@@ -203,7 +250,11 @@ test('an order needs a package, robots that there are, and a word of its own for
   await isRefusedAt('order-many');
   await assertAccessible(page, 'an order for many');
   // A name that there is not is no order for the others, and no robot is meant without one.
-  for (const [selector, said] of [['r1,r77', 'No robot has the name or id r77.'], ['!r77', 'No robot has the name or id r77.'], ['site=mars', 'No robot is meant.']]) {
+  for (const [selector, said] of [
+    ['r1,r77', 'No robot has the name or id r77.'],
+    ['!r77', 'No robot has the name or id r77.'],
+    ['site=mars', 'No robot is meant.'],
+  ]) {
     await robots.fill(selector);
     await dialog.locator('#match', { hasText: said }).waitFor();
     await robots.press('Enter');
@@ -227,7 +278,10 @@ test('an order needs a package, robots that there are, and a word of its own for
   await page.goto(`${server.url}/#/deployments`);
   await page.getByRole('button', { name: 'New deployment…' }).click();
   await deploy.waitFor();
-  assert.deepEqual([await robots.inputValue(), await dialog.getByLabel('Package').inputValue()], ['', '']);
+  assert.deepEqual(
+    [await robots.inputValue(), await dialog.getByLabel('Package').inputValue()],
+    ['', ''],
+  );
   assertQuiet(page);
 });
 
@@ -240,10 +294,16 @@ test('who waits for approval gets no orders, and is deleted like others', async 
   await wait('stranger', '02:00:00:00:00:81');
   const page = await open(t, server);
   const dialog = page.getByRole('dialog');
-  const said = dialog.getByText('1 of those that were chosen waits for approval and gets nothing until then.');
+  const said = dialog.getByText(
+    '1 of those that were chosen waits for approval and gets nothing until then.',
+  );
   await page.locator('[data-robot]').nth(1).waitFor();
   await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
-  for (const [button, title] of [['Label…', 'Label atlas'], ['Stop…', 'Stop tasks on atlas'], ['Push…', 'Push to atlas']]) {
+  for (const [button, title] of [
+    ['Label…', 'Label atlas'],
+    ['Stop…', 'Stop tasks on atlas'],
+    ['Push…', 'Push to atlas'],
+  ]) {
     await page.getByRole('button', { name: button }).click();
     await dialog.getByRole('heading', { name: title }).waitFor();
     await said.waitFor();
@@ -294,7 +354,13 @@ test('every order to tasks can be given to all that are chosen, wide and narrow'
   const server = await Server.start(t);
   const robots = await enrolAll(server, { atlas: {}, borea: {} });
   const it = await browser(t);
-  const orders = [['Stop', 'stopped'], ['Start', 'started'], ['Restart', 'restarted'], ['Roll back', 'rolled back'], ['Remove task', 'removed']];
+  const orders = [
+    ['Stop', 'stopped'],
+    ['Start', 'started'],
+    ['Restart', 'restarted'],
+    ['Roll back', 'rolled back'],
+    ['Remove task', 'removed'],
+  ];
   for (const width of [1280, 375]) {
     for (const version of ['1.0.0', '1.1.0']) {
       server.push('talker', `${version}-at${width}`, { to: '*' });
@@ -302,13 +368,20 @@ test('every order to tasks can be given to all that are chosen, wide and narrow'
     }
     const page = await open(t, server, { on: it, viewport: { width, height: 900 } });
     const dialog = page.getByRole('dialog');
-    for (const name of ['atlas', 'borea']) await page.getByRole('checkbox', { name: `Select ${name}` }).click();
+    for (const name of ['atlas', 'borea'])
+      await page.getByRole('checkbox', { name: `Select ${name}` }).click();
     await page.getByText('2 selected').waitFor();
     await assertAccessible(page, `what is done with the selected, at ${width}`);
-    const [inner, outer] = await page.evaluate(() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]);
+    const [inner, outer] = await page.evaluate(() => [
+      document.documentElement.scrollWidth,
+      document.documentElement.clientWidth,
+    ]);
     assert.ok(inner <= outer, `not wider than the window at ${width}: ${inner} > ${outer}`);
     const bar = page.getByRole('toolbar', { name: 'With the selected robots' });
-    assert.ok((await bar.boundingBox()).height < 120, `at ${width} the robots can be seen above the bar`);
+    assert.ok(
+      (await bar.boundingBox()).height < 120,
+      `at ${width} the robots can be seen above the bar`,
+    );
     for (const [button, done] of orders) {
       await bar.getByRole('button', { name: `${button}…`, exact: true }).click();
       await dialog.getByLabel('talker').check();

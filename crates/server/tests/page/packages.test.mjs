@@ -1,9 +1,21 @@
-// Packages and deployments in the page: a folder is brought, looked into, compared and ordered; what failed is retried.
+// Packages and deployments in the page: a folder is brought, looked into, compared and ordered;
+// what failed is retried.
 
 import { chmodSync, mkdirSync, writeFileSync } from 'node:fs';
 import { join } from 'node:path';
 import { test } from 'node:test';
-import { agent, assert, assertAccessible, assertQuiet, directory, eventually, open, Puppet, Server, takeComplaints } from './harness.mjs';
+import {
+  agent,
+  assert,
+  assertAccessible,
+  assertQuiet,
+  directory,
+  eventually,
+  open,
+  Puppet,
+  Server,
+  takeComplaints,
+} from './harness.mjs';
 
 const LONG = `${'d'.repeat(80)}/${'e'.repeat(60)}`;
 
@@ -18,7 +30,8 @@ function folder(t, name, files) {
   return top;
 }
 
-const manifest = (name, version, more = 'exec = ["./run.sh"]') => `name = "${name}"\nversion = "${version}"\n\n[run]\n${more}\n`;
+const manifest = (name, version, more = 'exec = ["./run.sh"]') =>
+  `name = "${name}"\nversion = "${version}"\n\n[run]\n${more}\n`;
 const SCRIPT = '#!/bin/sh\nexec sleep 1000\n';
 
 const bring = (page, path) => page.getByLabel('Folder to upload').setInputFiles(path);
@@ -26,7 +39,13 @@ const bring = (page, path) => page.getByLabel('Folder to upload').setInputFiles(
 test('a folder that is brought is the package that the command makes of it, and runs', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
-  const files = { 'task.toml': manifest('talker', '1.0.0'), 'run.sh': SCRIPT, [`${LONG}/größe.txt`]: 'x'.repeat(513), 'empty/none': '', '.git/HEAD': 'no' };
+  const files = {
+    'task.toml': manifest('talker', '1.0.0'),
+    'run.sh': SCRIPT,
+    [`${LONG}/größe.txt`]: 'x'.repeat(513),
+    'empty/none': '',
+    '.git/HEAD': 'no',
+  };
   const path = folder(t, 'talker', files);
   const page = await open(t, server, { hash: '#/packages' });
   await page.getByText('No package is here yet.').waitFor();
@@ -42,7 +61,10 @@ test('a folder that is brought is the package that the command makes of it, and 
   await assertAccessible(page, 'the order');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
   await page.locator('[data-part=atlas] .phase', { hasText: 'running' }).waitFor();
-  await page.locator('[data-part=atlas]').getByRole('button', { name: /^Phases of atlas/ }).click();
+  await page
+    .locator('[data-part=atlas]')
+    .getByRole('button', { name: /^Phases of atlas/ })
+    .click();
   await page.locator('.steps', { hasText: 'running' }).waitFor();
   await assertAccessible(page, 'the deployment');
   assertQuiet(page);
@@ -53,45 +75,83 @@ test('what is wrong with a folder is said with its file and key', async (t) => {
   const page = await open(t, server, { hash: '#/packages' });
   await bring(page, folder(t, 'notes', { 'readme.md': 'nothing' }));
   await page.getByText('notes: there is neither a task.toml nor a package.xml in it').waitFor();
-  await bring(page, folder(t, 'talker', { 'task.toml': manifest('talker', '1.0.0', 'exec = ["./absent.sh"]') }));
-  await page.locator('.upload', { hasText: 'talker' }).locator('.problem', { hasText: 'run.exec' }).waitFor();
+  await bring(
+    page,
+    folder(t, 'talker', { 'task.toml': manifest('talker', '1.0.0', 'exec = ["./absent.sh"]') }),
+  );
+  await page
+    .locator('.upload', { hasText: 'talker' })
+    .locator('.problem', { hasText: 'run.exec' })
+    .waitFor();
   assert.match(takeComplaints(page).join(), /422/);
-  await page.locator('.upload', { hasText: 'talker' }).getByRole('button', { name: 'Dismiss' }).click();
+  await page
+    .locator('.upload', { hasText: 'talker' })
+    .getByRole('button', { name: 'Dismiss' })
+    .click();
   await page.locator('.upload', { hasText: 'talker' }).waitFor({ state: 'detached' });
 });
 
 test('versions are looked into, compared and deleted', async (t) => {
   const server = await Server.start(t);
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, old: 'gone' } });
-  server.push('talker', '2.0.0', { files: { 'run.sh': `${SCRIPT}# longer\n`, new: 'here' }, more: 'stop_timeout_s = 20\n' });
+  server.push('talker', '2.0.0', {
+    files: { 'run.sh': `${SCRIPT}# longer\n`, new: 'here' },
+    more: 'stop_timeout_s = 20\n',
+  });
   const page = await open(t, server, { hash: '#/packages/talker' });
-  await page.getByRole('row', { name: /run\.sh/ }).getByText('0755').waitFor();
+  await page
+    .getByRole('row', { name: /run\.sh/ })
+    .getByText('0755')
+    .waitFor();
   await page.getByLabel('Compare with').selectOption('1.0.0');
   await page.getByRole('row', { name: /added new/ }).waitFor();
   await page.getByRole('row', { name: /removed old/ }).waitFor();
-  await page.getByRole('row', { name: /changed run\.sh/ }).getByText('+9 B').waitFor();
+  await page
+    .getByRole('row', { name: /changed run\.sh/ })
+    .getByText('+9 B')
+    .waitFor();
   await page.getByText('run.stop_timeout_s').waitFor();
   assert.match(page.url(), /with=1\.0\.0/);
   await assertAccessible(page, 'the package');
   await page.getByRole('link', { name: /^1\.0\.0/ }).click();
   await page.getByRole('button', { name: 'Delete…' }).click();
   await page.getByRole('dialog').getByRole('button', { name: 'Delete' }).click();
-  await eventually('the version to be gone', async () => (await server.ask('GET', '/packages')).packages.length === 1);
+  await eventually(
+    'the version to be gone',
+    async () => (await server.ask('GET', '/packages')).packages.length === 1,
+  );
   await page.getByRole('link', { name: /^1\.0\.0/ }).waitFor({ state: 'detached' });
   assertQuiet(page);
 });
 
 test('two packages of one version are told apart', async (t) => {
   const server = await Server.start(t);
-  const running = (more) => ({ each: ({ deployment, package: { version, manifest } }) => ({ active: { deployment, version, pid: 1, ...more(manifest.digest) } }) });
+  const running = (more) => ({
+    each: ({ deployment, package: { version, manifest } }) => ({
+      active: { deployment, version, pid: 1, ...more(manifest.digest) },
+    }),
+  });
   const atlas = await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' }, to: 'atlas' });
-  await atlas.report('running', running((manifest) => ({ manifest })));
+  await atlas.report(
+    'running',
+    running((manifest) => ({ manifest })),
+  );
   const borea = await Puppet.enroll(server, 'borea');
-  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'borea', force: true });
-  await borea.report('running', running((manifest) => ({ manifest })));
+  server.push('talker', '1.0.0', {
+    files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' },
+    to: 'borea',
+    force: true,
+  });
+  await borea.report(
+    'running',
+    running((manifest) => ({ manifest })),
+  );
   const page = await open(t, server, { hash: '#/packages/talker' });
-  const runsOn = (robot) => page.locator('section', { has: page.getByRole('heading', { name: 'Runs on 1' }) }).getByRole('link', { name: robot });
+  const runsOn = (robot) =>
+    page
+      .locator('section', { has: page.getByRole('heading', { name: 'Runs on 1' }) })
+      .getByRole('link', { name: robot });
   await page.getByRole('row', { name: /aarch64\.so/ }).waitFor();
   await runsOn('borea').waitFor();
   await page.getByRole('link', { name: /^1\.0\.0 \(/ }).click();
@@ -100,11 +160,19 @@ test('two packages of one version are told apart', async (t) => {
   // An older agent says which version, and not which of the two.
   await page.getByRole('link', { name: '1.0.0', exact: false }).first().click();
   await runsOn('borea').waitFor();
-  await atlas.report('running', running(() => ({})));
+  await atlas.report(
+    'running',
+    running(() => ({})),
+  );
   await page.getByRole('heading', { name: 'Runs on 2' }).waitFor();
   await page.goto(`${server.url}/#/packages`);
   await page.locator('[data-key]').getByRole('button', { name: /older/ }).click();
-  for (const [index, count] of ['2 robots', '1 robot'].entries()) await page.locator('[data-key]').nth(index).getByRole('link', { name: count, exact: true }).waitFor();
+  for (const [index, count] of ['2 robots', '1 robot'].entries())
+    await page
+      .locator('[data-key]')
+      .nth(index)
+      .getByRole('link', { name: count, exact: true })
+      .waitFor();
   await page.locator('[data-key]').nth(1).getByRole('link', { name: '1.0.0' }).last().click();
   await page.getByRole('row', { name: /x86_64\.so/ }).waitFor();
   assertQuiet(page);
@@ -114,7 +182,11 @@ test('what robots should have is not offered to be deleted', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' } });
-  server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' }, to: 'atlas', force: true });
+  server.push('talker', '1.0.0', {
+    files: { 'run.sh': SCRIPT, 'aarch64.so': 'another' },
+    to: 'atlas',
+    force: true,
+  });
   const page = await open(t, server, { hash: '#/packages/talker' });
   const dialog = page.getByRole('dialog');
   const remove = dialog.getByRole('button', { name: 'Delete' });
@@ -130,14 +202,21 @@ test('what robots should have is not offered to be deleted', async (t) => {
   await page.getByRole('row', { name: /x86_64\.so/ }).waitFor();
   await ask();
   await remove.click();
-  await eventually('the version to be gone', async () => (await server.ask('GET', '/packages')).packages.length === 1);
+  await eventually(
+    'the version to be gone',
+    async () => (await server.ask('GET', '/packages')).packages.length === 1,
+  );
   assertQuiet(page);
 });
 
 test('failures are told by their reason, and retried', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
-  const { id } = server.push('sensor', '0.1.0', { files: { 'run.sh': '#!/bin/sh\nexit 3\n' }, more: 'restart = "never"\n', to: 'atlas' });
+  const { id } = server.push('sensor', '0.1.0', {
+    files: { 'run.sh': '#!/bin/sh\nexit 3\n' },
+    more: 'restart = "never"\n',
+    to: 'atlas',
+  });
   const page = await open(t, server, { hash: `#/deployments/${id}` });
   const reason = page.locator('.reason', { hasText: 'on 1 robot' });
   await reason.waitFor();

@@ -1,14 +1,40 @@
-// Makes the pictures of the page in docs/page, light and dark: node crates/server/tests/page/pictures.mjs [DIRECTORY]
-// The server and the browser are real, most robots are puppets with a story, and one has ROS: TASKD_TEST_ROS says where.
+// Makes the pictures of the page in docs/page, light and dark: node
+// crates/server/tests/page/pictures.mjs [DIRECTORY] The server and the browser are real, most
+// robots are puppets with a story, and one has ROS: TASKD_TEST_ROS says where.
 
 import { randomBytes } from 'node:crypto';
 import { mkdirSync } from 'node:fs';
 import { join } from 'node:path';
-import { agent, browser, eventually, open, Puppet, root, ros, Server, settled } from './harness.mjs';
+import {
+  agent,
+  browser,
+  eventually,
+  open,
+  Puppet,
+  root,
+  ros,
+  Server,
+  settled,
+} from './harness.mjs';
 
 const target = process.argv[2] ?? join(root, 'docs/page');
 const SIZE = { width: 1280, height: 800 };
-const NAMES = ['atlas', 'borea', 'corvus', 'delphin', 'echo', 'fenn', 'gale', 'heron', 'iris', 'juno', 'kite', 'lynx', 'mica', 'nova'];
+const NAMES = [
+  'atlas',
+  'borea',
+  'corvus',
+  'delphin',
+  'echo',
+  'fenn',
+  'gale',
+  'heron',
+  'iris',
+  'juno',
+  'kite',
+  'lynx',
+  'mica',
+  'nova',
+];
 const GB = 1e9;
 /** Two nodes that do what a mapping robot's would, as far as the graph and the log show it. */
 const SLAM = `import math
@@ -64,21 +90,66 @@ async function story() {
   }
   await agent(t, server, 'orca', await ros(t));
   await agent(t, server, 'puma');
-  const machine = (name, index) => ({ disk_free_bytes: (14 + 7 * index) * GB, arch: index % 3 ? 'x86_64' : 'aarch64', ros_distros: ['jazzy'], ros: { distro: 'jazzy', rmw: 'rmw_fastrtps_cpp', domain_id: 0 } });
-  const report = async (name, phase, more = {}) => robots.get(name).report(phase, { host: machine(name, NAMES.indexOf(name)), link: { throughput_bytes_per_s: 2_400_000 + 90_000 * NAMES.indexOf(name), rtt_ms: 4 + 3 * NAMES.indexOf(name), reconnects: 0, losses: 0 }, ...more });
+  const machine = (name, index) => ({
+    disk_free_bytes: (14 + 7 * index) * GB,
+    arch: index % 3 ? 'x86_64' : 'aarch64',
+    ros_distros: ['jazzy'],
+    ros: { distro: 'jazzy', rmw: 'rmw_fastrtps_cpp', domain_id: 0 },
+  });
+  const report = async (name, phase, more = {}) =>
+    robots.get(name).report(phase, {
+      host: machine(name, NAMES.indexOf(name)),
+      link: {
+        throughput_bytes_per_s: 2_400_000 + 90_000 * NAMES.indexOf(name),
+        rtt_ms: 4 + 3 * NAMES.indexOf(name),
+        reconnects: 0,
+        losses: 0,
+      },
+      ...more,
+    });
   const floors = [4e6, 5e6, 6e6].map((bytes) => randomBytes(bytes));
   const lab = NAMES.filter((name, index) => index % 3 < 2);
 
-  server.push('mapper', '0.9.4', { to: '*', files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', 'params.yaml': 'resolution: 0.05\n' } });
+  server.push('mapper', '0.9.4', {
+    to: '*',
+    files: { 'run.sh': '#!/bin/sh\nexec sleep 1000\n', 'params.yaml': 'resolution: 0.05\n' },
+  });
   for (const name of NAMES) await report(name, 'running', running(1_200));
-  server.push('navigation', '2.3.1', { to: 'site=lab', files: { 'run.sh': '#!/bin/sh\nexec ./navigate\n', 'maps/floor1.pgm': floors[0], 'maps/floor2.pgm': floors[1], 'params.yaml': 'speed: 0.6\n' } });
+  server.push('navigation', '2.3.1', {
+    to: 'site=lab',
+    files: {
+      'run.sh': '#!/bin/sh\nexec ./navigate\n',
+      'maps/floor1.pgm': floors[0],
+      'maps/floor2.pgm': floors[1],
+      'params.yaml': 'speed: 0.6\n',
+    },
+  });
   for (const name of lab) await report(name, 'running', running(1_300));
-  server.push('navigation', '2.4.0', { to: 'site=lab', files: { 'run.sh': '#!/bin/sh\nexec ./navigate --smooth\n', 'maps/floor1.pgm': floors[0], 'maps/floor3.pgm': floors[2], 'params.yaml': 'speed: 0.8\n' } });
+  server.push('navigation', '2.4.0', {
+    to: 'site=lab',
+    files: {
+      'run.sh': '#!/bin/sh\nexec ./navigate --smooth\n',
+      'maps/floor1.pgm': floors[0],
+      'maps/floor3.pgm': floors[2],
+      'params.yaml': 'speed: 0.8\n',
+    },
+  });
   for (const [index, name] of lab.entries()) {
-    const conditions = name === 'echo' ? [{ code: 'held', text: 'held at the robot: a wheel is being changed' }] : [];
+    const conditions =
+      name === 'echo'
+        ? [{ code: 'held', text: 'held at the robot: a wheel is being changed' }]
+        : [];
     // Its other task runs on, whatever becomes of this one.
-    const says = (phase, more = () => ({})) => report(name, 'running', { conditions, each: (one) => (one.package.name === 'navigation' ? { phase, ...more(one) } : running(1_200).each(one)) });
-    const fetched = (part) => says('fetching', ({ package: { content } }) => ({ progress: { done: Math.round(part * content.size), total: content.size } }));
+    const says = (phase, more = () => ({})) =>
+      report(name, 'running', {
+        conditions,
+        each: (one) =>
+          one.package.name === 'navigation' ? { phase, ...more(one) } : running(1_200).each(one),
+      });
+    const fetched = (part) =>
+      says('fetching', ({ package: { content } }) => ({
+        progress: { done: Math.round(part * content.size), total: content.size },
+      }));
     await fetched(0.02);
     if (name === 'heron') continue;
     if (index % 5 === 1) {
@@ -89,30 +160,60 @@ async function story() {
     await says('building');
     if (index % 5 === 3) continue;
     if (name === 'delphin') {
-      await says('failed', () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1: fatal error: nav2_msgs/action/navigate_to_pose.hpp: No such file or directory' } }));
+      await says('failed', () => ({
+        failure: {
+          code: 'build_failed',
+          text: 'colcon build ended with status 1: fatal error: nav2_msgs/action/navigate_to_pose.hpp: No such file or directory',
+        },
+      }));
     } else {
       await says('starting');
       await says('running', running(2_000 + index).each);
     }
   }
-  for (const [index, name] of NAMES.entries()) await robots.get(name).vitals(sample(Date.now(), index));
+  for (const [index, name] of NAMES.entries())
+    await robots.get(name).vitals(sample(Date.now(), index));
   const map = corridor();
-  await robots.get('atlas').bringBack('mapper', [['maps/corridor.pgm', map], ['maps/corridor.yaml', 'image: corridor.pgm\nresolution: 0.05\n']]);
+  await robots.get('atlas').bringBack('mapper', [
+    ['maps/corridor.pgm', map],
+    ['maps/corridor.yaml', 'image: corridor.pgm\nresolution: 0.05\n'],
+  ]);
 
   const { deployments } = await server.ask('GET', '/deployments');
-  server.push('slam', '1.3.0', { files: { 'run.sh': '#!/bin/sh\nexec python3 slam.py\n', 'slam.py': SLAM }, more: "[ready]\nlifecycle = ['/slam']\n", to: 'orca' });
-  const isMapping = async () => (await server.ask('GET', '/robots/orca')).tasks.some(({ task, phase }) => task === 'slam' && phase === 'running');
+  server.push('slam', '1.3.0', {
+    files: { 'run.sh': '#!/bin/sh\nexec python3 slam.py\n', 'slam.py': SLAM },
+    more: "[ready]\nlifecycle = ['/slam']\n",
+    to: 'orca',
+  });
+  const isMapping = async () =>
+    (await server.ask('GET', '/robots/orca')).tasks.some(
+      ({ task, phase }) => task === 'slam' && phase === 'running',
+    );
   await eventually('the mapping to run', isMapping);
   const places = {
-    robots: 'robots', robot: 'robots/atlas', tasks: 'robots/delphin/tasks', ros: 'robots/orca/ros?node=/slam', logs: 'robots/orca/logs', outputs: 'robots/atlas/outputs', control: 'robots/atlas/control', edit: 'robots/atlas/edit',
-    packages: 'packages', package: 'packages/navigation', deployments: 'deployments', deployment: `deployments/${deployments[0].id}`, server: 'server', settings: 'settings',
+    robots: 'robots',
+    robot: 'robots/atlas',
+    tasks: 'robots/delphin/tasks',
+    ros: 'robots/orca/ros?node=/slam',
+    logs: 'robots/orca/logs',
+    outputs: 'robots/atlas/outputs',
+    control: 'robots/atlas/control',
+    edit: 'robots/atlas/edit',
+    packages: 'packages',
+    package: 'packages/navigation',
+    deployments: 'deployments',
+    deployment: `deployments/${deployments[0].id}`,
+    server: 'server',
+    settings: 'settings',
   };
   await server.enrolmentToken({ labels: { site: 'lab' }, uses: 20 });
   const it = await browser(t);
   for (const colorScheme of ['light', 'dark']) {
     const page = await open(t, server, { on: it, colorScheme, viewport: SIZE });
     // The server counts an hour by its own clock, and nobody waits that long for a picture.
-    await page.route('**/api/v1/robots/*/vitals', (route) => route.fulfill({ json: { samples: hour() } }));
+    await page.route('**/api/v1/robots/*/vitals', (route) =>
+      route.fulfill({ json: { samples: hour() } }),
+    );
     for (const [name, place] of Object.entries(places)) {
       await page.goto(`${server.url}/#/${place}`);
       await page.locator('main h1').first().waitFor();
@@ -127,7 +228,16 @@ async function story() {
   }
 }
 
-const running = (pid) => ({ each: (one) => ({ active: { deployment: one.deployment, version: one.package.version, manifest: one.package.manifest.digest, pid } }) });
+const running = (pid) => ({
+  each: (one) => ({
+    active: {
+      deployment: one.deployment,
+      version: one.package.version,
+      manifest: one.package.manifest.digest,
+      pid,
+    },
+  }),
+});
 
 /** How a machine does that works in bursts. */
 const sample = (at_ms, turn) => ({
@@ -143,19 +253,33 @@ const sample = (at_ms, turn) => ({
   battery_percent: Math.max(20, 90 - Math.floor(turn / 2)),
 });
 
-const hour = () => Array.from({ length: 60 }, (_, minute) => sample(Date.now() - (59 - minute) * 60_000, 59 - minute));
+const hour = () =>
+  Array.from({ length: 60 }, (_, minute) =>
+    sample(Date.now() - (59 - minute) * 60_000, 59 - minute),
+  );
 
 /** A map of a corridor with two rooms, as map_saver writes it. */
 function corridor() {
   const [width, height] = [240, 120];
   const pixels = Buffer.alloc(width * height, 205);
   const room = (x0, y0, x1, y1) => {
-    for (let y = y0; y <= y1; y += 1) for (let x = x0; x <= x1; x += 1) pixels[y * width + x] = x === x0 || x === x1 || y === y0 || y === y1 ? 0 : 254;
+    for (let y = y0; y <= y1; y += 1)
+      for (let x = x0; x <= x1; x += 1)
+        pixels[y * width + x] = x === x0 || x === x1 || y === y0 || y === y1 ? 0 : 254;
   };
   room(10, 50, 230, 76);
   room(30, 10, 100, 50);
   room(140, 76, 220, 112);
-  for (const [x, y] of [[60, 50], [61, 50], [62, 50], [63, 50], [180, 76], [181, 76], [182, 76]]) pixels[y * width + x] = 254;
+  for (const [x, y] of [
+    [60, 50],
+    [61, 50],
+    [62, 50],
+    [63, 50],
+    [180, 76],
+    [181, 76],
+    [182, 76],
+  ])
+    pixels[y * width + x] = 254;
   return Buffer.concat([Buffer.from(`P5\n${width} ${height}\n255\n`), pixels]);
 }
 

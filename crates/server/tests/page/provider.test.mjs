@@ -1,4 +1,5 @@
-// Signing in by an OpenID Connect provider that others made, in a real browser, as a person does it.
+// Signing in by an OpenID Connect provider that others made, in a real browser, as a person does
+// it.
 
 import { spawn } from 'node:child_process';
 import { once } from 'node:events';
@@ -17,9 +18,16 @@ const PEOPLE = [
 /** Starts the provider; answers its address. */
 async function provider(t) {
   const environment = process.env.TASKD_TEST_OIDC;
-  assert.ok(environment, 'TASKD_TEST_OIDC is not set: run ./scripts/test, or set it to the directory that scripts/need oidc prints');
+  assert.ok(
+    environment,
+    'TASKD_TEST_OIDC is not set: run ./scripts/test, or set it to the directory that scripts/need oidc prints',
+  );
   const claims = PEOPLE.flatMap((person) => ['--user-claims', JSON.stringify(person)]);
-  const child = spawn(join(environment, 'bin/python'), ['-m', 'oidc_provider_mock', '--port', '0', ...claims], { stdio: ['ignore', 'ignore', 'pipe'] });
+  const child = spawn(
+    join(environment, 'bin/python'),
+    ['-m', 'oidc_provider_mock', '--port', '0', ...claims],
+    { stdio: ['ignore', 'ignore', 'pipe'] },
+  );
   atEnd(t, async () => {
     child.kill();
     await once(child, 'exit');
@@ -62,7 +70,10 @@ test('the page offers the provider, and says what went wrong there', async (t) =
   const server = await Server.start(t, { configuration, http: `127.0.0.1:${port}` });
   const context = await (await browser(t)).newContext();
   // What the provider's own page would like to load from elsewhere.
-  await context.route((url) => url.hostname !== '127.0.0.1', (route) => route.abort());
+  await context.route(
+    (url) => url.hostname !== '127.0.0.1',
+    (route) => route.abort(),
+  );
   const page = await context.newPage();
   await page.goto(server.url);
   const signInAs = async (sub) => {
@@ -70,7 +81,10 @@ test('the page offers the provider, and says what went wrong there', async (t) =
     await page.getByRole('button', { name: sub, exact: true }).click();
   };
   await signInAs('2');
-  await page.getByRole('alert').filter({ hasText: 'You have no role here. Ask an administrator.' }).waitFor();
+  await page
+    .getByRole('alert')
+    .filter({ hasText: 'You have no role here. Ask an administrator.' })
+    .waitFor();
   assert.equal(page.url(), `${server.url}/`, 'the problem has left the address bar');
   await signInAs('1');
   await live(page);

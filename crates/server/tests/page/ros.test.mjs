@@ -1,13 +1,28 @@
-// The ROS graph of a robot in the page: real nodes are looked at, moved through their lifecycle and given parameters.
+// The ROS graph of a robot in the page: real nodes are looked at, moved through their lifecycle and
+// given parameters.
 
 import { test } from 'node:test';
-import { agent, assert, assertAccessible, assertQuiet, open, probe, ros, Server } from './harness.mjs';
+import {
+  agent,
+  assert,
+  assertAccessible,
+  assertQuiet,
+  open,
+  probe,
+  ros,
+  Server,
+} from './harness.mjs';
 
 test('nodes are looked at, changed and given parameters', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas', await ros(t));
-  const run = '#!/bin/sh\nexec python3 probe.py --node mapper --lifecycle --service /say --topic /ticks --hz 5\n';
-  server.push('mapper', '1.0.0', { files: { 'run.sh': run, 'probe.py': probe }, more: "[ready]\nhold_s = 0\ntimeout_s = 60\nlifecycle = ['/mapper']\n", to: 'atlas' });
+  const run =
+    '#!/bin/sh\nexec python3 probe.py --node mapper --lifecycle --service /say --topic /ticks --hz 5\n';
+  server.push('mapper', '1.0.0', {
+    files: { 'run.sh': run, 'probe.py': probe },
+    more: "[ready]\nhold_s = 0\ntimeout_s = 60\nlifecycle = ['/mapper']\n",
+    to: 'atlas',
+  });
   const page = await open(t, server, { hash: '#/robots/atlas/tasks' });
   await page.locator('.phase', { hasText: 'running' }).first().waitFor();
   await page.getByRole('link', { name: 'ROS' }).click();
@@ -18,7 +33,10 @@ test('nodes are looked at, changed and given parameters', async (t) => {
   await page.getByText('No node is like that.').waitFor();
   await page.getByPlaceholder('Filter nodes and topics').fill('');
 
-  await page.getByRole('region', { name: 'Table of nodes' }).getByRole('link', { name: '/mapper' }).click();
+  await page
+    .getByRole('region', { name: 'Table of nodes' })
+    .getByRole('link', { name: '/mapper' })
+    .click();
   const parameter = page.locator('.parameters li', { hasText: 'resolution' });
   await parameter.getByText('0.05').waitFor();
   await page.getByText('Offers').click();
@@ -38,7 +56,11 @@ test('nodes are looked at, changed and given parameters', async (t) => {
 
   // Nothing is done to a node without a question.
   const transitions = [];
-  page.on('request', (request) => request.postData()?.includes('"transition"') && transitions.push(request.postData()));
+  page.on(
+    'request',
+    (request) =>
+      request.postData()?.includes('"transition"') && transitions.push(request.postData()),
+  );
   const dialog = page.getByRole('dialog');
   await page.getByRole('button', { name: 'shutdown…' }).click();
   await dialog.getByText('of the task mapper on atlas is active').waitFor();

@@ -1,4 +1,5 @@
-// What is said of a deployment beside its robots: why some failed, how the bytes travel, and what was ordered.
+// What is said of a deployment beside its robots: why some failed, how the bytes travel, and what
+// was ordered.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { number, plural, words } from '../format.js';
@@ -8,9 +9,13 @@ import { canRetry } from './parts.js';
 
 const SHOWN_NAMES = 4;
 
-// Where the page is narrow both are folded, so that the robots below stay where they are when a failure comes.
+// Where the page is narrow both are folded, so that the robots below stay where they are when a
+// failure comes.
 
-/** The failures, the most frequent first. `act` has `show(reason)` and `retry(reason, parts)`, if this person may. */
+/**
+ * The failures, the most frequent first. `act` has `show(reason)` and `retry(reason, parts)`, if
+ * this person may.
+ */
 export function failures(reasons, chosen, act) {
   const groups = [...reasons].sort(([, one], [, other]) => other.length - one.length);
   return html`

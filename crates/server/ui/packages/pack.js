@@ -1,5 +1,6 @@
-// Packs a folder into a plain tar, as POSIX describes it: `ustar` headers, and a pax header where a name does not fit into one.
-// The archive is a list of pieces of files, so however large they are, none of them is read into memory.
+// Packs a folder into a plain tar, as POSIX describes it: `ustar` headers, and a pax header where a
+// name does not fit into one. The archive is a list of pieces of files, so however large they are,
+// none of them is read into memory.
 
 const BLOCK = 512;
 const NAME_BYTES = 100;
@@ -10,17 +11,28 @@ const TIME_S = 946_684_800;
 const READ_AT_ONCE = 16;
 const text = new TextEncoder();
 
-/** The archive of `entries`, each `{ path, file }`, or a directory without a file. Throws what a person can read. */
+/**
+ * The archive of `entries`, each `{ path, file }`, or a directory without a file. Throws what a
+ * person can read.
+ */
 export async function pack(entries) {
   const sorted = [...entries].sort((one, other) => (one.path < other.path ? -1 : 1));
   const modes = await modesOf(sorted);
   const pieces = [];
   sorted.forEach(({ path, file }, index) => {
     const size = file?.size ?? 0;
-    if (size > MAX_FILE_BYTES) throw new Error(`${path}: too large for the page, push it with taskd push`);
+    if (size > MAX_FILE_BYTES)
+      throw new Error(`${path}: too large for the page, push it with taskd push`);
     const name = file ? path : `${path}/`;
     if (!fits(name)) pieces.push(...paxOf(name));
-    pieces.push(header({ name: fits(name) ? name : 'long', mode: modes[index], size, type: file ? '0' : '5' }));
+    pieces.push(
+      header({
+        name: fits(name) ? name : 'long',
+        mode: modes[index],
+        size,
+        type: file ? '0' : '5',
+      }),
+    );
     if (size) pieces.push(file, new Uint8Array((BLOCK - (size % BLOCK)) % BLOCK));
   });
   pieces.push(new Uint8Array(2 * BLOCK));
@@ -32,7 +44,11 @@ const fits = (name) => name.length <= NAME_BYTES && /^[\x20-\x7e]*$/.test(name);
 
 function paxOf(name) {
   const record = text.encode(paxRecord('path', name));
-  return [header({ name: 'pax', mode: 0o644, size: record.length, type: 'x' }), record, new Uint8Array((BLOCK - (record.length % BLOCK)) % BLOCK)];
+  return [
+    header({ name: 'pax', mode: 0o644, size: record.length, type: 'x' }),
+    record,
+    new Uint8Array((BLOCK - (record.length % BLOCK)) % BLOCK),
+  ];
 }
 
 /** `27 path=some/where\n`, where the number counts the whole line's bytes, its own too. */
@@ -56,7 +72,13 @@ function header({ name, mode, size, type }) {
   put(148, ' '.repeat(8));
   put(156, type);
   put(257, 'ustar\0' + '00');
-  put(148, `${octal(block.reduce((sum, byte) => sum + byte, 0), 6)}\0 `);
+  put(
+    148,
+    `${octal(
+      block.reduce((sum, byte) => sum + byte, 0),
+      6,
+    )}\0 `,
+  );
   return block;
 }
 

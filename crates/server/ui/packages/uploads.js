@@ -8,13 +8,19 @@ import { tell } from '../notice.js';
 import { at } from '../router.js';
 import { pack } from './pack.js';
 
-const TYPES = [[/\.(tar\.zst|tzst|taskd)$/i, 'application/zstd'], [/\.tar$/i, 'application/x-tar']];
+const TYPES = [
+  [/\.(tar\.zst|tzst|taskd)$/i, 'application/zstd'],
+  [/\.tar$/i, 'application/x-tar'],
+];
 
 export class Uploads {
   #all = [];
   #last = Promise.resolve();
 
-  /** Sends what was chosen, one after the other. That a package has come, everybody hears from the stream. */
+  /**
+   * Sends what was chosen, one after the other. That a package has come, everybody hears from the
+   * stream.
+   */
   add(chosen) {
     for (const { name, file, entries } of chosen) {
       this.#add({ name, file, entries });
@@ -22,7 +28,14 @@ export class Uploads {
   }
 
   #add({ name, file, entries, force = false }) {
-    const one = { name, stage: 'waiting', done: 0, total: 0, problem: null, end: new AbortController() };
+    const one = {
+      name,
+      stage: 'waiting',
+      done: 0,
+      total: 0,
+      problem: null,
+      end: new AbortController(),
+    };
     // A version that is taken is taken over only at somebody's word.
     one.insist = () => {
       this.#forget(one);
@@ -39,16 +52,26 @@ export class Uploads {
     if (end.signal.aborted) return this.#forget(one);
     try {
       change(() => (one.stage = entries ? 'packing' : 'sending'));
-      const { blob, type } = entries ? { blob: await packed(name, await entries), type: 'application/x-tar' } : { blob: await file, type: typeOf(name) };
+      const { blob, type } = entries
+        ? { blob: await packed(name, await entries), type: 'application/x-tar' }
+        : { blob: await file, type: typeOf(name) };
       change(() => Object.assign(one, { stage: 'sending', total: blob.size }));
-      const told = (done) => change(() => Object.assign(one, { done, stage: done < blob.size ? 'sending' : 'checking' }));
-      const view = await upload(force ? '/packages?force=true' : '/packages', blob, type, { told, signal: end.signal });
+      const told = (done) =>
+        change(() =>
+          Object.assign(one, { done, stage: done < blob.size ? 'sending' : 'checking' }),
+        );
+      const view = await upload(force ? '/packages?force=true' : '/packages', blob, type, {
+        told,
+        signal: end.signal,
+      });
       this.#forget(one);
       const { name: stored, version } = view.package;
       tell(`${stored}@${version} is there.`, [at(['packages', stored], { version }), 'Look at it']);
     } catch (error) {
       if (end.signal.aborted) return this.#forget(one);
-      change(() => Object.assign(one, { problem: problemOf(error), isTaken: error.code === 'version_taken' }));
+      change(() =>
+        Object.assign(one, { problem: problemOf(error), isTaken: error.code === 'version_taken' }),
+      );
     }
   }
 
@@ -80,8 +103,12 @@ export class Uploads {
     return html`
       <li class="upload">
         <p><strong>${name}</strong>
-          ${problem ? nothing : html`<span class="quiet">${STAGES[stage]}</span>
-            ${total ? html`<progress max=${total} .value=${done} aria-label=${`${name} sent`}></progress><span class="quiet">${bytes({ done, total })}</span>` : nothing}`}
+          ${
+            problem
+              ? nothing
+              : html`<span class="quiet">${STAGES[stage]}</span>
+            ${total ? html`<progress max=${total} .value=${done} aria-label=${`${name} sent`}></progress><span class="quiet">${bytes({ done, total })}</span>` : nothing}`
+          }
           <button class="plain link" @click=${() => this.#end(one)}>${problem ? 'Dismiss' : 'Break off'}</button></p>
         ${isTaken ? html`<p><button class="plain link" @click=${insist}>Replace the version: robots that have the other content are marked as outdated</button></p>` : nothing}
         <p class="bad problem" role="alert">${problem ? `▲ ${problem}` : ''}</p>
@@ -89,10 +116,17 @@ export class Uploads {
   }
 }
 
-const STAGES = { waiting: 'waits', packing: 'is being packed', sending: 'is being sent', checking: 'is being checked and packed by the server' };
+const STAGES = {
+  waiting: 'waits',
+  packing: 'is being packed',
+  sending: 'is being sent',
+  checking: 'is being checked and packed by the server',
+};
 
 async function packed(name, entries) {
-  const isPackage = entries.some(({ path, file }) => file && (path === 'task.toml' || path === 'package.xml'));
+  const isPackage = entries.some(
+    ({ path, file }) => file && (path === 'task.toml' || path === 'package.xml'),
+  );
   if (!isPackage) throw new Error(`${name}: there is neither a task.toml nor a package.xml in it`);
   return pack(entries);
 }
@@ -105,6 +139,7 @@ function typeOf(name) {
 
 function problemOf(error) {
   if (error instanceof SignedOut) return 'You are signed out.';
-  if (error.status === 404 || error.status === 405) return 'This server takes packages from the command line alone: taskd push DIRECTORY';
+  if (error.status === 404 || error.status === 405)
+    return 'This server takes packages from the command line alone: taskd push DIRECTORY';
   return error.message;
 }

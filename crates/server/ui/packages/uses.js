@@ -3,15 +3,20 @@
 // Counting goes over all robots: not more often than somebody could read it.
 const COUNT_PAUSE_MS = 1_000;
 
-/** By which word each of these versions is meant: its number, or its digest where a newer one has the same. */
+/**
+ * By which word each of these versions is meant: its number, or its digest where a newer one has
+ * the same.
+ */
 export function namesOf(versions) {
   const taken = new Set();
-  return new Map(versions.map((one) => {
-    const { name, version, manifest } = one.package;
-    const isFirst = !taken.has(`${name}@${version}`);
-    taken.add(`${name}@${version}`);
-    return [one, isFirst ? version : manifest.digest];
-  }));
+  return new Map(
+    versions.map((one) => {
+      const { name, version, manifest } = one.package;
+      const isFirst = !taken.has(`${name}@${version}`);
+      taken.add(`${name}@${version}`);
+      return [one, isFirst ? version : manifest.digest];
+    }),
+  );
 }
 
 const byName = (one, other) => (one.name < other.name ? -1 : 1);
@@ -25,16 +30,22 @@ export class Uses {
     this.#fleet = fleet;
   }
 
-  /** The robots on which a process of this version lives, sorted by name. Several may have the same number; older agents say no more. */
+  /**
+   * The robots on which a process of this version lives, sorted by name. Several may have the same
+   * number; older agents say no more.
+   */
   of({ name, version, manifest }) {
     this.#count();
-    const [sure, likely] = [manifest.digest, `${name}@${version}`].map((key) => this.#robots.get(key) ?? []);
+    const [sure, likely] = [manifest.digest, `${name}@${version}`].map(
+      (key) => this.#robots.get(key) ?? [],
+    );
     return likely.length ? [...sure, ...likely].sort(byName) : sure;
   }
 
   /**
-   * The robots that should have this version, sorted by name. Of several packages with the same number only the order says which one
-   * is meant: robots whose order is not known here are left out then, unless it `isOnly` one.
+   * The robots that should have this version, sorted by name. Of several packages with the same
+   * number only the order says which one is meant: robots whose order is not known here are left
+   * out then, unless it `isOnly` one.
    */
   wanting({ name, version, manifest }, isOnly) {
     const isMeant = ({ task, version: wanted, deployment }) => {

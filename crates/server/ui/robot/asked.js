@@ -7,7 +7,8 @@ import { change } from '../frame.js';
 
 /** What can be done about a refusal. The refusal itself comes in words. */
 const ADVICE = {
-  no_ros: 'Without ROS there are no nodes, topics or parameters. The facts on Monitor say what the agent has found.',
+  no_ros:
+    'Without ROS there are no nodes, topics or parameters. The facts on Monitor say what the agent has found.',
   robot_offline: 'Questions go over MQTT. This page asks again by itself when the robot is back.',
   robot_silent: 'It may be busy, or its network slow.',
   unsupported: 'Its agent is older than this server.',
@@ -50,11 +51,17 @@ export class Asked {
       return [await askRobot(this.#page.robot.id, this.#question, this.#revive), null];
     } catch (error) {
       if (error instanceof SignedOut) return [null, null];
-      return [null, { text: this.#page.inWords(error.message), advice: ADVICE[error.code], code: error.code }];
+      return [
+        null,
+        { text: this.#page.inWords(error.message), advice: ADVICE[error.code], code: error.code },
+      ];
     }
   }
 
-  /** When the robot saw it so, and a button that asks again. `what` it is about is for those who can't see where it stands. */
+  /**
+   * When the robot saw it so, and a button that asks again. `what` it is about is for those who
+   * can't see where it stands.
+   */
   line(what, now) {
     const age = this.answer ? `as of ${ago(this.#answeredAt, now)}` : '';
     return html`<p class="asked quiet"><span>${this.isBusy ? 'asking…' : age}</span> <button class="plain link" ?disabled=${this.isBusy} aria-label=${`Refresh ${what}`} @click=${() => this.ask()}>Refresh</button></p>`;

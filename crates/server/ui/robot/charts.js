@@ -1,4 +1,5 @@
-// Curves over time, one below or beside the other, with one cursor for all of them. It draws samples and asks nobody.
+// Curves over time, one below or beside the other, with one cursor for all of them. It draws
+// samples and asks nobody.
 
 import { html } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { minute } from '../format.js';
@@ -10,7 +11,10 @@ const FONT = '12px system-ui, sans-serif';
 const GAP_MS = 150_000;
 const scheme = matchMedia('(prefers-color-scheme: dark)');
 
-/** Draws the curves of `figures`, each `{ id, title, most(samples), tick(value), lines: [{ title, of(sample) }] }`. */
+/**
+ * Draws the curves of `figures`, each `{ id, title, most(samples), tick(value), lines: [{ title,
+ * of(sample) }] }`.
+ */
 export class Charts {
   /** The sample that is pointed at; nothing while none is. */
   pointed = null;
@@ -20,7 +24,9 @@ export class Charts {
   #points = [];
   #window = [0, 1];
   #colours = {};
-  #observer = new ResizeObserver((entries) => entries.forEach(({ target, contentRect }) => this.#resize(target, contentRect.width)));
+  #observer = new ResizeObserver((entries) =>
+    entries.forEach(({ target, contentRect }) => this.#resize(target, contentRect.width)),
+  );
   /** Begins anew in the colours of now. */
   #recolour = () => {
     this.#colours = coloursNow();
@@ -46,7 +52,10 @@ export class Charts {
     this.#charts.clear();
   }
 
-  /** The place of a figure's curves. They show nothing that the words beside them do not say, so they are not read aloud. */
+  /**
+   * The place of a figure's curves. They show nothing that the words beside them do not say, so
+   * they are not read aloud.
+   */
   place = ({ id }) => html`<div class="curves" data-figure=${id} aria-hidden="true"></div>`;
 
   /** Shows these samples, the oldest first, between these two moments. */
@@ -58,7 +67,9 @@ export class Charts {
 
   /** Puts curves where a place for them has come into the page; to be called after each drawing. */
   async settle() {
-    const places = [...document.querySelectorAll('.curves')].filter((place) => this.#charts.get(place.dataset.figure)?.place !== place);
+    const places = [...document.querySelectorAll('.curves')].filter(
+      (place) => this.#charts.get(place.dataset.figure)?.place !== place,
+    );
     if (!places.length) return;
     // The first robot that is looked at brings the curves; the list of robots does without.
     const { default: UPlot } = await import('../vendor/uplot-1.6.32/uPlot.esm.js');
@@ -73,19 +84,32 @@ export class Charts {
       this.#observer.unobserve(old.place);
       old.chart.destroy();
     }
-    const chart = new UPlot(this.#options(this.#figures.find((figure) => figure.id === id), place.clientWidth), this.#dataOf(id), place);
+    const chart = new UPlot(
+      this.#options(
+        this.#figures.find((figure) => figure.id === id),
+        place.clientWidth,
+      ),
+      this.#dataOf(id),
+      place,
+    );
     this.#charts.set(id, { place, chart });
     this.#observer.observe(place);
   }
 
   #resize(place, width) {
     const { chart } = this.#charts.get(place.dataset.figure) ?? {};
-    if (chart && width && Math.round(width) !== chart.width) chart.setSize({ width: Math.round(width), height: HEIGHT });
+    if (chart && width && Math.round(width) !== chart.width)
+      chart.setSize({ width: Math.round(width), height: HEIGHT });
   }
 
   #dataOf(id) {
     const { lines } = this.#figures.find((figure) => figure.id === id);
-    return [this.#points.map(({ at_ms: then }) => then / 1000), ...lines.map(({ of }) => this.#points.map((point) => (point.isGap ? null : of(point) ?? null)))];
+    return [
+      this.#points.map(({ at_ms: then }) => then / 1000),
+      ...lines.map(({ of }) =>
+        this.#points.map((point) => (point.isGap ? null : (of(point) ?? null))),
+      ),
+    ];
   }
 
   #options({ most, tick, lines }, width) {
@@ -97,13 +121,42 @@ export class Charts {
       height: HEIGHT,
       padding: [8, 8, 0, 0],
       legend: { show: false },
-      cursor: { sync: { key: this.#key }, y: false, drag: { x: false, y: false }, points: { size: 7, width: 0, fill: (_, line) => this.#colours[strokes[line - 1]] } },
-      scales: { x: { time: true, range: () => this.#window }, y: { range: (_, __, highest) => [0, most(this.#points, highest)] } },
+      cursor: {
+        sync: { key: this.#key },
+        y: false,
+        drag: { x: false, y: false },
+        points: { size: 7, width: 0, fill: (_, line) => this.#colours[strokes[line - 1]] },
+      },
+      scales: {
+        x: { time: true, range: () => this.#window },
+        y: { range: (_, __, highest) => [0, most(this.#points, highest)] },
+      },
       axes: [
-        { ...axis, size: 24, space: 72, grid: { show: false }, values: (_, moments) => moments.map((s) => minute(s * 1000)) },
-        { ...axis, size: 68, space: 30, grid: { stroke: colour('--hair'), width: 1 }, values: (_, values) => values.map((value) => (this.#points.length ? tick(value) : '')) },
+        {
+          ...axis,
+          size: 24,
+          space: 72,
+          grid: { show: false },
+          values: (_, moments) => moments.map((s) => minute(s * 1000)),
+        },
+        {
+          ...axis,
+          size: 68,
+          space: 30,
+          grid: { stroke: colour('--hair'), width: 1 },
+          values: (_, values) => values.map((value) => (this.#points.length ? tick(value) : '')),
+        },
       ],
-      series: [{}, ...lines.map((_, line) => ({ stroke: colour(strokes[line]), width: 1.5, dash: line ? [4, 3] : [], fill: line ? null : colour('--accent-wash'), points: { show: false } }))],
+      series: [
+        {},
+        ...lines.map((_, line) => ({
+          stroke: colour(strokes[line]),
+          width: 1.5,
+          dash: line ? [4, 3] : [],
+          fill: line ? null : colour('--accent-wash'),
+          points: { show: false },
+        })),
+      ],
       hooks: { setCursor: [({ cursor: { idx: index } }) => this.#point(index)] },
     };
   }
@@ -119,10 +172,11 @@ export class Charts {
 function withGaps(samples) {
   return samples.flatMap((sample, index) => {
     const before = samples[index - 1]?.at_ms;
-    return before && sample.at_ms - before > GAP_MS ? [{ at_ms: before + 1, isGap: true }, sample] : [sample];
+    return before && sample.at_ms - before > GAP_MS
+      ? [{ at_ms: before + 1, isGap: true }, sample]
+      : [sample];
   });
 }
-
 
 /** A canvas knows no variables of CSS: what they are now is asked of an element. */
 function coloursNow() {
@@ -132,7 +186,9 @@ function coloursNow() {
     probe.style.color = `var(${name})`;
     return getComputedStyle(probe).color;
   };
-  const colours = Object.fromEntries(['--accent', '--accent-wash', '--quiet', '--hair'].map((name) => [name, of(name)]));
+  const colours = Object.fromEntries(
+    ['--accent', '--accent-wash', '--quiet', '--hair'].map((name) => [name, of(name)]),
+  );
   probe.remove();
   return colours;
 }

@@ -12,7 +12,12 @@ import { phaseSign, remarks } from '../signs.js';
 
 /** Each order, and when it would change something. */
 const ORDERS = [
-  { verb: 'start', title: 'Start', isOf: ({ wanted, phase }) => wanted === 'stopped' || ['bad', 'gone'].includes(tone(phase)) || phase === 'succeeded' },
+  {
+    verb: 'start',
+    title: 'Start',
+    isOf: ({ wanted, phase }) =>
+      wanted === 'stopped' || ['bad', 'gone'].includes(tone(phase)) || phase === 'succeeded',
+  },
   { verb: 'stop', title: 'Stop', isOf: ({ wanted }) => wanted === 'running' },
   { verb: 'restart', title: 'Restart', isOf: () => true },
   { verb: 'rollback', title: 'Roll back', isOf: () => true },
@@ -30,14 +35,24 @@ export class Control {
     const { app } = this.#page;
     const ids = new Set([robot.id]);
     return html`
-      ${app.can('operate') ? html`
+      ${
+        app.can('operate')
+          ? html`
         <section class="control" aria-labelledby="tasks">
           <header><h2 id="tasks">Tasks</h2><button class="primary" @click=${() => askPush(app, ids)}>Push a package…</button></header>
           ${robot.online ? nothing : html`<p class="quiet">It is offline: orders wait for it.</p>`}
-          ${robot.tasks.length
-            ? html`<ul class="orders">${repeat(robot.tasks, ({ task }) => task, (task) => this.#task(task, ids))}</ul>`
-            : html`<p class="quiet">It has no task. Push a package to give it one.</p>`}
-        </section>` : nothing}
+          ${
+            robot.tasks.length
+              ? html`<ul class="orders">${repeat(
+                  robot.tasks,
+                  ({ task }) => task,
+                  (task) => this.#task(task, ids),
+                )}</ul>`
+              : html`<p class="quiet">It has no task. Push a package to give it one.</p>`
+          }
+        </section>`
+          : nothing
+      }
       ${app.can('maintain') ? this.#putOut(robot, ids) : nothing}`;
   }
 

@@ -1,5 +1,5 @@
-// The configuration of a robot: its name and labels, how its tasks meet ROS, and what they may use. The robot's own file wins,
-// so beside each value stands what holds and where that is from.
+// The configuration of a robot: its name and labels, how its tasks meet ROS, and what they may use.
+// The robot's own file wins, so beside each value stands what holds and where that is from.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { parseLabels, relabelled } from '../acts.js';
@@ -9,11 +9,17 @@ import { change } from '../frame.js';
 import { tell } from '../notice.js';
 import { holding, SETTINGS, settingsWith, valueAt } from './settings.js';
 
-const [ROS, LIMITS] = [SETTINGS.filter(({ key }) => !key.startsWith('limits.')), SETTINGS.filter(({ key }) => key.startsWith('limits.'))];
+const [ROS, LIMITS] = [
+  SETTINGS.filter(({ key }) => !key.startsWith('limits.')),
+  SETTINGS.filter(({ key }) => key.startsWith('limits.')),
+];
 
 export class Edit {
   #page;
-  /** What was typed and not saved, by field. All else shows the robot as it is, also when that changes. */
+  /**
+   * What was typed and not saved, by field. All else shows the robot as it is, also when that
+   * changes.
+   */
   #draft = {};
   /** The labels that were there when they were typed over. */
   #labels = {};
@@ -69,7 +75,11 @@ export class Edit {
 
   #setting(setting, robot) {
     const set = valueAt(robot.settings, setting.key);
-    return this.#text(setting, set === undefined ? '' : setting.write(set), holding(setting, robot));
+    return this.#text(
+      setting,
+      set === undefined ? '' : setting.write(set),
+      holding(setting, robot),
+    );
   }
 
   /** A field: its words, what it holds, and what is wrong with that. */
@@ -78,7 +88,9 @@ export class Edit {
     const problem = this.#problems[key];
     const value = this.#draft[key] ?? saved;
     const type = ({ currentTarget }) => this.#type(key, currentTarget.value, saved);
-    const described = [hint && `${id}-hint`, held && `${id}-held`, `${id}-problem`].filter(Boolean).join(' ');
+    const described = [hint && `${id}-hint`, held && `${id}-held`, `${id}-problem`]
+      .filter(Boolean)
+      .join(' ');
     const invalid = problem ? 'true' : nothing;
     const control = choices
       ? html`<select id=${id} aria-describedby=${described} aria-invalid=${invalid} @change=${type}><option value="" .selected=${!value}>As the robot has it</option>${choices.map((choice) => html`<option value=${choice} .selected=${choice === value}>${choice} and above</option>`)}</select>`
@@ -124,7 +136,8 @@ export class Edit {
       const changed = await patch(`/robots/${robot.id}`, bodyOf(robot, draft, this.#labels));
       change(() => {
         // What was typed meanwhile stays.
-        for (const key of Object.keys(draft)) if (this.#draft[key] === draft[key]) delete this.#draft[key];
+        for (const key of Object.keys(draft))
+          if (this.#draft[key] === draft[key]) delete this.#draft[key];
         if (changed) {
           this.#labels = changed.labels;
           this.#page.app.fleet.add([changed]);
@@ -142,7 +155,13 @@ export class Edit {
   #refuse({ message, key: ours }, draft) {
     const named = /^(?:settings(?:\.|: ))?([a-z_.]+)(?:\[\d+\])?: ?(.*)$/s.exec(message);
     const keys = ['name', 'labels', ...SETTINGS.map(({ key }) => key)];
-    const key = ours ?? (keys.includes(named?.[1]) ? named[1] : message.includes('name') && 'name' in draft ? 'name' : null);
+    const key =
+      ours ??
+      (keys.includes(named?.[1])
+        ? named[1]
+        : message.includes('name') && 'name' in draft
+          ? 'name'
+          : null);
     const said = key === named?.[1] && !ours ? named[2] : message;
     // Where in the request it stood says nothing to whoever filled in a form.
     this.#problems = { [key ?? 'all']: said.replace(/ at line \d+ column \d+$/, '') };

@@ -1,5 +1,6 @@
-// What a robot's tasks, their nodes and its agent say, as they say it. What was said before, and in gaps, is asked of the robot,
-// which keeps its lines; where it can't be asked, the server's memory has the last of them.
+// What a robot's tasks, their nodes and its agent say, as they say it. What was said before, and in
+// gaps, is asked of the robot, which keeps its lines; where it can't be asked, the server's memory
+// has the last of them.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { get, SignedOut } from '../api.js';
@@ -11,10 +12,17 @@ import { Sheet, textOf } from './sheet.js';
 
 const KEPT = 5_000;
 const FETCHED = 1_000;
-// A browser allows six connections to a server. A tab nobody looks at lets go of its own, and fetches what it missed later.
+// A browser allows six connections to a server. A tab nobody looks at lets go of its own, and
+// fetches what it missed later.
 const HIDDEN_MS = 20_000;
 
-const LEVELS = [['', 'All levels'], ['info', 'Info and above'], ['warn', 'Warnings and above'], ['error', 'Errors and above'], ['fatal', 'Fatal only']];
+const LEVELS = [
+  ['', 'All levels'],
+  ['info', 'Info and above'],
+  ['warn', 'Warnings and above'],
+  ['error', 'Errors and above'],
+  ['fatal', 'Fatal only'],
+];
 
 export class Logs {
   #page;
@@ -99,14 +107,21 @@ export class Logs {
   }
 
   #take({ type, reason, lines, suppressed }) {
-    if (type === 'away') this.#state = { text: `Nothing comes: ${this.#page.inWords(reason)}`, isBad: true };
+    if (type === 'away')
+      this.#state = { text: `Nothing comes: ${this.#page.inWords(reason)}`, isBad: true };
     if (type === 'following') {
       this.#state = { text: 'Following', isOn: true };
       // Also after a gap: what was said in it is to be had by asking.
       this.#fetch();
     }
     if (type !== 'lines') return;
-    if (suppressed) this.#add([{ at_ms: lines[0]?.at_ms ?? this.#page.app.now(), note: `${plural(suppressed, 'line')} left out here because they were too many. The robot keeps them.` }]);
+    if (suppressed)
+      this.#add([
+        {
+          at_ms: lines[0]?.at_ms ?? this.#page.app.now(),
+          note: `${plural(suppressed, 'line')} left out here because they were too many. The robot keeps them.`,
+        },
+      ]);
     this.#add(lines);
   }
 
@@ -121,12 +136,17 @@ export class Logs {
     if (this.#lines.length > KEPT) this.#lines = this.#lines.slice(-KEPT);
   }
 
-  /** Asks for the newest lines there are, and puts those that are not known yet where they belong. */
+  /**
+   * Asks for the newest lines there are, and puts those that are not known yet where they belong.
+   */
   async #fetch() {
     if (this.#isFetching) return;
     this.#isFetching = true;
     const filter = this.#filter;
-    const said = await get(`/robots/${this.#page.robot.id}/logs`, { ...filter, max_lines: FETCHED }).catch((error) => (error instanceof SignedOut ? null : { error }));
+    const said = await get(`/robots/${this.#page.robot.id}/logs`, {
+      ...filter,
+      max_lines: FETCHED,
+    }).catch((error) => (error instanceof SignedOut ? null : { error }));
     this.#isFetching = false;
     if (filter !== this.#filter) return this.#end && this.#fetch();
     if (!said) return;
@@ -137,7 +157,8 @@ export class Logs {
   }
 
   #merge({ from, age_ms: age, reason, lines }) {
-    this.#memory = from === 'server' ? remembered(lines, age, reason && this.#page.inWords(reason)) : null;
+    this.#memory =
+      from === 'server' ? remembered(lines, age, reason && this.#page.inWords(reason)) : null;
     const known = new Map();
     for (const line of this.#lines) known.set(keyOf(line), (known.get(keyOf(line)) ?? 0) + 1);
     const unknown = lines.filter((line) => {
@@ -156,7 +177,9 @@ export class Logs {
 
   draw(robot) {
     const { level = '', task = '', q = '' } = this.#page.query;
-    const tasks = [...new Set([...robot.tasks.map((one) => one.task), task].filter(Boolean))].sort();
+    const tasks = [
+      ...new Set([...robot.tasks.map((one) => one.task), task].filter(Boolean)),
+    ].sort();
     const isPaused = this.#paused !== null;
     const said = this.#state.isBad ? this.#memory?.text : this.#memory?.whole;
     return html`
@@ -190,7 +213,12 @@ export class Logs {
   #count(q) {
     const { shown } = this.#sheet;
     if (q) return `${plural(shown, 'line')} with “${q}”`;
-    if (!shown) return this.#isFetching ? 'Asking for what was said before…' : this.#memory ? '' : 'Nothing has been said yet.';
+    if (!shown)
+      return this.#isFetching
+        ? 'Asking for what was said before…'
+        : this.#memory
+          ? ''
+          : 'Nothing has been said yet.';
     return `${plural(shown, 'line')}${shown >= KEPT ? '; older ones are no longer shown' : ''}`;
   }
 
@@ -221,8 +249,11 @@ export class Logs {
 
 /** That the robot could not be asked: shortly, where why is said already, and as a whole. */
 function remembered(lines, age, reason) {
-  const text = lines.length ? `What is here is from the server’s memory, last heard ${duration(age)} ago` : 'The server remembers no line of it';
+  const text = lines.length
+    ? `What is here is from the server’s memory, last heard ${duration(age)} ago`
+    : 'The server remembers no line of it';
   return { text, whole: reason ? `${text}: ${reason}` : text };
 }
 
-const keyOf = ({ at_ms: then, level, source, task, node, text, note }) => [then, level, source, task, node, text, note].join('\u0000');
+const keyOf = ({ at_ms: then, level, source, task, node, text, note }) =>
+  [then, level, source, task, node, text, note].join('\u0000');

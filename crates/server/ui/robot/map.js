@@ -1,10 +1,14 @@
-// Pictures of occupancy grids: browsers show PNG by themselves, but not the PGM of ROS's map_server.
+// Pictures of occupancy grids: browsers show PNG by themselves, but not the PGM of ROS's
+// map_server.
 
 const MAX_PIXELS = 16e6;
 
 export const isMap = (path) => /\.(pgm|png)$/i.test(path);
 
-/** Fetches the picture at `canvas.dataset.source` and draws it, pixel by pixel. Throws what a person can read. */
+/**
+ * Fetches the picture at `canvas.dataset.source` and draws it, pixel by pixel. Throws what a person
+ * can read.
+ */
 export async function drawMap(canvas) {
   const { source } = canvas.dataset;
   const response = await fetch(source);
@@ -22,7 +26,8 @@ export async function drawMap(canvas) {
 /** A PNG. How large it becomes is asked of its head: a few bytes can be a picture of any size. */
 function colours(bytes) {
   const head = [0x89, 0x50, 0x4e, 0x47];
-  if (bytes.length < 24 || head.some((byte, at) => bytes[at] !== byte)) throw new Error('it is no PNG picture');
+  if (bytes.length < 24 || head.some((byte, at) => bytes[at] !== byte))
+    throw new Error('it is no PNG picture');
   const view = new DataView(bytes.buffer);
   if (view.getUint32(16) * view.getUint32(20) > MAX_PIXELS) throw new Error('it is too large');
   return createImageBitmap(new Blob([bytes], { type: 'image/png' })).catch(() => {
@@ -46,19 +51,25 @@ function gray(bytes) {
   }
   const kind = word();
   const [width, height, most] = [word(), word(), word()].map(Number);
-  const isSane = (kind === 'P5' || kind === 'P2') && [width, height, most].every((count) => Number.isInteger(count) && count > 0) && most < 65536;
+  const isSane =
+    (kind === 'P5' || kind === 'P2') &&
+    [width, height, most].every((count) => Number.isInteger(count) && count > 0) &&
+    most < 65536;
   if (!isSane) throw new Error('it is no PGM picture');
   if (width * height > MAX_PIXELS) throw new Error('it is too large');
   at += 1;
   const wide = most > 255 ? 2 : 1;
   // In text each pixel takes a digit and what parts it from the next one.
-  if (bytes.length - at < (kind === 'P5' ? width * height * wide : 2 * width * height - 1)) throw new Error('it ends before its last row');
+  if (bytes.length - at < (kind === 'P5' ? width * height * wide : 2 * width * height - 1))
+    throw new Error('it ends before its last row');
   const picture = new ImageData(width, height);
   const { data } = picture;
   for (let pixel = 0; pixel < width * height; pixel += 1) {
     let value;
     if (kind === 'P2') value = Number(word());
-    else value = wide === 2 ? bytes[at + 2 * pixel] * 256 + bytes[at + 2 * pixel + 1] : bytes[at + pixel];
+    else
+      value =
+        wide === 2 ? bytes[at + 2 * pixel] * 256 + bytes[at + 2 * pixel + 1] : bytes[at + pixel];
     const first = 4 * pixel;
     data[first] = data[first + 1] = data[first + 2] = (value * 255) / most;
     data[first + 3] = 255;

@@ -1,4 +1,5 @@
-// How a robot does: its machine over the last hour and from now on, what it works on, and what is known of it.
+// How a robot does: its machine over the last hour and from now on, what it works on, and what is
+// known of it.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
@@ -21,7 +22,11 @@ const ASK_LATER_MS = 60_000;
 const KEPT_SAMPLES = 1_900;
 
 // Under which accounts tasks run, as the robot says.
-const accounts = { per_task: 'one for each task', shared: 'one for all tasks', agent: 'none: tasks run as the agent' };
+const accounts = {
+  per_task: 'one for each task',
+  shared: 'one for all tasks',
+  agent: 'none: tasks run as the agent',
+};
 const percent = (value) => `${Math.round(value)} %`;
 /** Three digits, so that a text that changes every two seconds keeps its width. */
 const rate = (value) => `${size(value).replace(/^(\d{3})\.\d/, '$1')}/s`;
@@ -29,19 +34,50 @@ const short = (text) => text.replace('.0 ', ' ');
 
 /** What has a curve. `say` puts one value in words, `tick` as short as an axis wants it. */
 const FIGURES = [
-  { id: 'cpu', title: 'CPU', say: percent, tick: percent, most: () => 100, lines: [{ of: (vitals) => vitals.cpu_percent }] },
+  {
+    id: 'cpu',
+    title: 'CPU',
+    say: percent,
+    tick: percent,
+    most: () => 100,
+    lines: [{ of: (vitals) => vitals.cpu_percent }],
+  },
   ofWhole('memory', 'Memory', 'memory_used_bytes', 'memory_total_bytes'),
   ofWhole('disk', 'Disk', 'disk_used_bytes', 'disk_total_bytes'),
   {
-    id: 'network', title: 'Network', say: rate, tick: (value) => short(rate(value)), most: (_, highest) => Math.max(1_000, (highest ?? 0) * 1.1),
-    lines: [{ title: 'in', of: (vitals) => vitals.network_in_bytes_per_s }, { title: 'out', of: (vitals) => vitals.network_out_bytes_per_s }],
+    id: 'network',
+    title: 'Network',
+    say: rate,
+    tick: (value) => short(rate(value)),
+    most: (_, highest) => Math.max(1_000, (highest ?? 0) * 1.1),
+    lines: [
+      { title: 'in', of: (vitals) => vitals.network_in_bytes_per_s },
+      { title: 'out', of: (vitals) => vitals.network_out_bytes_per_s },
+    ],
   },
-  { id: 'battery', title: 'Battery', isOptional: true, say: percent, tick: percent, most: () => 100, lines: [{ of: (vitals) => vitals.battery_percent }] },
+  {
+    id: 'battery',
+    title: 'Battery',
+    isOptional: true,
+    say: percent,
+    tick: percent,
+    most: () => 100,
+    lines: [{ of: (vitals) => vitals.battery_percent }],
+  },
 ];
 
 function ofWhole(id, title, used, total) {
-  const most = (samples, highest) => samples.findLast((vitals) => vitals[total])?.[total] ?? Math.max(1, highest ?? 1);
-  return { id, title, say: size, tick: (value) => short(size(value)), most, lines: [{ of: (vitals) => vitals[used] }], whole: (vitals) => vitals[total] };
+  const most = (samples, highest) =>
+    samples.findLast((vitals) => vitals[total])?.[total] ?? Math.max(1, highest ?? 1);
+  return {
+    id,
+    title,
+    say: size,
+    tick: (value) => short(size(value)),
+    most,
+    lines: [{ of: (vitals) => vitals[used] }],
+    whole: (vitals) => vitals[total],
+  };
 }
 
 export class Monitor {
@@ -88,7 +124,9 @@ export class Monitor {
   async refresh() {
     const { id, online } = this.#page.robot;
     this.#isOnline = online;
-    const [past, robot] = await Promise.all([`/robots/${id}/vitals`, `/robots/${id}`].map((path) => get(path).catch(() => null)));
+    const [past, robot] = await Promise.all(
+      [`/robots/${id}/vitals`, `/robots/${id}`].map((path) => get(path).catch(() => null)),
+    );
     change(() => {
       this.#isFetched = true;
       this.#mqtt = robot?.mqtt ?? null;
@@ -119,7 +157,12 @@ export class Monitor {
     } catch (error) {
       if (error instanceof SignedOut) return null;
       const isUseless = error.status === 400 || error.code === 'unsupported';
-      change(() => (this.#problem = isUseless ? 'This robot does not say more often how it does.' : this.#page.inWords(error.message)));
+      change(
+        () =>
+          (this.#problem = isUseless
+            ? 'This robot does not say more often how it does.'
+            : this.#page.inWords(error.message)),
+      );
       if (isUseless) return null;
       return error.code === 'robot_offline' ? ASK_LATER_MS : ASK_AGAIN_MS;
     }
@@ -129,7 +172,10 @@ export class Monitor {
   #take(samples) {
     const since = this.#page.app.now() - HOUR_MS;
     const all = new Map([...this.#samples, ...samples].map((sample) => [sample.at_ms, sample]));
-    this.#samples = [...all.values()].filter(({ at_ms: then }) => then >= since).sort((one, other) => one.at_ms - other.at_ms).slice(-KEPT_SAMPLES);
+    this.#samples = [...all.values()]
+      .filter(({ at_ms: then }) => then >= since)
+      .sort((one, other) => one.at_ms - other.at_ms)
+      .slice(-KEPT_SAMPLES);
     this.#isDue = true;
   }
 
@@ -140,7 +186,9 @@ export class Monitor {
   draw(robot, now) {
     const { ms } = this.#range;
     const shown = this.#samples.filter(({ at_ms: then }) => then >= now - ms);
-    const figures = FIGURES.filter(({ isOptional, lines }) => !isOptional || this.#samples.some(lines[0].of));
+    const figures = FIGURES.filter(
+      ({ isOptional, lines }) => !isOptional || this.#samples.some(lines[0].of),
+    );
     if (this.#isDue) this.#charts.show(shown, now - ms, now);
     this.#isDue = false;
     return html`
@@ -150,7 +198,11 @@ export class Monitor {
           <p class="quiet state">${this.#state(robot, now)}</p>
           <p class="range" role="group" aria-label="Show the last">${RANGES.map(({ id, title }) => html`<button class="plain" aria-pressed=${id === this.#range.id} @click=${() => this.#choose(id)}>${title}</button>`)}</p>
         </header>
-        <div class="charts">${repeat(figures, ({ id }) => id, (figure) => this.#figure(figure, shown))}</div>
+        <div class="charts">${repeat(
+          figures,
+          ({ id }) => id,
+          (figure) => this.#figure(figure, shown),
+        )}</div>
       </section>
       <div class="two-columns">
         <section aria-labelledby="work"><header><h2 id="work">Tasks</h2></header>${robot.tasks.length ? robot.tasks.map((task) => this.#task(task)) : html`<p class="quiet">Nothing has been ordered of it.</p>`}</section>
@@ -169,13 +221,16 @@ export class Monitor {
     });
   }
 
-  /** What the figures are: those of a moment that is pointed at, live ones, or the last there were. */
+  /**
+   * What the figures are: those of a moment that is pointed at, live ones, or the last there were.
+   */
   #state({ online }, now) {
     const { pointed } = this.#charts;
     if (pointed) return `at ${clock(pointed.at_ms)}`;
     const last = this.#samples.at(-1);
     if (online && last && now - last.at_ms < 3 * ASK_EVERY_MS) return sign(true, 'Live');
-    if (!last) return this.#isFetched ? 'It has not said how it does since the server started.' : '';
+    if (!last)
+      return this.#isFetched ? 'It has not said how it does since the server started.' : '';
     const age = `as of ${ago(last.at_ms, now)}`;
     return online ? [age, this.#problem].filter(Boolean).join('. ') : `${age}; it is offline`;
   }
@@ -212,13 +267,26 @@ export class Monitor {
     const code = (text) => html`<span class="code">${text}</span>`;
     const given = [
       ['State', robotState(robot)],
-      ['Last seen', robot.last_seen_ms && `${moment(robot.last_seen_ms)} (${ago(robot.last_seen_ms, now)})`],
+      [
+        'Last seen',
+        robot.last_seen_ms && `${moment(robot.last_seen_ms)} (${ago(robot.last_seen_ms, now)})`,
+      ],
       ['ID', code(robot.id)],
       ['MAC', code(robot.mac)],
       ['IP and port', robot.address && code(robot.address)],
-      ['Labels', Object.entries(robot.labels).map(([label, value]) => `${label}=${value}`).join(', ')],
+      [
+        'Labels',
+        Object.entries(robot.labels)
+          .map(([label, value]) => `${label}=${value}`)
+          .join(', '),
+      ],
       ['Enrolled', moment(robot.enrolled_at_ms)],
-      ['Generation', robot.generation === robot.observed_generation ? robot.generation : `${robot.generation}, the robot has ${robot.observed_generation}`],
+      [
+        'Generation',
+        robot.generation === robot.observed_generation
+          ? robot.generation
+          : `${robot.generation}, the robot has ${robot.observed_generation}`,
+      ],
       ['Host', host && `${host.hostname}, ${host.arch}, agent ${host.agent_version}`],
       ['ROS', host && ros(host)],
       ['Isolation', host?.isolation && words(host.isolation)],
@@ -227,9 +295,19 @@ export class Monitor {
       ['Load', vitals?.load_1m != null && `${vitals.load_1m.toFixed(2)} over a minute`],
       ['Temperature', vitals?.temperature_c != null && `${Math.round(vitals.temperature_c)} °C`],
       ['Battery', host?.battery_percent != null && percent(host.battery_percent)],
-      ['Publishers', host?.publishers != null && (host.publishers ? `asks for signatures, list ${host.publishers}` : 'asks for signatures, by its own list')],
+      [
+        'Publishers',
+        host?.publishers != null &&
+          (host.publishers
+            ? `asks for signatures, list ${host.publishers}`
+            : 'asks for signatures, by its own list'),
+      ],
       ['Network', link && network(link)],
-      ['MQTT', this.#mqtt && `connected for ${duration(now - this.#mqtt.since_ms)}, ${number(this.#mqtt.traffic.messages_in)} messages in, ${number(this.#mqtt.traffic.messages_out)} out`],
+      [
+        'MQTT',
+        this.#mqtt &&
+          `connected for ${duration(now - this.#mqtt.since_ms)}, ${number(this.#mqtt.traffic.messages_in)} messages in, ${number(this.#mqtt.traffic.messages_out)} out`,
+      ],
     ];
     return given.filter(([, fact]) => fact || fact === 0);
   }
@@ -243,7 +321,11 @@ export const why = ({ code, text }, before = '') => html`
 /** Between what the values were; of several lines the most of each. */
 function span(samples, lines, say) {
   const of = (line) => samples.map(line.of).filter((value) => value != null);
-  if (lines.length > 1) return lines.filter((line) => of(line).length).map((line, index) => `${index ? '' : 'up to '}${say(Math.max(...of(line)))} ${line.title}`).join(', ');
+  if (lines.length > 1)
+    return lines
+      .filter((line) => of(line).length)
+      .map((line, index) => `${index ? '' : 'up to '}${say(Math.max(...of(line)))} ${line.title}`)
+      .join(', ');
   const values = of(lines[0]);
   if (!values.length) return '';
   const [least, most] = [Math.min(...values), Math.max(...values)].map(say);
@@ -252,7 +334,9 @@ function span(samples, lines, say) {
 
 function ros({ ros: used, ros_distros: found }) {
   if (!used) return found.join(', ') || 'none found';
-  const domain = used.domain_id != null && `domain ${used.domain_id}${used.localhost_only ? ' on this host only' : ''}`;
+  const domain =
+    used.domain_id != null &&
+    `domain ${used.domain_id}${used.localhost_only ? ' on this host only' : ''}`;
   return [used.distro, used.rmw, domain].filter(Boolean).join(', ');
 }
 
@@ -262,5 +346,7 @@ function network({ throughput_bytes_per_s: throughput, rtt_ms: rtt, reconnects, 
     rtt != null && `${rtt} ms to the server`,
     reconnects ? `${plural(reconnects, 'session')} lost in the last hour` : null,
     losses ? `${plural(losses, 'transfer')} broken off in the last hour` : null,
-  ].filter(Boolean).join(', ');
+  ]
+    .filter(Boolean)
+    .join(', ');
 }

@@ -40,7 +40,10 @@ export class Outputs {
     clearTimeout(this.#timer);
   }
 
-  /** Looks again whenever it may have brought something back: each time one of its tasks stands elsewhere. */
+  /**
+   * Looks again whenever it may have brought something back: each time one of its tasks stands
+   * elsewhere.
+   */
   hear(robot) {
     if (this.#moment === momentOf(robot)) return;
     this.#moment = momentOf(robot);
@@ -65,11 +68,17 @@ export class Outputs {
     const list = this.#list;
     return html`
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}
-      ${list?.length
-        ? html`
-          <div class="outputs">${repeat(list.slice(0, this.#shown), ({ manifest }) => manifest, (output) => run(output, now))}</div>
+      ${
+        list?.length
+          ? html`
+          <div class="outputs">${repeat(
+            list.slice(0, this.#shown),
+            ({ manifest }) => manifest,
+            (output) => run(output, now),
+          )}</div>
           ${list.length > this.#shown ? html`<p><button class="quiet-button" @click=${() => change(() => (this.#shown += SHOWN_RUNS))}>Show older</button> <span class="quiet">${plural(list.length - this.#shown, 'run')} more</span></p>` : nothing}`
-        : html`<p class="empty quiet">${list ? html`Its tasks have brought nothing back. What they should is said in a package’s <code>[outputs]</code>.` : 'Fetching…'}</p>`}`;
+          : html`<p class="empty quiet">${list ? html`Its tasks have brought nothing back. What they should is said in a package’s <code>[outputs]</code>.` : 'Fetching…'}</p>`
+      }`;
   }
 
   drawn() {
@@ -77,12 +86,16 @@ export class Outputs {
   }
 }
 
-const momentOf = (robot) => robot?.tasks.map(({ task, run: count, phase }) => `${task} ${count} ${phase}`).join();
+const momentOf = (robot) =>
+  robot?.tasks.map(({ task, run: count, phase }) => `${task} ${count} ${phase}`).join();
 
 const run = (output, now) => html`
   <section class="run" aria-label=${`${output.task}, run ${output.run}`}>
     <header><h2>${output.task}<span class="quiet">@${output.version}</span></h2><p class="quiet">run ${output.run} · ${since(output.pushed_at_ms, now)}</p><a href=${at(['deployments', output.deployment])}>Deployment</a></header>
-    <div class="pictures">${output.files.filter(({ path, size: bytes }) => isMap(path) && bytes <= MAX_PICTURE_BYTES).slice(0, SHOWN_PICTURES).map((file) => picture(output, file))}</div>
+    <div class="pictures">${output.files
+      .filter(({ path, size: bytes }) => isMap(path) && bytes <= MAX_PICTURE_BYTES)
+      .slice(0, SHOWN_PICTURES)
+      .map((file) => picture(output, file))}</div>
     <ul>${output.files.slice(0, SHOWN_FILES).map((file) => html`<li><a class="code" href=${url(output, file)} download=${file.path.split('/').at(-1)}>${file.path}</a> <span class="quiet">${size(file.size)}</span></li>`)}</ul>
     ${output.files.length > SHOWN_FILES ? html`<p class="quiet">${output.files.length - SHOWN_FILES} more: <code>taskd output get</code></p>` : nothing}
   </section>`;
@@ -96,7 +109,10 @@ const picture = (output, file) => html`
 
 const url = ({ robot_id, task }, { digest }) => `/v2/outputs/${robot_id}/${task}/blobs/${digest}`;
 
-/** Draws the maps that have come into the page since the last time. What can't be drawn is said in its place. */
+/**
+ * Draws the maps that have come into the page since the last time. What can't be drawn is said in
+ * its place.
+ */
 function drawMaps() {
   for (const canvas of document.querySelectorAll('canvas[data-source]')) {
     const { source, drawn } = canvas.dataset;
@@ -107,6 +123,9 @@ function drawMaps() {
       canvas.hidden = Boolean(problem);
       canvas.nextElementSibling.textContent = problem;
     };
-    drawMap(canvas).then(() => say(''), ({ message }) => say(`The picture can't be shown: ${message}`));
+    drawMap(canvas).then(
+      () => say(''),
+      ({ message }) => say(`The picture can't be shown: ${message}`),
+    );
   }
 }

@@ -1,5 +1,5 @@
-// A robot's ROS graph as it is now: nodes with their lifecycle and parameters, and topics with who is at their ends. All of it
-// is asked of the robot, and says how old it is.
+// A robot's ROS graph as it is now: nodes with their lifecycle and parameters, and topics with who
+// is at their ends. All of it is asked of the robot, and says how old it is.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
@@ -26,8 +26,14 @@ const TRANSITION_WORDS = {
   shutdown: 'It ends its work for good: only a start of its task brings it back.',
 };
 
-/** Keeps numbers as they were written: to ROS 1.0 and 1 are of different types, and 64 bits are more than a number has here. */
-const exactly = (_, value, context) => (typeof value === 'number' && context?.source && JSON.rawJSON ? JSON.rawJSON(context.source) : value);
+/**
+ * Keeps numbers as they were written: to ROS 1.0 and 1 are of different types, and 64 bits are more
+ * than a number has here.
+ */
+const exactly = (_, value, context) =>
+  typeof value === 'number' && context?.source && JSON.rawJSON
+    ? JSON.rawJSON(context.source)
+    : value;
 
 export class Ros {
   #page;
@@ -113,21 +119,28 @@ export class Ros {
       <section aria-labelledby="nodes">
         <header><h2 id="nodes">Nodes${this.#nodes.answer ? html` <span class="count">${number(all.length)}</span>` : nothing}</h2>${this.#nodes.line('nodes', now)}</header>
         ${this.#nodes.refusal()}
-        ${nodes.length
-          ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of nodes"><table>
+        ${
+          nodes.length
+            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of nodes"><table>
               <thead><tr><th>Node</th><th>Task</th>${hasLifecycle ? html`<th>State</th>` : nothing}</tr></thead>
-              <tbody>${nodes.map((node) => html`
+              <tbody>${nodes.map(
+                (node) => html`
                 <tr aria-selected=${node.name === this.#chosen ? 'true' : nothing} class=${node.name === this.#chosen ? 'chosen' : ''}>
                   <td>${this.#link(node.name)}</td>
                   <td>${node.task ?? html`<span class="quiet">–</span>`}</td>
                   ${hasLifecycle ? html`<td>${lifecycleState(node)}</td>` : nothing}
-                </tr>`)}</tbody>
+                </tr>`,
+              )}</tbody>
             </table></div>`
-          : this.#nodes.answer ? html`<p class="quiet">${all.length ? 'No node is like that.' : 'There is no node on its graph.'}</p>` : nothing}
+            : this.#nodes.answer
+              ? html`<p class="quiet">${all.length ? 'No node is like that.' : 'There is no node on its graph.'}</p>`
+              : nothing
+        }
       </section>`;
   }
 
-  #link = (name) => html`<a class="code" href=${this.#page.at('ros', { node: name })} aria-current=${name === this.#chosen ? 'true' : nothing}>${name}</a>`;
+  #link = (name) =>
+    html`<a class="code" href=${this.#page.at('ros', { node: name })} aria-current=${name === this.#chosen ? 'true' : nothing}>${name}</a>`;
 
   #node(now) {
     const detail = this.#detail.answer?.nodes ?? [];
@@ -145,16 +158,26 @@ export class Ros {
           <header><h3 id="ends">Topics and services</h3>${this.#detail.line('topics and services', now)}</header>
           ${this.#detail.refusal()}
           ${detail.length > 1 ? html`<p class="bad"><span aria-hidden="true">▲ </span>${number(detail.length)} nodes have this name.</p>` : nothing}
-          ${detail.map(({ publishers, subscriptions, services, clients }) => [['Publishes', publishers], ['Subscribes to', subscriptions], ['Offers', services], ['Calls', clients]]
-            .filter(([, ends]) => ends.length)
-            .map(([title, ends]) => html`<details><summary>${title} <span class="count">${ends.length}</span></summary><ul class="ends">${ends.map(({ name, type }) => html`<li class="code">${name} <span class="quiet">${type}</span></li>`)}</ul></details>`))}
+          ${detail.map(({ publishers, subscriptions, services, clients }) =>
+            [
+              ['Publishes', publishers],
+              ['Subscribes to', subscriptions],
+              ['Offers', services],
+              ['Calls', clients],
+            ]
+              .filter(([, ends]) => ends.length)
+              .map(
+                ([title, ends]) =>
+                  html`<details><summary>${title} <span class="count">${ends.length}</span></summary><ul class="ends">${ends.map(({ name, type }) => html`<li class="code">${name} <span class="quiet">${type}</span></li>`)}</ul></details>`,
+              ),
+          )}
         </section>
       </section>`;
   }
 
   #lifecycle(node) {
     if (!node?.lifecycle) return nothing;
-    const transitions = this.#page.app.can('operate') ? TRANSITIONS[node.lifecycle] ?? [] : [];
+    const transitions = this.#page.app.can('operate') ? (TRANSITIONS[node.lifecycle] ?? []) : [];
     return html`
       <p class="lifecycle">Lifecycle: ${lifecycleState(node)}
         ${transitions.map((transition) => html`<button class="quiet-button" ?disabled=${this.#changing !== null} @click=${() => this.#askChange(node, transition)}>${transition}…</button>`)}
@@ -169,7 +192,8 @@ export class Ros {
       title: `${title} ${name}?`,
       action: title,
       isDangerous: ['shutdown', 'cleanup', 'deactivate'].includes(transition),
-      body: () => html`<p>The node <code>${name}</code>${task ? html` of the task <strong>${task}</strong>` : nothing} on <strong>${robot}</strong> is ${words(lifecycle)}. ${TRANSITION_WORDS[transition]}</p>`,
+      body: () =>
+        html`<p>The node <code>${name}</code>${task ? html` of the task <strong>${task}</strong>` : nothing} on <strong>${robot}</strong> is ${words(lifecycle)}. ${TRANSITION_WORDS[transition]}</p>`,
       act: () => void this.#change(name, transition),
     });
   }
@@ -180,9 +204,14 @@ export class Ros {
       this.#refused = null;
     });
     try {
-      const { state } = await askRobot(this.#page.robot.id, { type: 'lifecycle', node: name, transition });
+      const { state } = await askRobot(this.#page.robot.id, {
+        type: 'lifecycle',
+        node: name,
+        transition,
+      });
       tell(`${name} is ${words(state)}.`);
-      for (const answer of [this.#nodes.answer, this.#detail?.answer]) for (const node of answer?.nodes ?? []) if (node.name === name) node.lifecycle = state;
+      for (const answer of [this.#nodes.answer, this.#detail?.answer])
+        for (const node of answer?.nodes ?? []) if (node.name === name) node.lifecycle = state;
     } catch (error) {
       this.#refused = this.#page.inWords(error.message);
     }
@@ -197,7 +226,12 @@ export class Ros {
     const { answer } = this.#parameters;
     if (!answer) return nothing;
     if (!answer.parameters.length) return html`<p class="quiet">It has none.</p>`;
-    return html`<ul class="parameters">${repeat(answer.parameters, ({ name }) => name, (parameter) => (this.#editing?.name === parameter.name ? this.#form() : this.#parameter(parameter)))}</ul>`;
+    return html`<ul class="parameters">${repeat(
+      answer.parameters,
+      ({ name }) => name,
+      (parameter) =>
+        this.#editing?.name === parameter.name ? this.#form() : this.#parameter(parameter),
+    )}</ul>`;
   }
 
   #parameter({ name, value }) {
@@ -251,22 +285,34 @@ export class Ros {
     change(() => Object.assign(editing, { problem: null, isBusy: true }));
     try {
       const parameter = { name: editing.name, value: valueOf(editing.text) };
-      const { parameter: now } = await askRobot(this.#page.robot.id, { type: 'set_parameter', node, parameter }, exactly);
+      const { parameter: now } = await askRobot(
+        this.#page.robot.id,
+        { type: 'set_parameter', node, parameter },
+        exactly,
+      );
       change(() => {
-        const shown = this.#chosen === node && this.#parameters.answer?.parameters.find(({ name }) => name === now.name);
+        const shown =
+          this.#chosen === node &&
+          this.#parameters.answer?.parameters.find(({ name }) => name === now.name);
         if (shown) shown.value = now.value;
         if (this.#editing === editing) this.#close();
       });
       tell(`${now.name} is ${JSON.stringify(now.value)}.`);
     } catch (error) {
-      change(() => Object.assign(editing, { problem: this.#page.inWords(error.message), isBusy: false }));
+      change(() =>
+        Object.assign(editing, { problem: this.#page.inWords(error.message), isBusy: false }),
+      );
     }
   }
 
   drawn() {
-    if (this.#isRevealDue) document.querySelector('.ros .node')?.scrollIntoView({ block: 'nearest' });
+    if (this.#isRevealDue)
+      document.querySelector('.ros .node')?.scrollIntoView({ block: 'nearest' });
     this.#isRevealDue = false;
-    if (this.#left) [...document.querySelectorAll('.parameters [data-parameter]')].find(({ dataset }) => dataset.parameter === this.#left)?.focus();
+    if (this.#left)
+      [...document.querySelectorAll('.parameters [data-parameter]')]
+        .find(({ dataset }) => dataset.parameter === this.#left)
+        ?.focus();
     this.#left = null;
     if (!this.#editing?.isNew) return;
     this.#editing.isNew = false;
@@ -277,31 +323,51 @@ export class Ros {
 
   #topicTable(now) {
     const all = this.#topics.answer?.topics ?? [];
-    const topics = all.filter(({ name, types }) => [name, ...types].some((text) => text.toLowerCase().includes(this.#text)));
-    const ends = (names) => (names.length ? names.map((name) => html`<div>${this.#link(name)}</div>`) : html`<span class="quiet">none</span>`);
+    const topics = all.filter(({ name, types }) =>
+      [name, ...types].some((text) => text.toLowerCase().includes(this.#text)),
+    );
+    const ends = (names) =>
+      names.length
+        ? names.map((name) => html`<div>${this.#link(name)}</div>`)
+        : html`<span class="quiet">none</span>`;
     return html`
       <section aria-labelledby="topics">
         <header><h2 id="topics">Topics${this.#topics.answer ? html` <span class="count">${number(all.length)}</span>` : nothing}</h2>${this.#topics.line('topics', now)}</header>
         ${this.#topics.refusal()}
-        ${topics.length
-          ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of topics"><table class="topics">
+        ${
+          topics.length
+            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of topics"><table class="topics">
               <thead><tr><th>Topic</th><th>Type</th><th>Publishers</th><th>Subscribers</th></tr></thead>
-              <tbody>${topics.map(({ name, types, publishers, subscriptions }) => html`
+              <tbody>${topics.map(
+                ({ name, types, publishers, subscriptions }) => html`
                 <tr>
                   <td class="code">${name}</td>
                   <td class="code">${types.map((type) => html`<div>${type}</div>`)}${types.length > 1 ? html`<div class="bad">▲ its ends disagree</div>` : nothing}</td>
                   <td>${ends(publishers)}</td>
                   <td>${ends(subscriptions)}</td>
-                </tr>`)}</tbody>
+                </tr>`,
+              )}</tbody>
             </table></div>`
-          : this.#topics.answer ? html`<p class="quiet">${all.length ? 'No topic is like that.' : 'There is no topic on its graph.'}</p>` : nothing}
+            : this.#topics.answer
+              ? html`<p class="quiet">${all.length ? 'No topic is like that.' : 'There is no topic on its graph.'}</p>`
+              : nothing
+        }
       </section>`;
   }
 }
 
-const LIFECYCLE_SIGNS = { active: '● ', inactive: '○ ', unconfigured: '○ ', finalized: '✕ ', changing: '' };
+const LIFECYCLE_SIGNS = {
+  active: '● ',
+  inactive: '○ ',
+  unconfigured: '○ ',
+  finalized: '✕ ',
+  changing: '',
+};
 
-const lifecycleState = ({ lifecycle }) => (lifecycle ? html`<span class="lifecycle-state ${lifecycle}"><span aria-hidden="true">${LIFECYCLE_SIGNS[lifecycle] ?? ''}</span>${words(lifecycle)}</span>` : html`<span class="quiet">–</span>`);
+const lifecycleState = ({ lifecycle }) =>
+  lifecycle
+    ? html`<span class="lifecycle-state ${lifecycle}"><span aria-hidden="true">${LIFECYCLE_SIGNS[lifecycle] ?? ''}</span>${words(lifecycle)}</span>`
+    : html`<span class="quiet">–</span>`;
 
 /** The value that somebody has typed. */
 function valueOf(text) {

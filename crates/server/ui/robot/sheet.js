@@ -1,5 +1,6 @@
-// Thousands of log lines in the page. They are put there once and not drawn again with each frame, and the browser lays out
-// only those in sight. What a robot has said becomes text and nothing else.
+// Thousands of log lines in the page. They are put there once and not drawn again with each frame,
+// and the browser lays out only those in sight. What a robot has said becomes text and nothing
+// else.
 
 import { instant, iso, moment } from '../format.js';
 
@@ -20,7 +21,9 @@ export class Sheet {
   #place = null;
   #observer = new ResizeObserver(() => this.isAtEnd && this.toEnd());
 
-  /** At `most` so many lines; `changed` is called when a person scrolls to the end or away from it. */
+  /**
+   * At `most` so many lines; `changed` is called when a person scrolls to the end or away from it.
+   */
   constructor(most, changed) {
     this.#most = most;
     this.#changed = changed;
@@ -114,7 +117,15 @@ export class Sheet {
     }
     const text = part('span', 'text');
     text.append(...this.#marked(line.text));
-    element.append(part('time', 'at', instant(line.at_ms)), ' ', part('span', 'level', line.level), ' ', part('span', 'where', whereOf(line)), ' ', text);
+    element.append(
+      part('time', 'at', instant(line.at_ms)),
+      ' ',
+      part('span', 'level', line.level),
+      ' ',
+      part('span', 'where', whereOf(line)),
+      ' ',
+      text,
+    );
     element.title = moment(line.at_ms);
     return element;
   }
@@ -140,7 +151,11 @@ function part(name, className, text) {
 }
 
 /** Who said it: the node where one did, else the task, else where it was read. */
-const whereOf = ({ task, node, source }) => [task, node ?? (source === 'stdout' ? null : source)].filter(Boolean).join(' ');
+const whereOf = ({ task, node, source }) =>
+  [task, node ?? (source === 'stdout' ? null : source)].filter(Boolean).join(' ');
 
 /** A line as it is kept in a file. */
-export const textOf = (line) => (line.note ? `# ${line.note}` : `${iso(line.at_ms)} ${line.level.toUpperCase().padEnd(5)} [${whereOf(line)}] ${line.text}`);
+export const textOf = (line) =>
+  line.note
+    ? `# ${line.note}`
+    : `${iso(line.at_ms)} ${line.level.toUpperCase().padEnd(5)} [${whereOf(line)}] ${line.text}`;

@@ -1,4 +1,5 @@
-// Everything that was ordered of a robot, the newest first: how each order went, phase by phase, and why it failed.
+// Everything that was ordered of a robot, the newest first: how each order went, phase by phase,
+// and why it failed.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
@@ -49,13 +50,18 @@ export class Tasks {
 
   async #fetch(before) {
     try {
-      const { assignments, next = null } = await get(`/robots/${this.#page.robot.id}/tasks`, { limit: SHOWN, before });
+      const { assignments, next = null } = await get(`/robots/${this.#page.robot.id}/tasks`, {
+        limit: SHOWN,
+        before,
+      });
       change(() => {
         const old = this.#assignments ?? [];
         const fresh = new Set(assignments.map(({ deployment }) => deployment));
         const kept = old.filter(({ deployment }) => !fresh.has(deployment));
         if (before || old.length <= SHOWN) this.#next = next;
-        this.#assignments = before ? [...kept, ...assignments] : [...assignments, ...(next ? kept : [])];
+        this.#assignments = before
+          ? [...kept, ...assignments]
+          : [...assignments, ...(next ? kept : [])];
         this.#problem = null;
       });
     } catch (error) {
@@ -65,11 +71,15 @@ export class Tasks {
 
   draw(robot, now) {
     if (!this.#assignments && this.#problem) {
-      const text = this.#problem.status === 404 ? 'This server keeps no history of tasks. What is ordered now is on Monitor.' : this.#problem.message;
+      const text =
+        this.#problem.status === 404
+          ? 'This server keeps no history of tasks. What is ordered now is on Monitor.'
+          : this.#problem.message;
       return html`<p class="empty quiet">${text}</p>`;
     }
     if (!this.#assignments) return html`<p class="empty quiet">Fetching…</p>`;
-    if (!this.#assignments.length) return html`<p class="empty quiet">Nothing has been ordered of it.</p>`;
+    if (!this.#assignments.length)
+      return html`<p class="empty quiet">Nothing has been ordered of it.</p>`;
     const current = this.#assignments.filter(({ wanted }) => wanted);
     const past = this.#assignments.filter(({ wanted }) => !wanted);
     return html`
@@ -84,13 +94,27 @@ export class Tasks {
     return html`
       <section class="history" aria-label=${title}>
         <header><h2>${title}</h2></header>
-        ${repeat(assignments, ({ deployment }) => deployment, (assignment) => this.#assignment(assignment, now))}
+        ${repeat(
+          assignments,
+          ({ deployment }) => deployment,
+          (assignment) => this.#assignment(assignment, now),
+        )}
       </section>`;
   }
 
   #assignment(assignment, now) {
     const course = steps(assignment.timeline ?? [], assignment.kind, now);
-    const { deployment, package: { name, version }, phase, wanted, failure, attempts, delivery, superseded_by: newer, created_at_ms: then } = assignment;
+    const {
+      deployment,
+      package: { name, version },
+      phase,
+      wanted,
+      failure,
+      attempts,
+      delivery,
+      superseded_by: newer,
+      created_at_ms: then,
+    } = assignment;
     return html`
       <article class="assignment" data-deployment=${deployment}>
         <h3>${name}<span class="quiet">@${version}</span> ${phaseSign(phase)}${wanted === 'stopped' && phase !== 'stopped' ? html`<span class="quiet"> stop ordered</span>` : nothing}</h3>

@@ -1,5 +1,6 @@
-//! WebSocket frames (RFC 6455, section 5), both ways. What a frame carries is handed out as it comes and never gathered, so
-//! whoever sends a frame of any length makes nobody keep it. It does no I/O.
+//! WebSocket frames (RFC 6455, section 5), both ways. What a frame carries is handed out as it
+//! comes and never gathered, so whoever sends a frame of any length makes nobody keep it. It does
+//! no I/O.
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
 
@@ -7,7 +8,8 @@ use bytes::{Buf as _, BufMut as _, BytesMut};
 const MAX_CONTROL_BYTES: usize = 125;
 /// The most an encoded header takes.
 const MAX_HEADER_BYTES: usize = 14;
-/// Why a connection is closed: all is said, the protocol was broken, or this is not what is exchanged here.
+/// Why a connection is closed: all is said, the protocol was broken, or this is not what is
+/// exchanged here.
 pub(super) const NORMAL: u16 = 1000;
 const PROTOCOL_ERROR: u16 = 1002;
 const UNSUPPORTED_DATA: u16 = 1003;
@@ -102,7 +104,9 @@ impl Decoder {
         let frame = match &mut self.frame {
             Some(frame) => frame,
             none => {
-                let Some(frame) = read_header(self.role, &mut self.is_in_message, input)? else { return Ok(None) };
+                let Some(frame) = read_header(self.role, &mut self.is_in_message, input)? else {
+                    return Ok(None);
+                };
                 none.insert(frame)
             }
         };
@@ -128,7 +132,11 @@ impl Decoder {
     }
 }
 
-fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Result<Option<Frame>, Violation> {
+fn read_header(
+    role: Role,
+    is_in_message: &mut bool,
+    input: &mut BytesMut,
+) -> Result<Option<Frame>, Violation> {
     let &[first, second, ..] = &input[..] else { return Ok(None) };
     if first & RESERVED != 0 {
         return Err(Violation::new("an extension that was not agreed on"));
@@ -157,8 +165,12 @@ fn read_header(role: Role, is_in_message: &mut bool, input: &mut BytesMut) -> Re
     }
     let is_last = first & FIN != 0;
     match opcode {
-        Opcode::Binary if *is_in_message => return Err(Violation::new("a new message inside of another")),
-        Opcode::Continuation if !*is_in_message => return Err(Violation::new("the rest of no message")),
+        Opcode::Binary if *is_in_message => {
+            return Err(Violation::new("a new message inside of another"));
+        }
+        Opcode::Continuation if !*is_in_message => {
+            return Err(Violation::new("the rest of no message"));
+        }
         Opcode::Binary | Opcode::Continuation => *is_in_message = !is_last,
         _ if !is_last || usize::from(short) > MAX_CONTROL_BYTES => {
             return Err(Violation::new("a frame of control that is long or in parts"));
@@ -242,7 +254,8 @@ mod tests {
     use super::*;
 
     fn pieces(role: Role, bytes: &[u8], step: usize) -> Result<Vec<Piece>, Violation> {
-        let (mut decoder, mut input, mut pieces) = (Decoder::new(role), BytesMut::new(), Vec::new());
+        let (mut decoder, mut input, mut pieces) =
+            (Decoder::new(role), BytesMut::new(), Vec::new());
         for chunk in bytes.chunks(step.max(1)) {
             input.extend_from_slice(chunk);
             while let Some(piece) = decoder.decode(&mut input)? {

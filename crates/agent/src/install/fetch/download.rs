@@ -1,7 +1,9 @@
-//! One HTTP answer with a blob's bytes: asks for a range, judges what answered, and yields no more than that. It never touches the disk.
+//! One HTTP answer with a blob's bytes: asks for a range, judges what answered, and yields no more
+//! than that. It never touches the disk.
 //!
-//! There is no If-Range: the URL names the bytes by their digest, so they can't change between two requests, and a
-//! cache in between with entity tags of its own would only make every resumption start over.
+//! There is no If-Range: the URL names the bytes by their digest, so they can't change between two
+//! requests, and a cache in between with entity tags of its own would only make every resumption
+//! start over.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -19,8 +21,8 @@ use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryWords};
 
 /// What must come within each stall timeout.
 const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
-/// Overrides whatever limit the client has for whole requests: a large package on a bad link takes its time, and the
-/// stall timeout watches over it.
+/// Overrides whatever limit the client has for whole requests: a large package on a bad link takes
+/// its time, and the stall timeout watches over it.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(7 * 24 * 3600);
 /// No server may keep a robot away for longer.
 pub(crate) const MAX_RETRY_AFTER: Duration = Duration::from_secs(3600);
@@ -35,8 +37,8 @@ pub(super) struct Download {
     /// Bytes at the answer's start that are there already: the server did not honour the range.
     skip: u64,
     stall_timeout: Duration,
-    /// Time spent waiting since the last [`MIN_PROGRESS_BYTES`], and what came in it. Only waiting counts: a slow disk
-    /// is not the server's fault.
+    /// Time spent waiting since the last [`MIN_PROGRESS_BYTES`], and what came in it. Only waiting
+    /// counts: a slow disk is not the server's fault.
     waited: Duration,
     progressed: u64,
     asked_at: Instant,
@@ -53,17 +55,24 @@ impl Download {
     ) -> Result<Self, FetchError> {
         let mut request = request.timeout(REQUEST_TIMEOUT);
         if range.end < blob.size {
-            request = request.header(RANGE, format!("bytes={}-{}", range.start, range.end.saturating_sub(1)));
+            request = request
+                .header(RANGE, format!("bytes={}-{}", range.start, range.end.saturating_sub(1)));
         } else if range.start > 0 {
             request = request.header(RANGE, format!("bytes={}-", range.start));
         }
         let asked_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
-        let mut response = answer.map_err(|_| FetchError::Stalled(stall_timeout))?.map_err(FetchError::Unreachable)?;
+        let mut response = answer
+            .map_err(|_| FetchError::Stalled(stall_timeout))?
+            .map_err(FetchError::Unreachable)?;
         let skip = match judge(&response, repository, blob, &range) {
-            Err(FetchError::Unavailable { .. }) if !has_registrys_words(&mut response, stall_timeout).await => {
+            Err(FetchError::Unavailable { .. })
+                if !has_registrys_words(&mut response, stall_timeout).await =>
+            {
                 let status = response.status().as_u16();
-                return Err(FetchError::NotTheServer(format!("status {status} without a registry's error")));
+                return Err(FetchError::NotTheServer(format!(
+                    "status {status} without a registry's error"
+                )));
             }
             judged => judged?,
         };
@@ -89,7 +98,8 @@ impl Download {
         self.asked_at
     }
 
-    /// Sends all that comes to `sender`, until all that was asked for has passed or nobody takes it any more.
+    /// Sends all that comes to `sender`, until all that was asked for has passed or nobody takes it
+    /// any more.
     pub(super) async fn pass_on(&mut self, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
         while let Some(chunk) = self.next().await? {
             if sender.send(chunk).await.is_err() {
@@ -111,7 +121,8 @@ impl Download {
         Ok(bytes)
     }
 
-    /// The next bytes; `None` when all that was asked for has been handed out, whatever the server would still send.
+    /// The next bytes; `None` when all that was asked for has been handed out, whatever the server
+    /// would still send.
     pub(super) async fn next(&mut self) -> Result<Option<Bytes>, FetchError> {
         while self.position < self.end {
             let began = Instant::now();
@@ -152,13 +163,25 @@ fn judge(
     if header(headers, &CONTENT_TYPE)
         .is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("text/html"))
     {
-        return Err(FetchError::NotTheServer(format!("an HTML page with status {}", status.as_u16())));
+        return Err(FetchError::NotTheServer(format!(
+            "an HTML page with status {}",
+            status.as_u16()
+        )));
     }
     let offered = match status {
         StatusCode::OK => 0..blob.size,
         StatusCode::PARTIAL_CONTENT if is_range => match content_range(headers) {
-            Some((start, total)) if start == offset && total.is_none_or(|total| total == blob.size) => range.clone(),
-            _ => return Err(other_bytes(blob, "its Content-Range is not the one asked for".to_owned())),
+            Some((start, total))
+                if start == offset && total.is_none_or(|total| total == blob.size) =>
+            {
+                range.clone()
+            }
+            _ => {
+                return Err(other_bytes(
+                    blob,
+                    "its Content-Range is not the one asked for".to_owned(),
+                ));
+            }
         },
         StatusCode::RANGE_NOT_SATISFIABLE if is_range => {
             return Err(other_bytes(blob, format!("it has none from byte {offset} on")));
@@ -172,27 +195,39 @@ fn judge(
             let (digest, repository) = (blob.digest, repository.clone());
             return Err(FetchError::Unavailable { status: status.as_u16(), digest, repository });
         }
-        status => return Err(FetchError::NotTheServer(format!("status {} for a blob", status.as_u16()))),
+        status => {
+            return Err(FetchError::NotTheServer(format!("status {} for a blob", status.as_u16())));
+        }
     };
     match header(headers, &CONTENT_DIGEST) {
         Some(found) if found != blob.digest.to_string() => {
             return Err(other_bytes(blob, format!("they are {found:?}")));
         }
         None if !headers.contains_key(ETAG) => {
-            return Err(FetchError::NotTheServer("an answer with neither Docker-Content-Digest nor ETag".to_owned()));
+            return Err(FetchError::NotTheServer(
+                "an answer with neither Docker-Content-Digest nor ETag".to_owned(),
+            ));
         }
         _ => {}
     }
-    if let Some(length) = response.content_length().filter(|&length| length != offered.end - offered.start) {
-        let reason = format!("{length} bytes are offered from byte {} on, {} were ordered", offered.start, blob.size);
+    if let Some(length) =
+        response.content_length().filter(|&length| length != offered.end - offered.start)
+    {
+        let reason = format!(
+            "{length} bytes are offered from byte {} on, {} were ordered",
+            offered.start, blob.size
+        );
         return Err(other_bytes(blob, reason));
     }
     Ok(offset - offered.start)
 }
 
-/// Whether a refusal is the server's own. A proxy in front of one that restarts refuses as well, and passes.
+/// Whether a refusal is the server's own. A proxy in front of one that restarts refuses as well,
+/// and passes.
 async fn has_registrys_words(response: &mut reqwest::Response, patience: Duration) -> bool {
-    tokio::time::timeout(patience, RegistryWords::read(response)).await.is_ok_and(|words| words.are_a_registrys())
+    tokio::time::timeout(patience, RegistryWords::read(response))
+        .await
+        .is_ok_and(|words| words.are_a_registrys())
 }
 
 fn other_bytes(blob: BlobRef, reason: String) -> FetchError {
@@ -208,7 +243,8 @@ fn busy(status: StatusCode, headers: &HeaderMap) -> FetchError {
 
 /// First byte and, if it is told, whole size, of `bytes FIRST-LAST/SIZE`.
 fn content_range(headers: &HeaderMap) -> Option<(u64, Option<u64>)> {
-    let (range, total) = header(headers, &CONTENT_RANGE)?.strip_prefix("bytes ")?.split_once('/')?;
+    let (range, total) =
+        header(headers, &CONTENT_RANGE)?.strip_prefix("bytes ")?.split_once('/')?;
     let (start, _) = range.split_once('-')?;
     let total = if total == "*" { None } else { Some(total.parse().ok()?) };
     Some((start.parse().ok()?, total))

@@ -106,7 +106,9 @@ impl FetchError {
             | Self::Busy { .. } => Some(FailureCode::SERVER_UNREACHABLE),
             Self::Unauthorized => Some(FailureCode::UNAUTHORIZED),
             Self::Unavailable { .. } => Some(FailureCode::PACKAGE_UNAVAILABLE),
-            Self::DigestMismatch { .. } | Self::TooLarge { .. } => Some(FailureCode::DIGEST_MISMATCH),
+            Self::DigestMismatch { .. } | Self::TooLarge { .. } => {
+                Some(FailureCode::DIGEST_MISMATCH)
+            }
             Self::ManifestInvalid(_) => Some(FailureCode::MANIFEST_INVALID),
             Self::ArchiveRefused(_) => Some(FailureCode::ARCHIVE_REFUSED),
             Self::DiskFull(_) => Some(FailureCode::DISK_FULL),
@@ -133,7 +135,8 @@ impl FetchError {
             || !self.is_retryable() && !matches!(self, Self::Cancelled)
     }
 
-    /// How long the server wants this robot to stay away, if all that is wrong is that it has no room for it now.
+    /// How long the server wants this robot to stay away, if all that is wrong is that it has no
+    /// room for it now.
     pub fn told_to_wait(&self) -> Option<Duration> {
         match self {
             Self::Busy { status: 429 | 503, retry_after } => *retry_after,
@@ -160,11 +163,13 @@ impl FetchError {
         Self::DigestMismatch { digest, reason: format!("they hash to {found}") }
     }
 
-    /// A mismatch that is left after all that heals one on the way says so: what the server has is damaged.
+    /// A mismatch that is left after all that heals one on the way says so: what the server has is
+    /// damaged.
     pub(super) fn confirmed(self) -> Self {
         match self {
             Self::DigestMismatch { digest, reason } => {
-                let reason = format!("{reason}, also when fetched again; the server's copy is damaged");
+                let reason =
+                    format!("{reason}, also when fetched again; the server's copy is damaged");
                 Self::DigestMismatch { digest, reason }
             }
             other => other,
@@ -175,11 +180,15 @@ impl FetchError {
         Self::Disk { path: path.to_owned(), source }
     }
 
-    /// A write that failed because the disk is full is told with the figures of the file system that holds `path`.
+    /// A write that failed because the disk is full is told with the figures of the file system
+    /// that holds `path`.
     pub(crate) fn for_want_of_room(self, path: &Path, need: Need) -> Self {
         match self {
             Self::Disk { source, .. }
-                if matches!(source.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) =>
+                if matches!(
+                    source.kind(),
+                    io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded
+                ) =>
             {
                 match disk::room(path) {
                     Ok(room) => DiskFull { free: room.free, total: room.total, need }.into(),

@@ -1,5 +1,6 @@
-//! The blocking half of a pull: replays the `.part`, takes new bytes from the connection, and on their way to the
-//! unpacker hashes them and adds them to the `.part`. It alone decides whether the tree gets its place.
+//! The blocking half of a pull: replays the `.part`, takes new bytes from the connection, and on
+//! their way to the unpacker hashes them and adds them to the `.part`. It alone decides whether the
+//! tree gets its place.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -31,7 +32,8 @@ pub(super) struct Intake {
     receiver: mpsc::Receiver<Bytes>,
     progress: watch::Sender<Progress>,
     stop: CancellationToken,
-    /// Held until nothing of this try is going on any more, which may be after the pull was dropped.
+    /// Held until nothing of this try is going on any more, which may be after the pull was
+    /// dropped.
     _turn: Arc<OwnedMutexGuard<()>>,
 }
 
@@ -60,11 +62,17 @@ impl Intake {
     }
 
     /// Reads all bytes, unpacks them, and moves the tree to `src`.
-    pub(super) fn run(self, facts: &ContentFacts, src: &Path, need: Need) -> Result<(), FetchError> {
+    pub(super) fn run(
+        self,
+        facts: &ContentFacts,
+        src: &Path,
+        need: Need,
+    ) -> Result<(), FetchError> {
         let (part, staging) = (self.part.clone(), self.staging.clone());
         let result = self.unpack(facts).and_then(|()| place(&staging, src));
         let cleaned = match &result {
-            // The bytes have done their work, or are worth nothing. Those with another digest may be mended.
+            // The bytes have done their work, or are worth nothing. Those with another digest may
+            // be mended.
             Ok(()) | Err(FetchError::ArchiveRefused(_)) => durable::remove_file(&part),
             Err(_) => Ok(()),
         };
@@ -85,7 +93,8 @@ impl Intake {
         if let Err(UnpackError::Disk { path, source }) = unpacked {
             return Err(FetchError::Disk { path, source });
         }
-        // Read on even when the archive is refused: only the digest tells whether to blame the package or the way here.
+        // Read on even when the archive is refused: only the digest tells whether to blame the
+        // package or the way here.
         if bytes.failure.is_none() {
             let _ = io::copy(&mut bytes, &mut io::sink());
         }
@@ -132,8 +141,21 @@ impl Bytestream {
         if let Some(parent) = intake.part.parent() {
             durable::create_dir_all(parent).map_err(disk)?;
         }
-        let file = OpenOptions::new().read(true).append(true).create(true).open(&intake.part).map_err(disk)?;
-        Ok(Self { intake, file, replayed: 0, done: 0, current: Bytes::new(), hasher: Sha256::new(), failure: None })
+        let file = OpenOptions::new()
+            .read(true)
+            .append(true)
+            .create(true)
+            .open(&intake.part)
+            .map_err(disk)?;
+        Ok(Self {
+            intake,
+            file,
+            replayed: 0,
+            done: 0,
+            current: Bytes::new(),
+            hasher: Sha256::new(),
+            failure: None,
+        })
     }
 
     fn next(&mut self, buffer: &mut [u8]) -> Result<usize, FetchError> {
@@ -148,7 +170,10 @@ impl Bytestream {
                 Some(chunk) => self.keep(chunk)?,
                 None if self.done == self.intake.blob.size => return Ok(0),
                 None => {
-                    return Err(FetchError::Interrupted { received: self.done, size: self.intake.blob.size });
+                    return Err(FetchError::Interrupted {
+                        received: self.done,
+                        size: self.intake.blob.size,
+                    });
                 }
             }
         }
@@ -160,8 +185,10 @@ impl Bytestream {
     fn replay(&mut self, buffer: &mut [u8]) -> Result<usize, FetchError> {
         let left = self.intake.present - self.replayed;
         let wanted = left.min(buffer.len() as u64) as usize;
-        let count =
-            self.file.read(&mut buffer[..wanted]).map_err(|source| FetchError::disk(&self.intake.part, source))?;
+        let count = self
+            .file
+            .read(&mut buffer[..wanted])
+            .map_err(|source| FetchError::disk(&self.intake.part, source))?;
         if count == 0 && wanted > 0 {
             return Err(FetchError::disk(&self.intake.part, io::ErrorKind::UnexpectedEof.into()));
         }
@@ -171,7 +198,9 @@ impl Bytestream {
     }
 
     fn keep(&mut self, chunk: Bytes) -> Result<(), FetchError> {
-        self.file.write_all(&chunk).map_err(|source| FetchError::disk(&self.intake.part, source))?;
+        self.file
+            .write_all(&chunk)
+            .map_err(|source| FetchError::disk(&self.intake.part, source))?;
         self.account(&chunk);
         self.current = chunk;
         Ok(())
@@ -180,7 +209,9 @@ impl Bytestream {
     fn account(&mut self, bytes: &[u8]) {
         self.hasher.update(bytes);
         self.done += bytes.len() as u64;
-        self.intake.progress.send_replace(Progress { done: self.done, total: self.intake.blob.size });
+        self.intake
+            .progress
+            .send_replace(Progress { done: self.done, total: self.intake.blob.size });
     }
 }
 

@@ -1,5 +1,5 @@
-//! Blobs that came with the order itself, so that they need not be pulled. They are kept in memory until they are used
-//! or others come: what is lost is pulled.
+//! Blobs that came with the order itself, so that they need not be pulled. They are kept in memory
+//! until they are used or others come: what is lost is pulled.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};

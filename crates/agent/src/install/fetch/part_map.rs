@@ -1,5 +1,5 @@
-//! Which parts of a blob are there, and which of the others were asked for. Pure bookkeeping, bounded by the number of
-//! parts a blob may have; it never sees a byte of them.
+//! Which parts of a blob are there, and which of the others were asked for. Pure bookkeeping,
+//! bounded by the number of parts a blob may have; it never sees a byte of them.
 
 use task_proto::part::{Cut, PartRange};
 
@@ -18,7 +18,8 @@ pub(super) struct PartMap {
 impl PartMap {
     /// Of a blob of which the first `prefix` bytes are there.
     pub(super) fn new(cut: Cut, prefix: u64) -> Self {
-        let mut map = Self { cut, there: Bits::new(cut.count()), asked: Bits::new(cut.count()), bytes: 0 };
+        let mut map =
+            Self { cut, there: Bits::new(cut.count()), asked: Bits::new(cut.count()), bytes: 0 };
         for index in (0..cut.count()).take_while(|&index| cut.range(index).end <= prefix) {
             map.take(index);
         }
@@ -102,10 +103,12 @@ impl PartMap {
     }
 
     fn lacking(&self) -> impl Iterator<Item = u32> {
-        // Whole words first: a large blob has a million parts, most of them there or most of them not.
+        // Whole words first: a large blob has a million parts, most of them there or most of them
+        // not.
         let words = self.there.0.iter().zip(0u32..).filter(|(word, _)| **word != u64::MAX);
-        let indexes =
-            words.flat_map(|(word, at)| (0..64).filter(move |bit| word >> bit & 1 == 0).map(move |bit| at * 64 + bit));
+        let indexes = words.flat_map(|(word, at)| {
+            (0..64).filter(move |bit| word >> bit & 1 == 0).map(move |bit| at * 64 + bit)
+        });
         indexes.take_while(|&index| index < self.cut.count())
     }
 }
@@ -183,11 +186,17 @@ mod tests {
     #[test]
     fn a_beginning_counts_as_whole_parts_only() {
         let cut = Cut::new(10 * PART + 5, PART as u32).expect("a cut");
-        for (prefix, parts, bytes) in
-            [(0, 0, 0), (PART - 1, 0, 0), (3 * PART, 3, 3 * PART), (10 * PART + 5, 11, 10 * PART + 5)]
-        {
+        for (prefix, parts, bytes) in [
+            (0, 0, 0),
+            (PART - 1, 0, 0),
+            (3 * PART, 3, 3 * PART),
+            (10 * PART + 5, 11, 10 * PART + 5),
+        ] {
             let mut map = PartMap::new(cut, prefix);
-            assert_eq!(((0..11).filter(|&index| map.has(index)).count(), map.bytes()), (parts, bytes));
+            assert_eq!(
+                ((0..11).filter(|&index| map.has(index)).count(), map.bytes()),
+                (parts, bytes)
+            );
             assert_eq!(map.prefix(), bytes);
             assert_eq!(map.ask_below(2), parts < 2);
         }

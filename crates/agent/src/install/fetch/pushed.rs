@@ -1,9 +1,11 @@
-//! Gathers a content that the server pushes as parts over MQTT, until all of it is there or it is better pulled. Parts go
-//! into a file with holes, beside it a note of those that are on the disk, so that a later agent goes on from there.
+//! Gathers a content that the server pushes as parts over MQTT, until all of it is there or it is
+//! better pulled. Parts go into a file with holes, beside it a note of those that are on the disk,
+//! so that a later agent goes on from there.
 //!
-//! Nothing here trusts a part: each must fit the size that the signed state names, the first of them decides how the
-//! content is cut, and the whole is held against its digest by the same intake as a pull. What does not fit is counted
-//! and passed over; what is torn or wrong is found by the digest and pulled.
+//! Nothing here trusts a part: each must fit the size that the signed state names, the first of
+//! them decides how the content is cut, and the whole is held against its digest by the same intake
+//! as a pull. What does not fit is counted and passed over; what is torn or wrong is found by the
+//! digest and pulled.
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
@@ -41,7 +43,8 @@ const TAKEN_BACK_AFTER: Duration = Duration::from_millis(100);
 /// How long parts are waited for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PartPatience {
-    /// Without a part for so long, the lacking ones are asked for; the next time after twice as long.
+    /// Without a part for so long, the lacking ones are asked for; the next time after twice as
+    /// long.
     pub silence: Duration,
     /// Without a subscription for so long, the content is pulled.
     pub deaf: Duration,
@@ -51,7 +54,11 @@ pub struct PartPatience {
 
 impl Default for PartPatience {
     fn default() -> Self {
-        Self { silence: Duration::from_secs(2), deaf: Duration::from_secs(10), starved: Duration::from_secs(30) }
+        Self {
+            silence: Duration::from_secs(2),
+            deaf: Duration::from_secs(10),
+            starved: Duration::from_secs(30),
+        }
     }
 }
 
@@ -94,14 +101,15 @@ pub(super) struct Gathering<'a> {
     double: u64,
     noted_bytes: u64,
     noted_at: Instant,
-    /// A note that is being written. Parts go on meanwhile: the server takes a robot that does not acknowledge for one
-    /// that can't keep up.
+    /// A note that is being written. Parts go on meanwhile: the server takes a robot that does not
+    /// acknowledge for one that can't keep up.
     noting: Option<JoinHandle<io::Result<()>>>,
 }
 
 /// When what came last.
 struct Times {
-    /// A part of this content, whether it was there or not, or the subscription, or the last asking.
+    /// A part of this content, whether it was there or not, or the subscription, or the last
+    /// asking.
     quiet_since: Instant,
     /// How long the next silence may be.
     silence: Duration,
@@ -146,7 +154,8 @@ impl<'a> Gathering<'a> {
         })
     }
 
-    /// Gathers until all is there, and then lies where a pull looks for it, or until it is better pulled.
+    /// Gathers until all is there, and then lies where a pull looks for it, or until it is better
+    /// pulled.
     pub(super) async fn run(
         mut self,
         mut ear: Ear,
@@ -221,7 +230,8 @@ impl<'a> Gathering<'a> {
         }
     }
 
-    /// Takes messages off the session: writes those that are parts, and lets go of them, which acknowledges them.
+    /// Takes messages off the session: writes those that are parts, and lets go of them, which
+    /// acknowledges them.
     async fn take(&mut self, batch: Vec<Arrived>, times: &mut Times) -> Result<(), FetchError> {
         let now = Instant::now();
         let mut writes = Vec::with_capacity(batch.len());
@@ -257,7 +267,8 @@ impl<'a> Gathering<'a> {
         times.starved_since = now;
         self.tell_progress();
         times.came_at.get_or_insert(now);
-        let due = self.bytes() - self.noted_bytes >= NOTED_BYTES || self.noted_at.elapsed() >= NOTED_AFTER;
+        let due = self.bytes() - self.noted_bytes >= NOTED_BYTES
+            || self.noted_at.elapsed() >= NOTED_AFTER;
         if due && self.noting.as_ref().is_none_or(JoinHandle::is_finished) {
             self.noted().await?;
             self.begin_note();
@@ -288,7 +299,9 @@ impl<'a> Gathering<'a> {
                 return None;
             }
             // The server may cut it in another way than it did for an agent before this one.
-            earlier => self.map = Some(PartMap::new(cut, earlier.as_ref().map_or(0, PartMap::prefix))),
+            earlier => {
+                self.map = Some(PartMap::new(cut, earlier.as_ref().map_or(0, PartMap::prefix)))
+            }
         }
         self.is_cut = true;
         Some((index, cut.range(index).start))
@@ -303,7 +316,9 @@ impl<'a> Gathering<'a> {
                 if let Some(map) = &mut self.map {
                     map.ask_nothing();
                 }
-                self.asks.send_modify(|asks| *asks = Asks { missing: Some(Vec::new()), times: asks.times + 1 });
+                self.asks.send_modify(|asks| {
+                    *asks = Asks { missing: Some(Vec::new()), times: asks.times + 1 }
+                });
             }
             Hearing::Asked | Hearing::Refused | Hearing::Away => {
                 times.deaf_since.get_or_insert(now);
@@ -315,7 +330,9 @@ impl<'a> Gathering<'a> {
     fn next_look(&self, times: &Times) -> Instant {
         let next = match times.deaf_since {
             Some(since) => since + self.patience.deaf,
-            None => (times.quiet_since + times.silence).min(times.starved_since + self.patience.starved),
+            None => {
+                (times.quiet_since + times.silence).min(times.starved_since + self.patience.starved)
+            }
         };
         times.came_at.map_or(next, |at| next.min(at + TAKEN_BACK_AFTER))
     }
@@ -349,10 +366,12 @@ impl<'a> Gathering<'a> {
             // Nobody has said yet how many parts there are.
             None => vec![PartRange { from: 0, to: u32::MAX }],
         };
-        self.asks.send_modify(|asks| *asks = Asks { missing: Some(missing), times: asks.times + 1 });
+        self.asks
+            .send_modify(|asks| *asks = Asks { missing: Some(missing), times: asks.times + 1 });
     }
 
-    /// Asks no longer for what has come, so that whatever makes the robot report does not ask for it again.
+    /// Asks no longer for what has come, so that whatever makes the robot report does not ask for
+    /// it again.
     fn take_back(&self) {
         let asked = |asks: &Asks| asks.missing.as_ref().is_some_and(|missing| !missing.is_empty());
         if let Some(map) = self.map.as_ref().filter(|_| asked(&self.asks.borrow())) {
@@ -372,7 +391,8 @@ impl<'a> Gathering<'a> {
     /// Begins to bring what is there to the disk and then to say so in the note.
     fn begin_note(&mut self) {
         let Some(map) = &self.map else { return };
-        let (note, file, path, turn) = (map.note(), self.file.clone(), self.files.note.clone(), self.turn.clone());
+        let (note, file, path, turn) =
+            (map.note(), self.file.clone(), self.files.note.clone(), self.turn.clone());
         (self.noted_bytes, self.noted_at) = (map.bytes(), Instant::now());
         self.noting = Some(tokio::task::spawn_blocking(move || {
             file.sync_data()?;
@@ -402,7 +422,8 @@ async fn finished<T>(path: &Path, work: JoinHandle<io::Result<T>>) -> Result<T, 
     done.flatten().map_err(|source| FetchError::disk(path, source))
 }
 
-/// Makes the gathered parts up to the first gap the beginning that a pull goes on from, if that is more than it has.
+/// Makes the gathered parts up to the first gap the beginning that a pull goes on from, if that is
+/// more than it has.
 pub(super) fn hand_over(data: &DataDir, content: BlobRef) -> io::Result<()> {
     let files = Files::of(data, &content.digest);
     let Some(map) = files.read_note(content.size) else { return files.discard() };
@@ -424,7 +445,11 @@ pub(super) fn discard(data: &DataDir, content: &Digest) -> io::Result<()> {
 
 impl Files {
     fn of(data: &DataDir, digest: &Digest) -> Self {
-        Self { part: data.blob_part(digest), parts: data.blob_parts(digest), note: data.blob_parts_note(digest) }
+        Self {
+            part: data.blob_part(digest),
+            parts: data.blob_parts(digest),
+            note: data.blob_parts_note(digest),
+        }
     }
 
     /// The file, and what the note says of it; without a note it is empty.
@@ -443,9 +468,14 @@ impl Files {
 
     /// The note, if it is one about the file that is there.
     fn read_note(&self, size: u64) -> Option<PartMap> {
-        let is_small = fs::metadata(&self.note).is_ok_and(|metadata| metadata.len() <= MAX_NOTE_BYTES);
+        let is_small =
+            fs::metadata(&self.note).is_ok_and(|metadata| metadata.len() <= MAX_NOTE_BYTES);
         let is_of_file = fs::metadata(&self.parts).is_ok_and(|metadata| metadata.len() == size);
-        if is_small && is_of_file { PartMap::of_note(&fs::read(&self.note).ok()?, size) } else { None }
+        if is_small && is_of_file {
+            PartMap::of_note(&fs::read(&self.note).ok()?, size)
+        } else {
+            None
+        }
     }
 
     /// All parts are there.

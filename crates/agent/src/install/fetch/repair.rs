@@ -1,6 +1,7 @@
-//! Mends bytes that came with another digest than the ordered one. A digest of the whole does not say where the fault is,
-//! so each range is fetched anew over connections of its own until two copies agree on each byte; the copy that came
-//! first counts as one. What comes of it is held against the digest by the caller. Nothing here decides when to mend.
+//! Mends bytes that came with another digest than the ordered one. A digest of the whole does not
+//! say where the fault is, so each range is fetched anew over connections of its own until two
+//! copies agree on each byte; the copy that came first counts as one. What comes of it is held
+//! against the digest by the caller. Nothing here decides when to mend.
 
 use std::fs::OpenOptions;
 use std::os::unix::fs::FileExt as _;
@@ -21,12 +22,13 @@ const MAX_RANGE_BYTES: u64 = 4 * 1024 * 1024;
 const RANGES: u64 = 64;
 /// How often a range is fetched. With the copy that came first, two of which are to agree.
 const MAX_COPIES: usize = 8;
-/// Up to how many bytes before its range a copy begins. A fault that damages the same place of each answer then damages
-/// another byte each time.
+/// Up to how many bytes before its range a copy begins. A fault that damages the same place of each
+/// answer then damages another byte each time.
 const MAX_LEAD_BYTES: u64 = 4096;
 
 impl Fetcher {
-    /// Mends the `.part` of a content, all of whose bytes are there. The turn is held by writes that outlive this.
+    /// Mends the `.part` of a content, all of whose bytes are there. The turn is held by writes
+    /// that outlive this.
     pub(super) async fn repair_content(
         &self,
         package: &PackageRef,
@@ -38,10 +40,13 @@ impl Fetcher {
         let file = Arc::new(file.map_err(|source| FetchError::disk(&part, source))?);
         for (from, length) in ranges(blob.size) {
             let (read, mut first) = (file.clone(), vec![0; length]);
-            let first = on_disk(&part, move || read.read_exact_at(&mut first, from).map(|()| first)).await?;
+            let first =
+                on_disk(&part, move || read.read_exact_at(&mut first, from).map(|()| first))
+                    .await?;
             if let Some(agreed) = self.agreed(&repository, blob, from, first).await? {
                 let (written, turn) = (file.clone(), turn.clone());
-                on_disk(&part, move || written.write_all_at(&agreed, from).map(|()| drop(turn))).await?;
+                on_disk(&part, move || written.write_all_at(&agreed, from).map(|()| drop(turn)))
+                    .await?;
             }
         }
         Ok(())
@@ -56,7 +61,9 @@ impl Fetcher {
     ) -> Result<Vec<u8>, FetchError> {
         for (from, length) in ranges(blob.size) {
             let range = from as usize..from as usize + length;
-            if let Some(agreed) = self.agreed(repository, blob, from, bytes[range.clone()].to_vec()).await? {
+            if let Some(agreed) =
+                self.agreed(repository, blob, from, bytes[range.clone()].to_vec()).await?
+            {
                 bytes[range].copy_from_slice(&agreed);
             }
         }
@@ -86,7 +93,8 @@ impl Fetcher {
                 return Ok(Some(agreed));
             }
         }
-        let reason = format!("{} copies of those from byte {from} on agree on nothing", copies.len());
+        let reason =
+            format!("{} copies of those from byte {from} on agree on nothing", copies.len());
         Err(failure.unwrap_or(FetchError::DigestMismatch { digest: blob.digest, reason }))
     }
 
@@ -98,7 +106,9 @@ impl Fetcher {
         length: usize,
     ) -> Result<Vec<u8>, FetchError> {
         let (lead, end) = (rand::random_range(1..=MAX_LEAD_BYTES), from + length as u64);
-        let piece = async |from, end| self.download_range(repository, blob, from..end).await?.collect(end - from).await;
+        let piece = async |from, end| {
+            self.download_range(repository, blob, from..end).await?.collect(end - from).await
+        };
         if lead <= from {
             return Ok(piece(from - lead, end).await?.split_off(lead as usize));
         }
@@ -115,11 +125,12 @@ impl Fetcher {
 /// Where the ranges of `size` bytes begin, and how long each is.
 fn ranges(size: u64) -> impl Iterator<Item = (u64, usize)> {
     let length = size.div_ceil(RANGES).clamp(MIN_RANGE_BYTES, MAX_RANGE_BYTES);
-    (0..size.div_ceil(length)).map(move |index| (index * length, length.min(size - index * length) as usize))
+    (0..size.div_ceil(length))
+        .map(move |index| (index * length, length.min(size - index * length) as usize))
 }
 
-/// The bytes that at least two of the copies have, and more of them than have anything else; `None` while one has not got
-/// as many.
+/// The bytes that at least two of the copies have, and more of them than have anything else; `None`
+/// while one has not got as many.
 fn majority(copies: &[Vec<u8>]) -> Option<Vec<u8>> {
     let (first, others) = copies.split_first()?;
     let mut agreed = first.clone();
@@ -128,7 +139,10 @@ fn majority(copies: &[Vec<u8>]) -> Option<Vec<u8>> {
             continue;
         }
         let votes = |value: u8| copies.iter().filter(|copy| copy[at] == value).count();
-        let (best, count) = copies.iter().map(|copy| (copy[at], votes(copy[at]))).max_by_key(|(_, count)| *count)?;
+        let (best, count) = copies
+            .iter()
+            .map(|copy| (copy[at], votes(copy[at])))
+            .max_by_key(|(_, count)| *count)?;
         let is_tied = copies.iter().any(|copy| copy[at] != best && votes(copy[at]) == count);
         if count < 2 || is_tied {
             return None;
@@ -144,12 +158,18 @@ mod tests {
 
     #[test]
     fn majority_needs_two_copies_that_agree_on_each_byte() {
-        let copies = |texts: &[&str]| texts.iter().map(|text| text.as_bytes().to_vec()).collect::<Vec<_>>();
-        let agreed =
-            |texts: &[&str]| majority(&copies(texts)).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
+        let copies =
+            |texts: &[&str]| texts.iter().map(|text| text.as_bytes().to_vec()).collect::<Vec<_>>();
+        let agreed = |texts: &[&str]| {
+            majority(&copies(texts)).map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
+        };
         assert_eq!(agreed(&["abc"]), None);
         assert_eq!(agreed(&["abc", "abx"]), None);
-        assert_eq!(agreed(&["abc", "abx", "ybc"]).as_deref(), Some("abc"), "each copy has a fault of its own");
+        assert_eq!(
+            agreed(&["abc", "abx", "ybc"]).as_deref(),
+            Some("abc"),
+            "each copy has a fault of its own"
+        );
         assert_eq!(agreed(&["abx", "abc", "abx", "abc"]), None, "two against two");
         assert_eq!(agreed(&["abx", "abc", "abc"]).as_deref(), Some("abc"));
     }

@@ -1,6 +1,7 @@
-//! Pulls until the bytes have the ordered digest: a way that flips a byte is a fault of the network like a cut, and TCP does
-//! not notice all of them. Other bytes are pulled again as a whole, a few times, and then mended range by range. What is
-//! wrong even then is the server's fault, and said so.
+//! Pulls until the bytes have the ordered digest: a way that flips a byte is a fault of the network
+//! like a cut, and TCP does not notice all of them. Other bytes are pulled again as a whole, a few
+//! times, and then mended range by range. What is wrong even then is the server's fault, and said
+//! so.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,11 +15,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::{FetchError, Fetcher};
 
-/// How often bytes with another digest are fetched again as a whole. After that ranges of them are compared.
+/// How often bytes with another digest are fetched again as a whole. After that ranges of them are
+/// compared.
 const MAX_WHOLE_AGAIN: u32 = 2;
 
 impl Fetcher {
-    /// Pulls a content. A `.part` that a power cut spoiled, or parts that were pushed and are wrong, are pulled again as well.
+    /// Pulls a content. A `.part` that a power cut spoiled, or parts that were pushed and are
+    /// wrong, are pulled again as well.
     pub(super) async fn pull_until_verified(
         &self,
         package: &PackageRef,
@@ -41,27 +44,40 @@ impl Fetcher {
                 .ok_or(FetchError::Cancelled)?;
         }
         match self.pull_content(package, manifest, progress, cancel, turn.clone()).await {
-            Err(FetchError::DigestMismatch { .. }) if self.present(package)? == package.content.size => {}
+            Err(FetchError::DigestMismatch { .. })
+                if self.present(package)? == package.content.size => {}
             ended => return ended.map_err(FetchError::confirmed),
         }
         tracing::warn!(package = %package.name, "other bytes came again; ranges of them are compared");
         let repaired = cancel.run_until_cancelled(self.repair_content(package, &turn)).await;
         repaired.ok_or(FetchError::Cancelled)??;
-        self.pull_content(package, manifest, progress, cancel, turn).await.map_err(FetchError::confirmed)
+        self.pull_content(package, manifest, progress, cancel, turn)
+            .await
+            .map_err(FetchError::confirmed)
     }
 
-    /// Pulls a blob that is held in memory, again when the bytes have another digest, as for a content.
-    pub(super) async fn pull_whole(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
+    /// Pulls a blob that is held in memory, again when the bytes have another digest, as for a
+    /// content.
+    pub(super) async fn pull_whole(
+        &self,
+        repository: &RepositoryName,
+        blob: BlobRef,
+    ) -> Result<Vec<u8>, FetchError> {
         let mut again = 0;
         loop {
             let is_last = again == MAX_WHOLE_AGAIN;
             let error = match self.pull_once(repository, blob).await {
                 Ok(bytes) if Digest::of(&bytes) == blob.digest => return Ok(bytes),
                 Ok(bytes) if is_last => {
-                    let bytes = self.repaired(repository, blob, bytes).await.map_err(FetchError::confirmed)?;
+                    let bytes = self
+                        .repaired(repository, blob, bytes)
+                        .await
+                        .map_err(FetchError::confirmed)?;
                     let found = Digest::of(&bytes);
                     let is_repaired = found == blob.digest;
-                    return is_repaired.then_some(bytes).ok_or(FetchError::other_bytes(blob.digest, found).confirmed());
+                    return is_repaired
+                        .then_some(bytes)
+                        .ok_or(FetchError::other_bytes(blob.digest, found).confirmed());
                 }
                 Ok(bytes) => FetchError::other_bytes(blob.digest, Digest::of(&bytes)),
                 Err(error @ FetchError::DigestMismatch { .. }) if !is_last => error,
@@ -73,7 +89,11 @@ impl Fetcher {
         }
     }
 
-    async fn pull_once(&self, repository: &RepositoryName, blob: BlobRef) -> Result<Vec<u8>, FetchError> {
+    async fn pull_once(
+        &self,
+        repository: &RepositoryName,
+        blob: BlobRef,
+    ) -> Result<Vec<u8>, FetchError> {
         let request = || self.request(repository, blob);
         let download = self.start(request, repository, blob, 0..blob.size).await?;
         download.collect(blob.size).await

@@ -1,5 +1,5 @@
-//! The places that the server names for MQTT sessions: its own broker, or external ones in the order in which they are
-//! tried. It opens nothing.
+//! The places that the server names for MQTT sessions: its own broker, or external ones in the
+//! order in which they are tried. It opens nothing.
 
 use std::time::Duration;
 
@@ -29,10 +29,22 @@ pub(super) struct Destination {
 
 impl MqttAccess {
     /// The place with this number among those that the server names, beginning with 0.
-    pub(super) fn destination(&self, endpoint: Option<&MqttEndpoint>, number: usize) -> Destination {
-        let Some(MqttEndpoint { host, port, prefix, tls, external, alternatives }) = endpoint.cloned() else {
+    pub(super) fn destination(
+        &self,
+        endpoint: Option<&MqttEndpoint>,
+        number: usize,
+    ) -> Destination {
+        let Some(MqttEndpoint { host, port, prefix, tls, external, alternatives }) =
+            endpoint.cloned()
+        else {
             let (host, prefix) = (self.host.clone(), self.prefix.clone());
-            return Destination { host, port: self.port, prefix, is_encrypted: false, external: None };
+            return Destination {
+                host,
+                port: self.port,
+                prefix,
+                is_encrypted: false,
+                external: None,
+            };
         };
         let other = number.checked_sub(1).and_then(|at| alternatives.into_iter().nth(at));
         let MqttPlace { host, port, tls } = other.unwrap_or(MqttPlace { host, port, tls });

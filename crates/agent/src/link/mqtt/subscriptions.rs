@@ -1,5 +1,5 @@
-//! What a session is subscribed to: the robot's own topics, and the parts of the contents that somebody gathers. A
-//! refused subscription is tried again: the server may not have got so far yet.
+//! What a session is subscribed to: the robot's own topics, and the parts of the contents that
+//! somebody gathers. A refused subscription is tried again: the server may not have got so far yet.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -11,8 +11,8 @@ use tokio::time::Instant;
 
 use crate::transfer::parts::{Hearing, Listening, Wish};
 
-/// How long to wait on average after a refusal: a little at first, because the server may just be about to begin, then twice as
-/// long each time, up to the most.
+/// How long to wait on average after a refusal: a little at first, because the server may just be
+/// about to begin, then twice as long each time, up to the most.
 const FIRST_RETRY: Duration = Duration::from_millis(50);
 const RETRY: Duration = Duration::from_secs(1);
 /// How far a timer is set when there is nothing to wait for.
@@ -67,14 +67,16 @@ impl Subscriptions {
         let (_, whose, sent_at) = self.sent.swap_remove(at);
         let Whose::Content(wish) = whose else { return Some(sent_at.elapsed()) };
         // It may be wanted anew since it was asked for.
-        let subscription = self.contents.get_mut(&wish.digest).filter(|subscription| subscription.wish == wish)?;
+        let subscription =
+            self.contents.get_mut(&wish.digest).filter(|subscription| subscription.wish == wish)?;
         if matches!(answer.return_codes[..], [SubscribeReasonCode::Success(_)]) {
             subscription.stands = Stands::Granted;
             listening.tell(&wish, Hearing::Yes);
         } else {
             let pause = FIRST_RETRY.saturating_mul(1 << subscription.refusals.min(8)).min(RETRY);
             subscription.refusals = subscription.refusals.saturating_add(1);
-            subscription.stands = Stands::Due(Instant::now() + pause.mul_f64(0.5 + rand::random::<f64>()));
+            subscription.stands =
+                Stands::Due(Instant::now() + pause.mul_f64(0.5 + rand::random::<f64>()));
             listening.tell(&wish, Hearing::Refused);
         }
         None
@@ -90,7 +92,12 @@ impl Subscriptions {
     }
 
     /// Asks for what is wanted, and ends what is not wanted any more.
-    pub(super) fn tune(&mut self, client: &AsyncClient, prefix: &TopicPrefix, listening: &Listening) {
+    pub(super) fn tune(
+        &mut self,
+        client: &AsyncClient,
+        prefix: &TopicPrefix,
+        listening: &Listening,
+    ) {
         let now = Instant::now();
         let wanted = listening.wanted();
         let topic = |digest: &Digest| prefix.format(&Topic::Package(*digest));
@@ -111,8 +118,10 @@ impl Subscriptions {
                 continue;
             }
             subscription.wish = wish;
-            // With the highest quality of service each part comes with the one that it was sent with.
-            subscription.stands = match client.try_subscribe(topic(&wish.digest), QoS::ExactlyOnce) {
+            // With the highest quality of service each part comes with the one that it was sent
+            // with.
+            subscription.stands = match client.try_subscribe(topic(&wish.digest), QoS::ExactlyOnce)
+            {
                 Ok(()) => {
                     self.unsent.push_back(Whose::Content(wish));
                     Stands::Asked

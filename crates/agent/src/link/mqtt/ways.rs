@@ -1,5 +1,6 @@
-//! The ways an MQTT session may take to the server: over the broker's own port, or as a WebSocket over the HTTP port, which
-//! is open wherever a robot can reach its server at all. One that fails is given up for the other. It opens nothing.
+//! The ways an MQTT session may take to the server: over the broker's own port, or as a WebSocket
+//! over the HTTP port, which is open wherever a robot can reach its server at all. One that fails
+//! is given up for the other. It opens nothing.
 
 use std::sync::Arc;
 
@@ -35,8 +36,15 @@ impl Ways {
         Self { transport, tls, websocket, is_turned: false }
     }
 
-    /// The next way. A broker that is not the server's own has nothing but its port, and a certificate by somebody else.
-    pub(super) fn next(&self, host: &str, port: u16, is_encrypted: bool, external: Option<&ExternalBroker>) -> Route {
+    /// The next way. A broker that is not the server's own has nothing but its port, and a
+    /// certificate by somebody else.
+    pub(super) fn next(
+        &self,
+        host: &str,
+        port: u16,
+        is_encrypted: bool,
+        external: Option<&ExternalBroker>,
+    ) -> Route {
         let by_websocket = match self.transport {
             MqttTransport::Auto => self.is_turned,
             MqttTransport::Tcp => false,
@@ -46,7 +54,9 @@ impl Ways {
             None if by_websocket => return self.websocket.clone(),
             _ if !is_encrypted => None,
             None => Some(self.tls.clone()),
-            Some(broker) => Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates()))),
+            Some(broker) => {
+                Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates())))
+            }
         };
         Route { host: host.to_owned(), port, tls, websocket: None }
     }
@@ -87,7 +97,8 @@ mod tests {
         assert_eq!(direct(&ways), own_port);
         ways.turn();
         assert_eq!(direct(&ways), websocket);
-        let broker = ExternalBroker { password: "secret".to_owned(), client_id: None, ca_pin: None };
+        let broker =
+            ExternalBroker { password: "secret".to_owned(), client_id: None, ca_pin: None };
         assert_eq!(
             shown(ways.next("broker.lab", 1883, false, Some(&broker))),
             ("broker.lab".to_owned(), 1883, None, false),
@@ -100,14 +111,20 @@ mod tests {
         ways.turn();
         ways.begin_anew();
         assert_eq!(direct(&ways), own_port);
-        assert_eq!(shown(ways.next("fleet.lab", 1883, false, None)), ("fleet.lab".to_owned(), 1883, None, false));
+        assert_eq!(
+            shown(ways.next("fleet.lab", 1883, false, None)),
+            ("fleet.lab".to_owned(), 1883, None, false)
+        );
     }
 
     #[test]
     fn a_setting_leaves_no_choice() {
         let mut tcp = ways("http://10.0.0.7:8080", MqttTransport::Tcp);
         tcp.turn();
-        assert_eq!(shown(tcp.next("10.0.0.7", 1883, false, None)), ("10.0.0.7".to_owned(), 1883, None, false));
+        assert_eq!(
+            shown(tcp.next("10.0.0.7", 1883, false, None)),
+            ("10.0.0.7".to_owned(), 1883, None, false)
+        );
         let websocket = ways("http://10.0.0.7:8080", MqttTransport::Websocket);
         let way = ("10.0.0.7".to_owned(), 8080, Some("/mqtt".to_owned()), false);
         assert_eq!(shown(websocket.next("10.0.0.7", 1883, false, None)), way);

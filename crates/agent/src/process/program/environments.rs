@@ -1,6 +1,7 @@
-//! Looks into the environments of many processes. The kernel keeps who reads one waiting for as long as that process's memory
-//! is locked, which a driver or a network file system that hangs, or anybody with a file system of their own, makes for
-//! ever. So somebody else reads here, and a process whose environment does not come holds up one look, once.
+//! Looks into the environments of many processes. The kernel keeps who reads one waiting for as
+//! long as that process's memory is locked, which a driver or a network file system that hangs, or
+//! anybody with a file system of their own, makes for ever. So somebody else reads here, and a
+//! process whose environment does not come holds up one look, once.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -20,7 +21,8 @@ type Key = (u32, u64);
 /// Those that are still waited for, by whoever read them when it was too late.
 static SILENT: Silent = Silent(Mutex::new(None));
 
-/// What `read` finds in the environment of each of `entries`, but for those that do not come. `read` may wait for ever.
+/// What `read` finds in the environment of each of `entries`, but for those that do not come.
+/// `read` may wait for ever.
 pub fn look<T: Send + 'static>(
     entries: Vec<ProcessEntry>,
     read: impl Fn(&ProcessEntry) -> T + Clone + Send + 'static,
@@ -59,7 +61,8 @@ impl Silent {
                     }
                 }
             };
-            // Where no thread can be had, as when a task has taken them all, what there is has to do it.
+            // Where no thread can be had, as when a task has taken them all, what there is has to
+            // do it.
             match std::thread::Builder::new().name("environments".to_owned()).spawn(work.clone()) {
                 Ok(_) => drop(work),
                 Err(_) => work(),
@@ -70,7 +73,10 @@ impl Silent {
             }
             rest.drain(..found.len() - before);
             let Some(silent) = rest.first() else { return found };
-            tracing::warn!(pid = silent.pid, "the environment of this process does not come: its memory is locked");
+            tracing::warn!(
+                pid = silent.pid,
+                "the environment of this process does not come: its memory is locked"
+            );
             self.note(silent, Reader { read: count, at: found.len() - before });
             rest.remove(0);
         }
@@ -101,7 +107,8 @@ mod tests {
 
     #[test]
     fn one_that_does_not_come_is_waited_for_once_until_it_does() {
-        let entry = |pid| ProcessEntry { pid, parent: 1, group: pid, start_ticks: 0, is_zombie: false };
+        let entry =
+            |pid| ProcessEntry { pid, parent: 1, group: pid, start_ticks: 0, is_zombie: false };
         let entries: Vec<_> = (1..=4).map(entry).collect();
         let silent = Silent(Mutex::new(None));
         let (release, held) = mpsc::channel::<()>();
@@ -116,7 +123,13 @@ mod tests {
             }
             entry.pid * 10
         };
-        let look = || silent.look(entries.clone(), read.clone()).into_iter().map(|(_, ten)| ten).collect::<Vec<_>>();
+        let look = || {
+            silent
+                .look(entries.clone(), read.clone())
+                .into_iter()
+                .map(|(_, ten)| ten)
+                .collect::<Vec<_>>()
+        };
         assert_eq!(look(), [10, 30, 40]);
         assert_eq!(look(), [10, 30, 40]);
         assert_eq!(reads.load(Ordering::SeqCst), 1, "nobody waits for it again");

@@ -38,9 +38,13 @@ impl<E: Effects> Driver<E> {
                 }
             }
             Heard::TokenRefused(why) => {
-                let why: String = why.chars().filter(|c| !c.is_control()).take(MOST_REASON_CHARS).collect();
+                let why: String =
+                    why.chars().filter(|c| !c.is_control()).take(MOST_REASON_CHARS).collect();
                 if !self.ledger.removed || self.ledger.removed_because != why {
-                    tracing::warn!(why, "the server does not accept this robot's token: nothing new is begun");
+                    tracing::warn!(
+                        why,
+                        "the server does not accept this robot's token: nothing new is begun"
+                    );
                     (self.ledger.removed, self.ledger.removed_because) = (true, why);
                     self.dirty = true;
                 }
@@ -54,7 +58,8 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// The server has answered this robot, or signed something new for it: it has not removed it, or not for good.
+    /// The server has answered this robot, or signed something new for it: it has not removed it,
+    /// or not for good.
     fn known_by_server(&mut self) {
         self.withheld = None;
         if self.ledger.removed {
@@ -72,20 +77,31 @@ impl<E: Effects> Driver<E> {
                 REFUSALS.iter().for_each(|code| drop(self.conditions.remove(code)));
                 self.withheld = None;
                 if !inline.is_empty() {
-                    let packages = state.tasks.iter().flat_map(|task| [task.package.config, task.package.content]);
+                    let packages = state
+                        .tasks
+                        .iter()
+                        .flat_map(|task| [task.package.config, task.package.content]);
                     let blobs = packages.chain(state.evidence.blobs());
-                    let came = blobs.filter_map(|blob| Some((blob, Bytes::copy_from_slice(inline.get(&blob)?))));
+                    let came = blobs.filter_map(|blob| {
+                        Some((blob, Bytes::copy_from_slice(inline.get(&blob)?)))
+                    });
                     self.effects.offer(came.collect());
                 }
                 self.effects.heed(&state);
                 if self.desired.as_ref() != Some(&state) {
                     self.known_by_server();
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
-                    self.ledger.accepted = Some(Accepted { generation: state.generation, envelope });
-                    // The order may be for a label that the robot was given just before it: ask again.
-                    // Likewise for what a person has installed since the last one.
+                    self.ledger.accepted =
+                        Some(Accepted { generation: state.generation, envelope });
+                    // The order may be for a label that the robot was given just before it: ask
+                    // again. Likewise for what a person has installed since the last one.
                     (self.robot.labels, self.robot.installations) = (None, None);
-                    if self.views.values().filter_map(|view| view.prepared.as_ref()).any(requires_labels) {
+                    if self
+                        .views
+                        .values()
+                        .filter_map(|view| view.prepared.as_ref())
+                        .any(requires_labels)
+                    {
                         self.shared.post.notify_one();
                     }
                     self.desired = Some(state);
@@ -96,7 +112,10 @@ impl<E: Effects> Driver<E> {
                 let text = format!("a desired state was refused: {}", chain(&refused));
                 tracing::warn!("{text}");
                 let is_other = matches!(refused, Refused::Contradicts(_));
-                self.conditions.insert(if is_other { Report::STATE_CONTRADICTED } else { STATE_REFUSED }, text);
+                self.conditions.insert(
+                    if is_other { Report::STATE_CONTRADICTED } else { STATE_REFUSED },
+                    text,
+                );
             }
         }
     }
@@ -109,14 +128,25 @@ impl<E: Effects> Driver<E> {
         }
         if let Some(own) = self.speaker.labels.as_ref().filter(|own| **own != reply.labels) {
             let text = |labels: &Labels| {
-                labels.iter().map(|(key, value)| format!("{key}={value}")).collect::<Vec<_>>().join(",")
+                labels
+                    .iter()
+                    .map(|(key, value)| format!("{key}={value}"))
+                    .collect::<Vec<_>>()
+                    .join(",")
             };
-            differences.push(format!("labels are {:?} here and {:?} there", text(own), text(&reply.labels)));
+            differences.push(format!(
+                "labels are {:?} here and {:?} there",
+                text(own),
+                text(&reply.labels)
+            ));
         }
         if differences.is_empty() {
             self.conditions.remove("settings_differ");
         } else {
-            let text = format!("the server's settings hold, the robot's own differ: {}", differences.join("; "));
+            let text = format!(
+                "the server's settings hold, the robot's own differ: {}",
+                differences.join("; ")
+            );
             self.conditions.insert("settings_differ", text);
         }
         self.robot.labels = Some(reply.labels.clone());

@@ -1,9 +1,12 @@
-//! What the driver reports: a snapshot of the ledger in the wire's types, published when it says something new.
+//! What the driver reports: a snapshot of the ledger in the wire's types, published when it says
+//! something new.
 
 use std::sync::Arc;
 
 use task_proto::TaskName;
-use task_proto::report::{ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport};
+use task_proto::report::{
+    ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport,
+};
 use tokio::time::Instant;
 
 use super::hearing::REFUSALS;
@@ -24,7 +27,8 @@ impl<E: Effects> Driver<E> {
     pub(super) fn publish_report(&mut self) {
         let report = self.report();
         let again = std::mem::take(&mut self.asks_again);
-        let news = self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
+        let news =
+            self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
         if news || again {
             self.seq = report.seq;
             self.shared.reports.send_replace(Some(Arc::new(report)));
@@ -48,15 +52,22 @@ impl<E: Effects> Driver<E> {
             host: self.effects.host_facts(),
             conditions: self.all_conditions(),
             link: self.shared.meter.facts(Instant::now()),
-            tasks: tasks.map(|(task, record)| task_report(task, record, self.views.get(task), now_ms)).collect(),
+            tasks: tasks
+                .map(|(task, record)| task_report(task, record, self.views.get(task), now_ms))
+                .collect(),
         }
     }
 
     fn all_conditions(&self) -> Vec<Condition> {
-        let condition = |code: &str, text: &str| Condition { code: code.to_owned(), text: text.to_owned() };
-        let mut conditions: Vec<Condition> = self.conditions.iter().map(|(code, text)| condition(code, text)).collect();
+        let condition =
+            |code: &str, text: &str| Condition { code: code.to_owned(), text: text.to_owned() };
+        let mut conditions: Vec<Condition> =
+            self.conditions.iter().map(|(code, text)| condition(code, text)).collect();
         if self.held {
-            conditions.push(condition("held", "a person at the robot said hold: nothing is started or switched"));
+            conditions.push(condition(
+                "held",
+                "a person at the robot said hold: nothing is started or switched",
+            ));
         }
         conditions.extend(self.ledger.removal().map(|text| condition("removed", &text)));
         if let Some(text) = &self.robot.no_task_user {
@@ -64,7 +75,10 @@ impl<E: Effects> Driver<E> {
         }
         let wall_ms = self.effects.now().wall_ms;
         if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {
-            conditions.push(condition("state_expired", "the desired state has expired: nothing new is begun"));
+            conditions.push(condition(
+                "state_expired",
+                "the desired state has expired: nothing new is begun",
+            ));
         }
         if wall_ms < clock::PROGRAM_EXISTS_SINCE_MS {
             let text = format!(
@@ -76,7 +90,8 @@ impl<E: Effects> Driver<E> {
         if let Some(text) = &self.trust.refused_list {
             conditions.push(condition("publishers_refused", text));
         }
-        let undone: Vec<&str> = self.views.values().filter_map(|view| view.undone.as_deref()).collect();
+        let undone: Vec<&str> =
+            self.views.values().filter_map(|view| view.undone.as_deref()).collect();
         if !undone.is_empty() {
             conditions.push(condition("step_failed", &undone.join("; ")));
         }
@@ -84,11 +99,13 @@ impl<E: Effects> Driver<E> {
         conditions
     }
 
-    /// Whether the server need not send what it has sent before: not once half of the state's lifetime is over, so that
-    /// the server sends it signed anew, and not while the robot refuses what it was sent.
+    /// Whether the server need not send what it has sent before: not once half of the state's
+    /// lifetime is over, so that the server sends it signed anew, and not while the robot refuses
+    /// what it was sent.
     fn is_settled(&self) -> bool {
         let Some(state) = &self.desired else { return false };
-        let half_ms = state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
+        let half_ms =
+            state.issued_at_ms + state.expires_at_ms.saturating_sub(state.issued_at_ms) / 2;
         let refused = REFUSALS.iter().any(|code| self.conditions.contains_key(code));
         !refused && self.effects.now().wall_ms < half_ms
     }
@@ -103,22 +120,28 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
         report.tasks.iter_mut().for_each(|task| task.phase_ms = 0);
         report
     };
-    let battery = |report: &Report| report.host.battery_percent.map(|percent| percent / BATTERY_STEP_PERCENT);
+    let battery =
+        |report: &Report| report.host.battery_percent.map(|percent| percent / BATTERY_STEP_PERCENT);
     without_times(last) == without_times(next)
         && battery(last) == battery(next)
         && !link_meter::is_news(last.link.as_ref(), next.link.as_ref())
 }
 
-/// Why the run that is kept alive is not as it should be: something is missing that it once had, or the robot does not
-/// let an older one than ordered start again, or its files do not come back.
+/// Why the run that is kept alive is not as it should be: something is missing that it once had, or
+/// the robot does not let an older one than ordered start again, or its files do not come back.
 fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
-    let ready = record.active.as_ref().and_then(|active| active.process.as_ref()).is_some_and(|process| process.ready);
+    let ready = record
+        .active
+        .as_ref()
+        .and_then(|active| active.process.as_ref())
+        .is_some_and(|process| process.ready);
     match view.map(|view| &view.health) {
         Some(Health::Missing(missing)) if ready => Some(missing.failure()),
         _ => {
             let refusal = record.refusal().filter(|(question, _)| !record.concerns_order(question));
-            let of_order =
-                |lost: &&LostFiles| lost.deployment == record.order.deployment && lost.run == record.order.run;
+            let of_order = |lost: &&LostFiles| {
+                lost.deployment == record.order.deployment && lost.run == record.order.run
+            };
             let files = record.collections.iter().find_map(|files| files.failure.as_ref());
             let lost = record.lost.as_ref().filter(of_order).map(|lost| &lost.failure);
             let distrusted = distrusted(record, view).filter(|_| ready);
@@ -138,7 +161,12 @@ fn distrusted(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
     (vouched == Vouched::No).then(|| Failure::new(FailureCode::UNTRUSTED_PACKAGE, text))
 }
 
-fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms: u64) -> TaskReport {
+fn task_report(
+    task: &TaskName,
+    record: &TaskRecord,
+    view: Option<&View>,
+    now_ms: u64,
+) -> TaskReport {
     let (phase, failure) = record.standing();
     let lane = match phase {
         Phase::Fetching => Some(Lane::Prepare),
@@ -147,7 +175,8 @@ fn task_report(task: &TaskName, record: &TaskRecord, view: Option<&View>, now_ms
     };
     let progress = lane.and_then(|lane| view?.progress.get(&lane).copied());
     // All bytes are there: what is left of a pull is unpacking.
-    let unpacking = phase == Phase::Fetching && progress.is_some_and(|progress| progress.done >= progress.total);
+    let unpacking = phase == Phase::Fetching
+        && progress.is_some_and(|progress| progress.done >= progress.total);
     let active = record.active.as_ref();
     let for_order = active.filter(|active| active.is_for(&record.order));
     TaskReport {

@@ -1,5 +1,5 @@
-//! The steps under way: begun, interrupted when they serve nothing any more, and what their end means for the ledger.
-//! Which step is next is the plan's to say.
+//! The steps under way: begun, interrupted when they serve nothing any more, and what their end
+//! means for the ledger. Which step is next is the plan's to say.
 
 use std::time::Duration;
 
@@ -28,8 +28,10 @@ impl<E: Effects> Driver<E> {
         if matches!(step, Step::PullContent { .. } | Step::Collect(_)) {
             view.transfers.insert(step.lane(), transfer);
         }
-        view.asked = matches!(step, Step::PullContent { is_pushed: true, .. }).then(|| asked.clone());
-        let running = self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
+        view.asked =
+            matches!(step, Step::PullContent { is_pushed: true, .. }).then(|| asked.clone());
+        let running =
+            self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
         let (effects, lane, news) = (self.effects.clone(), step.lane(), self.asks.clone());
         let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
         let handle = self.steps.spawn(async move {
@@ -78,35 +80,51 @@ impl<E: Effects> Driver<E> {
             .under_way
             .iter()
             .filter(|((task, _), under_way)| {
-                !under_way.step.is_wanted(self.desired_task(task).as_ref(), self.ledger.tasks.get(task))
+                !under_way
+                    .step
+                    .is_wanted(self.desired_task(task).as_ref(), self.ledger.tasks.get(task))
             })
             .map(|(key, _)| key.clone())
             .collect();
         for key in unwanted {
-            if let Some(under_way) = self.under_way.get_mut(&key).filter(|under_way| under_way.drop_at.is_none()) {
+            if let Some(under_way) =
+                self.under_way.get_mut(&key).filter(|under_way| under_way.drop_at.is_none())
+            {
                 under_way.cancel.cancel();
                 under_way.drop_at = Some(now + INTERRUPT_GRACE);
             }
         }
         for ((task, _), under_way) in &mut self.under_way {
             if under_way.drop_at.is_some_and(|at| at <= now) {
-                tracing::warn!("{} does not end and is dropped", plan::describe(task, &under_way.step));
+                tracing::warn!(
+                    "{} does not end and is dropped",
+                    plan::describe(task, &under_way.step)
+                );
                 under_way.handle.abort();
                 under_way.drop_at = Some(now + INTERRUPT_GRACE);
             }
         }
     }
 
-    pub(super) fn step_ended(&mut self, ended: Result<(Id, (TaskName, Lane, Outcome)), tokio::task::JoinError>) {
+    pub(super) fn step_ended(
+        &mut self,
+        ended: Result<(Id, (TaskName, Lane, Outcome)), tokio::task::JoinError>,
+    ) {
         let (id, outcome) = match ended {
             Ok((id, (_, _, outcome))) => (id, outcome),
             Err(error) => {
-                let failure = Failure::new(FailureCode::IO_ERROR, format!("the step ended without a result: {error}"));
+                let failure = Failure::new(
+                    FailureCode::IO_ERROR,
+                    format!("the step ended without a result: {error}"),
+                );
                 (error.id(), Err(StepFailure { failure, retry_after_ms: Some(1000) }))
             }
         };
-        let found =
-            self.under_way.iter().find(|(_, under_way)| under_way.handle.id() == id).map(|(key, _)| key.clone());
+        let found = self
+            .under_way
+            .iter()
+            .find(|(_, under_way)| under_way.handle.id() == id)
+            .map(|(key, _)| key.clone());
         let Some((task, lane)) = found else { return };
         let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
         let view = self.views.entry(task.clone()).or_default();
@@ -146,7 +164,8 @@ impl<E: Effects> Driver<E> {
             return;
         }
         if matches!(step, Step::LookForRos(_)) {
-            self.robot.installations = Some(self.effects.robot_facts().installations.unwrap_or_default());
+            self.robot.installations =
+                Some(self.effects.robot_facts().installations.unwrap_or_default());
         }
         let Some(view) = self.views.get(task) else { return };
         let Some(situation) = self.situation(task, view, None, &[]) else { return };
@@ -180,5 +199,8 @@ async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
 /// A step that did not end in time. It is tried again: nothing is known of how far it came.
 fn late(deadline: Duration) -> StepFailure {
     let text = format!("the step did not end within {} s", deadline.as_secs());
-    StepFailure { failure: Failure::new(FailureCode::DEADLINE_EXCEEDED, text), retry_after_ms: Some(0) }
+    StepFailure {
+        failure: Failure::new(FailureCode::DEADLINE_EXCEEDED, text),
+        retry_after_ms: Some(0),
+    }
 }

@@ -95,8 +95,12 @@ impl Bench {
     /// The first report of which `expected` is true.
     async fn report(&self, expected: impl Fn(&Report) -> bool) -> Report {
         let mut reports = self.shared.reports.subscribe();
-        let found = reports.wait_for(|report| report.as_ref().is_some_and(|report| expected(report)));
-        let found = tokio::time::timeout(PATIENCE, found).await.expect("it is reported").expect("the driver lives");
+        let found =
+            reports.wait_for(|report| report.as_ref().is_some_and(|report| expected(report)));
+        let found = tokio::time::timeout(PATIENCE, found)
+            .await
+            .expect("it is reported")
+            .expect("the driver lives");
         Report::clone(found.as_ref().expect("waited for"))
     }
 
@@ -132,7 +136,8 @@ async fn an_order_runs_and_its_withdrawal_removes_it() {
 async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_it_is_installed() {
     let bench = Bench::new().await;
     bench.fake.state(|state| {
-        state.exec_depends = ["nav2_bringup", "python3-numpy", "std_msgs", "slam_toolbox"].map(str::to_owned).into();
+        state.exec_depends =
+            ["nav2_bringup", "python3-numpy", "std_msgs", "slam_toolbox"].map(str::to_owned).into();
         state.ros_packages = ["std_msgs".to_owned()].into();
     });
     bench.order(1, vec![order("1.0")]).await;
@@ -143,7 +148,9 @@ async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_i
     assert!(failure.text.contains(list), "{failure}");
     assert!(bench.fake.state(|state| state.contents.is_empty()), "nothing was pulled");
     // A person installs them; the same package is ordered again.
-    bench.fake.state(|state| state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned)));
+    bench.fake.state(|state| {
+        state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned))
+    });
     bench.order(2, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
 }
@@ -157,19 +164,31 @@ async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
     let report = bench.phase(Phase::Failed).await;
     assert_eq!(report.tasks[0].failure.as_ref().expect("why").code, FailureCode::UNTRUSTED_PACKAGE);
     bench.fake.state(|state| {
-        assert!(state.manifests.is_empty() && state.contents.is_empty() && state.started.is_empty());
-        assert_eq!((&state.heeded, &state.checked), (&vec![Generation(1)], &vec![unsigned.package.manifest.digest]));
+        assert!(
+            state.manifests.is_empty() && state.contents.is_empty() && state.started.is_empty()
+        );
+        assert_eq!(
+            (&state.heeded, &state.checked),
+            (&vec![Generation(1)], &vec![unsigned.package.manifest.digest])
+        );
     });
     bench.order(2, vec![signed.clone()]).await;
     bench.phase(Phase::Running).await;
     // Its publisher is revoked: it goes on, and the report says what that is worth.
     bench.fake.state(|state| {
         state.untrusted.insert(signed.package.manifest.digest);
-        state.trust = TrustFacts { epoch: 1, refused_list: Some("it is old".to_owned()), ..TrustFacts::default() };
+        state.trust = TrustFacts {
+            epoch: 1,
+            refused_list: Some("it is old".to_owned()),
+            ..TrustFacts::default()
+        };
     });
     let report = bench.report(|report| report.tasks[0].degraded.is_some()).await;
     assert_eq!(report.tasks[0].phase, Phase::Running);
-    assert_eq!(report.tasks[0].degraded.as_ref().expect("waited for").code, FailureCode::UNTRUSTED_PACKAGE);
+    assert_eq!(
+        report.tasks[0].degraded.as_ref().expect("waited for").code,
+        FailureCode::UNTRUSTED_PACKAGE
+    );
     assert!(has(&report, "publishers_refused"));
 }
 
@@ -198,9 +217,16 @@ async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     bench.fake.slow.store(true, std::sync::atomic::Ordering::SeqCst);
     bench.order(2, vec![order("2.0")]).await;
     let fetching = bench.phase(Phase::Fetching).await;
-    assert_eq!(fetching.tasks[0].active.as_ref().expect("the old one").version, old.package.version);
+    assert_eq!(
+        fetching.tasks[0].active.as_ref().expect("the old one").version,
+        old.package.version
+    );
     bench.order(3, vec![old.clone()]).await;
-    bench.report(|report| report.observed_generation == Generation(3) && report.tasks[0].phase == Phase::Running).await;
+    bench
+        .report(|report| {
+            report.observed_generation == Generation(3) && report.tasks[0].phase == Phase::Running
+        })
+        .await;
     let (started, alive) = bench.fake.state(|state| (state.started.len(), state.alive.len()));
     assert_eq!((started, alive), (1, 1));
     bench.end().await;
@@ -251,14 +277,17 @@ async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
     bench.phase(Phase::Running).await;
     bench.fake.state(|state| state.bad.insert(new.package.manifest.digest));
     bench.order(2, vec![new.clone()]).await;
-    let back = |report: &Report| report.tasks[0].phase == Phase::RolledBack && report.tasks[0].active.is_some();
+    let back = |report: &Report| {
+        report.tasks[0].phase == Phase::RolledBack && report.tasks[0].active.is_some()
+    };
     let report = bench.report(back).await;
     let task = &report.tasks[0];
     assert_eq!((&task.deployment, task.run), (&new.deployment, 1));
     assert_eq!(task.failure.as_ref().expect("why").to_string(), "lifecycle_failed: it will not");
     assert_eq!(task.active.as_ref().expect("the old one").deployment, old.deployment);
     // Neither a report nor a new agent makes it try again; a new run does.
-    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let (fake, key, robot) =
+        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;
     let bench = Bench::with(fake, ledger, key, robot).await;
     bench.report(back).await;
@@ -275,7 +304,10 @@ async fn the_gate_is_asked_first_and_its_reason_is_reported() {
     let order = order("1.0");
     bench.order(1, vec![order.clone()]).await;
     let report = bench.phase(Phase::Deferred).await;
-    assert_eq!(report.tasks[0].failure.as_ref().expect("why").to_string(), "gate_refused: carries a load");
+    assert_eq!(
+        report.tasks[0].failure.as_ref().expect("why").to_string(),
+        "gate_refused: carries a load"
+    );
     assert!(bench.fake.state(|state| state.started.is_empty()));
     bench.fake.state(|state| state.gate = Some(Ok(())));
     bench.phase(Phase::Running).await;
@@ -286,7 +318,10 @@ async fn the_gate_is_asked_first_and_its_reason_is_reported() {
     bench.fake.state(|state| state.gate = None);
     bench.phase(Phase::Stopped).await;
     let asked = bench.fake.state(|state| state.asked.clone());
-    assert!(asked.starts_with(&[GateStep::Start]) && asked.ends_with(&[GateStep::Stop]), "{asked:?}");
+    assert!(
+        asked.starts_with(&[GateStep::Start]) && asked.ends_with(&[GateStep::Stop]),
+        "{asked:?}"
+    );
 }
 
 #[tokio::test]
@@ -297,11 +332,14 @@ async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
     bench.order(1, vec![order.clone()]).await;
     bench.phase(Phase::Running).await;
     bench.fake.exit(0);
-    let sending = |report: &Report| report.tasks[0].progress == Some(Progress { done: 1, total: 2 });
+    let sending =
+        |report: &Report| report.tasks[0].progress == Some(Progress { done: 1, total: 2 });
     let report = bench.report(sending).await;
     assert_eq!((report.tasks[0].phase, &report.tasks[0].active), (Phase::Running, &None));
-    // The agent dies meanwhile: the job is not run again, its files are sent again, and this time refused.
-    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    // The agent dies meanwhile: the job is not run again, its files are sent again, and this time
+    // refused.
+    let (fake, key, robot) =
+        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;
     let failure = Failure::new(FailureCode::OUTPUTS_LOST, "too much");
     fake.state(|state| state.upload = Some(Err(StepFailure { failure, retry_after_ms: None })));
@@ -315,7 +353,8 @@ async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
     bench.fake.exit(3);
     let report = bench.phase(Phase::Failed).await;
     assert_eq!(report.tasks[0].degraded, None);
-    let (collected, started) = bench.fake.state(|state| (state.collected.clone(), state.started.len()));
+    let (collected, started) =
+        bench.fake.state(|state| (state.collected.clone(), state.started.len()));
     assert_eq!((collected, started), (vec![1, 2], 2));
 }
 
@@ -328,7 +367,11 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
     bench.say(forged).await;
     bench.report(|report| has(report, "state_refused")).await;
     bench.order(6, vec![order("1.1")]).await;
-    bench.report(|report| !has(report, "state_refused") && report.observed_generation == Generation(6)).await;
+    bench
+        .report(|report| {
+            !has(report, "state_refused") && report.observed_generation == Generation(6)
+        })
+        .await;
     bench.order(4, Vec::new()).await;
     let report = bench.report(|report| has(report, "state_refused")).await;
     assert_eq!((report.observed_generation, report.tasks.len()), (Generation(6), 1));
@@ -338,7 +381,11 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
     let report = bench.report(|report| has(report, Report::STATE_CONTRADICTED)).await;
     assert_eq!((report.reached_generation(), report.tasks.len()), (Generation(7), 1));
     bench.order(8, Vec::new()).await;
-    bench.report(|report| report.conditions.is_empty() && report.reached_generation() == Generation(8)).await;
+    bench
+        .report(|report| {
+            report.conditions.is_empty() && report.reached_generation() == Generation(8)
+        })
+        .await;
 }
 
 #[tokio::test]
@@ -346,15 +393,20 @@ async fn what_is_not_stopped_or_deleted_is_said_until_it_is() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
-    let failing =
-        |text: &str| StepFailure { failure: Failure::new(FailureCode::IO_ERROR, text), retry_after_ms: Some(0) };
+    let failing = |text: &str| StepFailure {
+        failure: Failure::new(FailureCode::IO_ERROR, text),
+        retry_after_ms: Some(0),
+    };
     bench.fake.state(|state| {
         state.stop = Some(failing("it does not end"));
         state.removal = Some(failing("read-only file system"));
     });
     bench.order(2, Vec::new()).await;
     let said = |report: &Report, text: &str| {
-        report.conditions.iter().any(|condition| condition.code == "step_failed" && condition.text == text)
+        report
+            .conditions
+            .iter()
+            .any(|condition| condition.code == "step_failed" && condition.text == text)
     };
     bench.report(|report| said(report, "stop talker: io_error: it does not end")).await;
     bench.fake.state(|state| state.stop = None);
@@ -368,7 +420,8 @@ async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
-    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let (fake, key, robot) =
+        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;
     let bench = Bench::with(fake, ledger, key, robot).await;
     let report = bench.phase(Phase::Running).await;
@@ -400,13 +453,18 @@ async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
     bench.order(2, vec![order("2.0")]).await;
     bench.phase(Phase::Deferred).await;
     bench.fake.state(|state| (state.disk_full, state.held) = (true, false));
-    // The new version's start would have to be written down: the old one is not stopped for what may never come.
+    // The new version's start would have to be written down: the old one is not stopped for what
+    // may never come.
     bench.report(|report| has(report, "ledger_unwritable")).await;
     assert_eq!(bench.fake.state(|state| (state.alive.len(), state.started.len())), (1, 1));
     bench.order(3, Vec::new()).await;
     let report = bench.report(|report| report.tasks.is_empty()).await;
     assert!(has(&report, "ledger_unwritable") && bench.fake.state(|state| state.alive.is_empty()));
-    assert_eq!(report.observed_generation, Generation(2), "what a power cut would take was not observed");
+    assert_eq!(
+        report.observed_generation,
+        Generation(2),
+        "what a power cut would take was not observed"
+    );
     bench.fake.state(|state| state.disk_full = false);
     bench.report(|report| report.observed_generation == Generation(3)).await;
 }
@@ -417,7 +475,11 @@ async fn a_robot_whose_clock_starts_in_1970_says_so_and_works() {
     bench.fake.state(|state| state.wall_ms = Some(5_000));
     bench.order(1, vec![order("1.0")]).await;
     let report = bench.phase(Phase::Running).await;
-    let condition = report.conditions.iter().find(|condition| condition.code == "clock_wrong").expect("it says so");
+    let condition = report
+        .conditions
+        .iter()
+        .find(|condition| condition.code == "clock_wrong")
+        .expect("it says so");
     assert!(condition.text.contains("it shows 1970-01-01,"), "{}", condition.text);
     bench.fake.state(|state| state.wall_ms = None);
     bench.order(2, vec![order("2.0")]).await;
@@ -460,10 +522,14 @@ async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
     let task = &report.tasks[0];
     assert_eq!((task.phase, task.attempts, &task.failure), (Phase::Fetching, 1, &None));
     assert_eq!(task.progress, Some(Progress { done: 1, total: 2 }));
-    // It waits in its record, so that a new agent of this boot waits on, and another order need not.
+    // It waits in its record, so that a new agent of this boot waits on, and another order need
+    // not.
     let ledger = bench.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger");
     let preparation = &ledger.tasks.values().next().expect("a task").preparation;
-    assert!(preparation.retry_at_ms > bench.fake.now().boot_ms + 3_000_000 && preparation.failure.is_none());
+    assert!(
+        preparation.retry_at_ms > bench.fake.now().boot_ms + 3_000_000
+            && preparation.failure.is_none()
+    );
     bench.order(2, vec![order("1.1")]).await;
     bench.phase(Phase::Running).await;
     assert_eq!(*bench.fake.pulls.borrow(), 2);
@@ -480,7 +546,9 @@ async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_i
     came.insert(Digest::of(b"content"), b"others".to_vec());
     came.insert(Digest::of(b"not asked for"), b"not asked for".to_vec());
     let rung = |heard: Heard| match heard {
-        Heard::Desired { envelope, .. } => Heard::Desired { envelope, inline: came.clone(), was_asked_for: false },
+        Heard::Desired { envelope, .. } => {
+            Heard::Desired { envelope, inline: came.clone(), was_asked_for: false }
+        }
         other => other,
     };
     bench.say(rung(bench.sealed(1, vec![order.clone()], &SigningKey::random()))).await;
@@ -498,7 +566,9 @@ async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
     let pushed = DesiredTask { delivery: Delivery::DirectPush, ..order("1.0") };
     bench.order(1, vec![pushed.clone()]).await;
     bench.phase(Phase::Fetching).await;
-    let says = |missing: Option<Vec<PartRange>>, times| bench.fake.asks.send_replace(Asks { missing, times });
+    let says = |missing: Option<Vec<PartRange>>, times| {
+        bench.fake.asks.send_replace(Asks { missing, times })
+    };
     let missing = |report: &Report| report.tasks[0].missing_parts.clone();
     says(Some(Vec::new()), 1);
     let first = bench.report(|report| missing(report) == Some(Vec::new())).await;
@@ -506,7 +576,9 @@ async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
     says(Some(ranges.clone()), 2);
     let second = bench.report(|report| missing(report).as_ref() == Some(&ranges)).await;
     says(Some(ranges.clone()), 3);
-    let third = bench.report(|report| report.seq > second.seq && missing(report).as_ref() == Some(&ranges)).await;
+    let third = bench
+        .report(|report| report.seq > second.seq && missing(report).as_ref() == Some(&ranges))
+        .await;
     assert!(first.seq < second.seq && second.seq < third.seq);
     // The server says that it should pull instead: what it gathers by is ended, and it pulls.
     bench.order(2, vec![DesiredTask { delivery: Delivery::PushPull, ..pushed }]).await;
@@ -525,14 +597,18 @@ async fn tasks_of_higher_priority_are_prepared_first() {
         order.package.manifest.digest = Digest::of(name.as_bytes());
         DesiredTask { priority, ..order }
     };
-    // Two at a time are prepared; these wait on a person, so that only the order of the pulls is seen.
+    // Two at a time are prepared; these wait on a person, so that only the order of the pulls is
+    // seen.
     bench.fake.state(|state| state.held = true);
     let tasks = [("a", -5), ("b", 0), ("c", 7), ("d", 100), ("e", 0), ("f", 7)];
     bench.order(1, tasks.map(|(name, priority)| named(name, priority)).into()).await;
-    let all_wait = |report: &Report| report.tasks.iter().filter(|task| task.phase == Phase::Deferred).count() == 6;
+    let all_wait = |report: &Report| {
+        report.tasks.iter().filter(|task| task.phase == Phase::Deferred).count() == 6
+    };
     bench.report(all_wait).await;
     let begun = bench.fake.state(|state| state.pulled.clone());
-    let place = |name: &str| begun.iter().position(|task| task.as_str() == name).expect("pulled") / 2;
+    let place =
+        |name: &str| begun.iter().position(|task| task.as_str() == name).expect("pulled") / 2;
     let places = ["d", "c", "f", "b", "e", "a"].map(place);
     assert_eq!(places, [0, 0, 1, 1, 2, 2], "{begun:?}");
 }

@@ -1,5 +1,5 @@
-//! The watchers of live processes: two for each, one for its end and one for what ROS says of it. They only tell the
-//! driver what they see; what is made of it is the plan's to say.
+//! The watchers of live processes: two for each, one for its end and one for what ROS says of it.
+//! They only tell the driver what they see; what is made of it is the plan's to say.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -26,7 +26,10 @@ impl<E: Effects> Driver<E> {
             let lives = matches!(view.process, Some(ProcessState::Alive { .. }));
             // A start that is under way still changes the record that its watcher is given.
             let starts = self.under_way.contains_key(&(task.clone(), crate::task::plan::Lane::Run));
-            if !lives || starts || view.watched.as_ref().is_some_and(|watched| watched.dir == process.dir) {
+            if !lives
+                || starts
+                || view.watched.as_ref().is_some_and(|watched| watched.dir == process.dir)
+            {
                 continue;
             }
             let until_dropped = CancellationToken::new();
@@ -37,8 +40,10 @@ impl<E: Effects> Driver<E> {
                 dir: process.dir.clone(),
                 sights: self.sights.clone(),
             };
-            view.watched =
-                Some(Watched { dir: process.dir.clone(), _until_dropped: until_dropped.clone().drop_guard() });
+            view.watched = Some(Watched {
+                dir: process.dir.clone(),
+                _until_dropped: until_dropped.clone().drop_guard(),
+            });
             tokio::spawn(async move {
                 // Cancel-safe: whatever was not sent is of no use any more.
                 tokio::select! {
@@ -97,6 +102,7 @@ impl<E: Effects> Watcher<E> {
 
     /// The driver no longer listens when the agent ends.
     async fn tell(&self, what: Sight) {
-        let _ = self.sights.send(Seen { task: self.task.clone(), dir: self.dir.clone(), what }).await;
+        let _ =
+            self.sights.send(Seen { task: self.task.clone(), dir: self.dir.clone(), what }).await;
     }
 }

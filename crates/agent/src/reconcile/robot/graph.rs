@@ -1,4 +1,5 @@
-//! The robot's ROS graph, for those who only look: whoever answers questions about it and listens to what nodes say.
+//! The robot's ROS graph, for those who only look: whoever answers questions about it and listens
+//! to what nodes say.
 
 use std::collections::BTreeMap;
 
@@ -19,8 +20,8 @@ impl Robot {
         self.graph.settled(self.ros_facts().as_ref()).await
     }
 
-    /// Takes part in the graph that `facts` say while this version runs, if it is one of ROS 2, so that what its nodes say is kept also
-    /// where the package promises nothing about them.
+    /// Takes part in the graph that `facts` say while this version runs, if it is one of ROS 2, so
+    /// that what its nodes say is kept also where the package promises nothing about them.
     pub(super) fn listen_to(&self, package: &PackageRef, facts: Option<&RosFacts>) {
         let Some(manifest) = fetch::stored_manifest(&self.data, package) else { return };
         let is_ros_2 = match launch::of(&manifest).ros {

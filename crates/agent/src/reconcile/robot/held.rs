@@ -1,4 +1,5 @@
-//! The settings that hold now, as the effects use them: made anew when the server says something else.
+//! The settings that hold now, as the effects use them: made anew when the server says something
+//! else.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError};
@@ -42,7 +43,8 @@ impl Held {
             .iter()
             .filter_map(|name| Some(((*name).to_owned(), std::env::var(name).ok()?)))
             .collect();
-        variables.extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
+        variables
+            .extend(config.ros_domain_id.map(|id| ("ROS_DOMAIN_ID".to_owned(), id.to_string())));
         let mut build_limits = BuildLimits::of_this_machine();
         if let Some(timeout_s) = config.limits.build_timeout_s {
             build_limits.timeout = Duration::from_secs(timeout_s);
@@ -54,7 +56,11 @@ impl Held {
             set,
             environment: environment::of_this_robot(&variables),
             build_limits,
-            task_limits: RunLimits { memory_bytes, pids: Some(config.task_pids), ..RunLimits::default() },
+            task_limits: RunLimits {
+                memory_bytes,
+                pids: Some(config.task_pids),
+                ..RunLimits::default()
+            },
             output_bytes: config.limits.output_bytes.unwrap_or(OUTPUT_BYTES),
             config,
             effective,
@@ -84,8 +90,11 @@ impl Robot {
             return;
         }
         let held = Held::of(&self.own, set.clone());
-        let (own, refused) =
-            held.effective.as_ref().map(|e| (e.own.join(", "), e.refused.join(", "))).unwrap_or_default();
+        let (own, refused) = held
+            .effective
+            .as_ref()
+            .map(|e| (e.own.join(", "), e.refused.join(", ")))
+            .unwrap_or_default();
         tracing::info!(own, "settings from the server");
         if !refused.is_empty() {
             tracing::warn!(refused, "settings from the server that are not taken");
@@ -93,8 +102,8 @@ impl Robot {
         self.fetcher.limit(&held.config.limits);
         self.graph.limit(held.config.limits.log_bytes);
         self.forward.send_replace(held.config.forward);
-        let same_ros =
-            held.config.underlays == before.config.underlays && held.config.workspace == before.config.workspace;
+        let same_ros = held.config.underlays == before.config.underlays
+            && held.config.workspace == before.config.workspace;
         *self.held.write().unwrap_or_else(PoisonError::into_inner) = held;
         if !same_ros {
             self.find_ros();
@@ -117,8 +126,10 @@ mod tests {
     async fn the_gate_is_asked_in_the_domain_that_the_server_has_set() {
         let temp = tempfile::tempdir().expect("a directory");
         let program = temp.path().join("gate.sh");
-        std::fs::write(&program, "#!/bin/sh\necho \"domain $ROS_DOMAIN_ID\"\nexit 1\n").expect("written");
-        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).expect("executable");
+        std::fs::write(&program, "#!/bin/sh\necho \"domain $ROS_DOMAIN_ID\"\nexit 1\n")
+            .expect("written");
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755))
+            .expect("executable");
         let robot = robot(temp.path(), &format!("[gate]\ncommand = [{program:?}]\n"));
         robot.adopt(&serde_json::from_value(json!({ "ros_domain_id": 7 })).expect("parses"));
         let question = GateQuestion {
@@ -127,7 +138,8 @@ mod tests {
             run: 1,
             version: "1.0".parse().expect("valid"),
         };
-        let refused = robot.ask_gate(&"talker".parse().expect("valid"), &question).await.expect_err("no");
+        let refused =
+            robot.ask_gate(&"talker".parse().expect("valid"), &question).await.expect_err("no");
         assert_eq!(refused.failure.text, "domain 7");
     }
 }

@@ -1,4 +1,5 @@
-//! What the plan is told of how a step ended: each module's error as a failure's code and text, and whether to try again.
+//! What the plan is told of how a step ended: each module's error as a failure's code and text, and
+//! whether to try again.
 
 use std::error::Error;
 use std::path::Path;
@@ -24,7 +25,9 @@ pub(super) fn pulled(outcome: Result<(), FetchError>) -> Result<Done, StepFailur
 }
 
 /// Does work on the disk in a thread that may block; a failure is tried again.
-pub(super) async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<(), StepFailure> {
+pub(super) async fn on_disk(
+    work: impl FnOnce() -> std::io::Result<()> + Send + 'static,
+) -> Result<(), StepFailure> {
     let done = tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other);
     done.flatten().map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
 }
@@ -43,14 +46,18 @@ pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
     finally(code, &error)
 }
 
-/// A build that failed on a disk without room, which holds `root`, says little of the package: it is tried again.
+/// A build that failed on a disk without room, which holds `root`, says little of the package: it
+/// is tried again.
 pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
     let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
     match disk::room(root) {
         Ok(room) if room.is_used_up() => {
             let text = format!("{} of {} bytes are free; {}", room.free, room.total, chain(&error));
             let least_ms = millis(disk::FULL_PAUSE);
-            StepFailure { failure: Failure::new(FailureCode::DISK_FULL, text), retry_after_ms: Some(least_ms) }
+            StepFailure {
+                failure: Failure::new(FailureCode::DISK_FULL, text),
+                retry_after_ms: Some(least_ms),
+            }
         }
         _ => finally(code, &error),
     }
@@ -58,11 +65,13 @@ pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
 
 pub(super) fn outputs_code(error: &OutputError) -> FailureCode {
     match error {
-        OutputError::Unreachable(_) | OutputError::NotTheServer { .. } | OutputError::Busy { .. } => {
-            FailureCode::SERVER_UNREACHABLE
-        }
+        OutputError::Unreachable(_)
+        | OutputError::NotTheServer { .. }
+        | OutputError::Busy { .. } => FailureCode::SERVER_UNREACHABLE,
         OutputError::Garbled { .. } => FailureCode::DIGEST_MISMATCH,
-        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => FailureCode::IO_ERROR,
+        OutputError::Read { .. } | OutputError::User(_) | OutputError::Note { .. } => {
+            FailureCode::IO_ERROR
+        }
         OutputError::Cancelled => FailureCode::INTERRUPTED,
         OutputError::Pattern { .. } | OutputError::TooMuch(_) | OutputError::Refused { .. } => {
             FailureCode::OUTPUTS_LOST

@@ -1,5 +1,5 @@
-//! The ROS that the robot has, as it was last seen: found by the settings that hold, and known better once somebody has
-//! looked into it.
+//! The ROS that the robot has, as it was last seen: found by the settings that hold, and known
+//! better once somebody has looked into it.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -26,9 +26,13 @@ use crate::task::plan::StepFailure;
 /// Where looking into ROS installations has its files.
 const SURVEY_DIR: &str = "survey";
 
-/// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes new files at each start and
-/// deletes none. What of them can't be deleted is no reason not to start.
-pub(super) async fn node_logs(version: &VersionDir, user: Option<&TaskUser>) -> [(String, String); 1] {
+/// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes
+/// new files at each start and deletes none. What of them can't be deleted is no reason not to
+/// start.
+pub(super) async fn node_logs(
+    version: &VersionDir,
+    user: Option<&TaskUser>,
+) -> [(String, String); 1] {
     let (logs, user) = (version.node_logs(), user.cloned());
     let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
     let empty = move || {
@@ -69,23 +73,32 @@ impl Robot {
 
     pub(super) fn setup_files(&self, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
         let version = launch::of(manifest).ros;
-        let found = underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
+        let found =
+            underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
     }
 
-    /// The same for a run that is to be started. What is not there is looked for once more; for a run that was ready before
-    /// it may come back, as a disk that is mounted late or a package that is being upgraded.
-    pub(super) fn setup_files_of(&self, run: &ActiveRun, manifest: &TaskManifest) -> Result<Vec<PathBuf>, StepFailure> {
+    /// The same for a run that is to be started. What is not there is looked for once more; for a
+    /// run that was ready before it may come back, as a disk that is mounted late or a package that
+    /// is being upgraded.
+    pub(super) fn setup_files_of(
+        &self,
+        run: &ActiveRun,
+        manifest: &TaskManifest,
+    ) -> Result<Vec<PathBuf>, StepFailure> {
         let again = |_| {
             self.find_ros();
             self.setup_files(manifest)
         };
         let retry_after_ms = run.ever_ready.then_some(0);
-        self.setup_files(manifest).or_else(again).map_err(|error| StepFailure { retry_after_ms, ..error })
+        self.setup_files(manifest)
+            .or_else(again)
+            .map_err(|error| StepFailure { retry_after_ms, ..error })
     }
 
-    /// Takes what can be found by the settings that hold for what there is, until somebody has looked into it. What has been
-    /// started already may have to be started again before anybody does.
+    /// Takes what can be found by the settings that hold for what there is, until somebody has
+    /// looked into it. What has been started already may have to be started again before anybody
+    /// does.
     pub(super) fn find_ros(&self) {
         let found = self.held().installations();
         *self.ros.write().unwrap_or_else(PoisonError::into_inner) = found;
@@ -138,7 +151,10 @@ mod tests {
         let data = crate::system::layout::DataDir::new(temp.path()).expect("a directory");
         let version = data.task(&"talker".parse().expect("valid")).version(&digest);
         let [(name, place)] = node_logs(&version, None).await;
-        assert_eq!((name.as_str(), Path::new(&place)), ("ROS_LOG_DIR", version.node_logs().as_path()));
+        assert_eq!(
+            (name.as_str(), Path::new(&place)),
+            ("ROS_LOG_DIR", version.node_logs().as_path())
+        );
         std::fs::create_dir_all(version.node_logs().join("2026-11-22")).expect("made");
         std::fs::write(version.node_logs().join("2026-11-22/launch.log"), "long").expect("written");
         node_logs(&version, None).await;
@@ -152,14 +168,18 @@ mod tests {
         let (path, settings) = setup(temp.path(), "setup.bash", "");
         let robot = robot(temp.path(), "");
         robot.adopt(&settings);
-        let setups =
-            |robot: &Robot| robot.installations().into_iter().flat_map(|found| found.setups).collect::<Vec<_>>();
+        let setups = |robot: &Robot| {
+            robot.installations().into_iter().flat_map(|found| found.setups).collect::<Vec<_>>()
+        };
         assert_eq!(setups(&robot), [path]);
         assert!(robot.ros_facts().is_some(), "its graph can be watched");
         let stays = RobotSettings { ros_domain_id: Some(7), ..settings };
         robot.ros.write().expect("sound")[0].packages = Some(["rclpy".to_owned()].into());
         robot.adopt(&stays);
-        assert!(robot.installations()[0].packages.is_some(), "what was seen of the same files is still true");
+        assert!(
+            robot.installations()[0].packages.is_some(),
+            "what was seen of the same files is still true"
+        );
         robot.adopt(&RobotSettings {
             underlays: Some(vec![own.to_str().expect("text").parse().expect("valid")]),
             ..stays
@@ -185,10 +205,14 @@ mod tests {
     async fn a_look_that_began_under_other_settings_is_not_what_counts() {
         let temp = tempfile::tempdir().expect("a directory");
         let (begun, go) = (temp.path().join("begun"), temp.path().join("go"));
-        let waiting =
-            format!("touch {}\nuntil [ -e {} ]; do read -rt 0.05 _ <> <(:); done\n", begun.display(), go.display());
+        let waiting = format!(
+            "touch {}\nuntil [ -e {} ]; do read -rt 0.05 _ <> <(:); done\n",
+            begun.display(),
+            go.display()
+        );
         let (_, before) = setup(temp.path(), "before.bash", &waiting);
-        let (path, after) = setup(temp.path(), "after.bash", "export ROS_DISTRO=jazzy ROS_VERSION=2\n");
+        let (path, after) =
+            setup(temp.path(), "after.bash", "export ROS_DISTRO=jazzy ROS_VERSION=2\n");
         let uid = nix::unistd::geteuid();
         let robot = Arc::new(robot(temp.path(), &format!("task_user = \"{uid}\"\n")));
         robot.adopt(&before);

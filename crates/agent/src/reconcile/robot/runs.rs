@@ -14,8 +14,9 @@ use crate::task::ledger::{ActiveRun, ProcessRecord};
 use crate::task::plan::StepFailure;
 
 impl Robot {
-    /// Ends what runs of every run directory in `runs` but one: a start that seemed to fail may have come about after all,
-    /// and there are never two processes of a task. Gives these directories.
+    /// Ends what runs of every run directory in `runs` but one: a start that seemed to fail may
+    /// have come about after all, and there are never two processes of a task. Gives these
+    /// directories.
     pub(super) async fn end_other_runs(
         &self,
         runs: &Path,
@@ -25,7 +26,8 @@ impl Robot {
         for dir in &others {
             match self.supervisor.stop(dir, Duration::ZERO).await {
                 Err(error)
-                    if error.is_malformed() && recorded(dir).is_some_and(|run| went_down_with_its_boot(&run)) => {}
+                    if error.is_malformed()
+                        && recorded(dir).is_some_and(|run| went_down_with_its_boot(&run)) => {}
                 stopped => {
                     stopped?;
                 }
@@ -35,14 +37,19 @@ impl Robot {
     }
 
     /// Deletes every run directory but one.
-    pub(super) async fn forget_runs(&self, runs: &Path, kept: Option<&Path>) -> Result<(), StepFailure> {
+    pub(super) async fn forget_runs(
+        &self,
+        runs: &Path,
+        kept: Option<&Path>,
+    ) -> Result<(), StepFailure> {
         let ended = self.end_other_runs(runs, kept).await;
         let others = ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
         on_disk(move || others.iter().try_for_each(|dir| durable::remove_dir_all(dir))).await
     }
 }
 
-/// Whether the machine was started again since: then nothing is left of the process, whatever its files say.
+/// Whether the machine was started again since: then nothing is left of the process, whatever its
+/// files say.
 pub(super) fn went_down_with_its_boot(process: &ProcessRecord) -> bool {
     clock::boot_id().is_ok_and(|boot_id| boot_id != process.boot_id)
 }
@@ -79,8 +86,10 @@ mod tests {
             "name": "talker", "version": "1.0", "run": { "exec": ["true"] },
             "content": { "tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0 },
         });
-        let rules = RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("a manifest"));
-        let (name, version, blob) = ("talker".parse(), "1.0".parse().expect("valid"), BlobRef::of(b"1"));
+        let rules =
+            RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("a manifest"));
+        let (name, version, blob) =
+            ("talker".parse(), "1.0".parse().expect("valid"), BlobRef::of(b"1"));
         let name: task_proto::TaskName = name.expect("valid");
         let order = DesiredTask {
             task: name.clone(),
@@ -107,12 +116,15 @@ mod tests {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");
-        let (now, before) = (run_of(&clock::boot_id().expect("a boot id")), run_of("an earlier boot"));
-        let [now_process, before_process] = [&now, &before].map(|run| run.process.clone().expect("a process"));
+        let (now, before) =
+            (run_of(&clock::boot_id().expect("a boot id")), run_of("an earlier boot"));
+        let [now_process, before_process] =
+            [&now, &before].map(|run| run.process.clone().expect("a process"));
         let dir = run_dir(&robot.run_dir(&talker, &now_process), BTreeMap::new());
         std::fs::write(dir.path().join("pid.json"), "{").expect("written");
         let record = |run: &ActiveRun| {
-            std::fs::write(dir.path().join(RUN_RECORD), serde_json::to_vec(run).expect("json")).expect("written");
+            std::fs::write(dir.path().join(RUN_RECORD), serde_json::to_vec(run).expect("json"))
+                .expect("written");
         };
         record(&now);
         assert_eq!(robot.process(&talker, &now_process).await, ProcessState::Unknown);
@@ -131,7 +143,8 @@ mod tests {
         let process = run_of("boot").process.expect("a process");
         let dir = run_dir(&robot.run_dir(&talker, &process), BTreeMap::new());
         let hangs = dir.try_lock().expect("locked").expect("nobody has it");
-        let looking = tokio::time::timeout(Duration::from_secs(10), robot.process(&talker, &process));
+        let looking =
+            tokio::time::timeout(Duration::from_secs(10), robot.process(&talker, &process));
         assert_eq!(looking.await.expect("at once"), ProcessState::Unknown);
         drop(hangs);
         // A process that another test is just starting shares the lock for a moment.
@@ -152,9 +165,13 @@ mod tests {
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");
         let run = run_dir(&robot.data.task(&talker).run().join("d.1.1.1"), BTreeMap::new());
-        #[expect(clippy::disallowed_methods, reason = "a process that a shim has started and not written down")]
+        #[expect(
+            clippy::disallowed_methods,
+            reason = "a process that a shim has started and not written down"
+        )]
         let mut command = std::process::Command::new("sleep");
-        let mut process = command.arg("1000").env(RUN_DIR_VARIABLE, run.path()).spawn().expect("started");
+        let mut process =
+            command.arg("1000").env(RUN_DIR_VARIABLE, run.path()).spawn().expect("started");
         robot.prune(&talker, &[], None).await.expect("pruned");
         assert_eq!(process.wait().expect("it has ended").signal(), Some(9));
         assert!(!run.path().exists());

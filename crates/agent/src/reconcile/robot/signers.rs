@@ -1,5 +1,5 @@
-//! Who has signed a package, as the robot's steps ask for it: before anything is fetched, once more at each step that
-//! fetches, builds or starts, whatever was planned.
+//! Who has signed a package, as the robot's steps ask for it: before anything is fetched, once more
+//! at each step that fetches, builds or starts, whatever was planned.
 
 use task_proto::desired::PackageRef;
 use tokio_util::sync::CancellationToken;
@@ -25,17 +25,24 @@ impl Robot {
         })
     }
 
-    /// The same for what was found to be so a moment ago. If it is no more, that is looked into first.
+    /// The same for what was found to be so a moment ago. If it is no more, that is looked into
+    /// first.
     pub(super) fn still_vouched(&self, package: &PackageRef) -> Result<(), StepFailure> {
         let Some(vouching) = &self.vouching else { return Ok(()) };
         let judged = vouching.judge(package, Use::Begin);
-        judged.map_err(|distrust| StepFailure { retry_after_ms: Some(0), ..refusal(&distrust, package) })
+        judged.map_err(|distrust| StepFailure {
+            retry_after_ms: Some(0),
+            ..refusal(&distrust, package)
+        })
     }
 }
 
 /// Only a list of publishers comes by itself: other signatures come with another order.
 fn refusal(distrust: &Distrust, package: &PackageRef) -> StepFailure {
-    StepFailure { failure: distrust.failure(package), retry_after_ms: distrust.may_pass().then_some(0) }
+    StepFailure {
+        failure: distrust.failure(package),
+        retry_after_ms: distrust.may_pass().then_some(0),
+    }
 }
 
 #[cfg(test)]
@@ -59,7 +66,8 @@ mod tests {
     async fn try_full(dir: &Path, step: impl AsyncFn() -> Result<(), StepFailure>) {
         let files = dir.join("files");
         std::fs::create_dir(&files).expect("made");
-        let refused = (0..).find_map(|number: u32| std::fs::write(files.join(number.to_string()), b"").err());
+        let refused =
+            (0..).find_map(|number: u32| std::fs::write(files.join(number.to_string()), b"").err());
         assert_eq!(refused.expect("full").kind(), io::ErrorKind::StorageFull);
         let failure = step().await.expect_err("there is no room");
         assert_eq!(failure.failure.code, FailureCode::DISK_FULL, "{}", failure.failure);
@@ -70,7 +78,10 @@ mod tests {
 
     async fn prepare_on_a_full_disk(dir: &Path) {
         let key = SigningKey::from_bytes([1; 32]);
-        let trusted = format!("task_user = \"root\"\n[trusted_publishers]\nkeys = [\"{}\"]\n", key.public_key());
+        let trusted = format!(
+            "task_user = \"root\"\n[trusted_publishers]\nkeys = [\"{}\"]\n",
+            key.public_key()
+        );
         let robot = robot(dir, &trusted);
         let manifest = serde_json::json!({
             "name": "talker", "version": "1.0", "run": { "exec": ["true"] },
@@ -108,9 +119,19 @@ mod tests {
     fn an_order_waits_for_a_disk_that_is_full_wherever_it_meets_it() {
         let temp = tempfile::tempdir().expect("a directory");
         with_own_mounts(|| {
-            mount(Some("tmpfs"), temp.path(), Some("tmpfs"), MsFlags::empty(), Some("nr_inodes=64")).expect("mounted");
+            mount(
+                Some("tmpfs"),
+                temp.path(),
+                Some("tmpfs"),
+                MsFlags::empty(),
+                Some("nr_inodes=64"),
+            )
+            .expect("mounted");
             // Only this thread sees what is mounted.
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime");
+            let runtime = tokio::runtime::Builder::new_current_thread()
+                .enable_all()
+                .build()
+                .expect("a runtime");
             runtime.block_on(prepare_on_a_full_disk(temp.path()));
         });
     }

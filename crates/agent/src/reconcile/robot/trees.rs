@@ -1,5 +1,5 @@
-//! What lies on the disk of a version, and whose it is: unpacked and built trees belong to root and are compared with their
-//! seal before each start, the directory beside them is the task's.
+//! What lies on the disk of a version, and whose it is: unpacked and built trees belong to root and
+//! are compared with their seal before each start, the directory beside them is the task's.
 
 use std::io;
 use std::os::unix::fs::MetadataExt as _;
@@ -25,7 +25,9 @@ use crate::task::plan::{Done, StepFailure};
 /// Why a version is not started or built.
 #[derive(Debug, thiserror::Error)]
 enum Unfit {
-    #[error("what is on the disk of this version was changed: {0}; it was deleted, to be fetched and built anew")]
+    #[error(
+        "what is on the disk of this version was changed: {0}; it was deleted, to be fetched and built anew"
+    )]
     Changed(Broken),
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -51,7 +53,8 @@ struct Trees {
 impl Robot {
     /// The accounts of a task; `None`: it runs as whoever the agent is.
     pub(super) fn accounts_of(&self, task: &TaskName) -> Result<Option<AccountPair>, StepFailure> {
-        let base = self.task_user.as_ref().map_err(|error| later(FailureCode::NO_TASK_USER, error, 0))?;
+        let base =
+            self.task_user.as_ref().map_err(|error| later(FailureCode::NO_TASK_USER, error, 0))?;
         let pair = base.as_ref().map(|base| self.accounts.of(task, base)).transpose();
         pair.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
     }
@@ -62,9 +65,14 @@ impl Robot {
     }
 
     /// Notes what lies on the disk of this version, which was unpacked or built just now.
-    pub(super) async fn seal(&self, package: &PackageRef, tool: BuildTool) -> Result<(), StepFailure> {
+    pub(super) async fn seal(
+        &self,
+        package: &PackageRef,
+        tool: BuildTool,
+    ) -> Result<(), StepFailure> {
         let (trees, protects) = (self.trees(package, tool), self.protects());
-        fit(self.data.root(), move || if protects { trees.note() } else { trees.forget_seal() }).await
+        fit(self.data.root(), move || if protects { trees.note() } else { trees.forget_seal() })
+            .await
     }
 
     /// The same once it was pulled; a pull that was put off has left nothing.
@@ -80,7 +88,8 @@ impl Robot {
         Ok(done)
     }
 
-    /// That this version is what was unpacked and, for a start, what was built of it. One that is not is deleted.
+    /// That this version is what was unpacked and, for a start, what was built of it. One that is
+    /// not is deleted.
     pub(super) async fn verify(
         &self,
         package: &PackageRef,
@@ -88,7 +97,11 @@ impl Robot {
         purpose: Purpose,
     ) -> Result<(), StepFailure> {
         let (trees, protects) = (self.trees(package, tool), self.protects());
-        fit(self.data.root(), move || if protects { trees.verify(purpose) } else { trees.forget_seal() }).await
+        fit(
+            self.data.root(),
+            move || if protects { trees.verify(purpose) } else { trees.forget_seal() },
+        )
+        .await
     }
 
     /// Makes the directory that a version runs in, for `user`, and lets it to what it is to run.
@@ -106,8 +119,8 @@ impl Robot {
         fit(self.data.root(), made).await
     }
 
-    /// Where a run of this version has written, and whom it ran as: an agent before this one let tasks run among their
-    /// package's own files.
+    /// Where a run of this version has written, and whom it ran as: an agent before this one let
+    /// tasks run among their package's own files.
     pub(super) fn written_in(
         &self,
         package: &PackageRef,
@@ -115,9 +128,13 @@ impl Robot {
     ) -> Result<(PathBuf, Option<TaskUser>), StepFailure> {
         let trees = self.trees(package, tool);
         if trees.version.work().is_dir() && trees.is_the_agents() {
-            return Ok((trees.version.work(), self.accounts_of(&package.name)?.map(|pair| pair.run)));
+            return Ok((
+                trees.version.work(),
+                self.accounts_of(&package.name)?.map(|pair| pair.run),
+            ));
         }
-        let user = self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?;
+        let user =
+            self.task_user.clone().map_err(|error| later(FailureCode::NO_TASK_USER, &error, 0))?;
         Ok((trees.former_work_dir(), user))
     }
 
@@ -158,7 +175,8 @@ impl Trees {
         Err(Unfit::Changed(broken))
     }
 
-    /// Takes over what an earlier agent had given to the account of all tasks, with what the task wrote into it.
+    /// Takes over what an earlier agent had given to the account of all tasks, with what the task
+    /// wrote into it.
     fn adopt(&self) -> Result<(), Unfit> {
         let owner = std::fs::symlink_metadata(self.version.root())?.uid();
         let since = work_dir::handed_over(&self.version)?;
@@ -180,9 +198,13 @@ impl Trees {
 }
 
 /// Does blocking work on the disk, which holds `root`.
-async fn fit(root: &Path, work: impl FnOnce() -> Result<(), Unfit> + Send + 'static) -> Result<(), StepFailure> {
+async fn fit(
+    root: &Path,
+    work: impl FnOnce() -> Result<(), Unfit> + Send + 'static,
+) -> Result<(), StepFailure> {
     use io::ErrorKind::{QuotaExceeded, StorageFull};
-    let done = tokio::task::spawn_blocking(work).await.map_err(|error| Unfit::Io(error.into())).flatten();
+    let done =
+        tokio::task::spawn_blocking(work).await.map_err(|error| Unfit::Io(error.into())).flatten();
     done.map_err(|unfit| match unfit {
         Unfit::Changed(_) => {
             let failure = Failure::new(FailureCode::TREE_CHANGED, unfit.to_string());

@@ -1,6 +1,7 @@
-//! The agent's end of the pipes to the program that takes part in the graph: it passes requests on, keeps what the program
-//! said last, and ends the program when nobody wants it any more, when it hangs, or when it does not keep to the protocol.
-//! The program reads what strangers send, so whatever it says is bounded here, and decides nothing.
+//! The agent's end of the pipes to the program that takes part in the graph: it passes requests on,
+//! keeps what the program said last, and ends the program when nobody wants it any more, when it
+//! hangs, or when it does not keep to the protocol. The program reads what strangers send, so
+//! whatever it says is bounded here, and decides nothing.
 
 use std::collections::HashMap;
 use std::pin::pin;
@@ -61,7 +62,8 @@ struct Routes {
 type Events = Lines<BufReader<ChildStdout>>;
 
 impl Connection {
-    /// Starts the program and waits until it takes part. It ends with `closing`, which is cancelled if it ends before.
+    /// Starts the program and waits until it takes part. It ends with `closing`, which is cancelled
+    /// if it ends before.
     pub async fn open(
         settings: GraphSettings,
         program: &GraphProgram,
@@ -73,10 +75,14 @@ impl Connection {
         let started = tokio::task::spawn_blocking(move || starting.start()).await;
         let mut child = started.map_err(std::io::Error::other).flatten().map_err(failed)?;
         let pipes = (child.stdin.take(), child.stdout.take(), child.id());
-        let (Some(mut input), Some(output), Some(pid)) = pipes else { return Err(GraphError::Closed) };
+        let (Some(mut input), Some(output), Some(pid)) = pipes else {
+            return Err(GraphError::Closed);
+        };
         let mut events = Lines::new(BufReader::new(output), MAX_EVENT_BYTES);
         let joining = join(settings, &mut input, &mut events);
-        let too_late = || GraphError::Start { reason: format!("it did not take part within {JOIN_TIMEOUT:?}") };
+        let too_late = || GraphError::Start {
+            reason: format!("it did not take part within {JOIN_TIMEOUT:?}"),
+        };
         let joined = tokio::time::timeout(JOIN_TIMEOUT, joining).await;
         if let Err(error) = joined.unwrap_or_else(|_| Err(too_late())) {
             let _ = child.kill().await;
@@ -103,7 +109,8 @@ impl Connection {
         Ok((connection, snapshot))
     }
 
-    /// Passes messages both ways until one side ends. The program's input ends with this, and the program with its input.
+    /// Passes messages both ways until one side ends. The program's input ends with this, and the
+    /// program with its input.
     async fn speak(
         &self,
         closing: &CancellationToken,
@@ -163,7 +170,8 @@ impl Connection {
                 self.missed.fetch_add(count, Ordering::Relaxed);
             }
             Event::Rate { meter, hz, since_last_ms, samples } => {
-                let rate = Rate { hz, since_last: since_last_ms.map(Duration::from_millis), samples };
+                let rate =
+                    Rate { hz, since_last: since_last_ms.map(Duration::from_millis), samples };
                 if let Some(known) = self.routes().meters.get(&meter) {
                     known.send_replace((rate, Instant::now()));
                 }
@@ -204,7 +212,8 @@ impl Connection {
 
     /// Has the program make a call. `within` is for each of the calls to a node that this takes.
     pub async fn call(&self, call: Call, within: Duration) -> Result<Answer, GraphError> {
-        let (id, within_ms) = (self.number(), u64::try_from(within.as_millis()).unwrap_or(u64::MAX));
+        let (id, within_ms) =
+            (self.number(), u64::try_from(within.as_millis()).unwrap_or(u64::MAX));
         let (answer, answered) = oneshot::channel();
         {
             let mut routes = self.routes();
@@ -223,7 +232,9 @@ impl Connection {
         match tokio::time::timeout(patience, answered).await {
             Ok(Ok(answer)) => answer,
             Ok(Err(_)) => Err(GraphError::Closed),
-            Err(_) => Err(GraphError::Write { reason: "the program on the graph does not answer".to_owned() }),
+            Err(_) => Err(GraphError::Write {
+                reason: "the program on the graph does not answer".to_owned(),
+            }),
         }
     }
 
@@ -259,7 +270,8 @@ impl Connection {
             }
             routes.meters.insert(meter, rate.clone());
         }
-        let counting = this.say(Request::Count { meter, topic: topic.clone(), kind: kind.to_owned() });
+        let counting =
+            this.say(Request::Count { meter, topic: topic.clone(), kind: kind.to_owned() });
         if let Err(error) = counting {
             this.routes().meters.remove(&meter);
             return Err(error);
@@ -300,7 +312,11 @@ enum Spoken {
     Lost(String),
 }
 
-async fn join(settings: GraphSettings, input: &mut ChildStdin, events: &mut Events) -> Result<(), GraphError> {
+async fn join(
+    settings: GraphSettings,
+    input: &mut ChildStdin,
+    events: &mut Events,
+) -> Result<(), GraphError> {
     let failed = |error: std::io::Error| GraphError::Start { reason: error.to_string() };
     let line = Request::Join(settings).line().map_err(failed)?;
     // A program that ends at once may have said why.

@@ -1,19 +1,21 @@
-//! Readers and writers of DDS topics, whose messages are CDR bytes: this is where the graph meets the DDS library. What
-//! the bytes mean is for others.
+//! Readers and writers of DDS topics, whose messages are CDR bytes: this is where the graph meets
+//! the DDS library. What the bytes mean is for others.
 
 use std::convert::Infallible;
 
 use futures_util::{Stream, StreamExt};
 use ros2_client::dds::rustdds::bytes::Bytes;
 use ros2_client::dds::rustdds::no_key::{
-    DataWriter, Decode, DefaultDecoder, DeserializedCacheChange, DeserializerAdapter, SerializerAdapter,
-    SimpleDataReader,
+    DataWriter, Decode, DefaultDecoder, DeserializedCacheChange, DeserializerAdapter,
+    SerializerAdapter, SimpleDataReader,
 };
 use ros2_client::dds::rustdds::policy::{Deadline, Durability, History, Lifespan, Ownership};
-use ros2_client::dds::rustdds::serialization::{deserialize_from_cdr_with_rep_id, to_writer_with_rep_id};
+use ros2_client::dds::rustdds::serialization::{
+    deserialize_from_cdr_with_rep_id, to_writer_with_rep_id,
+};
 use ros2_client::dds::rustdds::{
-    DomainParticipant, Duration, GUID, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity, RepresentationIdentifier,
-    Subscriber, TopicKind, WriteOptionsBuilder, rpc::SampleIdentity,
+    DomainParticipant, Duration, GUID, Publisher, QosPolicies, QosPolicyBuilder, RTPSEntity,
+    RepresentationIdentifier, Subscriber, TopicKind, WriteOptionsBuilder, rpc::SampleIdentity,
 };
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -87,22 +89,26 @@ impl Delivery {
             .deadline(Deadline(Duration::INFINITE))
             .lifespan(Lifespan { duration: Duration::INFINITE });
         let builder = match self {
-            Self::Reliable { depth } => {
-                builder.durability(Durability::Volatile).reliable(WRITE_WAIT).history(History::KeepLast { depth })
-            }
-            Self::Lasting { depth } => {
-                builder.durability(Durability::TransientLocal).reliable(WRITE_WAIT).history(History::KeepLast { depth })
-            }
-            Self::BestEffort => {
-                builder.durability(Durability::Volatile).best_effort().history(History::KeepLast { depth: 1 })
-            }
+            Self::Reliable { depth } => builder
+                .durability(Durability::Volatile)
+                .reliable(WRITE_WAIT)
+                .history(History::KeepLast { depth }),
+            Self::Lasting { depth } => builder
+                .durability(Durability::TransientLocal)
+                .reliable(WRITE_WAIT)
+                .history(History::KeepLast { depth }),
+            Self::BestEffort => builder
+                .durability(Durability::Volatile)
+                .best_effort()
+                .history(History::KeepLast { depth: 1 }),
         };
         builder.build()
     }
 }
 
 impl Cdr {
-    /// `value` in little-endian CDR, after `header`, which must end where eight-byte values may begin.
+    /// `value` in little-endian CDR, after `header`, which must end where eight-byte values may
+    /// begin.
     pub fn of(header: &[u8], value: &impl Serialize) -> Result<Self, GraphError> {
         let mut body = header.to_vec();
         let mut message = Vec::new();
@@ -141,19 +147,36 @@ impl Endpoints {
     }
 
     /// A reader of the DDS topic `topic` with the DDS type `kind`.
-    pub fn reader<M: Received>(&self, topic: &str, kind: &str, delivery: Delivery) -> Result<Reader<M>, GraphError> {
+    pub fn reader<M: Received>(
+        &self,
+        topic: &str,
+        kind: &str,
+        delivery: Delivery,
+    ) -> Result<Reader<M>, GraphError> {
         let failed = |source| GraphError::endpoint(topic, source);
         let qos = delivery.qos();
-        let dds = self.participant.create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey).map_err(failed)?;
-        let reader = self.subscriber.create_simple_datareader_no_key(&dds, Some(qos)).map_err(failed)?;
+        let dds = self
+            .participant
+            .create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey)
+            .map_err(failed)?;
+        let reader =
+            self.subscriber.create_simple_datareader_no_key(&dds, Some(qos)).map_err(failed)?;
         Ok(Reader { reader })
     }
 
     /// A writer to the DDS topic `topic` with the DDS type `kind`.
-    pub fn writer(&self, topic: &str, kind: &str, delivery: Delivery) -> Result<Writer, GraphError> {
+    pub fn writer(
+        &self,
+        topic: &str,
+        kind: &str,
+        delivery: Delivery,
+    ) -> Result<Writer, GraphError> {
         let failed = |source| GraphError::endpoint(topic, source);
         let qos = delivery.qos();
-        let dds = self.participant.create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey).map_err(failed)?;
+        let dds = self
+            .participant
+            .create_topic(topic.into(), kind.into(), &qos, TopicKind::NoKey)
+            .map_err(failed)?;
         let writer = self.publisher.create_datawriter_no_key(&dds, Some(qos)).map_err(failed)?;
         Ok(Writer { writer })
     }
@@ -165,15 +188,19 @@ impl<M: Received> Reader<M> {
         EndpointId::of(self.reader.guid())
     }
 
-    /// What arrives. Messages that cannot be read are left out; it never ends. Dropping it between two messages loses none.
+    /// What arrives. Messages that cannot be read are left out; it never ends. Dropping it between
+    /// two messages loses none.
     pub fn samples(&self) -> impl Stream<Item = Sample<M>> + Send + '_ {
-        self.reader.as_async_stream().filter_map(|read| std::future::ready(read.ok().map(Sample::of)))
+        self.reader
+            .as_async_stream()
+            .filter_map(|read| std::future::ready(read.ok().map(Sample::of)))
     }
 }
 
 impl<M> Sample<M> {
     fn of(change: DeserializedCacheChange<M>) -> Self {
-        let (writer, answers) = (EndpointId::of(change.writer_guid()), change.related_sample_identity());
+        let (writer, answers) =
+            (EndpointId::of(change.writer_guid()), change.related_sample_identity());
         let number = i64::from(change.sequence_number);
         Self { message: change.into_value(), writer, number, answers }
     }
@@ -191,7 +218,11 @@ impl Writer {
     }
 
     /// Sends one message; `related` says what it belongs to, where that is asked for.
-    pub async fn write(&self, message: Cdr, related: Option<SampleIdentity>) -> Result<SampleIdentity, GraphError> {
+    pub async fn write(
+        &self,
+        message: Cdr,
+        related: Option<SampleIdentity>,
+    ) -> Result<SampleIdentity, GraphError> {
         let options = WriteOptionsBuilder::new().related_sample_identity_opt(related).build();
         self.writer
             .async_write_with_options(message, options)
@@ -222,7 +253,11 @@ impl Received for Cdr {
 
     fn from_body(encoding: RepresentationIdentifier, body: &[u8]) -> Self {
         // An empty body is no message of any type that is read here.
-        let body = if body.len() <= MAX_MESSAGE_BYTES { Bytes::copy_from_slice(body) } else { Bytes::new() };
+        let body = if body.len() <= MAX_MESSAGE_BYTES {
+            Bytes::copy_from_slice(body)
+        } else {
+            Bytes::new()
+        };
         Self { encoding, body }
     }
 }
@@ -281,7 +316,11 @@ impl<M: Received> DefaultDecoder<M> for Adapter {
 impl<M: Received> Decode<'_, M> for PassThrough {
     type Error = Infallible;
 
-    fn decode_bytes(self, body: &[u8], encoding: RepresentationIdentifier) -> Result<M, Infallible> {
+    fn decode_bytes(
+        self,
+        body: &[u8],
+        encoding: RepresentationIdentifier,
+    ) -> Result<M, Infallible> {
         Ok(M::from_body(encoding, body))
     }
 }

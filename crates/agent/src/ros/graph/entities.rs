@@ -1,7 +1,8 @@
-//! `rmw_dds_common/msg/ParticipantEntitiesInfo`, by which each participant says which nodes it holds and which readers
-//! and writers belong to them. Its form changed: a gid is 24 bytes up to Humble and 16 from Iron on, and nothing in the
-//! message says which; only one of the two adds up. Bytes come from strangers: every count and length has a limit, and
-//! what does not add up is refused whole.
+//! `rmw_dds_common/msg/ParticipantEntitiesInfo`, by which each participant says which nodes it
+//! holds and which readers and writers belong to them. Its form changed: a gid is 24 bytes up to
+//! Humble and 16 from Iron on, and nothing in the message says which; only one of the two adds up.
+//! Bytes come from strangers: every count and length has a limit, and what does not add up is
+//! refused whole.
 
 use task_proto::ros::GraphName;
 
@@ -83,7 +84,9 @@ impl ParticipantEntities {
         }
         [GidForm::Bytes16, GidForm::Bytes24]
             .into_iter()
-            .find_map(|form| Reader { body, at: 0, little_endian, form }.message().map(|read| (read, form)))
+            .find_map(|form| {
+                Reader { body, at: 0, little_endian, form }.message().map(|read| (read, form))
+            })
             .ok_or(EntitiesError::Malformed)
     }
 
@@ -93,7 +96,8 @@ impl ParticipantEntities {
         writer.gid(&self.participant.of_participant());
         writer.count(self.nodes.len());
         for node in &self.nodes {
-            let (namespace, name) = node.name.as_str().rsplit_once('/').unwrap_or(("", node.name.as_str()));
+            let (namespace, name) =
+                node.name.as_str().rsplit_once('/').unwrap_or(("", node.name.as_str()));
             writer.text(if namespace.is_empty() { "/" } else { namespace });
             writer.text(name);
             for endpoints in [&node.readers, &node.writers] {
@@ -146,7 +150,8 @@ impl Reader<'_> {
         self.at = self.at.next_multiple_of(4);
         let little_endian = self.little_endian;
         let bytes = self.take(4)?.try_into().ok()?;
-        let number = if little_endian { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) };
+        let number =
+            if little_endian { u32::from_le_bytes(bytes) } else { u32::from_be_bytes(bytes) };
         usize::try_from(number).ok()
     }
 
@@ -169,7 +174,8 @@ impl Reader<'_> {
         Some(EndpointId(*id))
     }
 
-    /// Gids, all of this participant: nobody speaks for another, and a wrong form does not get past this.
+    /// Gids, all of this participant: nobody speaks for another, and a wrong form does not get past
+    /// this.
     fn gids(&mut self, of: ParticipantId) -> Option<Vec<EndpointId>> {
         let count = self.count(MAX_ENDPOINTS)?;
         (0..count).map(|_| self.gid().filter(|gid| gid.participant() == of)).collect()
@@ -206,14 +212,17 @@ mod tests {
 
     use super::*;
 
-    /// A message as `rmw_dds_common` defines it, put together by hand from the definitions and not by the code under test:
-    /// `Gid { char data[16] }` (up to Humble `data[24]`, of which the last 8 are zero), `NodeEntitiesInfo { string
-    /// node_namespace; string node_name; Gid[] reader_gid_seq; Gid[] writer_gid_seq }`, `ParticipantEntitiesInfo { Gid gid;
-    /// NodeEntitiesInfo[] node_entities_info_seq }`. In CDR numbers are aligned to four bytes from the body's beginning,
-    /// texts are their length with a closing zero, and then that.
+    /// A message as `rmw_dds_common` defines it, put together by hand from the definitions and not
+    /// by the code under test: `Gid { char data[16] }` (up to Humble `data[24]`, of which the last
+    /// 8 are zero), `NodeEntitiesInfo { string node_namespace; string node_name; Gid[]
+    /// reader_gid_seq; Gid[] writer_gid_seq }`, `ParticipantEntitiesInfo { Gid gid;
+    /// NodeEntitiesInfo[] node_entities_info_seq }`. In CDR numbers are aligned to four bytes from
+    /// the body's beginning, texts are their length with a closing zero, and then that.
     fn fixture(gid_bytes: usize) -> Vec<u8> {
         let gid = |entity: [u8; 4]| {
-            let mut gid = [&[0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0][..], &entity].concat();
+            let mut gid =
+                [&[0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0][..], &entity]
+                    .concat();
             gid.resize(gid_bytes, 0);
             gid
         };
@@ -243,7 +252,8 @@ mod tests {
     }
 
     fn expected() -> ParticipantEntities {
-        let participant = ParticipantId([0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0]);
+        let participant =
+            ParticipantId([0x01, 0x0f, 0xa1, 0xa2, 0xa3, 0xa4, 0xa5, 0xa6, 0, 0, 0, 0]);
         let endpoint = |entity: [u8; 4]| {
             let mut id = participant.of_participant();
             id.0[12..].copy_from_slice(&entity);
@@ -255,7 +265,10 @@ mod tests {
             writers,
         };
         let writers = vec![endpoint([0, 0, 2, 3]), endpoint([0, 0, 3, 3])];
-        let nodes = vec![node("/robot/talker", vec![endpoint([0, 0, 1, 4])], writers), node("/ear", vec![], vec![])];
+        let nodes = vec![
+            node("/robot/talker", vec![endpoint([0, 0, 1, 4])], writers),
+            node("/ear", vec![], vec![]),
+        ];
         ParticipantEntities { participant, nodes, misnamed: 0 }
     }
 
@@ -265,7 +278,10 @@ mod tests {
             assert_eq!(ParticipantEntities::decode(&bytes, true), Ok((expected(), form)));
             assert_eq!(expected().encode(form), bytes);
             let nothing = ParticipantEntities { nodes: vec![], ..expected() };
-            assert_eq!(ParticipantEntities::decode(&nothing.encode(form), true), Ok((nothing, form)));
+            assert_eq!(
+                ParticipantEntities::decode(&nothing.encode(form), true),
+                Ok((nothing, form))
+            );
         }
     }
 
@@ -287,9 +303,13 @@ mod tests {
     fn a_message_that_does_not_add_up_is_refused_whole() {
         for length in [16, 24] {
             let whole = fixture(length);
-            // The longer form without its end, cut right behind its first gid's 16 bytes, is an empty one of the shorter form.
+            // The longer form without its end, cut right behind its first gid's 16 bytes, is an
+            // empty one of the shorter form.
             for shorter in (0..whole.len()).filter(|at| length == 16 || !(20..24).contains(at)) {
-                assert_eq!(ParticipantEntities::decode(&whole[..shorter], true), Err(EntitiesError::Malformed));
+                assert_eq!(
+                    ParticipantEntities::decode(&whole[..shorter], true),
+                    Err(EntitiesError::Malformed)
+                );
             }
             let longer = [&whole[..], &[0; 4]].concat();
             assert_eq!(ParticipantEntities::decode(&longer, true), Err(EntitiesError::Malformed));
@@ -297,7 +317,8 @@ mod tests {
             assert!(ParticipantEntities::decode(&padded, true).is_ok());
             assert_eq!(ParticipantEntities::decode(&whole, false), Err(EntitiesError::Malformed));
         }
-        // A gid of another participant, a count that nothing stands behind, and a message without end.
+        // A gid of another participant, a count that nothing stands behind, and a message without
+        // end.
         let mut stranger = fixture(16);
         stranger[48] ^= 1;
         assert_eq!(ParticipantEntities::decode(&stranger, true), Err(EntitiesError::Malformed));
@@ -305,7 +326,10 @@ mod tests {
         endless[16..20].copy_from_slice(&u32::MAX.to_le_bytes());
         assert_eq!(ParticipantEntities::decode(&endless, true), Err(EntitiesError::Malformed));
         let huge = vec![0; MAX_BYTES + 1];
-        assert_eq!(ParticipantEntities::decode(&huge, true), Err(EntitiesError::TooLong(MAX_BYTES + 1)));
+        assert_eq!(
+            ParticipantEntities::decode(&huge, true),
+            Err(EntitiesError::TooLong(MAX_BYTES + 1))
+        );
     }
 
     #[test]

@@ -1,5 +1,6 @@
-//! What nodes say to everybody: log lines on `/rosout` and statuses on `/diagnostics`. Each is read once, when somebody
-//! first wants it, and passed on to all who listen; whoever is too slow is told how many messages it missed.
+//! What nodes say to everybody: log lines on `/rosout` and statuses on `/diagnostics`. Each is read
+//! once, when somebody first wants it, and passed on to all who listen; whoever is too slow is told
+//! how many messages it missed.
 
 use std::collections::BTreeMap;
 use std::pin::pin;
@@ -24,7 +25,8 @@ pub const CAPACITY: usize = 1024;
 pub const MAX_TEXT_BYTES: usize = 8 * 1024;
 /// The most statuses of one message on `/diagnostics`, and the most values of one status.
 pub const MAX_STATUSES: usize = 256;
-/// The most bytes that the values of one status may have together: many statuses wait for a slow listener.
+/// The most bytes that the values of one status may have together: many statuses wait for a slow
+/// listener.
 const MAX_VALUES_BYTES: usize = 16 * 1024;
 /// How many writers' numbers are remembered.
 const MAX_WRITERS: usize = 4096;
@@ -115,7 +117,8 @@ pub struct Feeds {
 type Running = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
 impl Feeds {
-    /// A listener to `/rosout`, and what reads it, where nobody did. The first listener gets the last lines from before.
+    /// A listener to `/rosout`, and what reads it, where nobody did. The first listener gets the
+    /// last lines from before.
     pub fn rosout(
         &self,
         endpoints: &Endpoints,
@@ -129,7 +132,12 @@ impl Feeds {
             let lines = move |sample: Sample<Cdr>| {
                 let log: Log = sample.message.value(0)?;
                 let lost = lost.before(sample.writer, sample.number);
-                Some(vec![RosoutLine::of(log, sample.writer.participant(), lost, &snapshot.borrow())])
+                Some(vec![RosoutLine::of(
+                    log,
+                    sample.writer.participant(),
+                    lost,
+                    &snapshot.borrow(),
+                )])
             };
             Ok((reader, lines))
         };
@@ -144,12 +152,17 @@ impl Feeds {
     ) -> Result<(broadcast::Receiver<Arc<DiagnosticStatus>>, Option<Running>), GraphError> {
         let read = || {
             let delivery = Delivery::Reliable { depth: 100 };
-            let reader = reader(endpoints, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", delivery)?;
+            let reader =
+                reader(endpoints, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", delivery)?;
             let statuses = |sample: Sample<Cdr>| {
                 let array: DiagnosticArray = sample.message.value(0)?;
                 let (stamp, participant) = (array.stamp, sample.writer.participant());
                 let statuses = array.status.into_iter().take(MAX_STATUSES);
-                Some(statuses.map(|status| DiagnosticStatus::of(status, stamp, participant)).collect())
+                Some(
+                    statuses
+                        .map(|status| DiagnosticStatus::of(status, stamp, participant))
+                        .collect(),
+                )
             };
             Ok((reader, statuses))
         };
@@ -157,7 +170,12 @@ impl Feeds {
     }
 }
 
-fn reader(endpoints: &Endpoints, topic: &str, kind: &str, delivery: Delivery) -> Result<Reader<Cdr>, GraphError> {
+fn reader(
+    endpoints: &Endpoints,
+    topic: &str,
+    kind: &str,
+    delivery: Delivery,
+) -> Result<Reader<Cdr>, GraphError> {
     let invalid = || GraphError::Kind(kind.to_owned());
     let topic = topic.parse().map_err(|_| invalid())?;
     let kind = names::type_to_dds(Role::Topic, kind).ok_or_else(invalid)?;
@@ -206,7 +224,9 @@ impl Lost {
             self.last.clear();
         }
         let last = self.last.insert(writer, number);
-        last.map_or(0, |last| u64::try_from(number.saturating_sub(last).saturating_sub(1)).unwrap_or(0))
+        last.map_or(0, |last| {
+            u64::try_from(number.saturating_sub(last).saturating_sub(1)).unwrap_or(0)
+        })
     }
 }
 
@@ -242,7 +262,11 @@ impl DiagnosticStatus {
             _ => DiagnosticLevel::Stale,
         };
         let mut left = MAX_VALUES_BYTES;
-        let values = status.values.into_iter().take(MAX_STATUSES).map(|(name, value)| (cut(name), cut(value)));
+        let values = status
+            .values
+            .into_iter()
+            .take(MAX_STATUSES)
+            .map(|(name, value)| (cut(name), cut(value)));
         let values = values.take_while(|(name, value)| {
             let fits = name.len() + value.len() <= left;
             left = left.saturating_sub(name.len() + value.len());
@@ -260,13 +284,15 @@ impl DiagnosticStatus {
     }
 }
 
-/// The participant's node whose logger this is: `/robot/talker` has `robot.talker`, and all below it.
+/// The participant's node whose logger this is: `/robot/talker` has `robot.talker`, and all below
+/// it.
 fn node_of(logger: &str, participant: ParticipantId, snapshot: &Snapshot) -> Option<GraphName> {
     let is_of = |node: &GraphName| {
         let name = node.as_str().trim_start_matches('/').replace('/', ".");
         logger.strip_prefix(&name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     };
-    let nodes = snapshot.nodes.iter().filter(|node| node.participant == participant && is_of(&node.name));
+    let nodes =
+        snapshot.nodes.iter().filter(|node| node.participant == participant && is_of(&node.name));
     // A line may come before its node is known; what a whole name looks like is taken for one.
     let known = nodes.map(|node| node.name.clone()).max_by_key(|name| name.as_str().len());
     known.or_else(|| format!("/{}", logger.replace('.', "/")).parse().ok())
@@ -289,8 +315,17 @@ mod tests {
     fn gaps_in_numbers_are_lost_messages() {
         let mut lost = Lost::default();
         let (one, two) = (EndpointId([1; 16]), EndpointId([2; 16]));
-        let found = [(one, 7), (two, 1), (one, 8), (one, 12), (two, 2), (one, 3), (one, i64::MAX), (one, i64::MIN)]
-            .map(|(writer, number)| lost.before(writer, number));
+        let found = [
+            (one, 7),
+            (two, 1),
+            (one, 8),
+            (one, 12),
+            (two, 2),
+            (one, 3),
+            (one, i64::MAX),
+            (one, i64::MIN),
+        ]
+        .map(|(writer, number)| lost.before(writer, number));
         assert_eq!(found[..6], [0, 0, 0, 3, 0, 0]);
         assert_eq!(found[7], 0);
     }
@@ -309,7 +344,14 @@ mod tests {
         for name in ["/robot/talker", "/robot/talker/inner", "/other"] {
             let (publishers, subscriptions, services, clients) = Default::default();
             let name = name.parse().expect("name");
-            let node = super::super::Node { name, participant, publishers, subscriptions, services, clients };
+            let node = super::super::Node {
+                name,
+                participant,
+                publishers,
+                subscriptions,
+                services,
+                clients,
+            };
             snapshot.nodes.push(node);
         }
         let found = |logger| node_of(logger, participant, &snapshot).map(|name| name.to_string());

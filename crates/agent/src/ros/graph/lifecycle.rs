@@ -44,10 +44,15 @@ pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), G
 }
 
 /// The state the node is in.
-pub(super) async fn state(clients: &Clients, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
+pub(super) async fn state(
+    clients: &Clients,
+    node: &GraphName,
+    within: Duration,
+) -> Result<LifecycleState, GraphError> {
     let service = service_of(node, GET_STATE.0)?;
-    let state: State =
-        clients.call(&service, GET_STATE.1, &Nothing { filler: 0 }, within, Repeat::WhileThereIsTime).await?;
+    let state: State = clients
+        .call(&service, GET_STATE.1, &Nothing { filler: 0 }, within, Repeat::WhileThereIsTime)
+        .await?;
     Ok(of_id(state.id))
 }
 
@@ -59,8 +64,9 @@ pub(super) async fn change(
     within: Duration,
 ) -> Result<bool, GraphError> {
     let service = service_of(node, CHANGE_STATE.0)?;
-    let changed: Changed =
-        clients.call(&service, CHANGE_STATE.1, &request_of(transition), within, Repeat::Never).await?;
+    let changed: Changed = clients
+        .call(&service, CHANGE_STATE.1, &request_of(transition), within, Repeat::Never)
+        .await?;
     Ok(changed.success)
 }
 
@@ -75,8 +81,8 @@ fn of_id(id: u8) -> LifecycleState {
     }
 }
 
-/// The numbers are those of `lifecycle_msgs/msg/Transition`. Shutdown has another number in every state, but one label,
-/// which nodes look at first.
+/// The numbers are those of `lifecycle_msgs/msg/Transition`. Shutdown has another number in every
+/// state, but one label, which nodes look at first.
 fn request_of(transition: Transition) -> Change {
     match transition {
         Transition::Configure => Change { id: 1, label: "" },

@@ -1,5 +1,6 @@
-//! How ROS writes its names in DDS: `/chatter` is the DDS topic `rt/chatter`, a service is the pair `rq/…Request` and
-//! `rr/…Reply`, `std_msgs/msg/String` is the DDS type `std_msgs::msg::dds_::String_`. Both ways, and nothing else.
+//! How ROS writes its names in DDS: `/chatter` is the DDS topic `rt/chatter`, a service is the pair
+//! `rq/…Request` and `rr/…Reply`, `std_msgs/msg/String` is the DDS type
+//! `std_msgs::msg::dds_::String_`. Both ways, and nothing else.
 
 use task_proto::ros::GraphName;
 
@@ -50,7 +51,9 @@ pub fn type_from_dds(role: Role, dds: &str) -> Option<String> {
         Role::Request => name.strip_suffix("_Request")?,
         Role::Reply => name.strip_suffix("_Response")?,
     };
-    let word = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_');
+    let word = |text: &str| {
+        !text.is_empty() && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+    };
     (word(package) && word(kind) && word(name)).then(|| format!("{package}/{kind}/{name}"))
 }
 
@@ -98,13 +101,25 @@ mod tests {
 
     #[test]
     fn what_is_not_ros_is_left_alone() {
-        for dds in
-            ["ros_discovery_info", "DCPSParticipant", "rq/noEnd", "rt/", "rt/a b", "rt//x", "xx/chatter", "rt/\u{e9}"]
-        {
+        for dds in [
+            "ros_discovery_info",
+            "DCPSParticipant",
+            "rq/noEnd",
+            "rt/",
+            "rt/a b",
+            "rt//x",
+            "xx/chatter",
+            "rt/\u{e9}",
+        ] {
             assert_eq!(from_dds(dds), None, "{dds:?}");
         }
-        for dds in ["String", "std_msgs::msg::String_", "::msg::dds_::String_", "a::msg::dds_::B C_", "a::msg::dds_::B"]
-        {
+        for dds in [
+            "String",
+            "std_msgs::msg::String_",
+            "::msg::dds_::String_",
+            "a::msg::dds_::B C_",
+            "a::msg::dds_::B",
+        ] {
             assert_eq!(type_from_dds(Role::Topic, dds), None, "{dds:?}");
         }
         for ros in ["std_msgs/String", "std_msgs/msg/String/more", "std_msgs/msg/", "a/msg/B C"] {

@@ -1,9 +1,10 @@
-//! The one task that listens to discovery. It owns what participants said about their nodes and which remote endpoints
-//! are matched with ours; it publishes snapshots, and wakes whoever waits for a change.
+//! The one task that listens to discovery. It owns what participants said about their nodes and
+//! which remote endpoints are matched with ours; it publishes snapshots, and wakes whoever waits
+//! for a change.
 //!
-//! Where the DDS library's events are not enough: a killed process says nothing, so its participant is lost only when its
-//! lease ends (Fast DDS: 20 s), and events are dropped when too many come at once; so everything is also looked at every
-//! few seconds.
+//! Where the DDS library's events are not enough: a killed process says nothing, so its participant
+//! is lost only when its lease ends (Fast DDS: 20 s), and events are dropped when too many come at
+//! once; so everything is also looked at every few seconds.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
@@ -12,7 +13,9 @@ use std::time::Duration;
 
 use futures_util::StreamExt;
 use ros2_client::dds::rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
-use ros2_client::dds::rustdds::{DomainParticipant, DomainParticipantStatusEvent as Event, RTPSEntity, StatusEvented};
+use ros2_client::dds::rustdds::{
+    DomainParticipant, DomainParticipantStatusEvent as Event, RTPSEntity, StatusEvented,
+};
 use tokio::sync::watch;
 use tokio::time::{Instant, MissedTickBehavior, interval, sleep_until};
 use tokio_util::sync::CancellationToken;
@@ -65,7 +68,12 @@ impl Matches {
     /// The participants matched with both of ours: they can hear the request, and we their answer.
     pub fn with_both(&self, writer: EndpointId, reader: EndpointId) -> BTreeSet<ParticipantId> {
         let participants = |own| -> BTreeSet<_> {
-            self.remotes.get(&own).into_iter().flatten().map(|remote| remote.participant()).collect()
+            self.remotes
+                .get(&own)
+                .into_iter()
+                .flatten()
+                .map(|remote| remote.participant())
+                .collect()
         };
         &participants(writer) & &participants(reader)
     }
@@ -95,12 +103,19 @@ impl Observer {
         matches: watch::Sender<Matches>,
     ) -> Self {
         let own = EndpointId::of(participant.guid()).participant();
-        Self { participant, own, said: BTreeMap::new(), first_seen: BTreeMap::new(), snapshot, matches }
+        Self {
+            participant,
+            own,
+            said: BTreeMap::new(),
+            first_seen: BTreeMap::new(),
+            snapshot,
+            matches,
+        }
     }
 
-    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back: the library then keeps to
-    /// itself what it hears by best effort, which is who is new, until the clock shows the former time again. Another
-    /// participant knows nothing of that time.
+    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back:
+    /// the library then keeps to itself what it hears by best effort, which is who is new, until
+    /// the clock shows the former time again. Another participant knows nothing of that time.
     pub async fn run(mut self, discovery: Reader<Cdr>, closing: CancellationToken) {
         let listener = self.participant.status_listener();
         let mut events = pin!(listener.as_async_status_stream());
@@ -144,7 +159,9 @@ impl Observer {
             Event::RemoteReaderMatched { local_writer: own, remote_reader: remote }
             | Event::RemoteWriterMatched { local_reader: own, remote_writer: remote } => {
                 let (own, remote) = (EndpointId::of(own), EndpointId::of(remote));
-                self.matches.send_if_modified(|matches| matches.remotes.entry(own).or_default().insert(remote));
+                self.matches.send_if_modified(|matches| {
+                    matches.remotes.entry(own).or_default().insert(remote)
+                });
                 false
             }
             Event::ReaderLost { guid, .. } | Event::WriterLost { guid, .. } => {
@@ -194,7 +211,9 @@ impl Observer {
             Ok((entities, _form)) => {
                 tracing::debug!(%from, of = %entities.participant, "a participant speaks for another");
             }
-            Err(error) => tracing::debug!(%from, error = %error, "a participant's nodes cannot be read"),
+            Err(error) => {
+                tracing::debug!(%from, error = %error, "a participant's nodes cannot be read")
+            }
         }
     }
 
@@ -202,19 +221,31 @@ impl Observer {
     fn look(&mut self) {
         let readers = self.participant.discovered_readers();
         let writers = self.participant.discovered_writers();
-        let readers: Vec<_> =
-            readers.iter().map(discovered_reader).filter(|d| self.is_ros(d)).take(MAX_DISCOVERED).collect();
-        let writers: Vec<_> =
-            writers.iter().map(discovered_writer).filter(|d| self.is_ros(d)).take(MAX_DISCOVERED).collect();
+        let readers: Vec<_> = readers
+            .iter()
+            .map(discovered_reader)
+            .filter(|d| self.is_ros(d))
+            .take(MAX_DISCOVERED)
+            .collect();
+        let writers: Vec<_> = writers
+            .iter()
+            .map(discovered_writer)
+            .filter(|d| self.is_ros(d))
+            .take(MAX_DISCOVERED)
+            .collect();
         let now = std::time::Instant::now();
-        let present: BTreeSet<_> = readers.iter().chain(&writers).map(|endpoint| endpoint.id.participant()).collect();
+        let present: BTreeSet<_> =
+            readers.iter().chain(&writers).map(|endpoint| endpoint.id.participant()).collect();
         self.said.retain(|id, _| present.contains(id));
         // A participant is seen before its endpoints are.
-        self.first_seen.retain(|id, seen| present.contains(id) || now.duration_since(*seen) < NEWCOMER);
+        self.first_seen
+            .retain(|id, seen| present.contains(id) || now.duration_since(*seen) < NEWCOMER);
         for id in present.iter().take(MAX_PARTICIPANTS) {
             self.first_seen.entry(*id).or_insert(now);
         }
-        self.unmatch(|remote| !present.contains(&remote.participant()) && remote.participant() != self.own);
+        self.unmatch(|remote| {
+            !present.contains(&remote.participant()) && remote.participant() != self.own
+        });
         let seen = Snapshot::of(now, &self.said, &self.first_seen, &readers, &writers);
         self.snapshot.send_if_modified(|current| {
             let changed = !seen.shows_the_same_as(current);
@@ -223,7 +254,8 @@ impl Observer {
         });
     }
 
-    /// Whether an endpoint is of another's ROS: the agent's own and DDS's built-in ones are not looked at.
+    /// Whether an endpoint is of another's ROS: the agent's own and DDS's built-in ones are not
+    /// looked at.
     fn is_ros(&self, endpoint: &Discovered) -> bool {
         endpoint.id.participant() != self.own
             && (endpoint.topic == super::names::DISCOVERY_TOPIC
@@ -237,7 +269,12 @@ fn discovered_reader(data: &DiscoveredReaderData) -> Discovered {
         id: EndpointId::of(data.reader_proxy.remote_reader_guid),
         topic: data.subscription_topic_data.topic_name().clone(),
         kind: data.subscription_topic_data.type_name().clone(),
-        locators: locators.iter().filter(|locator| locator.is_udp()).take(MAX_LOCATORS).map(|l| (*l).into()).collect(),
+        locators: locators
+            .iter()
+            .filter(|locator| locator.is_udp())
+            .take(MAX_LOCATORS)
+            .map(|l| (*l).into())
+            .collect(),
     }
 }
 
@@ -247,7 +284,12 @@ fn discovered_writer(data: &DiscoveredWriterData) -> Discovered {
         id: EndpointId::of(data.writer_proxy.remote_writer_guid),
         topic: data.publication_topic_data.topic_name.clone(),
         kind: data.publication_topic_data.type_name.clone(),
-        locators: locators.iter().filter(|locator| locator.is_udp()).take(MAX_LOCATORS).map(|l| (*l).into()).collect(),
+        locators: locators
+            .iter()
+            .filter(|locator| locator.is_udp())
+            .take(MAX_LOCATORS)
+            .map(|l| (*l).into())
+            .collect(),
     }
 }
 
@@ -265,7 +307,8 @@ mod tests {
     #[test]
     fn a_clock_that_is_set_back_is_noticed_and_one_that_is_corrected_is_not() {
         let before = Clocks { wall_ms: 1_000_000, boot_ms: 50_000 };
-        let fell_back = |wall_ms: u64, boot_ms: u64| Clocks { wall_ms, boot_ms }.fell_back_since(before);
+        let fell_back =
+            |wall_ms: u64, boot_ms: u64| Clocks { wall_ms, boot_ms }.fell_back_since(before);
         assert!(!fell_back(1_003_000, 53_000));
         assert!(!fell_back(1_002_100, 53_000), "slewed");
         assert!(!fell_back(9_000_000, 53_000), "set forward");

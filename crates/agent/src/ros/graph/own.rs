@@ -1,4 +1,5 @@
-//! The agent's own node, as others see it: it says which readers and writers it has, and takes back what is gone.
+//! The agent's own node, as others see it: it says which readers and writers it has, and takes back
+//! what is gone.
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -56,7 +57,8 @@ impl OwnNode {
             readers: held.readers.iter().copied().collect(),
             writers: held.writers.iter().copied().collect(),
         };
-        let entities = ParticipantEntities { participant: self.participant, nodes: vec![node], misnamed: 0 };
+        let entities =
+            ParticipantEntities { participant: self.participant, nodes: vec![node], misnamed: 0 };
         self.announcer.put(Cdr::little_endian(entities.encode(self.form)));
     }
 }

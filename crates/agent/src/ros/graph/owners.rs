@@ -1,10 +1,12 @@
-//! Whose a participant is. DDS does not say which process a participant lives in, but every participant announces the UDP
-//! addresses it listens at, and on this host the kernel knows whose sockets those are. That works with every vendor; where
-//! it cannot tell (another network namespace, no permission, an address that other hosts have too, no UDP at all) it says
-//! so, and [`Participant::first_seen`] is what is left.
+//! Whose a participant is. DDS does not say which process a participant lives in, but every
+//! participant announces the UDP addresses it listens at, and on this host the kernel knows whose
+//! sockets those are. That works with every vendor; where it cannot tell (another network
+//! namespace, no permission, an address that other hosts have too, no UDP at all) it says so, and
+//! [`Participant::first_seen`] is what is left.
 //!
-//! A killed process's participant stays on the graph until its lease ends, and its ports may be another's by then. So a
-//! participant that was seen before a process was started is never that process's.
+//! A killed process's participant stays on the graph until its lease ends, and its ports may be
+//! another's by then. So a participant that was seen before a process was started is never that
+//! process's.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
@@ -33,8 +35,8 @@ pub struct Owners {
     pub theirs: BTreeSet<ParticipantId>,
     /// In another process, here or elsewhere.
     pub others: BTreeSet<ParticipantId>,
-    /// In no process any more: its addresses are all this host's, and nobody listens there who could be it. Discovery knows
-    /// of it until its lease ends.
+    /// In no process any more: its addresses are all this host's, and nobody listens there who
+    /// could be it. Discovery knows of it until its lease ends.
     pub gone: BTreeSet<ParticipantId>,
     /// It cannot be told.
     pub unknown: BTreeSet<ParticipantId>,
@@ -64,7 +66,8 @@ impl Owners {
         host.judge(participants)
     }
 
-    /// The process on this host that a participant lives in, where it can be told. It looks at every process.
+    /// The process on this host that a participant lives in, where it can be told. It looks at
+    /// every process.
     pub(super) fn process_of(participant: &Participant) -> Option<u32> {
         let host = Host::look(Path::new("/proc"), &[]).ok()?;
         host.holder(Path::new("/proc"), &participant.locators)
@@ -120,12 +123,14 @@ impl Host {
         owners
     }
 
-    /// Whether one of the processes listens at these addresses, and did when they were first seen; `None`: it cannot be
-    /// told.
+    /// Whether one of the processes listens at these addresses, and did when they were first seen;
+    /// `None`: it cannot be told.
     fn holds(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> Option<bool> {
-        let ports = locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
+        let ports =
+            locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
         let (mut theirs, mut others, mut shared) = (false, false, false);
-        let is_held = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
+        let is_held =
+            |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
         for sockets in ports.filter_map(|port| self.sockets.get(&port)) {
             match sockets.iter().filter(|socket| is_held(socket)).count() {
                 0 => others = true,
@@ -133,10 +138,13 @@ impl Host {
                 _ => shared = true,
             }
         }
-        // Whoever has the address now may listen at the same port, so that it is held here proves nothing.
+        // Whoever has the address now may listen at the same port, so that it is held here proves
+        // nothing.
         let former = locators.iter().filter(|locator| self.former.contains(&locator.ip()));
-        let may_be_here = former.filter_map(|locator| self.sockets.get(&locator.port())).flatten().any(is_held);
-        // Another host may have one of our addresses too (a container bridge's), but hardly all of them.
+        let may_be_here =
+            former.filter_map(|locator| self.sockets.get(&locator.port())).flatten().any(is_held);
+        // Another host may have one of our addresses too (a container bridge's), but hardly all of
+        // them.
         let all_here = locators.iter().all(|locator| self.is_here(locator.ip()));
         match (theirs, others, shared) {
             _ if locators.is_empty() => None,
@@ -146,10 +154,12 @@ impl Host {
         }
     }
 
-    /// Whether all these addresses are this host's, and at one of them nobody listens who did when they were first seen.
-    /// One is enough: a participant listens at all that it announces, and some of its ports are shared with others.
+    /// Whether all these addresses are this host's, and at one of them nobody listens who did when
+    /// they were first seen. One is enough: a participant listens at all that it announces, and
+    /// some of its ports are shared with others.
     fn is_deserted(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> bool {
-        let is_too_young = |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP < seen_for);
+        let is_too_young =
+            |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP < seen_for);
         let is_left = |locator: &SocketAddr| {
             let sockets = self.sockets.get(&locator.port());
             sockets.is_none_or(|sockets| sockets.iter().all(is_too_young))
@@ -162,9 +172,12 @@ impl Host {
     fn holder(&self, proc: &Path, locators: &BTreeSet<SocketAddr>) -> Option<u32> {
         let here = locators.iter().filter(|locator| self.is_here(locator.ip()));
         let ports = here.filter_map(|locator| self.sockets.get(&locator.port()));
-        let own: BTreeSet<u64> = ports.filter(|sockets| sockets.len() == 1).flatten().copied().collect();
+        let own: BTreeSet<u64> =
+            ports.filter(|sockets| sockets.len() == 1).flatten().copied().collect();
         let network = fs::metadata(proc.join("self/ns/net")).ok()?.ino();
-        let processes = fs::read_dir(proc).ok()?.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+        let processes = fs::read_dir(proc)
+            .ok()?
+            .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
         processes.into_iter().find(|pid: &u32| {
             // One that another user hides stays without a name.
             let held = held_by(*pid, &proc.join(pid.to_string()), network).ok().flatten();
@@ -177,7 +190,8 @@ impl Host {
     }
 }
 
-/// The addresses that this host had when somebody looked, since the agent was started, and has no longer.
+/// The addresses that this host had when somebody looked, since the agent was started, and has no
+/// longer.
 fn former(now: &BTreeSet<IpAddr>) -> BTreeSet<IpAddr> {
     static EVER: Mutex<BTreeSet<IpAddr>> = Mutex::new(BTreeSet::new());
     let mut ever = EVER.lock().unwrap_or_else(PoisonError::into_inner);
@@ -203,16 +217,23 @@ fn socket_of(line: &str) -> Option<(u16, u64)> {
 }
 
 /// How old a process is and the sockets it holds; `None`: it has another network than this.
-fn held_by(pid: u32, process: &Path, network: u64) -> io::Result<Option<(Duration, BTreeSet<u64>)>> {
+fn held_by(
+    pid: u32,
+    process: &Path,
+    network: u64,
+) -> io::Result<Option<(Duration, BTreeSet<u64>)>> {
     if fs::metadata(process.join("ns/net"))?.ino() != network {
         return Ok(None);
     }
-    let Some(identity) = ProcessIdentity::of(pid)? else { return Err(io::ErrorKind::NotFound.into()) };
+    let Some(identity) = ProcessIdentity::of(pid)? else {
+        return Err(io::ErrorKind::NotFound.into());
+    };
     let mut sockets = BTreeSet::new();
     for file in fs::read_dir(process.join("fd"))?.take(MAX_FILES) {
         // A file that was closed in between is no socket any more.
         let Ok(target) = fs::read_link(file?.path()) else { continue };
-        let inode = target.to_str().and_then(|text| text.strip_prefix("socket:[")?.strip_suffix(']'));
+        let inode =
+            target.to_str().and_then(|text| text.strip_prefix("socket:[")?.strip_suffix(']'));
         sockets.extend(inode.and_then(|inode| inode.parse::<u64>().ok()));
     }
     Ok(Some((identity.age()?, sockets)))
@@ -232,7 +253,10 @@ mod tests {
 
     fn host(complete: bool) -> Host {
         Host {
-            addresses: BTreeSet::from(["192.168.1.5".parse().expect("ip"), "172.17.0.1".parse().expect("ip")]),
+            addresses: BTreeSet::from([
+                "192.168.1.5".parse().expect("ip"),
+                "172.17.0.1".parse().expect("ip"),
+            ]),
             former: BTreeSet::from(["192.168.1.4".parse().expect("ip")]),
             sockets: BTreeMap::from([
                 (7411, BTreeSet::from([1])),
@@ -258,17 +282,20 @@ mod tests {
             (&["192.168.1.7:7413", "172.17.0.1:7413"], true, Some(false)),
             (&["192.168.1.5:7413"], false, None),
             (&["192.168.1.7:7411"], false, None),
-            // A port that two processes share says nothing, and two that contradict each other no more.
+            // A port that two processes share says nothing, and two that contradict each other no
+            // more.
             (&["192.168.1.5:7417"], true, None),
             (&["192.168.1.5:7417", "192.168.1.5:7411"], true, Some(true)),
             (&["192.168.1.5:7411", "192.168.1.5:7413"], true, None),
-            // It announces an address that this host has lost; who has that now may be meant as well.
+            // It announces an address that this host has lost; who has that now may be meant as
+            // well.
             (&["192.168.1.4:7411"], true, None),
             (&["192.168.1.4:7413"], true, Some(false)),
             (&["192.168.1.4:7411", "192.168.1.5:7411"], true, None),
             (&[], true, None),
         ] {
-            let found = host(complete).holds(&participant(locators).locators, Duration::from_secs(1));
+            let found =
+                host(complete).holds(&participant(locators).locators, Duration::from_secs(1));
             assert_eq!(found, expected, "{locators:?} {complete}");
         }
     }
@@ -295,10 +322,14 @@ mod tests {
             (&["192.168.1.5:7415", "192.168.1.7:7415"], 1, false),
             (&[], 1, false),
         ] {
-            let found = host(true).is_deserted(&participant(locators).locators, Duration::from_secs(seen_for_s));
+            let found = host(true)
+                .is_deserted(&participant(locators).locators, Duration::from_secs(seen_for_s));
             assert_eq!(found, expected, "{locators:?} {seen_for_s}");
         }
-        assert!(!Host::default().is_deserted(&participant(&["127.0.0.1:7415"]).locators, Duration::ZERO));
+        assert!(
+            !Host::default()
+                .is_deserted(&participant(&["127.0.0.1:7415"]).locators, Duration::ZERO)
+        );
     }
 
     #[test]
@@ -314,8 +345,7 @@ mod tests {
 
     #[test]
     fn lines_of_the_table_are_read() {
-        let line =
-            "  512: 00000000:1CF3 00000000:0000 07 00000000:00000000 00:00000000 00000000  1000        0 41557 2 0 0";
+        let line = "  512: 00000000:1CF3 00000000:0000 07 00000000:00000000 00:00000000 00000000  1000        0 41557 2 0 0";
         assert_eq!(socket_of(line), Some((7411, 41557)));
         assert_eq!(socket_of("   sl  local_address"), None);
     }

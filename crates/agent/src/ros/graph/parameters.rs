@@ -1,11 +1,12 @@
-//! Parameters of nodes: list, get and set, by the services every node has unless it was told not to.
+//! Parameters of nodes: list, get and set, by the services every node has unless it was told not
+//! to.
 
 use std::time::Duration;
 
 use ros2_client::parameters::raw;
 use ros2_client::rcl_interfaces::{
-    GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse, SetParametersRequest,
-    SetParametersResponse,
+    GetParametersRequest, GetParametersResponse, ListParametersRequest, ListParametersResponse,
+    SetParametersRequest, SetParametersResponse,
 };
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::{Number, Value};
@@ -69,14 +70,22 @@ pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), G
 }
 
 /// The names of the node's parameters.
-pub(super) async fn list(clients: &Clients, node: &GraphName, within: Duration) -> Result<Vec<String>, GraphError> {
+pub(super) async fn list(
+    clients: &Clients,
+    node: &GraphName,
+    within: Duration,
+) -> Result<Vec<String>, GraphError> {
     let request = ListParametersRequest { prefixes: Vec::new(), depth: 0 };
     let service = service_of(node, LIST.0)?;
     let answer: ListParametersResponse =
         clients.call(&service, LIST.1, &request, within, Repeat::WhileThereIsTime).await?;
     let names = answer.result.names;
     if names.len() > MAX_PARAMETERS {
-        return Err(GraphError::TooMany { what: "parameters".to_owned(), node: node.clone(), found: names.len() });
+        return Err(GraphError::TooMany {
+            what: "parameters".to_owned(),
+            node: node.clone(),
+            found: names.len(),
+        });
     }
     Ok(names)
 }
@@ -114,11 +123,16 @@ pub(super) async fn set(
     within: Duration,
 ) -> Result<Vec<SetResult>, GraphError> {
     if parameters.len() > MAX_PARAMETERS {
-        return Err(GraphError::TooMany { what: "parameters".to_owned(), node: node.clone(), found: parameters.len() });
+        return Err(GraphError::TooMany {
+            what: "parameters".to_owned(),
+            node: node.clone(),
+            found: parameters.len(),
+        });
     }
     let service = service_of(node, SET.0)?;
     let names: Vec<_> = parameters.iter().map(|(name, _)| name.clone()).collect();
-    let wire = |(name, value): (String, ParameterValue)| raw::Parameter { name, value: value.into_wire() };
+    let wire =
+        |(name, value): (String, ParameterValue)| raw::Parameter { name, value: value.into_wire() };
     let request = SetParametersRequest { parameter: parameters.into_iter().map(wire).collect() };
     let answer: SetParametersResponse =
         clients.call(&service, SET.1, &request, within, Repeat::WhileThereIsTime).await?;
@@ -156,7 +170,9 @@ impl ParameterValue {
         match values.first() {
             // An empty list has no type of its own; `fitting` gives it one.
             None => Some(Self::Strings(Vec::new())),
-            Some(Value::Bool(_)) => values.iter().map(Value::as_bool).collect::<Option<_>>().map(Self::Bools),
+            Some(Value::Bool(_)) => {
+                values.iter().map(Value::as_bool).collect::<Option<_>>().map(Self::Bools)
+            }
             Some(Value::Number(_)) => match all_integers {
                 Some(integers) => Some(Self::Integers(integers)),
                 None => values.iter().map(Value::as_f64).collect::<Option<_>>().map(Self::Doubles),
@@ -169,15 +185,20 @@ impl ParameterValue {
         }
     }
 
-    /// The same value in the type that `current` has, where it can be said in it: people write `1` for a double, and an
-    /// empty list for any list.
+    /// The same value in the type that `current` has, where it can be said in it: people write `1`
+    /// for a double, and an empty list for any list.
     #[must_use]
     pub fn fitting(self, current: &Self) -> Self {
-        #[expect(clippy::cast_precision_loss, reason = "whoever writes such a number for a double means about that")]
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "whoever writes such a number for a double means about that"
+        )]
         let double = |integer: i64| integer as f64;
         match (self, current) {
             (Self::Integer(value), Self::Double(_)) => Self::Double(double(value)),
-            (Self::Integers(values), Self::Doubles(_)) => Self::Doubles(values.into_iter().map(double).collect()),
+            (Self::Integers(values), Self::Doubles(_)) => {
+                Self::Doubles(values.into_iter().map(double).collect())
+            }
             (Self::Integers(values), Self::Bytes(_)) => {
                 match values.iter().map(|value| u8::try_from(*value)).collect() {
                     Ok(bytes) => Self::Bytes(bytes),
@@ -197,7 +218,9 @@ impl ParameterValue {
 
     /// The value as people read it. Numbers that JSON does not have are texts.
     pub fn to_json(&self) -> Value {
-        let double = |value: &f64| Number::from_f64(*value).map_or_else(|| Value::from(value.to_string()), Value::from);
+        let double = |value: &f64| {
+            Number::from_f64(*value).map_or_else(|| Value::from(value.to_string()), Value::from)
+        };
         match self {
             Self::NotSet => Value::Null,
             Self::Bool(value) => Value::from(*value),
@@ -298,9 +321,16 @@ mod tests {
 
     #[test]
     fn values_read_as_they_were_written() {
-        for value in
-            [json!(null), json!(true), json!(3), json!(2.5), json!("a"), json!([1, 2]), json!([1.5]), json!(["a"])]
-        {
+        for value in [
+            json!(null),
+            json!(true),
+            json!(3),
+            json!(2.5),
+            json!("a"),
+            json!([1, 2]),
+            json!([1.5]),
+            json!(["a"]),
+        ] {
             let parameter = ParameterValue::from_json(&value).expect("a value");
             assert_eq!(parameter.to_json(), value);
             assert_eq!(ParameterValue::of_wire(parameter.clone().into_wire()), parameter);
@@ -313,12 +343,28 @@ mod tests {
 
     #[test]
     fn a_value_takes_the_type_the_node_has() {
-        let fitting = |value, current| ParameterValue::from_json(&value).expect("a value").fitting(&current);
+        let fitting =
+            |value, current| ParameterValue::from_json(&value).expect("a value").fitting(&current);
         assert_eq!(fitting(json!(1), ParameterValue::Double(0.5)), ParameterValue::Double(1.0));
-        assert_eq!(fitting(json!([1, 2]), ParameterValue::Doubles(vec![])), ParameterValue::Doubles(vec![1.0, 2.0]));
-        assert_eq!(fitting(json!([]), ParameterValue::Bools(vec![true])), ParameterValue::Bools(vec![]));
-        assert_eq!(fitting(json!([1, 255]), ParameterValue::Bytes(vec![])), ParameterValue::Bytes(vec![1, 255]));
-        assert_eq!(fitting(json!([1, 256]), ParameterValue::Bytes(vec![])), ParameterValue::Integers(vec![1, 256]));
-        assert_eq!(fitting(json!("a"), ParameterValue::Integer(1)), ParameterValue::String("a".into()));
+        assert_eq!(
+            fitting(json!([1, 2]), ParameterValue::Doubles(vec![])),
+            ParameterValue::Doubles(vec![1.0, 2.0])
+        );
+        assert_eq!(
+            fitting(json!([]), ParameterValue::Bools(vec![true])),
+            ParameterValue::Bools(vec![])
+        );
+        assert_eq!(
+            fitting(json!([1, 255]), ParameterValue::Bytes(vec![])),
+            ParameterValue::Bytes(vec![1, 255])
+        );
+        assert_eq!(
+            fitting(json!([1, 256]), ParameterValue::Bytes(vec![])),
+            ParameterValue::Integers(vec![1, 256])
+        );
+        assert_eq!(
+            fitting(json!("a"), ParameterValue::Integer(1)),
+            ParameterValue::String("a".into())
+        );
     }
 }

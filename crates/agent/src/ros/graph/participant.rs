@@ -1,5 +1,5 @@
-//! Takes part in the ROS graph with a DDS participant of this process: it says what the graph shows, and performs calls.
-//! Only the program that [`super::serve`] is runs it.
+//! Takes part in the ROS graph with a DDS participant of this process: it says what the graph
+//! shows, and performs calls. Only the program that [`super::serve`] is runs it.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr};
@@ -61,7 +61,8 @@ impl LocalGraph {
         opened.unwrap_or(Err(GraphError::Closed))
     }
 
-    /// Opens sockets and starts the library's threads; it must run inside the runtime, on a thread that may block.
+    /// Opens sockets and starts the library's threads; it must run inside the runtime, on a thread
+    /// that may block.
     fn join(settings: &GraphSettings) -> Result<Self, GraphError> {
         let domain_id = settings.domain_id;
         let mut builder = DomainParticipantBuilder::new(domain_id)
@@ -70,8 +71,9 @@ impl LocalGraph {
         if settings.localhost_only {
             builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
         }
-        let participant =
-            builder.build().map_err(|source| GraphError::Join { domain_id, reason: source.to_string() })?;
+        let participant = builder
+            .build()
+            .map_err(|source| GraphError::Join { domain_id, reason: source.to_string() })?;
         let tasks = Tasks {
             closing: CancellationToken::new(),
             tracker: TaskTracker::new(),
@@ -79,9 +81,13 @@ impl LocalGraph {
         };
         let endpoints = Arc::new(Endpoints::of(&participant)?);
         let lasting = |depth| Delivery::Lasting { depth };
-        let announcer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(1))?;
-        let discovery =
-            endpoints.reader::<Cdr>(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(DISCOVERY_DEPTH))?;
+        let announcer =
+            endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting(1))?;
+        let discovery = endpoints.reader::<Cdr>(
+            names::DISCOVERY_TOPIC,
+            names::DISCOVERY_TYPE,
+            lasting(DISCOVERY_DEPTH),
+        )?;
         let form = GidForm::of_distro(settings.distro.as_deref());
         let own = Arc::new(OwnNode::new(settings.node_name.clone(), form, announcer));
         own.add(&[], &[]);
@@ -95,23 +101,33 @@ impl LocalGraph {
             observer.run(discovery, closing).await;
         });
         let clients = Clients::new(endpoints.clone(), own, matches);
-        Ok(Self { shared: Arc::new(Shared { snapshot, clients, endpoints, feeds: Feeds::default(), tasks }) })
+        Ok(Self {
+            shared: Arc::new(Shared {
+                snapshot,
+                clients,
+                endpoints,
+                feeds: Feeds::default(),
+                tasks,
+            }),
+        })
     }
 
-    /// Wakes when the graph shows something else, many changes at once as one. It ends when the graph is closed.
+    /// Wakes when the graph shows something else, many changes at once as one. It ends when the
+    /// graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
     }
 
-    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need for this node. A node that
-    /// starts later finds it there, and answers the sooner.
+    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need
+    /// for this node. A node that starts later finds it there, and answers the sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
         lifecycle::prepare(&self.shared.clients, node).await?;
         parameters::prepare(&self.shared.clients, node).await
     }
 
-    /// Waits until a server of this service would hear a request, and its answer would be heard; says which participants
-    /// have one. Without `kind` the service's type is taken from what the graph shows.
+    /// Waits until a server of this service would hear a request, and its answer would be heard;
+    /// says which participants have one. Without `kind` the service's type is taken from what the
+    /// graph shows.
     pub async fn service_answers(
         &self,
         service: &GraphName,
@@ -139,10 +155,16 @@ impl LocalGraph {
     ) -> Result<String, GraphError> {
         let kind = |snapshot: &Snapshot| -> Option<String> {
             let node = snapshot.servers_of(service).next()?;
-            node.services.iter().find(|offered| offered.name == *service).map(|offered| offered.kind.clone())
+            node.services
+                .iter()
+                .find(|offered| offered.name == *service)
+                .map(|offered| offered.kind.clone())
         };
         let mut changes = self.changes();
-        let found = tokio::time::timeout_at(deadline, changes.wait_for(|snapshot| kind(snapshot).is_some()));
+        let found = tokio::time::timeout_at(
+            deadline,
+            changes.wait_for(|snapshot| kind(snapshot).is_some()),
+        );
         match found.await {
             Ok(Ok(snapshot)) => kind(&snapshot).ok_or(GraphError::Closed),
             Ok(Err(_closed)) => Err(GraphError::Closed),
@@ -151,12 +173,16 @@ impl LocalGraph {
     }
 
     /// The state this lifecycle node is in.
-    pub async fn lifecycle_state(&self, node: &GraphName, within: Duration) -> Result<LifecycleState, GraphError> {
+    pub async fn lifecycle_state(
+        &self,
+        node: &GraphName,
+        within: Duration,
+    ) -> Result<LifecycleState, GraphError> {
         self.while_open(lifecycle::state(&self.shared.clients, node, within)).await
     }
 
-    /// Asks this lifecycle node for a transition, once; says whether it made it. After [`GraphError::NoAnswer`] it may
-    /// have: ask for its state.
+    /// Asks this lifecycle node for a transition, once; says whether it made it. After
+    /// [`GraphError::NoAnswer`] it may have: ask for its state.
     pub async fn change_state(
         &self,
         node: &GraphName,
@@ -173,7 +199,8 @@ impl LocalGraph {
         within: Duration,
     ) -> Result<Vec<(String, ParameterValue)>, GraphError> {
         let names = self.while_open(parameters::list(&self.shared.clients, node, within)).await?;
-        let values = self.while_open(parameters::get(&self.shared.clients, node, &names, within)).await?;
+        let values =
+            self.while_open(parameters::get(&self.shared.clients, node, &names, within)).await?;
         Ok(names.into_iter().zip(values).collect())
     }
 
@@ -184,7 +211,9 @@ impl LocalGraph {
         name: &str,
         within: Duration,
     ) -> Result<ParameterValue, GraphError> {
-        let values = self.while_open(parameters::get(&self.shared.clients, node, &[name.to_owned()], within)).await?;
+        let values = self
+            .while_open(parameters::get(&self.shared.clients, node, &[name.to_owned()], within))
+            .await?;
         Ok(values.into_iter().next().unwrap_or(ParameterValue::NotSet))
     }
 
@@ -198,8 +227,8 @@ impl LocalGraph {
         self.while_open(parameters::set(&self.shared.clients, node, parameters, within)).await
     }
 
-    /// What nodes log, from now on; the first who asks also gets the last lines from before, for nodes keep them. A
-    /// listener that is too slow is told how many lines it missed.
+    /// What nodes log, from now on; the first who asks also gets the last lines from before, for
+    /// nodes keep them. A listener that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let Shared { feeds, endpoints, snapshot, tasks, .. } = &*self.shared;
         let (receiver, running) = feeds.rosout(endpoints, snapshot.clone(), &tasks.closing)?;
@@ -215,9 +244,11 @@ impl LocalGraph {
         Ok(receiver)
     }
 
-    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings are.
+    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings
+    /// are.
     pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<Counter, GraphError> {
-        let dds_kind = names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
+        let dds_kind = names::type_to_dds(Role::Topic, kind)
+            .ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
         let topic = names::to_dds(Role::Topic, topic);
         let reader = self.shared.endpoints.reader(&topic, &dds_kind, Delivery::BestEffort)?;
         let (counter, counting) = Counter::new(reader, &self.shared.tasks.closing);
@@ -226,7 +257,10 @@ impl LocalGraph {
     }
 
     /// What `call` gives, or an error as soon as the graph is closed.
-    async fn while_open<T>(&self, call: impl Future<Output = Result<T, GraphError>>) -> Result<T, GraphError> {
+    async fn while_open<T>(
+        &self,
+        call: impl Future<Output = Result<T, GraphError>>,
+    ) -> Result<T, GraphError> {
         self.shared.tasks.closing.run_until_cancelled(call).await.unwrap_or(Err(GraphError::Closed))
     }
 
@@ -270,7 +304,8 @@ mod tests {
 
     async fn open(node_name: &str) -> LocalGraph {
         let node_name = node_name.parse().expect("name");
-        let settings = GraphSettings { domain_id: DOMAIN, localhost_only: true, node_name, distro: None };
+        let settings =
+            GraphSettings { domain_id: DOMAIN, localhost_only: true, node_name, distro: None };
         LocalGraph::open(&settings).await.expect("graph")
     }
 
@@ -298,7 +333,9 @@ mod tests {
         let own = EndpointId::of(forger.guid()).participant();
         let endpoints = Endpoints::of(&forger).expect("endpoints");
         let lasting = Delivery::Lasting { depth: 500 };
-        let writer = endpoints.writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting).expect("writer");
+        let writer = endpoints
+            .writer(names::DISCOVERY_TOPIC, names::DISCOVERY_TYPE, lasting)
+            .expect("writer");
         for length in (0..2000).step_by(7) {
             let byte = |at: usize| u8::try_from((length * 31 + at * 17) % 256).expect("a byte");
             writer.put(Cdr::little_endian((0..length).map(byte).collect()));
@@ -306,7 +343,9 @@ mod tests {
         writer.put(Cdr::little_endian(vec![0xff; 2 * MAX_MESSAGE_BYTES]));
         says(&writer, stolen, "/stolen", GidForm::Bytes16);
         // Messages of one writer keep their order: what came before was dealt with when this shows.
-        for (node, form) in [("/old", GidForm::Bytes24), ("/new", GidForm::Bytes16), ("/older", GidForm::Bytes24)] {
+        for (node, form) in
+            [("/old", GidForm::Bytes24), ("/new", GidForm::Bytes16), ("/older", GidForm::Bytes24)]
+        {
             says(&writer, own, node, form);
             let snapshot = shows(&graph, node).await;
             let names: Vec<_> = snapshot.nodes.iter().map(|node| node.name.as_str()).collect();

@@ -1,5 +1,6 @@
-//! The program that takes part in the graph for the agent, and what it is kept in: an account without rights, little
-//! memory, no capabilities, no way to more of them, nothing of the agent's but two pipes.
+//! The program that takes part in the graph for the agent, and what it is kept in: an account
+//! without rights, little memory, no capabilities, no way to more of them, nothing of the agent's
+//! but two pipes.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -35,13 +36,19 @@ pub struct GraphProgram {
 }
 
 impl GraphProgram {
-    /// The agent's own program, for the agent whose data is in `data` and whose tasks run as `task_user`.
-    pub fn of_this_agent(data: &Path, cgroups: Option<Cgroups>, task_user: Option<&TaskUser>) -> Self {
+    /// The agent's own program, for the agent whose data is in `data` and whose tasks run as
+    /// `task_user`.
+    pub fn of_this_agent(
+        data: &Path,
+        cgroups: Option<Cgroups>,
+        task_user: Option<&TaskUser>,
+    ) -> Self {
         let group = cgroups.map(|cgroups| (cgroups, data.join("graph")));
         Self { path: "/proc/self/exe".into(), account: account(task_user), group }
     }
 
-    /// The agent's program at `path`, with the rights that an agent's has, but without a control group.
+    /// The agent's program at `path`, with the rights that an agent's has, but without a control
+    /// group.
     pub fn at(path: impl Into<PathBuf>) -> Self {
         Self { path: path.into(), account: account(None), group: None }
     }
@@ -55,13 +62,18 @@ impl GraphProgram {
         };
         let group = self.group.as_ref().and_then(|(cgroups, dir)| {
             let made = cgroups.create(dir, &limits);
-            made.inspect_err(|error| tracing::warn!(%error, "the ROS graph has no control group")).ok()
+            made.inspect_err(|error| tracing::warn!(%error, "the ROS graph has no control group"))
+                .ok()
         });
         // The threads are limited by the group alone: the account may have other processes.
         let limits = RunLimits { pids: None, ..limits };
-        let confinement = Confinement::new(&self.path, group.as_ref(), &limits, self.account.as_ref())?;
-        let environment: BTreeMap<_, _> =
-            std::env::var(LOG_VARIABLE).ok().map(|value| (LOG_VARIABLE.to_owned(), value)).into_iter().collect();
+        let confinement =
+            Confinement::new(&self.path, group.as_ref(), &limits, self.account.as_ref())?;
+        let environment: BTreeMap<_, _> = std::env::var(LOG_VARIABLE)
+            .ok()
+            .map(|value| (LOG_VARIABLE.to_owned(), value))
+            .into_iter()
+            .collect();
         program::spawn_graph(&self.path, &environment, NICE, MEMORY_BYTES, confinement)
     }
 
@@ -81,7 +93,8 @@ fn account(task_user: Option<&TaskUser>) -> Option<TaskUser> {
         return None;
     }
     let own = TaskUser::find(Some(ACCOUNT)).ok().flatten();
-    let nobody = || TaskUser { name: NOBODY.to_string(), uid: NOBODY, gid: NOBODY, groups: Vec::new() };
+    let nobody =
+        || TaskUser { name: NOBODY.to_string(), uid: NOBODY, gid: NOBODY, groups: Vec::new() };
     let user = own.or_else(|| task_user.cloned()).unwrap_or_else(nobody);
     // It opens no device.
     Some(TaskUser { groups: Vec::new(), ..user })

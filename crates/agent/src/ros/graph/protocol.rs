@@ -1,9 +1,10 @@
-//! What the agent and the program that takes part in the ROS graph for it say to each other: one JSON object a line, on the
-//! program's standard input and output. `task-agent graph` is one such program; another need only speak the same.
+//! What the agent and the program that takes part in the ROS graph for it say to each other: one
+//! JSON object a line, on the program's standard input and output. `task-agent graph` is one such
+//! program; another need only speak the same.
 //!
-//! Both sides ignore fields and lines that they do not know, so either may be older. A line has a limit: an event that is
-//! longer ends the program, a request that is longer is refused where it is made. Times are ages in milliseconds, because
-//! two programs need not have one clock.
+//! Both sides ignore fields and lines that they do not know, so either may be older. A line has a
+//! limit: an event that is longer ends the program, a request that is longer is refused where it is
+//! made. Times are ages in milliseconds, because two programs need not have one clock.
 //!
 //! ```text
 //! agent                                    program
@@ -246,7 +247,12 @@ impl Shown {
         Self {
             age_ms: millis(now.saturating_duration_since(snapshot.at)),
             nodes: snapshot.nodes.clone(),
-            participants: snapshot.participants.iter().take(MAX_PARTICIPANTS).map(participant).collect(),
+            participants: snapshot
+                .participants
+                .iter()
+                .take(MAX_PARTICIPANTS)
+                .map(participant)
+                .collect(),
             omitted: snapshot.omitted,
         }
     }
@@ -259,8 +265,9 @@ impl Shown {
         kept > 0
     }
 
-    /// The snapshot, as it was received `now`. `before` is the one that was received before: since when a participant has
-    /// been seen stays what it was, however long this message was on its way.
+    /// The snapshot, as it was received `now`. `before` is the one that was received before: since
+    /// when a participant has been seen stays what it was, however long this message was on its
+    /// way.
     pub fn received(self, now: Instant, before: &Snapshot) -> Snapshot {
         let ago = |age_ms| now.checked_sub(Duration::from_millis(age_ms)).unwrap_or(now);
         let mut nodes = self.nodes;
@@ -270,8 +277,12 @@ impl Shown {
         let participants = self.participants.into_iter().take(MAX_PARTICIPANTS).map(|shown| {
             let seen = ago(shown.seen_ms);
             let known = before.participants.get(&shown.id).map(|known| known.first_seen);
-            let first_seen = known.filter(|known| seen.saturating_duration_since(*known) < ALIVE_INTERVAL);
-            (shown.id, Participant { locators: shown.locators, first_seen: first_seen.unwrap_or(seen) })
+            let first_seen =
+                known.filter(|known| seen.saturating_duration_since(*known) < ALIVE_INTERVAL);
+            (
+                shown.id,
+                Participant { locators: shown.locators, first_seen: first_seen.unwrap_or(seen) },
+            )
         });
         let participants: BTreeMap<_, _> = participants.collect();
         Snapshot { at: ago(self.age_ms), nodes, participants, omitted }
@@ -287,7 +298,8 @@ impl Event {
             if line.len() <= MAX_EVENT_BYTES {
                 return Ok(line);
             }
-            let is_shorter = if let Self::Snapshot(shown) = &mut event { shown.halve() } else { false };
+            let is_shorter =
+                if let Self::Snapshot(shown) = &mut event { shown.halve() } else { false };
             if !is_shorter {
                 return Err(io::Error::new(io::ErrorKind::InvalidData, "an event is too long"));
             }
@@ -300,7 +312,11 @@ impl Request {
     pub fn line(&self) -> io::Result<Vec<u8>> {
         line_of(self).and_then(|line| {
             let fits = line.len() <= MAX_REQUEST_BYTES;
-            if fits { Ok(line) } else { Err(io::Error::new(io::ErrorKind::InvalidData, "a request is too long")) }
+            if fits {
+                Ok(line)
+            } else {
+                Err(io::Error::new(io::ErrorKind::InvalidData, "a request is too long"))
+            }
         })
     }
 }
@@ -358,7 +374,14 @@ mod tests {
     fn node(name: &str) -> Node {
         let (publishers, subscriptions, services, clients) = Default::default();
         let participant = ParticipantId([1; 12]);
-        Node { name: name.parse().expect("a name"), participant, publishers, subscriptions, services, clients }
+        Node {
+            name: name.parse().expect("a name"),
+            participant,
+            publishers,
+            subscriptions,
+            services,
+            clients,
+        }
     }
 
     #[test]
@@ -369,7 +392,8 @@ mod tests {
             node_name: "/agent".parse().expect("a name"),
             distro: None,
         };
-        let call = Call::Parameter { node: "/talker".parse().expect("a name"), name: "rate".to_owned() };
+        let call =
+            Call::Parameter { node: "/talker".parse().expect("a name"), name: "rate".to_owned() };
         let requests = [
             (
                 Request::Join(settings),
@@ -382,7 +406,10 @@ mod tests {
             (Request::Listen(Feed::Rosout), json!({"listen": "rosout"})),
         ];
         for (request, expected) in requests {
-            assert_eq!(serde_json::from_slice::<Value>(&request.line().expect("a line")).expect("JSON"), expected);
+            assert_eq!(
+                serde_json::from_slice::<Value>(&request.line().expect("a line")).expect("JSON"),
+                expected
+            );
         }
         let value = ParameterValue::Doubles(vec![1.0, f64::NAN, f64::NEG_INFINITY]);
         let answer = Event::Answer { id: 1, answer: Answer::Parameter(value) };
@@ -390,7 +417,8 @@ mod tests {
         let expected = json!({"answer": {"id": 1, "answer": {"parameter": {"doubles": [1.0, "NaN", "-inf"]}}}});
         assert_eq!(serde_json::from_slice::<Value>(&line).expect("JSON"), expected);
         let read: Event = serde_json::from_slice(&line).expect("an event");
-        let Event::Answer { answer: Answer::Parameter(ParameterValue::Doubles(read)), .. } = read else {
+        let Event::Answer { answer: Answer::Parameter(ParameterValue::Doubles(read)), .. } = read
+        else {
             panic!("another event: {read:?}")
         };
         assert!(read[0] == 1.0 && read[1].is_nan() && read[2] == f64::NEG_INFINITY);
@@ -398,7 +426,8 @@ mod tests {
 
     #[tokio::test]
     async fn unknown_lines_and_fields_are_ignored_and_long_lines_end_it() {
-        let text = b"{\"sing\":{}}\nnot JSON\n{\"unchanged\":{\"age_ms\":5,\"mood\":\"good\"}}\n".to_vec();
+        let text =
+            b"{\"sing\":{}}\nnot JSON\n{\"unchanged\":{\"age_ms\":5,\"mood\":\"good\"}}\n".to_vec();
         let mut lines = Lines::new(&text[..], 100);
         let read = lines.next::<Event>().await.expect("a line").expect("an event");
         assert!(matches!(read, Event::Unchanged { age_ms: 5 }), "{read:?}");
@@ -415,7 +444,8 @@ mod tests {
         let mut sent = Snapshot::empty(at(900));
         sent.nodes = vec![node("/a"), node("/b")];
         let locators = BTreeSet::from(["127.0.0.1:7411".parse().expect("an address")]);
-        sent.participants.insert(ParticipantId([1; 12]), Participant { locators, first_seen: at(400) });
+        sent.participants
+            .insert(ParticipantId([1; 12]), Participant { locators, first_seen: at(400) });
         let message = serde_json::to_vec(&Shown::of(&sent, at(1000))).expect("JSON");
         let shown: Shown = serde_json::from_slice(&message).expect("a snapshot");
         let first = shown.clone().received(at(1000), &Snapshot::empty(start));
@@ -436,7 +466,9 @@ mod tests {
         }
         let line = Event::Snapshot(Shown::of(&snapshot, Instant::now())).line().expect("a line");
         assert!(line.len() <= MAX_EVENT_BYTES);
-        let Event::Snapshot(shown) = serde_json::from_slice(&line).expect("an event") else { panic!("another event") };
+        let Event::Snapshot(shown) = serde_json::from_slice(&line).expect("an event") else {
+            panic!("another event")
+        };
         assert_eq!((shown.nodes.len(), shown.omitted), (MAX_NODES / 4, MAX_NODES / 4 * 3));
     }
 

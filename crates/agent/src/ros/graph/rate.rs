@@ -59,7 +59,8 @@ impl Counter {
     ) -> (Self, impl Future<Output = ()> + Send + use<>) {
         let arrivals = Arc::new(Mutex::new(Arrivals::since(Instant::now())));
         let ending = closing.child_token();
-        let meter = Self { arrivals: arrivals.clone(), _ends_with_this: ending.clone().drop_guard() };
+        let meter =
+            Self { arrivals: arrivals.clone(), _ends_with_this: ending.clone().drop_guard() };
         (meter, count(reader, arrivals, ending))
     }
 
@@ -106,13 +107,19 @@ impl Arrivals {
         let window = WINDOW.min(now.duration_since(self.since));
         // With more samples than are remembered, the window is what they span.
         let window = match self.recent.front() {
-            Some(first) if self.recent.len() == MAX_SAMPLES => window.min(now.duration_since(*first)),
+            Some(first) if self.recent.len() == MAX_SAMPLES => {
+                window.min(now.duration_since(*first))
+            }
             _ => window,
         };
         let counted = self.recent.iter().filter(|at| now.duration_since(**at) <= window).count();
         #[expect(clippy::cast_precision_loss, reason = "at most 4096")]
         let hz = if window.is_zero() { 0.0 } else { counted as f64 / window.as_secs_f64() };
-        Rate { hz, since_last: self.recent.back().map(|last| now.duration_since(*last)), samples: self.samples }
+        Rate {
+            hz,
+            since_last: self.recent.back().map(|last| now.duration_since(*last)),
+            samples: self.samples,
+        }
     }
 }
 

@@ -1,5 +1,5 @@
-//! The program that takes part in the graph: it does what it reads on its input, says on its output what comes of it, and
-//! ends with its input. It has no other ties to the agent.
+//! The program that takes part in the graph: it does what it reads on its input, says on its output
+//! what comes of it, and ends with its input. It has no other ties to the agent.
 
 use std::collections::HashMap;
 use std::io;
@@ -14,7 +14,9 @@ use tokio::time::{MissedTickBehavior, interval, timeout};
 
 use super::GraphError;
 use super::participant::LocalGraph;
-use super::protocol::{ALIVE_INTERVAL, Answer, Call, Event, Feed, Lines, MAX_REQUEST_BYTES, Request, Shown};
+use super::protocol::{
+    ALIVE_INTERVAL, Answer, Call, Event, Feed, Lines, MAX_REQUEST_BYTES, Request, Shown,
+};
 use super::rate::{Counter, Rate};
 
 /// Events that wait to be written.
@@ -27,10 +29,16 @@ const MAX_COUNTERS: usize = 1024;
 const RATE_INTERVAL: Duration = Duration::from_millis(250);
 
 /// Does what is read from `input` until that ends, or until the graph is closed.
-pub async fn serve(input: impl AsyncRead + Unpin + Send + 'static, output: impl AsyncWrite + Unpin) -> io::Result<()> {
+pub async fn serve(
+    input: impl AsyncRead + Unpin + Send + 'static,
+    output: impl AsyncWrite + Unpin,
+) -> io::Result<()> {
     let mut requests = Lines::new(BufReader::new(input), MAX_REQUEST_BYTES);
     let Some(Request::Join(settings)) = requests.next().await? else {
-        return Err(io::Error::new(io::ErrorKind::InvalidData, "the first line is not {\"join\":…}"));
+        return Err(io::Error::new(
+            io::ErrorKind::InvalidData,
+            "the first line is not {\"join\":…}",
+        ));
     };
     let (events, queued) = mpsc::channel(QUEUED_EVENTS);
     let serving = async move {
@@ -48,7 +56,10 @@ pub async fn serve(input: impl AsyncRead + Unpin + Send + 'static, output: impl 
     serving.await.map_err(io::Error::other)?
 }
 
-async fn write(mut output: impl AsyncWrite + Unpin, mut queued: mpsc::Receiver<Event>) -> io::Result<()> {
+async fn write(
+    mut output: impl AsyncWrite + Unpin,
+    mut queued: mpsc::Receiver<Event>,
+) -> io::Result<()> {
     while let Some(event) = queued.recv().await {
         output.write_all(&event.line()?).await?;
         output.flush().await?;
@@ -83,10 +94,11 @@ async fn take_part(
                     let (graph, events) = (graph.clone(), events.clone());
                     tasks.spawn(async move {
                         let _permit = permit;
-                        let event = match perform(&graph, call, Duration::from_millis(within_ms)).await {
-                            Ok(answer) => Event::Answer { id, answer },
-                            Err(error) => Event::Refused { id, error },
-                        };
+                        let event =
+                            match perform(&graph, call, Duration::from_millis(within_ms)).await {
+                                Ok(answer) => Event::Answer { id, answer },
+                                Err(error) => Event::Refused { id, error },
+                            };
                         let _ = events.send(event).await;
                     });
                 }
@@ -97,7 +109,9 @@ async fn take_part(
                 }
                 Request::Count { meter, topic, kind } => match graph.rate(&topic, &kind) {
                     Ok(counter) => drop(meters.send((meter, Some(counter))).await),
-                    Err(error) => tracing::warn!(%topic, %error, "the messages of a topic can't be counted"),
+                    Err(error) => {
+                        tracing::warn!(%topic, %error, "the messages of a topic can't be counted")
+                    }
                 },
                 Request::StopCounting { meter } => drop(meters.send((meter, None)).await),
             }
@@ -134,7 +148,10 @@ async fn show(graph: LocalGraph, events: mpsc::Sender<Event>) {
 }
 
 /// Says the rates of the topics that are counted, whenever one is another than was said last.
-async fn say_rates(mut meters: mpsc::Receiver<(u64, Option<Counter>)>, events: mpsc::Sender<Event>) {
+async fn say_rates(
+    mut meters: mpsc::Receiver<(u64, Option<Counter>)>,
+    events: mpsc::Sender<Event>,
+) {
     let mut counters: HashMap<u64, (Counter, Rate)> = HashMap::new();
     let mut ticks = interval(RATE_INTERVAL);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -174,7 +191,9 @@ fn listen(graph: &LocalGraph, feed: Feed, events: &mpsc::Sender<Event>, tasks: &
             tasks.spawn(pass_on(heard, events.clone(), |line| Event::Rosout((*line).clone())));
         }),
         Feed::Diagnostics => graph.diagnostics().map(|heard| {
-            tasks.spawn(pass_on(heard, events.clone(), |status| Event::Diagnostic((*status).clone())));
+            tasks.spawn(pass_on(heard, events.clone(), |status| {
+                Event::Diagnostic((*status).clone())
+            }));
         }),
     };
     if let Err(error) = listening {
@@ -182,7 +201,11 @@ fn listen(graph: &LocalGraph, feed: Feed, events: &mpsc::Sender<Event>, tasks: &
     }
 }
 
-async fn pass_on<T: Clone>(mut heard: broadcast::Receiver<T>, events: mpsc::Sender<Event>, event: impl Fn(T) -> Event) {
+async fn pass_on<T: Clone>(
+    mut heard: broadcast::Receiver<T>,
+    events: mpsc::Sender<Event>,
+    event: impl Fn(T) -> Event,
+) {
     loop {
         let event = match heard.recv().await {
             Ok(message) => event(message),
@@ -202,9 +225,15 @@ async fn perform(graph: &LocalGraph, call: Call, within: Duration) -> Result<Ans
             Answer::Servers(graph.service_answers(&service, kind.as_deref(), within).await?)
         }
         Call::LifecycleState { node } => Answer::State(graph.lifecycle_state(&node, within).await?),
-        Call::ChangeState { node, transition } => Answer::Changed(graph.change_state(&node, transition, within).await?),
+        Call::ChangeState { node, transition } => {
+            Answer::Changed(graph.change_state(&node, transition, within).await?)
+        }
         Call::Parameters { node } => Answer::Parameters(graph.parameters(&node, within).await?),
-        Call::Parameter { node, name } => Answer::Parameter(graph.parameter(&node, &name, within).await?),
-        Call::SetParameters { node, parameters } => Answer::Set(graph.set_parameters(&node, parameters, within).await?),
+        Call::Parameter { node, name } => {
+            Answer::Parameter(graph.parameter(&node, &name, within).await?)
+        }
+        Call::SetParameters { node, parameters } => {
+            Answer::Set(graph.set_parameters(&node, parameters, within).await?)
+        }
     })
 }

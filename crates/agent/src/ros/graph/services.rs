@@ -1,5 +1,6 @@
-//! Calls to services. A request before both sides have found each other is lost without a word, so a call waits for that
-//! first; no call waits without a limit; and only what may be done twice is asked again.
+//! Calls to services. A request before both sides have found each other is lost without a word, so
+//! a call waits for that first; no call waits without a limit; and only what may be done twice is
+//! asked again.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
@@ -22,7 +23,8 @@ use super::observer::Matches;
 use super::own::OwnNode;
 use super::{EndpointId, GraphError, ParticipantId};
 
-/// The most services that are kept ready to be called; beyond it the one that was not used for the longest time goes.
+/// The most services that are kept ready to be called; beyond it the one that was not used for the
+/// longest time goes.
 pub const MAX_CLIENTS: usize = 256;
 /// How long one try of a call that may be repeated waits for its answer.
 const TRY: Duration = Duration::from_secs(2);
@@ -65,7 +67,11 @@ struct Client {
 
 impl Clients {
     /// None yet.
-    pub fn new(endpoints: Arc<Endpoints>, own: Arc<OwnNode>, matches: watch::Sender<Matches>) -> Self {
+    pub fn new(
+        endpoints: Arc<Endpoints>,
+        own: Arc<OwnNode>,
+        matches: watch::Sender<Matches>,
+    ) -> Self {
         Self { endpoints, own, matches, kept: Mutex::default() }
     }
 
@@ -74,8 +80,8 @@ impl Clients {
         self.client(service, kind).await.map(drop)
     }
 
-    /// The participants with a server of this service that hears requests and whose answers are heard; waits until there
-    /// is one.
+    /// The participants with a server of this service that hears requests and whose answers are
+    /// heard; waits until there is one.
     pub async fn servers(
         &self,
         service: &GraphName,
@@ -128,7 +134,10 @@ impl Clients {
     ) -> Result<BTreeSet<ParticipantId>, GraphError> {
         let (writer, reader) = client.ids;
         let mut matches = self.matches.subscribe();
-        let found = timeout_at(deadline, matches.wait_for(|matches| !matches.with_both(writer, reader).is_empty()));
+        let found = timeout_at(
+            deadline,
+            matches.wait_for(|matches| !matches.with_both(writer, reader).is_empty()),
+        );
         match found.await {
             Ok(Ok(matches)) => Ok(matches.with_both(writer, reader)),
             Ok(Err(_closed)) => Err(GraphError::Closed),
@@ -157,7 +166,9 @@ impl Clients {
 
     fn drop_one(&self, kept: &mut Kept) {
         let idle = kept.clients.iter().filter(|(_, (_, client))| Arc::strong_count(client) == 1);
-        let Some(key) = idle.min_by_key(|(_, (used, _))| *used).map(|(key, _)| key.clone()) else { return };
+        let Some(key) = idle.min_by_key(|(_, (used, _))| *used).map(|(key, _)| key.clone()) else {
+            return;
+        };
         if let Some((_, client)) = kept.clients.remove(&key) {
             let (writer, reader) = client.ids;
             self.own.remove(&[reader], &[writer]);
@@ -174,7 +185,8 @@ impl Clients {
 impl Client {
     fn new(endpoints: &Endpoints, service: &GraphName, kind: &str) -> Result<Self, GraphError> {
         let dds = |role| {
-            let dds_kind = names::type_to_dds(role, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
+            let dds_kind =
+                names::type_to_dds(role, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
             Ok::<_, GraphError>((names::to_dds(role, service), dds_kind))
         };
         let (request_topic, request_kind) = dds(Role::Request)?;
@@ -187,7 +199,12 @@ impl Client {
     }
 
     /// Sends the request and waits for its answer, passing over answers to others.
-    async fn ask(&self, replies: &Reader<Cdr>, request: &impl Serialize, framed: bool) -> Result<Cdr, GraphError> {
+    async fn ask(
+        &self,
+        replies: &Reader<Cdr>,
+        request: &impl Serialize,
+        framed: bool,
+    ) -> Result<Cdr, GraphError> {
         let mut answers = pin!(replies.samples());
         if framed {
             let header = self.cyclone_header();

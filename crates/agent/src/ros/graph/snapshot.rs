@@ -1,5 +1,6 @@
-//! What the graph shows at one moment: participants and nodes with their endpoints, put together from what participants
-//! say about their nodes and what discovery says about readers and writers. Values only; it asks nobody.
+//! What the graph shows at one moment: participants and nodes with their endpoints, put together
+//! from what participants say about their nodes and what discovery says about readers and writers.
+//! Values only; it asks nobody.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -29,7 +30,8 @@ pub struct EndpointId(pub [u8; 16]);
 pub struct Snapshot {
     /// When it was known to be so.
     pub at: Instant,
-    /// The nodes, sorted by name. Names are not unique: two nodes may have the same. The agent's own node is not among them.
+    /// The nodes, sorted by name. Names are not unique: two nodes may have the same. The agent's
+    /// own node is not among them.
     pub nodes: Vec<Node>,
     /// The participants, also those without nodes, without the agent's own.
     pub participants: BTreeMap<ParticipantId, Participant>,
@@ -63,7 +65,8 @@ pub struct Node {
 pub struct Participant {
     /// Where it listens: the UDP addresses it announces.
     pub locators: BTreeSet<SocketAddr>,
-    /// When the agent first saw it: what was there before a process was started is none of that process's.
+    /// When the agent first saw it: what was there before a process was started is none of that
+    /// process's.
     pub first_seen: Instant,
 }
 
@@ -93,8 +96,8 @@ impl Snapshot {
         Self { at, nodes: Vec::new(), participants: BTreeMap::new(), omitted: 0 }
     }
 
-    /// Put together from what participants said, and what discovery has. A participant that discovery has lost, and
-    /// nodes of which nobody speaks, are not in it.
+    /// Put together from what participants said, and what discovery has. A participant that
+    /// discovery has lost, and nodes of which nobody speaks, are not in it.
     pub fn of(
         at: Instant,
         said: &BTreeMap<ParticipantId, ParticipantEntities>,
@@ -106,11 +109,14 @@ impl Snapshot {
         for endpoint in readers.iter().chain(writers) {
             let id = endpoint.id.participant();
             let first_seen = first_seen.get(&id).copied().unwrap_or(at);
-            let participant =
-                snapshot.participants.entry(id).or_insert(Participant { locators: BTreeSet::new(), first_seen });
+            let participant = snapshot
+                .participants
+                .entry(id)
+                .or_insert(Participant { locators: BTreeSet::new(), first_seen });
             participant.locators.extend(&endpoint.locators);
         }
-        let endpoints = by_id(readers, Direction::Reads).chain(by_id(writers, Direction::Writes)).collect();
+        let endpoints =
+            by_id(readers, Direction::Reads).chain(by_id(writers, Direction::Writes)).collect();
         for (id, entities) in said.iter().filter(|(id, _)| snapshot.participants.contains_key(id)) {
             snapshot.omitted += entities.misnamed;
             for node in &entities.nodes {
@@ -128,7 +134,9 @@ impl Snapshot {
 
     /// Whether it shows the same as `other`, at whatever time.
     pub fn shows_the_same_as(&self, other: &Self) -> bool {
-        self.nodes == other.nodes && self.participants == other.participants && self.omitted == other.omitted
+        self.nodes == other.nodes
+            && self.participants == other.participants
+            && self.omitted == other.omitted
     }
 
     /// The nodes of this name.
@@ -138,12 +146,16 @@ impl Snapshot {
 
     /// The nodes that offer this service.
     pub fn servers_of(&self, service: &GraphName) -> impl Iterator<Item = &Node> {
-        self.nodes.iter().filter(move |node| node.services.iter().any(|offered| offered.name == *service))
+        self.nodes
+            .iter()
+            .filter(move |node| node.services.iter().any(|offered| offered.name == *service))
     }
 
     /// The nodes that publish this topic.
     pub fn publishers_of(&self, topic: &GraphName) -> impl Iterator<Item = &Node> {
-        self.nodes.iter().filter(move |node| node.publishers.iter().any(|published| published.name == *topic))
+        self.nodes
+            .iter()
+            .filter(move |node| node.publishers.iter().any(|published| published.name == *topic))
     }
 }
 
@@ -178,19 +190,22 @@ impl Node {
             };
             list.push(Endpoint { name, kind });
         }
-        for list in [&mut node.publishers, &mut node.subscriptions, &mut node.services, &mut node.clients] {
+        for list in
+            [&mut node.publishers, &mut node.subscriptions, &mut node.services, &mut node.clients]
+        {
             list.sort();
             list.dedup();
         }
         node
     }
 
-    /// Whether it can be asked for its lifecycle state. A node that has just appeared may not have said so yet.
+    /// Whether it can be asked for its lifecycle state. A node that has just appeared may not have
+    /// said so yet.
     pub fn has_lifecycle(&self) -> bool {
         let wanted = format!("{}/get_state", self.name);
-        self.services
-            .iter()
-            .any(|service| service.name.as_str() == wanted && service.kind == "lifecycle_msgs/srv/GetState")
+        self.services.iter().any(|service| {
+            service.name.as_str() == wanted && service.kind == "lifecycle_msgs/srv/GetState"
+        })
     }
 }
 

@@ -1,5 +1,5 @@
-//! Brings one promised node up: its parameters are set, then it is configured and activated, from whichever state it is
-//! in. Pure: it says what to ask the node next and takes the answers in.
+//! Brings one promised node up: its parameters are set, then it is configured and activated, from
+//! whichever state it is in. Pure: it says what to ask the node next and takes the answers in.
 //!
 //! ```text
 //! seen ─► parameters ─► configure ─► parameters ─► activate ─► parameters ─► up: only looked at from now on
@@ -18,7 +18,8 @@ use crate::ros::graph::ParticipantId;
 const ASK_AGAIN_MS: u64 = 500;
 /// How often a lifecycle node that is up is asked for its state.
 const LOOK_EVERY_MS: u64 = 2000;
-/// How long a node that is up may declare parameters before those it did not declare count as rejected.
+/// How long a node that is up may declare parameters before those it did not declare count as
+/// rejected.
 const UNDECLARED_PATIENCE_MS: u64 = 3000;
 
 /// Something to ask a node.
@@ -85,7 +86,8 @@ pub(super) struct BringUp {
     ask_at_ms: u64,
 }
 
-/// Whether a rejection only says that the node does not know the parameter yet: rclcpp and rclpy have words of their own.
+/// Whether a rejection only says that the node does not know the parameter yet: rclcpp and rclpy
+/// have words of their own.
 fn is_undeclared(reason: &str) -> bool {
     reason.contains("not declared") || reason.contains("undeclared")
 }
@@ -174,7 +176,8 @@ impl BringUp {
         let stage = self.state.unwrap_or(LifecycleState::Active);
         let may_take = self.tried_in != Some(stage) || stage == LifecycleState::Active;
         if stage != LifecycleState::Changing && !self.pending.is_empty() && may_take {
-            let pending = self.pending.iter().map(|(name, (value, _))| (name.clone(), value.clone()));
+            let pending =
+                self.pending.iter().map(|(name, (value, _))| (name.clone(), value.clone()));
             return Some(Ask::Set(pending.collect()));
         }
         match self.state {
@@ -205,7 +208,9 @@ impl BringUp {
         self.silent_since_ms = None;
         match (&question.ask, answer) {
             (_, Answer::State(state)) => self.is_in(state, now_ms),
-            (Ask::Transition(transition), Answer::Transition(true)) => self.is_in(goal(*transition), now_ms),
+            (Ask::Transition(transition), Answer::Transition(true)) => {
+                self.is_in(goal(*transition), now_ms)
+            }
             (Ask::Transition(transition), Answer::Transition(false)) => {
                 self.failed = Some(*transition);
                 self.state = None;
@@ -217,10 +222,16 @@ impl BringUp {
 
     fn is_in(&mut self, state: LifecycleState, now_ms: u64) {
         self.state = Some(state);
-        // Until it is known where the other attempt led, nothing has failed: somebody else may bring it up as well.
+        // Until it is known where the other attempt led, nothing has failed: somebody else may
+        // bring it up as well.
         let failed = if state == LifecycleState::Changing { None } else { self.failed.take() };
         if let Some(transition) = failed.filter(|transition| !leads_to(*transition, state)) {
-            let text = format!("`{}` failed to {} and is {}", self.node, transition.as_str(), state.as_str());
+            let text = format!(
+                "`{}` failed to {} and is {}",
+                self.node,
+                transition.as_str(),
+                state.as_str()
+            );
             self.refused = Some(Failure::new(FailureCode::LIFECYCLE_FAILED, text));
         } else if state == LifecycleState::Finalized && !self.is_up {
             let text = format!("`{}` is finalized, from where nothing leads to active", self.node);
@@ -249,12 +260,17 @@ impl BringUp {
                 }
             }
         }
-        let rejected = || self.pending.iter().filter_map(|(name, (value, said))| Some((name, value, said.as_ref()?)));
+        let rejected = || {
+            self.pending
+                .iter()
+                .filter_map(|(name, (value, said))| Some((name, value, said.as_ref()?)))
+        };
         let for_good = rejected().any(|(_, _, reason)| !is_undeclared(reason));
         let waits = stage == LifecycleState::Active && rejected().next().is_some();
         let since_ms = if waits { *self.undeclared_since_ms.get_or_insert(now_ms) } else { now_ms };
         if for_good || now_ms.saturating_sub(since_ms) >= UNDECLARED_PATIENCE_MS {
-            let each = rejected().map(|(name, value, reason)| format!("`{}` {name} = {value}: {reason}", self.node));
+            let each = rejected()
+                .map(|(name, value, reason)| format!("`{}` {name} = {value}: {reason}", self.node));
             let text = each.collect::<Vec<_>>().join("; ");
             self.refused = Some(Failure::new(FailureCode::PARAMETER_REJECTED, text));
         } else if waits {

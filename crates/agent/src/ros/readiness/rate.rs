@@ -24,7 +24,11 @@ impl Rate {
     pub(super) fn of(min_hz: f64) -> Self {
         // A rate is above zero, and what does not fit is cut off by the clamp.
         let window_ms = (MESSAGES / min_hz * 1000.0) as u64;
-        Self { min_hz, window_ms: window_ms.clamp(MIN_WINDOW_MS, MAX_WINDOW_MS), counts: VecDeque::new() }
+        Self {
+            min_hz,
+            window_ms: window_ms.clamp(MIN_WINDOW_MS, MAX_WINDOW_MS),
+            counts: VecDeque::new(),
+        }
     }
 
     pub(super) fn min_hz(&self) -> f64 {
@@ -55,8 +59,8 @@ impl Rate {
         (elapsed_ms >= self.window_ms).then(|| (last - first) as f64 * 1000.0 / elapsed_ms as f64)
     }
 
-    /// Whether the topic carries what it must; `None`: that can't be said yet. Where the stretch begins and ends between
-    /// two messages one may fall outside, so one is given away.
+    /// Whether the topic carries what it must; `None`: that can't be said yet. Where the stretch
+    /// begins and ends between two messages one may fall outside, so one is given away.
     pub(super) fn suffices(&self) -> Option<bool> {
         let ((first_ms, first), (last_ms, last)) = (self.counts.front()?, self.counts.back()?);
         let wanted = self.min_hz * (last_ms - first_ms) as f64 / 1000.0;

@@ -55,7 +55,8 @@ impl Stage {
 
     fn add(&mut self, participant: ParticipantId, node: &str, services: &[&str], topics: &[&str]) {
         let endpoints = |names: &[&str]| {
-            let endpoint = |text: &&str| Endpoint { name: name(text), kind: "test_msgs/msg/Empty".to_owned() };
+            let endpoint =
+                |text: &&str| Endpoint { name: name(text), kind: "test_msgs/msg/Empty".to_owned() };
             names.iter().map(endpoint).collect::<Vec<_>>()
         };
         self.snapshot.nodes.push(Node {
@@ -117,7 +118,8 @@ fn nodes(texts: &[&str]) -> Promise {
 }
 
 fn lifecycle(parameters: &[(&str, serde_json::Value)]) -> Promise {
-    let values = parameters.iter().map(|(name, value)| ((*name).to_owned(), value.clone())).collect();
+    let values =
+        parameters.iter().map(|(name, value)| ((*name).to_owned(), value.clone())).collect();
     Promise {
         lifecycle: names(&["/mapper"]),
         parameters: BTreeMap::from([(name("/mapper"), values)]),
@@ -185,11 +187,17 @@ fn what_a_stranger_does_is_no_fault_of_the_run() {
     stage.add(OTHER, "/mapper", &[], &[]);
     assert!(matches!(stage.after(0), Health::Holds { .. }));
     let health = stage.after(FOREIGN_MS);
-    assert_eq!((missing(&health).code.as_str(), missing(&health).is_its_own), ("node_name_taken", false));
+    assert_eq!(
+        (missing(&health).code.as_str(), missing(&health).is_its_own),
+        ("node_name_taken", false)
+    );
     stage.remove(OURS);
     stage.after(0);
     let health = stage.after(GRACE_MS);
-    assert_eq!((missing(&health).code.as_str(), missing(&health).is_its_own), ("node_name_taken", true));
+    assert_eq!(
+        (missing(&health).code.as_str(), missing(&health).is_its_own),
+        ("node_name_taken", true)
+    );
 }
 
 #[test]
@@ -225,11 +233,13 @@ fn parameters_go_in_before_configure_and_late_ones_after() {
 
 #[test]
 fn every_rejected_parameter_is_listed_and_nothing_is_configured() {
-    let mut stage = Stage::new(lifecycle(&[("a", json!(1)), ("b", json!("x")), ("c", json!(2))]), false);
+    let mut stage =
+        Stage::new(lifecycle(&[("a", json!(1)), ("b", json!("x")), ("c", json!(2))]), false);
     stage.add(OURS, "/mapper", &[], &[]);
     stage.after(0);
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
-    let all = vec![("a".to_owned(), json!(1)), ("b".to_owned(), json!("x")), ("c".to_owned(), json!(2))];
+    let all =
+        vec![("a".to_owned(), json!(1)), ("b".to_owned(), json!("x")), ("c".to_owned(), json!(2))];
     let results = vec![
         Err("must be positive".to_owned()),
         Err("('Invalid access to undeclared parameter(s)', ['b'])".to_owned()),
@@ -237,7 +247,12 @@ fn every_rejected_parameter_is_listed_and_nothing_is_configured() {
     ];
     stage.answers(&Ask::Set(all), Answer::Set(results));
     let text = refused(&stage.after(0));
-    assert!(text.starts_with("parameter_rejected: `/mapper` a = 1: must be positive; `/mapper` b = \"x\": "), "{text}");
+    assert!(
+        text.starts_with(
+            "parameter_rejected: `/mapper` a = 1: must be positive; `/mapper` b = \"x\": "
+        ),
+        "{text}"
+    );
     assert!(!text.contains(" c = "), "{text}");
     assert_eq!(stage.asked(), []);
 }
@@ -254,8 +269,10 @@ fn a_parameter_that_nobody_declares_is_rejected_in_the_end() {
         stage.answers(&set, Answer::Set(vec![Err("undeclared".to_owned())]));
     }
     missing(&stage.after(ASK_AGAIN_MS));
-    stage
-        .answers(&Ask::Set(vec![("unheard_of".to_owned(), json!(1))]), Answer::Set(vec![Err("undeclared".to_owned())]));
+    stage.answers(
+        &Ask::Set(vec![("unheard_of".to_owned(), json!(1))]),
+        Answer::Set(vec![Err("undeclared".to_owned())]),
+    );
     assert!(refused(&stage.after(0)).starts_with("parameter_rejected"));
 }
 
@@ -267,7 +284,10 @@ fn a_failed_transition_is_named_with_the_state_it_led_to() {
     let mut stage = Stage::managed(LifecycleState::Inactive);
     stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(false));
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
-    assert_eq!(refused(&stage.after(0)), "lifecycle_failed: `/mapper` failed to activate and is unconfigured");
+    assert_eq!(
+        refused(&stage.after(0)),
+        "lifecycle_failed: `/mapper` failed to activate and is unconfigured"
+    );
 }
 
 #[test]
@@ -351,7 +371,10 @@ fn a_hiccup_of_discovery_is_no_loss_but_a_dead_process_is_at_once() {
     stage.ours.remove(&OURS);
     stage.gone.insert(OURS);
     let health = stage.after(10);
-    assert_eq!(missing(&health).failure().to_string(), "node_vanished: `/mapper` left the graph; its process is gone");
+    assert_eq!(
+        missing(&health).failure().to_string(),
+        "node_vanished: `/mapper` left the graph; its process is gone"
+    );
 }
 
 #[test]
@@ -380,7 +403,8 @@ fn a_node_that_comes_back_is_brought_up_again_and_one_that_left_active_is_not() 
     // It came back so soon that it was not missed, but it is not active.
     assert_eq!(missing(&stage.after(10)).code, FailureCode::NODE_INACTIVE);
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
-    stage.answers(&Ask::Set(vec![("resolution".to_owned(), json!(0.1))]), Answer::Set(vec![Ok(())]));
+    stage
+        .answers(&Ask::Set(vec![("resolution".to_owned(), json!(0.1))]), Answer::Set(vec![Ok(())]));
     stage.answers(&Ask::Transition(Transition::Configure), Answer::Transition(true));
     stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(true));
     assert!(matches!(stage.after(10), Health::Holds { .. }));

@@ -1,4 +1,5 @@
-//! Whose the participants of a graph are, as far as one run is concerned: its own, somebody else's, or nobody's any more.
+//! Whose the participants of a graph are, as far as one run is concerned: its own, somebody else's,
+//! or nobody's any more.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -8,7 +9,8 @@ use std::time::{Duration, Instant};
 use crate::ros::graph::{Graph, Owners, Participant, ParticipantId, Snapshot};
 use crate::ros::readiness::Promise;
 
-/// How long before its start was recorded a process may have been seen: the record is written after the start.
+/// How long before its start was recorded a process may have been seen: the record is written after
+/// the start.
 const START_SLACK: Duration = Duration::from_secs(1);
 
 /// Participants by whose they are.
@@ -25,8 +27,8 @@ pub(super) struct Whose {
 }
 
 impl Whose {
-    /// Looks at the participants of `snapshot`, where the run has the processes `pids` and was started at `started`.
-    /// `ever_ours` are those that were found to be its own before.
+    /// Looks at the participants of `snapshot`, where the run has the processes `pids` and was
+    /// started at `started`. `ever_ours` are those that were found to be its own before.
     pub(super) async fn look(
         snapshot: Arc<Snapshot>,
         pids: Vec<u32>,
@@ -48,7 +50,8 @@ impl Whose {
         for (id, participant) in participants {
             let was_ours = ever_ours.contains(id);
             // Where the kernel can't tell, what came after the start counts as the run's.
-            let later = started.is_some_and(|started| participant.first_seen + START_SLACK >= started);
+            let later =
+                started.is_some_and(|started| participant.first_seen + START_SLACK >= started);
             let ours = owners.theirs.contains(id) || (owners.unknown.contains(id) && later);
             if owners.gone.contains(id) || replaced.contains(id) || (was_ours && !ours) {
                 whose.gone.insert(*id);
@@ -64,11 +67,13 @@ impl Whose {
         whose
     }
 
-    /// The same, with those of the others that have promised names as processes of this robot, where that can be told. It
-    /// takes a moment for each of them.
+    /// The same, with those of the others that have promised names as processes of this robot,
+    /// where that can be told. It takes a moment for each of them.
     pub(super) async fn naming_takers(mut self, promise: &Promise, snapshot: &Snapshot) -> Self {
         for id in promise.takers(snapshot, &self.others) {
-            let (Some(words), Some(participant)) = (self.others.get_mut(&id), snapshot.participants.get(&id)) else {
+            let (Some(words), Some(participant)) =
+                (self.others.get_mut(&id), snapshot.participants.get(&id))
+            else {
                 continue;
             };
             if let Some(pid) = Graph::process_of(participant.clone()).await {
@@ -84,7 +89,8 @@ impl Whose {
     }
 }
 
-/// Those whose address another one has that was seen later: two processes can't have one port, so the first is gone.
+/// Those whose address another one has that was seen later: two processes can't have one port, so
+/// the first is gone.
 fn replaced(participants: &BTreeMap<ParticipantId, Participant>) -> BTreeSet<ParticipantId> {
     let mut newest: BTreeMap<SocketAddr, (Instant, ParticipantId)> = BTreeMap::new();
     for (id, participant) in participants {
@@ -95,13 +101,19 @@ fn replaced(participants: &BTreeMap<ParticipantId, Participant>) -> BTreeSet<Par
     }
     let is_replaced = |id: &ParticipantId, participant: &Participant| {
         let mut locators = participant.locators.iter().peekable();
-        locators.peek().is_some() && locators.all(|locator| newest.get(locator).is_some_and(|(_, by)| by != id))
+        locators.peek().is_some()
+            && locators.all(|locator| newest.get(locator).is_some_and(|(_, by)| by != id))
     };
-    participants.iter().filter(|(id, participant)| is_replaced(id, participant)).map(|(id, _)| *id).collect()
+    participants
+        .iter()
+        .filter(|(id, participant)| is_replaced(id, participant))
+        .map(|(id, _)| *id)
+        .collect()
 }
 
 fn describe(participant: &Participant) -> String {
-    let hosts: BTreeSet<_> = participant.locators.iter().map(|locator| locator.ip().to_string()).collect();
+    let hosts: BTreeSet<_> =
+        participant.locators.iter().map(|locator| locator.ip().to_string()).collect();
     match hosts.first() {
         Some(host) => format!("another process (at {host})"),
         None => "another process".to_owned(),

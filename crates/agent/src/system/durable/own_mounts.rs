@@ -3,7 +3,8 @@
 use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 
-/// Does `work` in a thread that may mount what it likes. Where only root may do that, it is said that it is left out.
+/// Does `work` in a thread that may mount what it likes. Where only root may do that, it is said
+/// that it is left out.
 pub(crate) fn with_own_mounts(work: impl FnOnce() + Send) {
     let enter = || {
         unshare(CloneFlags::CLONE_NEWNS)?;

@@ -1,5 +1,6 @@
-//! Removes directory trees that somebody else made: of any depth, longer than a path can be, full of links. It takes a
-//! bounded number of descriptors and a bounded stack, goes by descriptors alone and follows no link.
+//! Removes directory trees that somebody else made: of any depth, longer than a path can be, full
+//! of links. It takes a bounded number of descriptors and a bounded stack, goes by descriptors
+//! alone and follows no link.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -19,7 +20,8 @@ const MAX_LEVELS: usize = 32;
 /// What a directory is called that was moved up, before its number.
 const MOVED_UP: &str = ".deeper-";
 
-/// Removes a directory with all it holds, if it is there; so it does a file or link. No link is followed.
+/// Removes a directory with all it holds, if it is there; so it does a file or link. No link is
+/// followed.
 pub fn remove_dir_all(path: &Path) -> io::Result<()> {
     match unlinkat(AT_FDCWD, path, UnlinkatFlags::NoRemoveDir) {
         Ok(()) | Err(Errno::ENOENT) => return Ok(()),
@@ -45,7 +47,8 @@ struct Removal<'a> {
 }
 
 impl Removal<'_> {
-    /// Removes what is in `dir`. What lies more than `levels` below it goes to the top, for a later pass.
+    /// Removes what is in `dir`. What lies more than `levels` below it goes to the top, for a later
+    /// pass.
     fn empty(&mut self, dir: &OwnedFd, levels: usize) -> io::Result<()> {
         for entry in fs::read_dir(by_descriptor(dir))? {
             let name = entry?.file_name();
@@ -78,8 +81,8 @@ impl Removal<'_> {
     }
 }
 
-/// Opens a directory, which gets the rights that its removal takes: a build may leave some that even their owner can't
-/// change.
+/// Opens a directory, which gets the rights that its removal takes: a build may leave some that
+/// even their owner can't change.
 fn open_dir(at: impl AsFd, name: &(impl NixPath + ?Sized)) -> io::Result<OwnedFd> {
     let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     let dir = openat(at, name, flags, Mode::empty())?;
@@ -106,7 +109,8 @@ mod tests {
 
     use super::*;
 
-    /// Deeper than a stack of two megabytes is for whoever calls itself at each level, and than there are descriptors.
+    /// Deeper than a stack of two megabytes is for whoever calls itself at each level, and than
+    /// there are descriptors.
     const DEPTH: usize = 20_000;
 
     #[test]

@@ -1,4 +1,5 @@
-//! How a run is to be run, as the ledger keeps it: the package's manifest need not be there any more.
+//! How a run is to be run, as the ledger keeps it: the package's manifest need not be there any
+//! more.
 
 use serde::{Deserialize, Serialize};
 use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};

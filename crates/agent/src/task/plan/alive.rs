@@ -1,5 +1,5 @@
-//! What is made of a process that lives and is wanted: whether it is ready, whether it goes on as it should, whether it
-//! has had its time. Pure, like the plan.
+//! What is made of a process that lives and is wanted: whether it is ready, whether it goes on as
+//! it should, whether it has had its time. Pure, like the plan.
 
 use task_proto::manifest::{Restart, TaskKind};
 use task_proto::report::{Failure, FailureCode};
@@ -45,7 +45,8 @@ fn gets_ready(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) ->
         Health::Refused(failure) => failure.clone(),
         // What came in time has its time to hold.
         Health::Holds { since_ms } if *since_ms <= too_late_ms => {
-            let ready_at_ms = (*since_ms).max(process.started_ms) + u64::from(active.rules.hold_s) * 1000;
+            let ready_at_ms =
+                (*since_ms).max(process.started_ms) + u64::from(active.rules.hold_s) * 1000;
             return if s.now_ms >= ready_at_ms {
                 record(transition::ready(s))
             } else {
@@ -63,8 +64,9 @@ fn gets_ready(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) ->
             Failure::new(FailureCode::NOT_READY, text)
         }
     };
-    // A run that was ready before, and was started again, is started again once more; a first one has failed. That goes for a
-    // refusal as well: a device may come later than its driver after the power did.
+    // A run that was ready before, and was started again, is started again once more; a first one
+    // has failed. That goes for a refusal as well: a device may come later than its driver after
+    // the power did.
     let again = active.ever_ready && starts_again(active);
     record(transition::condemned(s, Condemned { failure, again }))
 }
@@ -74,11 +76,15 @@ fn goes_on(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Ne
         && missing.is_its_own
         && starts_again(active)
     {
-        let enough_ms = missing.since_ms.max(process.started_ms) + u64::from(active.rules.ready_timeout_s) * 1000;
+        let enough_ms = missing.since_ms.max(process.started_ms)
+            + u64::from(active.rules.ready_timeout_s) * 1000;
         if s.now_ms < enough_ms {
             return rest(active, process, enough_ms);
         }
-        return record(transition::condemned(s, Condemned { failure: missing.failure(), again: true }));
+        return record(transition::condemned(
+            s,
+            Condemned { failure: missing.failure(), again: true },
+        ));
     }
     let deadline_ms = deadline_ms(active, process);
     if active.restarts_in_a_row == 0 {
@@ -88,7 +94,13 @@ fn goes_on(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Ne
     if s.now_ms >= calm_at_ms && !matches!(s.health, Health::Missing(_)) {
         return record(transition::calm(s.record));
     }
-    tidy(s, [deadline_ms, Some(calm_at_ms).filter(|at_ms| *at_ms > s.now_ms)].into_iter().flatten().min())
+    tidy(
+        s,
+        [deadline_ms, Some(calm_at_ms).filter(|at_ms| *at_ms > s.now_ms)]
+            .into_iter()
+            .flatten()
+            .min(),
+    )
 }
 
 /// Whether the policy starts a process again that failed. A job's is not: it runs once.

@@ -1,7 +1,7 @@
 //! What is done about the files that ended runs are to bring back. Pure, like the plan.
 //!
-//! That a run is over is in the ledger before its files travel, so a job is never run again for their sake. A job's end
-//! is reported once they are there, or were given up.
+//! That a run is over is in the ledger before its files travel, so a job is never run again for
+//! their sake. A job's end is reported once they are there, or were given up.
 
 use task_proto::manifest::TaskKind;
 
@@ -15,7 +15,9 @@ const MAX_WAITING: usize = 4;
 
 /// The next step towards the files of ended runs being at the server.
 pub fn collect(s: &Situation<'_>) -> Next {
-    let Some(collection) = s.record.collections.first().filter(|_| s.desired.is_some() && !s.deleting) else {
+    let Some(collection) =
+        s.record.collections.first().filter(|_| s.desired.is_some() && !s.deleting)
+    else {
         return Next::Rest { until_ms: None };
     };
     let give_up_ms = collection.since_ms + GIVE_UP_MS;
@@ -28,9 +30,11 @@ pub fn collect(s: &Situation<'_>) -> Next {
     Next::Act(Step::Collect(Box::new(collection.clone())))
 }
 
-/// Whether a job's files are still where a process of `run` would write. A service does not wait for its last files.
+/// Whether a job's files are still where a process of `run` would write. A service does not wait
+/// for its last files.
 pub(super) fn occupies(record: &TaskRecord, run: &ActiveRun) -> bool {
-    let is_in_the_way = |files: &Collection| files.package == run.package && files.kind == TaskKind::Job;
+    let is_in_the_way =
+        |files: &Collection| files.package == run.package && files.kind == TaskKind::Job;
     record.collections.iter().any(is_in_the_way)
 }
 

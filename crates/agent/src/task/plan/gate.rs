@@ -1,10 +1,11 @@
 //! When the robot's gate is asked, and what its answer means. Pure, like the plan.
 //!
-//! It is asked before a run is started for the first time or for the first time since the robot was booted, before the
-//! operator's order stops one, and before one version takes the place of another; that one answer covers the stop of the
-//! old, the start of the new, and the return of the old should the new one not get ready. It is not asked before a
-//! process is started again that ended by itself, nor before one is stopped that failed: the robot has let it in, and is
-//! no better off with half of it.
+//! It is asked before a run is started for the first time or for the first time since the robot was
+//! booted, before the operator's order stops one, and before one version takes the place of
+//! another; that one answer covers the stop of the old, the start of the new, and the return of the
+//! old should the new one not get ready. It is not asked before a process is started again that
+//! ended by itself, nor before one is stopped that failed: the robot has let it in, and is no
+//! better off with half of it.
 
 use task_proto::desired::Wanted;
 
@@ -35,7 +36,9 @@ pub fn consult(s: &Situation<'_>) -> Next {
         (None, Some(_)) => record(transition::ungated(s)),
         (Some(question), Some(gate)) if gate.question == question => match gate.answer {
             Some(GateAnswer::Allowed) => rest(None),
-            Some(GateAnswer::Refused(_)) if s.now_ms < gate.retry_at_ms => rest(Some(gate.retry_at_ms)),
+            Some(GateAnswer::Refused(_)) if s.now_ms < gate.retry_at_ms => {
+                rest(Some(gate.retry_at_ms))
+            }
             _ => Next::Act(Step::Ask(question)),
         },
         (Some(question), _) => Next::Act(Step::Ask(question)),
@@ -96,7 +99,9 @@ fn question(s: &Situation<'_>) -> Option<GateQuestion> {
             of_order(GateStep::Start)
         });
     }
-    let starts = |active: &&crate::task::ledger::ActiveRun| active.end.is_none() && !active.admitted && !s.held;
+    let starts = |active: &&crate::task::ledger::ActiveRun| {
+        active.end.is_none() && !active.admitted && !s.held
+    };
     active.filter(starts)?;
     (order.wanted == Wanted::Running && s.desired.is_some()).then(|| of_active(GateStep::Start))?
 }

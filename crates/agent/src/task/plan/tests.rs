@@ -1,5 +1,6 @@
-//! Properties of the plan, shown in a small simulated world: whatever happens in whatever order, no job runs twice, no
-//! task has two processes, what is not wanted is interrupted, and once it is quiet everything converges.
+//! Properties of the plan, shown in a small simulated world: whatever happens in whatever order, no
+//! job runs twice, no task has two processes, what is not wanted is interrupted, and once it is
+//! quiet everything converges.
 
 mod world;
 
@@ -15,7 +16,8 @@ use crate::task::observed::Missing;
 fn run_rules() -> impl Strategy<Value = Run> {
     let kind = prop_oneof![Just(TaskKind::Service), Just(TaskKind::Job)];
     let on_boot = prop_oneof![Just(OnBoot::Start), Just(OnBoot::Hold)];
-    let restart = prop_oneof![Just(Restart::Always), Just(Restart::OnFailure), Just(Restart::Never)];
+    let restart =
+        prop_oneof![Just(Restart::Always), Just(Restart::OnFailure), Just(Restart::Never)];
     (kind, on_boot, restart, any::<bool>()).prop_map(|(kind, on_boot, restart, idempotent)| Run {
         kind,
         on_boot,
@@ -133,7 +135,9 @@ fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
     world.happen(Happening::Effect { well: true });
     world.happen(Happening::Learn);
-    let active = |world: &World| world.record.as_ref().and_then(|record| record.active.clone()).expect("active");
+    let active = |world: &World| {
+        world.record.as_ref().and_then(|record| record.active.clone()).expect("active")
+    };
     assert_eq!((world.alive.len(), active(&world).restarts, active(&world).process), (0, 1, None));
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
@@ -151,7 +155,10 @@ fn run_whose_tree_was_changed_is_fetched_and_built_anew_before_it_starts() {
         (record.standing().0, record.standing().1.map(|failure| failure.code.clone()))
     };
     assert!(matches!(world.steps[..], [(Step::PullContent { .. }, false)]), "{:?}", world.steps);
-    assert_eq!(standing(&world), (Phase::Fetching, Some(task_proto::report::FailureCode::TREE_CHANGED)));
+    assert_eq!(
+        standing(&world),
+        (Phase::Fetching, Some(task_proto::report::FailureCode::TREE_CHANGED))
+    );
     world.happen(Happening::Wait { ms: 90_000 });
     assert!(world.alive.is_empty(), "it is not started before it is there");
     world.settle();
@@ -211,7 +218,10 @@ fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_
         }
         world.happen(Happening::Reboot);
         assert_eq!(phase(&world), expected, "{may_have_begun}");
-        assert_eq!(matches!(world.steps[..], [(Step::Start(_), false)]), expected == Phase::Starting);
+        assert_eq!(
+            matches!(world.steps[..], [(Step::Start(_), false)]),
+            expected == Phase::Starting
+        );
     }
 }
 
@@ -295,14 +305,24 @@ fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() 
     let (phase, failure) = record.standing();
     assert_eq!(phase, Phase::RolledBack);
     assert_eq!(failure.expect("why").to_string(), "not_ready: `/mapper` is gone within 30 s");
-    assert!(matches!(&world.steps[..], [(Step::Start(run), false)] if run.package == package(0)), "{:?}", world.steps);
+    assert!(
+        matches!(&world.steps[..], [(Step::Start(run), false)] if run.package == package(0)),
+        "{:?}",
+        world.steps
+    );
     world.settle();
-    assert_eq!((world.alive.len(), world.record.as_ref().expect("a record").phase), (1, Phase::RolledBack));
+    assert_eq!(
+        (world.alive.len(), world.record.as_ref().expect("a record").phase),
+        (1, Phase::RolledBack)
+    );
     // A reboot brings the old one back, and the order is not tried again by itself.
     world.happen(Happening::Reboot);
     world.settle();
     let record = world.record.as_ref().expect("a record");
-    assert_eq!((record.phase, &record.active.as_ref().expect("active").package), (Phase::RolledBack, &package(0)));
+    assert_eq!(
+        (record.phase, &record.active.as_ref().expect("active").package),
+        (Phase::RolledBack, &package(0))
+    );
     world.bad = None;
     world.happen(Happening::Order { deployment: 1, run: 2, stop: false });
     world.settle();
@@ -331,7 +351,11 @@ fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
             if at == cut {
                 world.happen(Happening::Reboot);
             }
-            world.happen(if at % 2 == 0 { Happening::Wait { ms: 15_000 } } else { Happening::Effect { well: true } });
+            world.happen(if at % 2 == 0 {
+                Happening::Wait { ms: 15_000 }
+            } else {
+                Happening::Effect { well: true }
+            });
             world.happen(Happening::Learn);
         }
         world.settle();
@@ -354,7 +378,10 @@ fn when_the_old_version_fails_after_it_came_back_the_order_has_failed() {
     let (phase, failure) = world.record.as_ref().expect("a record").standing();
     let text = &failure.expect("why").text;
     assert_eq!((phase, world.alive.len()), (Phase::Failed, 0));
-    assert!(text.contains("within 30 s\n1.0, which had come back, failed: the process ended"), "{text}");
+    assert!(
+        text.contains("within 30 s\n1.0, which had come back, failed: the process ended"),
+        "{text}"
+    );
 }
 
 #[test]
@@ -364,7 +391,10 @@ fn what_the_operator_had_stopped_does_not_come_back() {
     world.settle();
     assert_eq!(phase(&world), Phase::Stopped);
     world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
-    assert!(world.steps.iter().all(|(step, _)| step.lane() == Lane::Prepare), "the old one stays down meanwhile");
+    assert!(
+        world.steps.iter().all(|(step, _)| step.lane() == Lane::Prepare),
+        "the old one stays down meanwhile"
+    );
     bad_order(&mut world);
     assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
 }
@@ -388,7 +418,9 @@ fn bad_order(world: &mut World) {
 
 #[test]
 fn a_task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
-    for (restart, again) in [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)] {
+    for (restart, again) in
+        [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)]
+    {
         let mut world = running(Run { restart, ..Run::default() });
         world.happen(Happening::Sees(Sight::NotAll));
         world.happen(Happening::Wait { ms: 29_999 });
@@ -420,7 +452,11 @@ fn a_task_must_hold_for_its_time_without_a_break() {
     assert_eq!(phase(&world), Phase::Running);
     let mut world = running(Run::default());
     world.happen(Happening::Sees(Sight::Refused));
-    assert_eq!((phase(&world), world.steps.len()), (Phase::Running, 0), "only a start can be refused");
+    assert_eq!(
+        (phase(&world), world.steps.len()),
+        (Phase::Running, 0),
+        "only a start can be refused"
+    );
 }
 
 #[test]
@@ -461,7 +497,10 @@ fn a_job_has_its_deadline() {
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
     world.settle();
     let (phase, failure) = world.record.as_ref().expect("a record").standing();
-    assert_eq!((phase, &failure.expect("why").code), (Phase::Failed, &FailureCode::DEADLINE_EXCEEDED));
+    assert_eq!(
+        (phase, &failure.expect("why").code),
+        (Phase::Failed, &FailureCode::DEADLINE_EXCEEDED)
+    );
 }
 
 #[test]
@@ -513,7 +552,10 @@ fn a_stop_that_the_gate_refuses_waits_while_the_task_is_looked_after() {
     assert_eq!((phase(&world), world.alive.len()), (Phase::Deferred, 1));
     world.happen(Happening::Sees(Sight::NotAll));
     world.happen(Happening::Wait { ms: 30_000 });
-    assert!(world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))), "what failed is stopped unasked");
+    assert!(
+        world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))),
+        "what failed is stopped unasked"
+    );
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
 }
@@ -533,12 +575,23 @@ fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
 fn every_step_of_the_run_lane_has_a_deadline() {
     let order = order(1, 1, 1, Wanted::Running);
     let stop_timeout_s = 3600;
-    let run = ActiveRun::of(&order, RunRules::from(&manifest(&Run { stop_timeout_s, ..Run::default() })), 0);
-    let steps =
-        [Step::Start(Box::new(run.clone())), Step::Stop(Box::new(run)), Step::Prune { kept: Vec::new() }, Step::Remove];
+    let run = ActiveRun::of(
+        &order,
+        RunRules::from(&manifest(&Run { stop_timeout_s, ..Run::default() })),
+        0,
+    );
+    let steps = [
+        Step::Start(Box::new(run.clone())),
+        Step::Stop(Box::new(run)),
+        Step::Prune { kept: Vec::new() },
+        Step::Remove,
+    ];
     assert!(steps.iter().all(|step| step.lane() == Lane::Run && step.deadline().is_some()));
     let stop = steps[1].deadline().expect("checked");
-    assert!(stop > Duration::from_secs(2 * u64::from(stop_timeout_s)), "both signals have their time: {stop:?}");
+    assert!(
+        stop > Duration::from_secs(2 * u64::from(stop_timeout_s)),
+        "both signals have their time: {stop:?}"
+    );
 }
 
 #[test]
@@ -557,7 +610,12 @@ fn who_has_signed_it_is_looked_for_before_anything_of_it_is_fetched() {
     assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
     world.happen(Happening::Effect { well: true });
     assert_eq!(phase(&world), Phase::Failed);
-    let failure = world.record.as_ref().expect("a record").preparation.failure.clone().expect("a reason");
+    let failure =
+        world.record.as_ref().expect("a record").preparation.failure.clone().expect("a reason");
     assert_eq!(failure.code, FailureCode::UNTRUSTED_PACKAGE);
-    assert!(world.steps.is_empty() && world.disk.iter().all(|(_, level)| *level < 2), "{:?}", world.disk);
+    assert!(
+        world.steps.is_empty() && world.disk.iter().all(|(_, level)| *level < 2),
+        "{:?}",
+        world.disk
+    );
 }

@@ -1,4 +1,5 @@
-//! How a record changes: by an order, by the beginning and end of a step, by what a process did. Pure, like the plan.
+//! How a record changes: by an order, by the beginning and end of a step, by what a process did.
+//! Pure, like the plan.
 
 use task_proto::desired::{DesiredTask, Wanted};
 use task_proto::manifest::{OnBoot, Restart, TaskKind};
@@ -6,8 +7,8 @@ use task_proto::report::{Failure, FailureCode, Phase};
 
 use super::{MAX_RESTARTS_IN_A_ROW, Situation, Step, run_dir_name};
 use crate::task::ledger::{
-    ActiveRun, Collection, Condemned, End, GateAnswer, GateRecord, LostFiles, Preparation, ProcessRecord, RunRules,
-    TaskRecord,
+    ActiveRun, Collection, Condemned, End, GateAnswer, GateRecord, LostFiles, Preparation,
+    ProcessRecord, RunRules, TaskRecord,
 };
 use crate::task::observed::Exit;
 
@@ -45,7 +46,8 @@ const MAX_GATE_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait before a process is started again.
 const MAX_RESTART_BACKOFF_MS: u64 = 60 * 1000;
 
-/// Exponential backoff with full jitter, `jitter` being even from 0 to 1: the wait after the `attempt`th failure.
+/// Exponential backoff with full jitter, `jitter` being even from 0 to 1: the wait after the
+/// `attempt`th failure.
 pub fn backoff_ms(attempt: u32, max_ms: u64, jitter: f64) -> u64 {
     let ceiling = BACKOFF_BASE_MS.saturating_mul(1 << attempt.clamp(1, 20)).min(max_ms);
     // Rounding a positive number below 2^32 loses nothing that matters.
@@ -68,18 +70,31 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
 }
 
 /// The record that is written before `step` is done. `start` is the agent's start counter.
-pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms: u64) -> TaskRecord {
+pub fn begun(
+    record: &TaskRecord,
+    step: &Step,
+    boot_id: &str,
+    start: u64,
+    now_ms: u64,
+) -> TaskRecord {
     let mut record = record.clone();
     let phase = match step {
-        Step::CheckSigners(_) | Step::PullManifest(_) | Step::LookForRos(_) | Step::PullContent { .. } => {
-            Some(Phase::Fetching)
-        }
+        Step::CheckSigners(_)
+        | Step::PullManifest(_)
+        | Step::LookForRos(_)
+        | Step::PullContent { .. } => Some(Phase::Fetching),
         Step::Build(_) => Some(Phase::Building),
-        Step::Ask(_) | Step::Start(_) | Step::Stop(_) | Step::Collect(_) | Step::Prune { .. } | Step::Remove => None,
+        Step::Ask(_)
+        | Step::Start(_)
+        | Step::Stop(_)
+        | Step::Collect(_)
+        | Step::Prune { .. }
+        | Step::Remove => None,
     };
     if let Some(phase) = phase {
         let again = record.preparation.phase == phase && record.preparation.failure.is_some();
-        record.preparation.attempts = if again { record.preparation.attempts.saturating_add(1) } else { 1 };
+        record.preparation.attempts =
+            if again { record.preparation.attempts.saturating_add(1) } else { 1 };
         record.preparation.phase = phase;
     }
     if let Step::Start(run) = step {
@@ -87,7 +102,11 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
             let runs = [record.active.clone(), record.fallback.clone()];
             record.retire_active(run);
             for left in runs {
-                collect_if_left(&mut record, left.filter(|left| left.package != run.package), now_ms);
+                collect_if_left(
+                    &mut record,
+                    left.filter(|left| left.package != run.package),
+                    now_ms,
+                );
             }
         }
         record.gate = None;
@@ -113,7 +132,12 @@ pub fn begun(record: &TaskRecord, step: &Step, boot_id: &str, start: u64, now_ms
     if let Step::Ask(question) = step
         && record.gate.as_ref().is_none_or(|gate| gate.question != *question)
     {
-        record.gate = Some(GateRecord { question: question.clone(), answer: None, refusals: 0, retry_at_ms: 0 });
+        record.gate = Some(GateRecord {
+            question: question.clone(),
+            answer: None,
+            refusals: 0,
+            retry_at_ms: 0,
+        });
     }
     record.settle_phase(now_ms);
     record
@@ -141,14 +165,17 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
                 active.ever_started = true;
                 if let Some(process) = &mut active.process {
                     process.started_ms = s.now_ms;
-                    process.pid = if let Done::Started(pid) = done { Some(pid) } else { process.pid };
+                    process.pid =
+                        if let Done::Started(pid) = done { Some(pid) } else { process.pid };
                 }
             }
         }
         (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
             prepare_changed(&mut record, &failure);
-            // It may have come about after all: what is made of the failure waits until no process is there.
-            if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
+            // It may have come about after all: what is made of the failure waits until no process
+            // is there.
+            if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut())
+            {
                 process.condemned = Some(Condemned { failure, again: retry_after_ms.is_some() });
             }
         }
@@ -166,7 +193,8 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
         }
         (Step::Stop(_), Err(_)) => {
             if let Some(active) = &mut record.active {
-                active.retry_at_ms = s.now_ms + backoff_ms(1, MAX_STEP_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
+                active.retry_at_ms =
+                    s.now_ms + backoff_ms(1, MAX_STEP_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
             }
         }
         (Step::Ask(question), outcome) => {
@@ -175,17 +203,21 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
             }
         }
         (Step::Collect(files), Ok(_)) => record.collections.retain(|other| !other.is_same(files)),
-        (Step::Collect(files), Err(StepFailure { failure, retry_after_ms })) => match retry_after_ms {
-            Some(least_ms) => {
-                for files in record.collections.iter_mut().filter(|other| other.is_same(files)) {
-                    files.attempts = files.attempts.saturating_add(1);
-                    let wait_ms = backoff_ms(files.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
-                    files.retry_at_ms = s.now_ms.saturating_add(wait_ms.max(BACKOFF_BASE_MS));
-                    files.failure = Some(failure.clone());
+        (Step::Collect(files), Err(StepFailure { failure, retry_after_ms })) => {
+            match retry_after_ms {
+                Some(least_ms) => {
+                    for files in record.collections.iter_mut().filter(|other| other.is_same(files))
+                    {
+                        files.attempts = files.attempts.saturating_add(1);
+                        let wait_ms =
+                            backoff_ms(files.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
+                        files.retry_at_ms = s.now_ms.saturating_add(wait_ms.max(BACKOFF_BASE_MS));
+                        files.failure = Some(failure.clone());
+                    }
                 }
+                None => lose_files(&mut record, files, Some(&failure)),
             }
-            None => lose_files(&mut record, files, Some(&failure)),
-        },
+        }
         (Step::Remove, Err(_)) => {
             record.preparation.attempts = record.preparation.attempts.saturating_add(1);
             let wait_ms = backoff_ms(record.preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter);
@@ -202,7 +234,8 @@ fn prepare_changed(record: &mut TaskRecord, failure: &Failure) {
     let is_ordered = record.active.as_ref().is_some_and(|active| active.is_for(&record.order));
     if failure.code == FailureCode::TREE_CHANGED && is_ordered {
         let (kind, failure) = (record.preparation.kind, Some(failure.clone()));
-        record.preparation = Preparation { phase: Phase::Fetching, failure, kind, ..Preparation::default() };
+        record.preparation =
+            Preparation { phase: Phase::Fetching, failure, kind, ..Preparation::default() };
     }
 }
 
@@ -211,7 +244,8 @@ fn answered(gate: &mut GateRecord, s: &Situation<'_>, refusal: Option<StepFailur
         None => GateAnswer::Allowed,
         Some(StepFailure { failure, .. }) => {
             gate.refusals = gate.refusals.saturating_add(1);
-            gate.retry_at_ms = s.now_ms + backoff_ms(gate.refusals, MAX_GATE_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
+            gate.retry_at_ms = s.now_ms
+                + backoff_ms(gate.refusals, MAX_GATE_BACKOFF_MS, s.jitter).max(BACKOFF_BASE_MS);
             GateAnswer::Refused(failure)
         }
     });
@@ -235,13 +269,15 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
         Err(StepFailure { failure, retry_after_ms: Some(least_ms) }) => {
             preparation.failure = Some(failure);
             // Retries go on until the order ends: the server lets it expire.
-            let wait_ms = backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
+            let wait_ms =
+                backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
             preparation.retry_at_ms = s.now_ms.saturating_add(wait_ms);
         }
     }
 }
 
-/// What is added to a wait of `least_ms`, so that robots that were told the same do not all come back at once.
+/// What is added to a wait of `least_ms`, so that robots that were told the same do not all come
+/// back at once.
 fn wait_jitter_ms(least_ms: u64, jitter: f64) -> u64 {
     let most_ms = (least_ms / 4).clamp(BACKOFF_BASE_MS, MAX_WAIT_JITTER_MS);
     (most_ms as f64 * jitter.clamp(0.0, 1.0)) as u64
@@ -305,14 +341,15 @@ pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
 pub(super) fn not_restored(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let failure = record.preparation.failure.clone();
-    let unknown = || Failure::new(FailureCode::TREE_CHANGED, "what it is to run is not on the disk any more");
+    let unknown =
+        || Failure::new(FailureCode::TREE_CHANGED, "what it is to run is not on the disk any more");
     give_up(&mut record, s, failure.unwrap_or_else(unknown));
     record.settle_phase(s.now_ms);
     record
 }
 
-/// The record when it turns out that the process it announces was never started: as if it had not been tried, unless the
-/// start is known to have failed.
+/// The record when it turns out that the process it announces was never started: as if it had not
+/// been tried, unless the start is known to have failed.
 pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let process = record.active.as_mut().and_then(|active| active.process.take());
@@ -357,9 +394,11 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     record
 }
 
-/// Sees to the files of `run`, whose process is gone, unless the run goes on: with another process, or later.
+/// Sees to the files of `run`, whose process is gone, unless the run goes on: with another process,
+/// or later.
 fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
-    let goes_on = record.active.as_ref().is_some_and(|active| active.is_same(run) && active.end.is_none());
+    let goes_on =
+        record.active.as_ref().is_some_and(|active| active.is_same(run) && active.end.is_none());
     let stopped = record.order.wanted == Wanted::Stopped;
     // One that was replaced may come back; it is over once the new one is ready.
     if !goes_on || stopped {
@@ -367,8 +406,8 @@ fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
     }
 }
 
-/// Sees to the files of a run that has left the record without an end of its own: it was stopped for another one, and will
-/// not come back.
+/// Sees to the files of a run that has left the record without an end of its own: it was stopped
+/// for another one, and will not come back.
 fn collect_if_left(record: &mut TaskRecord, run: Option<ActiveRun>, now_ms: u64) {
     let Some(run) = run.filter(|run| run.end.is_none() && run.has_started()) else { return };
     if ![&record.active, &record.fallback].into_iter().flatten().any(|other| other.is_same(&run)) {
@@ -394,7 +433,10 @@ pub(super) fn gave_up_files(s: &Situation<'_>, files: &Collection) -> TaskRecord
 
 fn lose_files(record: &mut TaskRecord, files: &Collection, why: Option<&Failure>) {
     record.collections.retain(|other| !other.is_same(files));
-    let why = why.map_or_else(|| "other runs ended before they could be sent".to_owned(), ToString::to_string);
+    let why = why.map_or_else(
+        || "other runs ended before they could be sent".to_owned(),
+        ToString::to_string,
+    );
     let text = format!("files of run {} did not come back: {why}", files.run);
     let failure = Failure::new(FailureCode::OUTPUTS_LOST, text);
     record.lost = Some(LostFiles { deployment: files.deployment.clone(), run: files.run, failure });
@@ -425,11 +467,14 @@ fn job_ended(active: &mut ActiveRun, exit: &Exit) {
         Some(_) if exit.is_success() => Some(End { phase: Phase::Succeeded, failure: None }),
         Some(_) => Some(exited(exit)),
         None if active.rules.idempotent => None,
-        None => Some(interrupted("the job's process was gone, without an exit status, when it was looked for")),
+        None => Some(interrupted(
+            "the job's process was gone, without an exit status, when it was looked for",
+        )),
     };
 }
 
-/// A service that was never ready gets its readiness time to be so; one that was gets [`MAX_RESTARTS_IN_A_ROW`].
+/// A service that was never ready gets its readiness time to be so; one that was gets
+/// [`MAX_RESTARTS_IN_A_ROW`].
 fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure, again: bool) {
     let Some(active) = &mut record.active else { return };
     let tried_ms = s.now_ms.saturating_sub(active.first_start_ms);
@@ -439,10 +484,12 @@ fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure
     }
     active.restarts = active.restarts.saturating_add(1);
     active.restarts_in_a_row += 1;
-    active.retry_at_ms = s.now_ms + backoff_ms(active.restarts_in_a_row, MAX_RESTART_BACKOFF_MS, s.jitter);
+    active.retry_at_ms =
+        s.now_ms + backoff_ms(active.restarts_in_a_row, MAX_RESTART_BACKOFF_MS, s.jitter);
 }
 
-/// The active run is over for good. The one it replaced comes back, if it was never as good as that.
+/// The active run is over for good. The one it replaced comes back, if it was never as good as
+/// that.
 fn give_up(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure) {
     let Some(active) = &mut record.active else { return };
     let Some(mut before) = record.fallback.take() else {
@@ -456,13 +503,21 @@ fn give_up(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure) {
     record.finish(deployment, run, End { phase: Phase::RolledBack, failure: Some(failure) });
 }
 
-/// After a rollback the order stands by the run that came back: once that is over as well, it is not `rolled_back`.
+/// After a rollback the order stands by the run that came back: once that is over as well, it is
+/// not `rolled_back`.
 fn came_back_in_vain(record: &mut TaskRecord, phase: Phase, what: &str) {
-    let Some(active) = record.active.as_ref().filter(|active| !active.is_for(&record.order)) else { return };
-    let Some(end) = record.end_of_order().filter(|end| end.phase == Phase::RolledBack) else { return };
+    let Some(active) = record.active.as_ref().filter(|active| !active.is_for(&record.order)) else {
+        return;
+    };
+    let Some(end) = record.end_of_order().filter(|end| end.phase == Phase::RolledBack) else {
+        return;
+    };
     let why = end.failure.clone().map(|failure| {
         let version = &active.package.version;
-        Failure::new(failure.code, format!("{}\n{version}, which had come back, {what}", failure.text))
+        Failure::new(
+            failure.code,
+            format!("{}\n{version}, which had come back, {what}", failure.text),
+        )
     });
     let (deployment, run) = (record.order.deployment.clone(), record.order.run);
     record.finish(deployment, run, End { phase, failure: why });

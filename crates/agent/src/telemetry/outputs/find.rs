@@ -1,5 +1,6 @@
-//! Finds the files that `outputs.paths` names: regular files below one directory. Links are neither followed nor brought
-//! back, because a task could point them at what is not its own; nor are pipes, sockets and devices, which are not opened.
+//! Finds the files that `outputs.paths` names: regular files below one directory. Links are neither
+//! followed nor brought back, because a task could point them at what is not its own; nor are
+//! pipes, sockets and devices, which are not opened.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read as _};
@@ -20,7 +21,11 @@ const MAX_LOOKED_AT: usize = 200_000;
 const MAX_DEPTH: usize = 48;
 
 /// The files that match, sorted by path, with their digests.
-pub(super) fn files(directory: &Path, patterns: &[String], max_bytes: u64) -> Result<Vec<OutputFile>, OutputError> {
+pub(super) fn files(
+    directory: &Path,
+    patterns: &[String],
+    max_bytes: u64,
+) -> Result<Vec<OutputFile>, OutputError> {
     let mut found = BTreeMap::new();
     let patterns = patterns.iter().map(|pattern| parts(pattern)).collect::<Result<Vec<_>, _>>()?;
     let unreadable = |below: &str| {
@@ -42,7 +47,8 @@ pub(super) fn files(directory: &Path, patterns: &[String], max_bytes: u64) -> Re
         )));
     }
     let hashed = found.into_iter().map(|(path, size)| {
-        let blob = hash(&root, Path::new(path.as_str()), size).map_err(unreadable(path.as_str()))?;
+        let blob =
+            hash(&root, Path::new(path.as_str()), size).map_err(unreadable(path.as_str()))?;
         Ok(OutputFile { path, blob })
     });
     hashed.collect()
@@ -90,7 +96,9 @@ where
         for name in directory.names().map_err(unreadable(prefix))? {
             let name = name.map_err(unreadable(prefix))?;
             self.left = self.left.checked_sub(1).ok_or_else(|| {
-                OutputError::TooMuch(format!("more than {MAX_LOOKED_AT} names would have to be looked at"))
+                OutputError::TooMuch(format!(
+                    "more than {MAX_LOOKED_AT} names would have to be looked at"
+                ))
             })?;
             // What has no printable name can't be named in a manifest either.
             let Ok(name) = name.into_string() else { continue };
@@ -117,7 +125,8 @@ where
     }
 }
 
-/// The digest of a file as long as it was when it was found: something may still write to it, without end.
+/// The digest of a file as long as it was when it was found: something may still write to it,
+/// without end.
 pub(super) fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
     let mut file = root.file(path)?.take(found);
     let (mut hash, mut size) = (Sha256::new(), 0);
@@ -157,17 +166,30 @@ mod tests {
         std::os::unix::fs::symlink("../../secret.pgm", root.join("maps/link.pgm")).expect("linked");
         std::os::unix::fs::symlink("..", root.join("up")).expect("linked");
         std::os::unix::fs::symlink("/dev/zero", root.join("maps/zero.pgm")).expect("linked");
-        nix::unistd::mkfifo(&root.join("maps/pipe.pgm"), nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
+        nix::unistd::mkfifo(&root.join("maps/pipe.pgm"), nix::sys::stat::Mode::S_IRWXU)
+            .expect("a pipe");
 
-        assert_eq!(names(&root, &["maps/*.pgm", "maps/a.*"]), ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm"]);
+        assert_eq!(
+            names(&root, &["maps/*.pgm", "maps/a.*"]),
+            ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm"]
+        );
         assert_eq!(names(&root, &["**/*.pgm"]), ["maps/a.pgm", "maps/b.pgm", "maps/old/c.pgm"]);
-        assert_eq!(names(&root, &["maps/**"]), ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm", "maps/old/c.pgm"]);
+        assert_eq!(
+            names(&root, &["maps/**"]),
+            ["maps/a.pgm", "maps/a.yaml", "maps/b.pgm", "maps/old/c.pgm"]
+        );
         assert_eq!(names(&root, &["./log.txt", "nothing/*", "maps", "up/*.pgm"]), ["log.txt"]);
         let blob = files(&root, &["log.txt".to_owned()], 100).expect("found")[0].blob;
         assert_eq!(blob, BlobRef { digest: Digest::of(b"log.txt"), size: 7 });
         let dir = Directory::open(&root).expect("opened");
-        assert_eq!(hash(&dir, Path::new("log.txt"), 3).expect("read"), BlobRef { digest: Digest::of(b"log"), size: 3 });
-        assert!(matches!(files(&root, &["../*".to_owned()], 100), Err(OutputError::Pattern { .. })));
+        assert_eq!(
+            hash(&dir, Path::new("log.txt"), 3).expect("read"),
+            BlobRef { digest: Digest::of(b"log"), size: 3 }
+        );
+        assert!(matches!(
+            files(&root, &["../*".to_owned()], 100),
+            Err(OutputError::Pattern { .. })
+        ));
         assert!(matches!(files(&root, &["maps/*".to_owned()], 20), Err(OutputError::TooMuch(_))));
     }
 }

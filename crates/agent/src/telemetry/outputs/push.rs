@@ -1,5 +1,6 @@
-//! Pushes an output through the OCI distribution API: the config and the manifest, to hear whether it would be kept, then
-//! blobs in chunks that go on where they broke off, then the manifest once more.
+//! Pushes an output through the OCI distribution API: the config and the manifest, to hear whether
+//! it would be kept, then blobs in chunks that go on where they broke off, then the manifest once
+//! more.
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
@@ -33,7 +34,8 @@ const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
 const OTHER_BYTES: &str = "DIGEST_INVALID";
 /// How long one request may take.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
-/// How often an upload is begun again in one go that the server has forgotten, or received as other bytes.
+/// How often an upload is begun again in one go that the server has forgotten, or received as other
+/// bytes.
 const MAX_BEGINNINGS: u32 = 3;
 /// How often a request whose body the server received as other bytes is sent again in one go.
 const MAX_SENT_AGAIN: u32 = 3;
@@ -46,7 +48,8 @@ pub struct Registry {
     client: reqwest::Client,
     base: Url,
     token: Credential,
-    /// Whose turn it is to push: the server keeps so much of a robot that is not listed yet, and two would share that.
+    /// Whose turn it is to push: the server keeps so much of a robot that is not listed yet, and
+    /// two would share that.
     turn: Arc<Semaphore>,
 }
 
@@ -61,20 +64,26 @@ impl Registry {
 
     fn request(&self, method: Method, path: &str) -> RequestBuilder {
         let mut url = self.base.clone();
-        let (path, query) = path.split_once('?').map_or((path, None), |(path, query)| (path, Some(query)));
+        let (path, query) =
+            path.split_once('?').map_or((path, None), |(path, query)| (path, Some(query)));
         url.set_path(&format!("{}{path}", self.base.path().trim_end_matches('/')));
         url.set_query(query);
         self.client.request(method, url).bearer_auth(self.token.current()).timeout(REQUEST_TIMEOUT)
     }
 
     /// Sends what makes the registry take these bytes as a whole, and has its word that it did.
-    async fn store(&self, what: &str, digest: Digest, request: RequestBuilder) -> Result<(), OutputError> {
+    async fn store(
+        &self,
+        what: &str,
+        digest: Digest,
+        request: RequestBuilder,
+    ) -> Result<(), OutputError> {
         let response = self.send(what, request).await?;
         if is_of(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
     }
 
-    /// The same for bytes that are held in memory and known to be those of the digest: where the server received others,
-    /// they are sent again.
+    /// The same for bytes that are held in memory and known to be those of the digest: where the
+    /// server received others, they are sent again.
     async fn store_exactly(
         &self,
         what: &str,
@@ -84,12 +93,19 @@ impl Registry {
         let mut again = 0;
         loop {
             match self.store(what, digest, request()).await {
-                Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES || code == OTHER_MANIFEST => {
+                Err(OutputError::Refused { code, text, .. })
+                    if code == OTHER_BYTES || code == OTHER_MANIFEST =>
+                {
                     if again == MAX_SENT_AGAIN {
                         return Err(OutputError::Garbled { text });
                     }
                     again += 1;
-                    tracing::warn!(what, text, again, "the server received other bytes; they are sent again");
+                    tracing::warn!(
+                        what,
+                        text,
+                        again,
+                        "the server received other bytes; they are sent again"
+                    );
                 }
                 stored => return stored,
             }
@@ -97,7 +113,11 @@ impl Registry {
     }
 
     /// Sends what begins or goes on with an upload; gives its answer and where it goes on.
-    async fn upload(&self, what: &str, request: RequestBuilder) -> Result<(Response, String), OutputError> {
+    async fn upload(
+        &self,
+        what: &str,
+        request: RequestBuilder,
+    ) -> Result<(Response, String), OutputError> {
         let response = self.send(what, request).await?;
         location(&response).map(|location| (response, location))
     }
@@ -116,7 +136,11 @@ impl Registry {
 
     async fn send(&self, what: &str, request: RequestBuilder) -> Result<Response, OutputError> {
         let response = request.send().await.map_err(OutputError::Unreachable)?;
-        if response.status().is_success() { Ok(response) } else { Err(refusal(what, response).await) }
+        if response.status().is_success() {
+            Ok(response)
+        } else {
+            Err(refusal(what, response).await)
+        }
     }
 }
 
@@ -127,7 +151,8 @@ pub(super) async fn push(
     output: &OutputSet,
     progress: &watch::Sender<Progress>,
 ) -> Result<(), OutputError> {
-    let refused = || OutputError::TooMuch("the robot's or task's name can't be a repository's".to_owned());
+    let refused =
+        || OutputError::TooMuch("the robot's or task's name can't be a repository's".to_owned());
     let (repository, tag) = output.repository().zip(output.tag()).ok_or_else(refused)?;
     let total = output.files.iter().map(|file| file.blob.size).sum();
     progress.send_replace(Progress { done: 0, total });
@@ -142,11 +167,12 @@ pub(super) async fn push(
         done: 0,
         progress,
     };
-    let config = serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
+    let config =
+        serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
     let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
     push.small(config_ref.digest, config.into()).await?;
-    let manifest =
-        serde_json::to_vec(&output.manifest(config_ref)).map_err(|error| note_error(&order.notes, error.into()))?;
+    let manifest = serde_json::to_vec(&output.manifest(config_ref))
+        .map_err(|error| note_error(&order.notes, error.into()))?;
     let list = async || {
         let put = || {
             let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
@@ -204,10 +230,13 @@ impl Push<'_> {
             let is_first = beginnings < MAX_BEGINNINGS;
             match sent {
                 // The server has collected the upload, or took a chunk whose answer was lost.
-                Err(OutputError::Refused { status: 404 | 416, .. }) if is_first => self.note(blob.digest, None)?,
+                Err(OutputError::Refused { status: 404 | 416, .. }) if is_first => {
+                    self.note(blob.digest, None)?
+                }
                 Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES => {
                     self.note(blob.digest, None)?;
-                    // A task that runs again writes where it wrote before. Otherwise the way there is at fault.
+                    // A task that runs again writes where it wrote before. Otherwise the way there
+                    // is at fault.
                     if !self.is_unchanged(path, blob).await? {
                         return Err(self.changed(path));
                     }
@@ -224,7 +253,9 @@ impl Push<'_> {
     /// Pushes what fits into one request.
     async fn small(&self, digest: Digest, bytes: Bytes) -> Result<(), OutputError> {
         let post = || {
-            let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
+            let post = self
+                .registry
+                .request(Method::POST, &format!("{}/blobs/uploads/?digest={digest}", self.base));
             post.header(CONTENT_TYPE, "application/octet-stream").body(bytes.clone())
         };
         self.registry.store_exactly("a file", digest, post).await
@@ -233,8 +264,12 @@ impl Push<'_> {
     async fn is_unchanged(&self, path: &str, blob: BlobRef) -> Result<bool, OutputError> {
         let (root, file, size) = (self.order.directory.clone(), PathBuf::from(path), blob.size);
         let hash = move || find::hash(&Directory::open(&root)?, &file, size);
-        let hashed = task_user::do_as(self.order.user.as_ref(), hash).await.map_err(OutputError::User)?;
-        let hashed = hashed.map_err(|source| OutputError::Read { path: self.order.directory.join(path), source })?;
+        let hashed =
+            task_user::do_as(self.order.user.as_ref(), hash).await.map_err(OutputError::User)?;
+        let hashed = hashed.map_err(|source| OutputError::Read {
+            path: self.order.directory.join(path),
+            source,
+        })?;
         Ok(hashed == blob)
     }
 
@@ -251,14 +286,16 @@ impl Push<'_> {
                 (location, uploaded(&status).min(blob.size))
             }
             None => {
-                let post = self.registry.request(Method::POST, &format!("{}/blobs/uploads/", self.base));
+                let post =
+                    self.registry.request(Method::POST, &format!("{}/blobs/uploads/", self.base));
                 let (_, location) = self.registry.upload("an upload", post).await?;
                 self.note(blob.digest, Some(location.clone()))?;
                 (location, 0)
             }
         };
         while offset < blob.size {
-            let bytes = read_part(self.order, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
+            let bytes =
+                read_part(self.order, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
             let last = offset + bytes.len() as u64 - 1;
             let patch = self.registry.request(Method::PATCH, &location);
             let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
@@ -286,15 +323,22 @@ fn note_error(path: &Path, source: std::io::Error) -> OutputError {
     OutputError::Note { path: path.to_owned(), source }
 }
 
-/// What an earlier try noted of these files; nothing, if that can't be read: then uploads begin anew.
+/// What an earlier try noted of these files; nothing, if that can't be read: then uploads begin
+/// anew.
 fn read_notes(path: &Path, output: &OutputSet) -> Notes {
-    let read = std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<Notes>(&bytes).ok());
+    let read =
+        std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<Notes>(&bytes).ok());
     let mut notes = read.unwrap_or_default();
     notes.retain(|digest, _| output.files.iter().any(|file| file.blob.digest == *digest));
     notes
 }
 
-async fn read_part(order: &OutputOrder, path: &str, offset: u64, length: u64) -> Result<Vec<u8>, OutputError> {
+async fn read_part(
+    order: &OutputOrder,
+    path: &str,
+    offset: u64,
+    length: u64,
+) -> Result<Vec<u8>, OutputError> {
     let (root, path) = (order.directory.clone(), PathBuf::from(path));
     let failed_at = root.join(&path);
     let read = move || {
@@ -302,7 +346,11 @@ async fn read_part(order: &OutputOrder, path: &str, offset: u64, length: u64) ->
         file.seek(SeekFrom::Start(offset))?;
         let mut bytes = Vec::new();
         file.take(length).read_to_end(&mut bytes)?;
-        if bytes.len() as u64 == length { Ok(bytes) } else { Err(std::io::Error::other("it became shorter")) }
+        if bytes.len() as u64 == length {
+            Ok(bytes)
+        } else {
+            Err(std::io::Error::other("it became shorter"))
+        }
     };
     let read = task_user::do_as(order.user.as_ref(), read).await.map_err(OutputError::User)?;
     read.map_err(|source| OutputError::Read { path: failed_at, source })
@@ -324,11 +372,17 @@ fn location(response: &Response) -> Result<String, OutputError> {
 
 /// Whether the answer is about these bytes, as a registry's is that has them.
 fn is_of(response: &Response, digest: Digest) -> bool {
-    response.headers().get(CONTENT_DIGEST).is_some_and(|value| value.as_bytes() == digest.to_string().as_bytes())
+    response
+        .headers()
+        .get(CONTENT_DIGEST)
+        .is_some_and(|value| value.as_bytes() == digest.to_string().as_bytes())
 }
 
 fn not_the_server(response: &Response) -> OutputError {
-    OutputError::NotTheServer { status: response.status().as_u16(), text: "without a registry's headers".to_owned() }
+    OutputError::NotTheServer {
+        status: response.status().as_u16(),
+        text: "without a registry's headers".to_owned(),
+    }
 }
 
 async fn refusal(what: &str, mut response: Response) -> OutputError {
@@ -341,7 +395,8 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
                 | StatusCode::UNAUTHORIZED
                 | StatusCode::CONFLICT
         );
-    let seconds = response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
+    let seconds =
+        response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
     let words = RegistryWords::read(&mut response).await;
     let (status, is_own) = (status.as_u16(), words.are_a_registrys());
     let RegistryWords { code, text } = words;
@@ -361,7 +416,10 @@ mod tests {
 
     #[tokio::test]
     async fn no_server_keeps_files_back_for_long() {
-        let busy = http::Response::builder().status(503).header(RETRY_AFTER, u64::MAX.to_string()).body("");
+        let busy = http::Response::builder()
+            .status(503)
+            .header(RETRY_AFTER, u64::MAX.to_string())
+            .body("");
         let refused = refusal("a file", busy.expect("an answer").into()).await;
         assert_eq!(refused.retry_after(), Some(MAX_RETRY_AFTER), "{refused}");
     }

@@ -1,5 +1,6 @@
-//! One attempt to sign in: a secret that only the browser keeps, in a cookie, while it is away at the provider. What the
-//! provider is told is made of it, so that an answer is only good in the browser that asked, and nothing is remembered here.
+//! One attempt to sign in: a secret that only the browser keeps, in a cookie, while it is away at
+//! the provider. What the provider is told is made of it, so that an answer is only good in the
+//! browser that asked, and nothing is remembered here.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -70,11 +71,24 @@ mod tests {
         let (attempt, other) = (Attempt::random(), Attempt::random());
         let kept = Attempt::kept(&attempt.reveal()).expect("it was kept");
         assert!(kept.has_state(&attempt.state()) && kept.nonce() == attempt.nonce());
-        assert!(!other.has_state(&attempt.state()) && !attempt.has_state("") && other.nonce() != attempt.nonce());
-        let told = [attempt.state(), attempt.nonce(), attempt.verifier(), attempt.challenge(), attempt.reveal()];
+        assert!(
+            !other.has_state(&attempt.state())
+                && !attempt.has_state("")
+                && other.nonce() != attempt.nonce()
+        );
+        let told = [
+            attempt.state(),
+            attempt.nonce(),
+            attempt.verifier(),
+            attempt.challenge(),
+            attempt.reveal(),
+        ];
         let different: std::collections::BTreeSet<&String> = told.iter().collect();
         assert_eq!(different.len(), told.len());
-        assert!(told.iter().all(|text| text.len() == 43), "as long as RFC 7636 wants a verifier at least");
+        assert!(
+            told.iter().all(|text| text.len() == 43),
+            "as long as RFC 7636 wants a verifier at least"
+        );
         for bad in ["", "x", &"A".repeat(42), &"A".repeat(44), &"!".repeat(43)] {
             assert!(Attempt::kept(bad).is_none(), "{bad:?}");
         }

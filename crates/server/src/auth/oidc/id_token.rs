@@ -1,5 +1,6 @@
-//! An ID token: a signed document in which the provider says who has signed in (OpenID Connect Core, 2 and 3.1.3.7). It is
-//! believed if a key of the provider made it, for this server, now, and for this attempt.
+//! An ID token: a signed document in which the provider says who has signed in (OpenID Connect
+//! Core, 2 and 3.1.3.7). It is believed if a key of the provider made it, for this server, now, and
+//! for this attempt.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -79,8 +80,17 @@ impl<'a> IdToken<'a> {
     }
 
     /// What it says, if it is to be believed.
-    pub(super) fn verify(&self, keys: &KeySet, expected: &Expected<'_>) -> Result<Claims, IdTokenError> {
-        if !keys.made(self.key_id.as_deref(), self.algorithm, self.signed.as_bytes(), &self.signature) {
+    pub(super) fn verify(
+        &self,
+        keys: &KeySet,
+        expected: &Expected<'_>,
+    ) -> Result<Claims, IdTokenError> {
+        if !keys.made(
+            self.key_id.as_deref(),
+            self.algorithm,
+            self.signed.as_bytes(),
+            &self.signature,
+        ) {
             return Err(IdTokenError::Signature);
         }
         let claims = Claims(object(self.payload)?);
@@ -145,8 +155,12 @@ impl Claims {
             return wrong("aud", "it is for another client");
         }
         match self.text("azp") {
-            Some(client) if client != expected.client_id => return wrong("azp", "it was given to another client"),
-            None if audiences.len() > 1 => return wrong("azp", "it is missing, and there are several audiences"),
+            Some(client) if client != expected.client_id => {
+                return wrong("azp", "it was given to another client");
+            }
+            None if audiences.len() > 1 => {
+                return wrong("azp", "it is missing, and there are several audiences");
+            }
             _ => {}
         }
         let now_s = expected.now_ms as f64 / 1000.0;
@@ -184,8 +198,12 @@ mod tests {
     use super::*;
 
     const NOW_S: u64 = 1_800_000_000;
-    const EXPECTED: Expected<'_> =
-        Expected { issuer: "https://id.example", client_id: "taskd", nonce: "n", now_ms: NOW_S * 1000 };
+    const EXPECTED: Expected<'_> = Expected {
+        issuer: "https://id.example",
+        client_id: "taskd",
+        nonce: "n",
+        now_ms: NOW_S * 1000,
+    };
 
     /// A provider's key and the set it is published in.
     struct Signer {
@@ -196,11 +214,17 @@ mod tests {
     impl Signer {
         fn new() -> Self {
             let random = SystemRandom::new();
-            let document = EcdsaKeyPair::generate_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, &random).expect("a key");
-            let pair = EcdsaKeyPair::from_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, document.as_ref(), &random);
+            let document = EcdsaKeyPair::generate_pkcs8(&ECDSA_P256_SHA256_FIXED_SIGNING, &random)
+                .expect("a key");
+            let pair = EcdsaKeyPair::from_pkcs8(
+                &ECDSA_P256_SHA256_FIXED_SIGNING,
+                document.as_ref(),
+                &random,
+            );
             let pair = pair.expect("a key");
             let point = pair.public_key().as_ref();
-            let (x, y) = (URL_SAFE_NO_PAD.encode(&point[1..33]), URL_SAFE_NO_PAD.encode(&point[33..]));
+            let (x, y) =
+                (URL_SAFE_NO_PAD.encode(&point[1..33]), URL_SAFE_NO_PAD.encode(&point[33..]));
             let key = json!({ "kty": "EC", "crv": "P-256", "kid": "k", "x": x, "y": y });
             Self { pair, keys: KeySet::read(&json!({ "keys": [key] })) }
         }
@@ -269,8 +293,13 @@ mod tests {
             ("sub", json!({ "sub": "a\nb" })),
             ("sub", json!({ "sub": "x".repeat(256) })),
         ] {
-            let refused = signer.verified(&signer.sign(&header(), &claims_with(bad.clone()))).expect_err(claim);
-            assert!(matches!(refused, IdTokenError::Claim { claim: found, .. } if found == claim), "{bad}: {refused}");
+            let refused = signer
+                .verified(&signer.sign(&header(), &claims_with(bad.clone())))
+                .expect_err(claim);
+            assert!(
+                matches!(refused, IdTokenError::Claim { claim: found, .. } if found == claim),
+                "{bad}: {refused}"
+            );
         }
     }
 
@@ -279,22 +308,36 @@ mod tests {
         let (signer, other) = (Signer::new(), Signer::new());
         let good = signer.sign(&header(), &claims());
         let (signed, signature) = good.rsplit_once('.').expect("parts");
-        assert_eq!(signer.verified(&other.sign(&header(), &claims())), Err(IdTokenError::Signature));
+        assert_eq!(
+            signer.verified(&other.sign(&header(), &claims())),
+            Err(IdTokenError::Signature)
+        );
         let admin = URL_SAFE_NO_PAD.encode(json!({ "groups": ["admins"] }).to_string());
         let forged = format!("{}.{admin}.{signature}", signed.split_once('.').expect("parts").0);
         assert_eq!(signer.verified(&forged), Err(IdTokenError::Signature));
         assert_eq!(signer.verified(&format!("{signed}.")), Err(IdTokenError::Signature));
         let unknown = json!({ "alg": "ES256", "kid": "other" });
-        assert_eq!(signer.verified(&signer.sign(&unknown, &claims())), Err(IdTokenError::Signature));
+        assert_eq!(
+            signer.verified(&signer.sign(&unknown, &claims())),
+            Err(IdTokenError::Signature)
+        );
         for alg in ["none", "HS256", "RS512", ""] {
             let token = signer.sign(&json!({ "alg": alg, "kid": "k" }), &claims());
             assert_eq!(signer.verified(&token), Err(IdTokenError::Algorithm), "{alg}");
         }
         // A public key is no secret that a token could be signed with.
-        assert_eq!(signer.verified(&signer.sign(&json!({ "alg": "RS256" }), &claims())), Err(IdTokenError::Signature));
+        assert_eq!(
+            signer.verified(&signer.sign(&json!({ "alg": "RS256" }), &claims())),
+            Err(IdTokenError::Signature)
+        );
         let critical = json!({ "alg": "ES256", "kid": "k", "crit": ["exp"] });
-        assert_eq!(signer.verified(&signer.sign(&critical, &claims())), Err(IdTokenError::Malformed));
-        for bad in ["", "a", "a.b", "a.b.c", "..", &format!("{good}.x"), &"x".repeat(MOST_BYTES + 1)] {
+        assert_eq!(
+            signer.verified(&signer.sign(&critical, &claims())),
+            Err(IdTokenError::Malformed)
+        );
+        for bad in
+            ["", "a", "a.b", "a.b.c", "..", &format!("{good}.x"), &"x".repeat(MOST_BYTES + 1)]
+        {
             assert_eq!(signer.verified(bad), Err(IdTokenError::Malformed), "{bad:.40}");
         }
     }
@@ -317,7 +360,9 @@ mod tests {
         for (name, value) in found {
             assert!(claims.has(name, value), "{name}");
         }
-        for (name, value) in [("groups", "c"), ("groups", ""), ("level", "3"), ("realm_access", "admin"), ("", "")] {
+        for (name, value) in
+            [("groups", "c"), ("groups", ""), ("level", "3"), ("realm_access", "admin"), ("", "")]
+        {
             assert!(!claims.has(name, value), "{name}");
         }
     }

@@ -1,9 +1,11 @@
-//! The provider's public keys (RFC 7517), and whether one of them made a signature: RSA or ECDSA on P-256, each with
-//! SHA-256. A key is only ever used for the algorithm that it is for.
+//! The provider's public keys (RFC 7517), and whether one of them made a signature: RSA or ECDSA on
+//! P-256, each with SHA-256. A key is only ever used for the algorithm that it is for.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
-use ring::signature::{ECDSA_P256_SHA256_FIXED, RSA_PKCS1_2048_8192_SHA256, RsaPublicKeyComponents, UnparsedPublicKey};
+use ring::signature::{
+    ECDSA_P256_SHA256_FIXED, RSA_PKCS1_2048_8192_SHA256, RsaPublicKeyComponents, UnparsedPublicKey,
+};
 use serde_json::Value;
 
 /// The most keys that are looked at.
@@ -60,7 +62,13 @@ impl KeySet {
     }
 
     /// Whether the key of this id, or without an id one of them, made the signature.
-    pub(super) fn made(&self, id: Option<&str>, algorithm: Algorithm, message: &[u8], signature: &[u8]) -> bool {
+    pub(super) fn made(
+        &self,
+        id: Option<&str>,
+        algorithm: Algorithm,
+        message: &[u8],
+        signature: &[u8],
+    ) -> bool {
         self.candidates(id, algorithm).any(|key| key.public.made(message, signature))
     }
 
@@ -84,9 +92,9 @@ impl Public {
                 let key = RsaPublicKeyComponents { n: modulus, e: exponent };
                 key.verify(&RSA_PKCS1_2048_8192_SHA256, message, signature).is_ok()
             }
-            Self::P256 { point } => {
-                UnparsedPublicKey::new(&ECDSA_P256_SHA256_FIXED, point).verify(message, signature).is_ok()
-            }
+            Self::P256 { point } => UnparsedPublicKey::new(&ECDSA_P256_SHA256_FIXED, point)
+                .verify(message, signature)
+                .is_ok(),
         }
     }
 }
@@ -98,7 +106,9 @@ fn key(key: &Value) -> Option<Key> {
         return None;
     }
     let public = match text("kty")? {
-        "RSA" => Public::Rsa { modulus: significant(number("n")?), exponent: significant(number("e")?) },
+        "RSA" => {
+            Public::Rsa { modulus: significant(number("n")?), exponent: significant(number("e")?) }
+        }
         "EC" if text("crv") == Some("P-256") => {
             let (x, y) = (number("x")?, number("y")?);
             if (x.len(), y.len()) != (COORDINATE_BYTES, COORDINATE_BYTES) {
@@ -125,7 +135,8 @@ mod tests {
 
     use super::*;
 
-    /// A key that another library made, and its signature of "taskd". A zero stands before the number.
+    /// A key that another library made, and its signature of "taskd". A zero stands before the
+    /// number.
     const MODULUS: &str = "AMQuNJDfmwJ5gOo1I5qkpJlO-UAI7qEUDpLyXXVA9x2sUyVesowaz0BGCX2D9ABHuWY76W-j8QT1oJZTV7dFPKR7_LlHgY55KR8L\
          VQeIfGaKpCZez_0GXo8FNf755GJO3Sq5dDCgGDRSmCmkADvczU7JbTDMtw03cRe94-WZOOpeH6FLD86yb_nzBHazBLbQlcddbiCp\
          cg8iCjvzAx0-S0V4-uSEpAwBkVwB9KAV-U-UNA6nn-7vO2R-1I_Gy8YL4FqQpg4RImBbfBO14k7QbvWwTxSUNa0YMWPJxzX3AQXp\
@@ -137,7 +148,9 @@ mod tests {
 
     #[test]
     fn a_signature_is_of_one_key_one_text_and_one_algorithm() {
-        let set = KeySet::read(&json!({ "keys": [{ "kty": "RSA", "kid": "k", "n": MODULUS, "e": "AQAB" }] }));
+        let set = KeySet::read(
+            &json!({ "keys": [{ "kty": "RSA", "kid": "k", "n": MODULUS, "e": "AQAB" }] }),
+        );
         let signature = URL_SAFE_NO_PAD.decode(SIGNATURE).expect("base64");
         assert!(set.made(Some("k"), Algorithm::Rs256, b"taskd", &signature));
         assert!(set.made(None, Algorithm::Rs256, b"taskd", &signature));

@@ -1,6 +1,7 @@
-//! Signing in by an OpenID Connect provider, the authorization code flow with PKCE: where the browser is sent, what its code
-//! is exchanged for, and whom the ID token means. It knows the provider's documents and keys for a while. It never decides
-//! what somebody may do here, and stores nothing.
+//! Signing in by an OpenID Connect provider, the authorization code flow with PKCE: where the
+//! browser is sent, what its code is exchanged for, and whom the ID token means. It knows the
+//! provider's documents and keys for a while. It never decides what somebody may do here, and
+//! stores nothing.
 
 mod attempt;
 mod id_token;
@@ -32,7 +33,8 @@ const MOST_BYTES: usize = 1024 * 1024;
 const MOST_EXCHANGES: usize = 16;
 /// How long the provider's documents count.
 const LIFETIME_MS: u64 = 60 * 60 * 1000;
-/// How long after asking for its documents it is not asked again, if that failed or a key was not among them.
+/// How long after asking for its documents it is not asked again, if that failed or a key was not
+/// among them.
 const PAUSE_MS: u64 = 10_000;
 /// The longest secret in the file.
 const MOST_SECRET_BYTES: u64 = 4096;
@@ -139,7 +141,13 @@ impl Provider {
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
             .build()
             .map_err(OidcSetUpError::Client)?;
-        Ok(Self { settings, secret, http, known: Mutex::default(), exchanges: Semaphore::new(MOST_EXCHANGES) })
+        Ok(Self {
+            settings,
+            secret,
+            http,
+            known: Mutex::default(),
+            exchanges: Semaphore::new(MOST_EXCHANGES),
+        })
     }
 
     /// What it is set to.
@@ -171,19 +179,33 @@ impl Provider {
     }
 
     /// Whom the code stands for that the attempt ended with.
-    pub async fn who(&self, attempt: &Attempt, code: &str, now_ms: u64) -> Result<Claims, OidcError> {
+    pub async fn who(
+        &self,
+        attempt: &Attempt,
+        code: &str,
+        now_ms: u64,
+    ) -> Result<Claims, OidcError> {
         let _turn = self.exchanges.try_acquire().map_err(|_| OidcError::Busy)?;
         let document = self.document(now_ms).await?;
         let token = self.exchange(&document, attempt, code).await?;
         let token = IdToken::parse(&token)?;
         let keys = self.keys(&document, &token, now_ms).await?;
         let nonce = attempt.nonce();
-        let expected =
-            Expected { issuer: &self.settings.issuer, client_id: &self.settings.client_id, nonce: &nonce, now_ms };
+        let expected = Expected {
+            issuer: &self.settings.issuer,
+            client_id: &self.settings.client_id,
+            nonce: &nonce,
+            now_ms,
+        };
         Ok(token.verify(&keys, &expected)?)
     }
 
-    async fn exchange(&self, document: &Document, attempt: &Attempt, code: &str) -> Result<String, OidcError> {
+    async fn exchange(
+        &self,
+        document: &Document,
+        attempt: &Attempt,
+        code: &str,
+    ) -> Result<String, OidcError> {
         let what = "token endpoint";
         let (redirect_uri, verifier) = (self.settings.redirect_uri(), attempt.verifier());
         let mut form = vec![
@@ -197,14 +219,18 @@ impl Provider {
             Some(secret) if document.takes_basic() => {
                 request = request.header("authorization", basic(&self.settings.client_id, secret));
             }
-            Some(secret) => form.extend([("client_id", self.settings.client_id.as_str()), ("client_secret", secret)]),
+            Some(secret) => form.extend([
+                ("client_id", self.settings.client_id.as_str()),
+                ("client_secret", secret),
+            ]),
             None => form.push(("client_id", &self.settings.client_id)),
         }
         let (status, body) = read(what, request.form(&form)).await?;
         if status.is_success() {
             return Ok(parsed::<TokenAnswer>(what, &body)?.id_token);
         }
-        let said = parsed::<TokenRefusal>(what, &body).map_or(String::new(), |refusal| refusal.error);
+        let said =
+            parsed::<TokenRefusal>(what, &body).map_or(String::new(), |refusal| refusal.error);
         let said: String = said.chars().filter(|c| c.is_ascii_graphic()).take(40).collect();
         Err(OidcError::Unusable { what, reason: format!("it answered {status} {said}") })
     }
@@ -219,19 +245,26 @@ impl Provider {
         if known.is_resting(now_ms) {
             return Err(OidcError::Resting);
         }
-        let document = self.fetch_document().await.inspect_err(|_| known.failed_ms = Some(now_ms))?;
+        let document =
+            self.fetch_document().await.inspect_err(|_| known.failed_ms = Some(now_ms))?;
         known.document = Some((document.clone(), now_ms));
         Ok(document)
     }
 
     async fn fetch_document(&self) -> Result<Document, OidcError> {
         let what = "discovery document";
-        let url = format!("{}/.well-known/openid-configuration", self.settings.issuer.trim_end_matches('/'));
+        let url = format!(
+            "{}/.well-known/openid-configuration",
+            self.settings.issuer.trim_end_matches('/')
+        );
         let document: Document = self.fetch(what, &url).await?;
         let unusable = |reason: String| Err(OidcError::Unusable { what, reason });
         // Or else one provider could speak for another.
         if document.issuer != self.settings.issuer {
-            return unusable(format!("its issuer is {:?}, not {:?}", document.issuer, self.settings.issuer));
+            return unusable(format!(
+                "its issuer is {:?}, not {:?}",
+                document.issuer, self.settings.issuer
+            ));
         }
         for (key, url) in [
             ("authorization_endpoint", &document.authorization_endpoint),
@@ -246,11 +279,17 @@ impl Provider {
     }
 
     /// The provider's keys, and the one the token names among them, if there is such a one.
-    async fn keys(&self, document: &Document, token: &IdToken<'_>, now_ms: u64) -> Result<KeySet, OidcError> {
+    async fn keys(
+        &self,
+        document: &Document,
+        token: &IdToken<'_>,
+        now_ms: u64,
+    ) -> Result<KeySet, OidcError> {
         let mut known = self.known.lock().await;
         if let Some((keys, since_ms)) = &known.keys {
             let age_ms = now_ms.saturating_sub(*since_ms);
-            // It may have a new key; but nobody makes the server ask again and again by naming keys that are none.
+            // It may have a new key; but nobody makes the server ask again and again by naming keys
+            // that are none.
             let is_enough = age_ms < PAUSE_MS || token.has_key_in(keys);
             if age_ms < LIFETIME_MS && is_enough {
                 return Ok(keys.clone());
@@ -265,7 +304,11 @@ impl Provider {
         Ok(keys)
     }
 
-    async fn fetch<T: DeserializeOwned>(&self, what: &'static str, url: &str) -> Result<T, OidcError> {
+    async fn fetch<T: DeserializeOwned>(
+        &self,
+        what: &'static str,
+        url: &str,
+    ) -> Result<T, OidcError> {
         let (status, body) = read(what, self.http.get(url)).await?;
         if !status.is_success() {
             return Err(OidcError::Unusable { what, reason: format!("it answered {status}") });
@@ -281,7 +324,8 @@ impl Known {
 }
 
 impl Document {
-    /// Whether the client's secret goes into the header, as it does unless the provider says otherwise.
+    /// Whether the client's secret goes into the header, as it does unless the provider says
+    /// otherwise.
     fn takes_basic(&self) -> bool {
         let methods = self.token_endpoint_auth_methods_supported.as_deref().unwrap_or_default();
         let takes = |wanted: &str| methods.iter().any(|method| method == wanted);
@@ -289,13 +333,19 @@ impl Document {
     }
 }
 
-async fn read(what: &'static str, request: RequestBuilder) -> Result<(StatusCode, Vec<u8>), OidcError> {
+async fn read(
+    what: &'static str,
+    request: RequestBuilder,
+) -> Result<(StatusCode, Vec<u8>), OidcError> {
     let unreachable = |source| OidcError::Unreachable { what, source };
     let mut response = request.send().await.map_err(unreachable)?;
     let mut body = Vec::new();
     while let Some(chunk) = response.chunk().await.map_err(unreachable)? {
         if body.len() + chunk.len() > MOST_BYTES {
-            return Err(OidcError::Unusable { what, reason: format!("it has more than {MOST_BYTES} bytes") });
+            return Err(OidcError::Unusable {
+                what,
+                reason: format!("it has more than {MOST_BYTES} bytes"),
+            });
         }
         body.extend_from_slice(&chunk);
     }
@@ -304,8 +354,10 @@ async fn read(what: &'static str, request: RequestBuilder) -> Result<(StatusCode
 
 fn parsed<T: DeserializeOwned>(what: &'static str, body: &[u8]) -> Result<T, OidcError> {
     // What serde says of it may repeat a secret.
-    let reason = |error: serde_json::Error| format!("line {}: {:?}", error.line(), error.classify());
-    serde_json::from_slice(body).map_err(|error| OidcError::Unusable { what, reason: reason(error) })
+    let reason =
+        |error: serde_json::Error| format!("line {}: {:?}", error.line(), error.classify());
+    serde_json::from_slice(body)
+        .map_err(|error| OidcError::Unusable { what, reason: reason(error) })
 }
 
 /// Both are written as in a form before they are put together (RFC 6749, 2.3.1).
@@ -337,7 +389,10 @@ mod tests {
 
     #[test]
     fn the_secret_goes_as_a_form_would_have_it() {
-        assert_eq!(basic("taskd", "a b:c%&ä"), format!("Basic {}", STANDARD.encode("taskd:a+b%3Ac%25%26%C3%A4")));
+        assert_eq!(
+            basic("taskd", "a b:c%&ä"),
+            format!("Basic {}", STANDARD.encode("taskd:a+b%3Ac%25%26%C3%A4"))
+        );
     }
 
     #[test]
@@ -345,7 +400,9 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("secret");
         assert!(matches!(read_secret(&path), Err(OidcSetUpError::SecretFile { .. })));
-        for (text, expected) in [("s3cret\n", Some("s3cret")), ("", None), (" \n", None), ("a\nb", None)] {
+        for (text, expected) in
+            [("s3cret\n", Some("s3cret")), ("", None), (" \n", None), ("a\nb", None)]
+        {
             std::fs::write(&path, text).expect("written");
             assert_eq!(read_secret(&path).ok().as_deref(), expected, "{text:?}");
         }

@@ -1,5 +1,5 @@
-//! One package on its way to many through an external broker: a window on the broker's acknowledgements, and who listens as
-//! far as robots report it.
+//! One package on its way to many through an external broker: a window on the broker's
+//! acknowledgements, and who listens as far as robots report it.
 
 use std::collections::HashSet;
 use std::sync::{Arc, Mutex};

@@ -1,7 +1,8 @@
-//! Brokers that are not ours: the server is a client of one of them, with one session that is begun anew, with jitter,
-//! whenever it ends, there or at the next. What MQTT 3.1.1 does not tell a client is not known here: who listens, who was let in, from where. Who is there
-//! follows from what robots say; nobody can be put out. Messages prove only what the broker's access control list does:
-//! the robot that a topic names. Reports never come this way (see docs/decisions).
+//! Brokers that are not ours: the server is a client of one of them, with one session that is begun
+//! anew, with jitter, whenever it ends, there or at the next. What MQTT 3.1.1 does not tell a
+//! client is not known here: who listens, who was let in, from where. Who is there follows from
+//! what robots say; nobody can be put out. Messages prove only what the broker's access control
+//! list does: the robot that a topic names. Reports never come this way (see docs/decisions).
 
 mod crowd;
 mod outbox;
@@ -34,7 +35,8 @@ pub const CANARY_LEVEL: &str = "server";
 const WINDOW_KIB: u32 = 4 * 1024;
 /// How long the broker may leave so many unacknowledged.
 const PART_PATIENCE: Duration = Duration::from_secs(30);
-/// How long whoever rings many robots waits for room at most; a session that takes nothing ends by itself.
+/// How long whoever rings many robots waits for room at most; a session that takes nothing ends by
+/// itself.
 const ROOM_PATIENCE: Duration = Duration::from_secs(60);
 /// The longest wait between two tries to connect.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
@@ -46,7 +48,8 @@ const GOOD_SESSION: Duration = Duration::from_secs(30);
 /// Which brokers, and as whom.
 #[derive(Debug, Clone)]
 pub struct ExternalConfig {
-    /// Where they are, with the server's user and password there. One at a time is used; the next one when it fails.
+    /// Where they are, with the server's user and password there. One at a time is used; the next
+    /// one when it fails.
     pub brokers: BrokerUrls,
     /// Which one a session was up at last, for those who tell robots.
     pub current: Arc<AtomicUsize>,
@@ -91,9 +94,12 @@ pub(super) struct External {
 }
 
 impl External {
-    /// Begins to connect. It goes on until [`External::shutdown`], whatever the broker does; the receiver always has how
-    /// it is.
-    pub(super) fn start(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> (Arc<Self>, watch::Receiver<Health>) {
+    /// Begins to connect. It goes on until [`External::shutdown`], whatever the broker does; the
+    /// receiver always has how it is.
+    pub(super) fn start(
+        config: ExternalConfig,
+        inbox: Arc<dyn Inbox>,
+    ) -> (Arc<Self>, watch::Receiver<Health>) {
         let (sender, health) = watch::channel(Health::Recovering(format!(
             "the server has not connected to the broker at {} yet",
             config.brokers.first().address()
@@ -159,7 +165,8 @@ impl External {
         self.config.brokers.all().iter().enumerate().map(place).collect()
     }
 
-    /// No session: nobody can be reached, and who is there is found out anew in the next one. Whether there was one.
+    /// No session: nobody can be reached, and who is there is found out anew in the next one.
+    /// Whether there was one.
     fn leave(&self) -> bool {
         let was_up = {
             let mut outbox = lock(&self.outbox);
@@ -212,9 +219,16 @@ impl External {
     }
 
     /// Publishes a part once there is a place for it in the window of unacknowledged ones.
-    async fn publish_part(&self, digest: Digest, payload: Bytes, qos: PartQos) -> Result<(), NotConnected> {
-        let kib = u32::try_from(payload.len().div_ceil(1024)).map_or(WINDOW_KIB, |kib| kib.min(WINDOW_KIB));
-        let place = tokio::time::timeout(PART_PATIENCE, self.window.clone().acquire_many_owned(kib)).await;
+    async fn publish_part(
+        &self,
+        digest: Digest,
+        payload: Bytes,
+        qos: PartQos,
+    ) -> Result<(), NotConnected> {
+        let kib = u32::try_from(payload.len().div_ceil(1024))
+            .map_or(WINDOW_KIB, |kib| kib.min(WINDOW_KIB));
+        let place =
+            tokio::time::timeout(PART_PATIENCE, self.window.clone().acquire_many_owned(kib)).await;
         let place = place.map_err(|_| NotConnected)?.map_err(|_| NotConnected)?;
         let topic = Topic::Package(digest);
         lock(&self.outbox).part(Letter { topic, payload, qos, place: Some(place) })?;
@@ -268,7 +282,8 @@ fn pause(failures: u32, jitter: f64) -> Duration {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+    // half-done.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 

@@ -1,5 +1,6 @@
-//! What waits to be published at an external broker: questions before desired states before parts of packages, and of a
-//! robot's desired states only the newest. It holds nothing while there is no session: whoever puts something in is told.
+//! What waits to be published at an external broker: questions before desired states before parts
+//! of packages, and of a robot's desired states only the newest. It holds nothing while there is no
+//! session: whoever puts something in is told.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -90,7 +91,12 @@ impl Outbox {
 
     pub(super) fn next(&mut self) -> Option<Letter> {
         let to = |robot, topic, payload| {
-            Some(Letter { topic: Topic::Robot(robot, topic), payload, qos: PartQos::AtLeastOnce, place: None })
+            Some(Letter {
+                topic: Topic::Robot(robot, topic),
+                payload,
+                qos: PartQos::AtLeastOnce,
+                place: None,
+            })
         };
         if let Some((robot, payload)) = self.questions.pop_front() {
             return to(robot, RobotTopic::Request, payload);
@@ -119,7 +125,9 @@ mod tests {
         assert_eq!(outbox.ring(&robot, "lost".into()), Err(NotConnected));
         assert_eq!(outbox.ask(&robot, "lost".into()), Err(NotAsked::NotConnected));
         outbox.open();
-        outbox.part(Letter { topic, payload: "part".into(), qos: PartQos::AtMostOnce, place }).expect("open");
+        outbox
+            .part(Letter { topic, payload: "part".into(), qos: PartQos::AtMostOnce, place })
+            .expect("open");
         outbox.ring(&robot, "older".into()).expect("open");
         outbox.ring(&robot, "newer".into()).expect("open");
         outbox.ask(&robot, "question".into()).expect("open");

@@ -1,5 +1,6 @@
-//! Who is at an external broker, as far as robots say so themselves: by their `status`, which ends with their last will,
-//! and by everything else they publish. Pure; it neither reads messages nor tells anyone.
+//! Who is at an external broker, as far as robots say so themselves: by their `status`, which ends
+//! with their last will, and by everything else they publish. Pure; it neither reads messages nor
+//! tells anyone.
 
 use std::collections::HashMap;
 
@@ -33,8 +34,8 @@ pub(super) struct Turn {
 }
 
 impl Present {
-    /// The robot published its status, or the broker did in its name. One that names an older connection than is known
-    /// comes too late.
+    /// The robot published its status, or the broker did in its name. One that names an older
+    /// connection than is known comes too late.
     pub(super) fn status(&mut self, robot: &RobotId, status: &Status) -> Turn {
         let position = Some((status.start, status.connection));
         let Some(seat) = self.robots.get_mut(robot) else {
@@ -110,9 +111,17 @@ mod tests {
     #[test]
     fn a_robot_is_there_from_its_status_to_its_will() {
         let (mut present, robot) = (Present::default(), RobotId::random());
-        assert_eq!(present.status(&robot, &status(false, 1, 1)), turn(None, None), "nobody was there");
+        assert_eq!(
+            present.status(&robot, &status(false, 1, 1)),
+            turn(None, None),
+            "nobody was there"
+        );
         assert_eq!(present.status(&robot, &status(true, 1, 1)), turn(None, 1));
-        assert_eq!(present.status(&robot, &status(true, 1, 1)), turn(None, None), "it repeats itself");
+        assert_eq!(
+            present.status(&robot, &status(true, 1, 1)),
+            turn(None, None),
+            "it repeats itself"
+        );
         assert!(present.contains(&robot));
         assert_eq!(present.status(&robot, &status(false, 1, 1)), turn(1, None));
         assert_eq!(present.count(), 0);
@@ -134,7 +143,11 @@ mod tests {
         let (mut present, robot) = (Present::default(), RobotId::random());
         assert_eq!(present.heard(&robot), turn(None, 1));
         assert_eq!(present.heard(&robot), turn(None, None));
-        assert_eq!(present.status(&robot, &status(true, 5, 5)), turn(None, None), "now it has a name");
+        assert_eq!(
+            present.status(&robot, &status(true, 5, 5)),
+            turn(None, None),
+            "now it has a name"
+        );
         assert_eq!(present.status(&robot, &status(false, 5, 4)), turn(None, None));
         assert_eq!(present.clear(), [(robot.clone(), 1)]);
         assert_eq!(present.heard(&robot), turn(None, 2));

@@ -1,5 +1,6 @@
-//! One session at an external broker, and the only place in the server that names rumqttc: subscribes, hears itself once
-//! to know that the broker passes messages on, then takes in what robots say and publishes what waits.
+//! One session at an external broker, and the only place in the server that names rumqttc:
+//! subscribes, hears itself once to know that the broker passes messages on, then takes in what
+//! robots say and publishes what waits.
 
 use std::collections::VecDeque;
 use std::error::Error;
@@ -8,8 +9,8 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use rumqttc::{
-    AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Outgoing, Packet, Publish, QoS,
-    SubscribeFilter, Transport,
+    AsyncClient, ConnectReturnCode, ConnectionError, Event, MqttOptions, Outgoing, Packet, Publish,
+    QoS, SubscribeFilter, Transport,
 };
 use task_proto::RobotId;
 use task_proto::report::Status;
@@ -35,15 +36,16 @@ const GOODBYE_PATIENCE: Duration = Duration::from_secs(1);
 const MAX_IN_FLIGHT: u16 = 256;
 /// Requests between this task and rumqttc, and events the other way.
 const QUEUED: usize = 64;
-/// The largest message that is taken in. A larger one ends the session, so the broker should refuse it before: see
-/// docs/broker.md.
+/// The largest message that is taken in. A larger one ends the session, so the broker should refuse
+/// it before: see docs/broker.md.
 const MAX_TAKEN_BYTES: usize = 4 * 1024 * 1024;
 /// The largest that is sent: a part, and what is around it.
 const MAX_SENT_BYTES: usize = MAX_PART_BYTES + 1024;
 /// The largest status that is read.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
 /// What robots say that is not a report.
-const HEARD: [RobotTopic; 4] = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
+const HEARD: [RobotTopic; 4] =
+    [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
 /// MQTT's fixed header at most, and the packet id.
 const HEADER_BYTES: usize = 7;
 
@@ -68,13 +70,22 @@ impl Ended {
     pub(super) fn text(&self, url: &BrokerUrl) -> String {
         let broker = format!("the broker at {}", url.address());
         match self {
-            Self::Refused(ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized) => {
-                format!("{broker} does not accept the user {} with the password in `broker`", url.user_name)
+            Self::Refused(
+                ConnectReturnCode::BadUserNamePassword | ConnectReturnCode::NotAuthorized,
+            ) => {
+                format!(
+                    "{broker} does not accept the user {} with the password in `broker`",
+                    url.user_name
+                )
             }
             Self::Refused(code) => format!("{broker} refuses the server: {code:?}"),
-            Self::Unreachable(error) => format!("{broker} can't be reached: {}", with_causes(error)),
+            Self::Unreachable(error) => {
+                format!("{broker} can't be reached: {}", with_causes(error))
+            }
             Self::Deaf => {
-                format!("{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`")
+                format!(
+                    "{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`"
+                )
             }
             Self::Lost(ConnectionError::Io(error)) => format!("{broker} can't be reached: {error}"),
             Self::Lost(ConnectionError::NetworkTimeout) => format!("{broker} does not answer"),
@@ -84,7 +95,11 @@ impl Ended {
 }
 
 /// Runs one session to its end; `None`: the server stops.
-pub(super) async fn run(external: &External, place: &Place, health: &watch::Sender<Health>) -> Option<Ended> {
+pub(super) async fn run(
+    external: &External,
+    place: &Place,
+    health: &watch::Sender<Health>,
+) -> Option<Ended> {
     let line = tokio::select! {
         line = Line::open(&place.route, NETWORK_TIMEOUT) => line,
         () = external.stop.cancelled() => return None,
@@ -96,7 +111,8 @@ pub(super) async fn run(external: &External, place: &Place, health: &watch::Send
     let (client, mut event_loop) = AsyncClient::new(options(external, place, &line), QUEUED);
     event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs());
     let (events_in, mut events) = mpsc::channel(QUEUED);
-    // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as the session.
+    // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as
+    // the session.
     let pump = async {
         loop {
             match event_loop.poll().await {
@@ -134,7 +150,8 @@ pub(super) async fn run(external: &External, place: &Place, health: &watch::Send
     };
     if ended.is_none() && session.client.try_disconnect().is_ok() {
         // It ends by itself once the broker has closed the connection.
-        let goodbye = async { tokio::join!(&mut pump, async { while events.recv().await.is_some() {} }) };
+        let goodbye =
+            async { tokio::join!(&mut pump, async { while events.recv().await.is_some() {} }) };
         let goodbye = async {
             tokio::select! {
                 _ = goodbye => {}
@@ -183,7 +200,15 @@ struct Session<'a> {
 impl<'a> Session<'a> {
     fn new(external: &'a External, place: &'a Place, client: AsyncClient) -> Self {
         let canary = format!("{}/{CANARY_LEVEL}", external.config.prefix);
-        Self { external, place, client, canary, is_up: false, unsent: VecDeque::new(), sent: VecDeque::new() }
+        Self {
+            external,
+            place,
+            client,
+            canary,
+            is_up: false,
+            unsent: VecDeque::new(),
+            sent: VecDeque::new(),
+        }
     }
 
     /// Takes in what happened; whether the session has come up by that.
@@ -191,7 +216,9 @@ impl<'a> Session<'a> {
         self.count(&event);
         match event {
             Event::Incoming(Packet::ConnAck(_)) => self.begin(),
-            Event::Incoming(Packet::Publish(message)) if message.topic == self.canary => return self.come_up(),
+            Event::Incoming(Packet::Publish(message)) if message.topic == self.canary => {
+                return self.come_up();
+            }
             Event::Incoming(Packet::Publish(message)) => self.hear(message).await,
             Event::Incoming(Packet::PubAck(ack)) => self.acknowledged(ack.pkid),
             Event::Incoming(Packet::PubComp(complete)) => self.acknowledged(complete.pkid),
@@ -217,13 +244,16 @@ impl<'a> Session<'a> {
         let heard = HEARD.map(|topic| format!("{prefix}/r/+/{}", topic.as_str()));
         let filters = heard.into_iter().chain([self.canary.clone()]);
         // The queue is empty at the start of a session, and a lost session is noticed by the pump.
-        let _ = self.client.try_subscribe_many(filters.map(|path| SubscribeFilter::new(path, QoS::AtLeastOnce)));
+        let _ = self
+            .client
+            .try_subscribe_many(filters.map(|path| SubscribeFilter::new(path, QoS::AtLeastOnce)));
         if self.client.try_publish(&self.canary, QoS::AtLeastOnce, false, "up").is_ok() {
             self.unsent.push_back(None);
         }
     }
 
-    /// The server hears itself: from here on robots can be reached, and each is asked by its doorbell whether it is there.
+    /// The server hears itself: from here on robots can be reached, and each is asked by its
+    /// doorbell whether it is there.
     fn come_up(&mut self) -> bool {
         if self.is_up {
             return false;
@@ -242,7 +272,10 @@ impl<'a> Session<'a> {
         if message.retain {
             return;
         }
-        let Some(Topic::Robot(robot, topic)) = self.external.config.prefix.parse(&message.topic) else { return };
+        let Some(Topic::Robot(robot, topic)) = self.external.config.prefix.parse(&message.topic)
+        else {
+            return;
+        };
         if !HEARD.contains(&topic) {
             return;
         }
@@ -260,8 +293,14 @@ impl<'a> Session<'a> {
         self.tell(&robot, &turn);
         // The status with which it went away is of none.
         let connection = lock(&self.external.present).connection(&robot).unwrap_or_default();
-        let message =
-            RobotMessage { robot, topic, payload: message.payload, peer: None, connection, token_number: None };
+        let message = RobotMessage {
+            robot,
+            topic,
+            payload: message.payload,
+            peer: None,
+            connection,
+            token_number: None,
+        };
         // None of these topics is stored, so this answers at once.
         let _ = self.external.inbox.receive(message).await;
     }

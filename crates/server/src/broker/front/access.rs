@@ -1,4 +1,5 @@
-//! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything up.
+//! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything
+//! up.
 
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
@@ -39,8 +40,8 @@ pub(super) enum Hearing {
     Router,
 }
 
-/// Where the visitor's message on `topic` goes; `None` if the visitor may not send it. A robot speaks on its own
-/// from-robot topics only, an operator not at all.
+/// Where the visitor's message on `topic` goes; `None` if the visitor may not send it. A robot
+/// speaks on its own from-robot topics only, an operator not at all.
 pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
     match visitor {
         Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
@@ -59,14 +60,20 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
     }
 }
 
-/// What the visitor hears by a subscription to `filter`; `None` if the visitor may not make it. A robot hears what is
-/// said to it, by exact name; an operator anything whose first levels are the prefix.
-pub(super) fn may_subscribe(visitor: &Visitor, prefix: &TopicPrefix, filter: &str) -> Option<Hearing> {
+/// What the visitor hears by a subscription to `filter`; `None` if the visitor may not make it. A
+/// robot hears what is said to it, by exact name; an operator anything whose first levels are the
+/// prefix.
+pub(super) fn may_subscribe(
+    visitor: &Visitor,
+    prefix: &TopicPrefix,
+    filter: &str,
+) -> Option<Hearing> {
     match visitor {
         Visitor::Canary => (filter == CANARY_TOPIC).then_some(Hearing::Router),
-        Visitor::Operator(_) => {
-            filter.strip_prefix(prefix.as_str()).is_some_and(|rest| rest.starts_with('/')).then_some(Hearing::Router)
-        }
+        Visitor::Operator(_) => filter
+            .strip_prefix(prefix.as_str())
+            .is_some_and(|rest| rest.starts_with('/'))
+            .then_some(Hearing::Router),
         Visitor::Robot { robot, .. } => match prefix.parse(filter)? {
             Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => Some(Hearing::Desired),
             Topic::Robot(owner, RobotTopic::Request) if owner == *robot => Some(Hearing::Request),
@@ -107,9 +114,15 @@ mod tests {
     fn a_robot_speaks_on_its_own_topics_only() {
         let prefix = TopicPrefix::default();
         let route = |topic: &str| may_publish(&robot(), &prefix, topic);
-        assert_eq!(route("taskd/v1/r/r00000000000000a1/report"), Some(Route::Inbox(RobotTopic::Report)));
+        assert_eq!(
+            route("taskd/v1/r/r00000000000000a1/report"),
+            Some(Route::Inbox(RobotTopic::Report))
+        );
         assert_eq!(route("taskd/v1/r/r00000000000000a1/log"), Some(Route::Inbox(RobotTopic::Log)));
-        assert_eq!(route("taskd/v1/r/r00000000000000a1/telemetry"), Some(Route::Inbox(RobotTopic::Telemetry)));
+        assert_eq!(
+            route("taskd/v1/r/r00000000000000a1/telemetry"),
+            Some(Route::Inbox(RobotTopic::Telemetry))
+        );
         for denied in [
             "taskd/v1/r/r00000000000000a1/desired",
             "taskd/v1/r/r00000000000000a1/request",
@@ -154,10 +167,20 @@ mod tests {
     fn an_operator_hears_what_lies_below_the_prefix() {
         let prefix = TopicPrefix::default();
         let hearing = |filter: &str| may_subscribe(&operator(), &prefix, filter);
-        for allowed in ["taskd/v1/#", "taskd/v1/r/+/report", "taskd/v1/r/r00000000000000a1/status"] {
+        for allowed in ["taskd/v1/#", "taskd/v1/r/+/report", "taskd/v1/r/r00000000000000a1/status"]
+        {
             assert_eq!(hearing(allowed), Some(Hearing::Router), "{allowed}");
         }
-        for denied in ["#", "+/v1/#", "taskd/#", "taskd/+/r/#", "taskd/v1", "taskd/v10/#", "$SYS/#", CANARY_TOPIC] {
+        for denied in [
+            "#",
+            "+/v1/#",
+            "taskd/#",
+            "taskd/+/r/#",
+            "taskd/v1",
+            "taskd/v10/#",
+            "$SYS/#",
+            CANARY_TOPIC,
+        ] {
             assert_eq!(hearing(denied), None, "{denied}");
         }
     }
@@ -176,7 +199,9 @@ mod tests {
         ] {
             assert!(matches(filter, topic), "{filter} {topic}");
         }
-        for (filter, topic) in [("a/+", "a"), ("+", "/a"), ("a", "a/b"), ("a/b", "a"), ("a/+", "a/b/c"), ("A", "a")] {
+        for (filter, topic) in
+            [("a/+", "a"), ("+", "/a"), ("a", "a/b"), ("a/b", "a"), ("a/+", "a/b/c"), ("A", "a")]
+        {
             assert!(!matches(filter, topic), "{filter} {topic}");
         }
     }

@@ -17,7 +17,12 @@ pub(super) struct Attendance<'a> {
 
 impl<'a> Attendance<'a> {
     /// The session is live; `None` if it is no robot's.
-    pub(super) fn begin(context: &'a Context, visitor: &Visitor, peer: SocketAddr, connection: u64) -> Option<Self> {
+    pub(super) fn begin(
+        context: &'a Context,
+        visitor: &Visitor,
+        peer: SocketAddr,
+        connection: u64,
+    ) -> Option<Self> {
         let Visitor::Robot { robot, .. } = visitor else { return None };
         context.inbox.connected(robot, Some(peer), connection);
         Some(Self { inbox: &*context.inbox, robot: robot.clone(), connection })

@@ -1,6 +1,6 @@
-//! Reads what clients send: MQTT 3.1.1, strictly. rumqttd's decoder is not used, because it overlooks wrong flags,
-//! trailing bytes, zero packet ids and bad filters, some of which its router does not survive; its encoder is.
-//! It never answers anything and holds no state between packets.
+//! Reads what clients send: MQTT 3.1.1, strictly. rumqttd's decoder is not used, because it
+//! overlooks wrong flags, trailing bytes, zero packet ids and bad filters, some of which its router
+//! does not survive; its encoder is. It never answers anything and holds no state between packets.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use rumqttd::protocol::v4::{V4, write_remaining_length};
@@ -95,8 +95,8 @@ pub enum DecodeError {
     /// Another MQTT, of this protocol level.
     #[error("asks for protocol level {0}, and only MQTT 3.1.1 (level 4) is spoken")]
     UnknownProtocol(u8),
-    /// The server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this one keeps none. One without a payload
-    /// asks to keep nothing.
+    /// The server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this one keeps
+    /// none. One without a payload asks to keep nothing.
     #[error("sends a message to be retained, and nothing is retained here")]
     Retained,
     /// More bytes than a packet may have here.
@@ -109,8 +109,9 @@ pub enum DecodeError {
 
 use DecodeError::Malformed;
 
-/// Takes one packet off the front of `input`; `None` if more bytes are needed. What is wrong is said as early as the
-/// bytes show it, so that nobody has to wait for the rest of a packet that will be refused.
+/// Takes one packet off the front of `input`; `None` if more bytes are needed. What is wrong is
+/// said as early as the bytes show it, so that nobody has to wait for the rest of a packet that
+/// will be refused.
 pub fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>, DecodeError> {
     let Some(&first) = input.first() else { return Ok(None) };
     check_first_byte(first)?;
@@ -130,7 +131,8 @@ pub fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>
 /// Writes `packet`, one that we send.
 pub(super) fn encode(packet: Packet, output: &mut BytesMut) {
     if let Err(error) = V4.write(packet, output) {
-        // What we write is bounded and complete, so this is a bug; the client notices a missing packet by itself.
+        // What we write is bounded and complete, so this is a bug; the client notices a missing
+        // packet by itself.
         tracing::error!(%error, "could not encode an MQTT packet");
     }
 }
@@ -143,7 +145,8 @@ pub fn encode_publish(publish: &Publish, output: &mut BytesMut) {
     }
 }
 
-/// Writes all of a PUBLISH but its payload; false, and nothing is written, if no packet can be as large.
+/// Writes all of a PUBLISH but its payload; false, and nothing is written, if no packet can be as
+/// large.
 pub(super) fn encode_publish_head(
     topic: &str,
     qos: QoS,
@@ -154,7 +157,9 @@ pub(super) fn encode_publish_head(
     let (has_id, before) = (qos != QoS::AtMostOnce, output.len());
     let length = 2 + topic.len() + if has_id { 2 } else { 0 } + payload_bytes;
     output.put_u8(0x30 | (qos as u8) << 1);
-    let (Ok(topic_bytes), Ok(_)) = (u16::try_from(topic.len()), write_remaining_length(output, length)) else {
+    let (Ok(topic_bytes), Ok(_)) =
+        (u16::try_from(topic.len()), write_remaining_length(output, length))
+    else {
         output.truncate(before);
         tracing::error!(length, "could not encode an MQTT message");
         return false;
@@ -191,7 +196,11 @@ fn remaining_length(input: &[u8]) -> Result<Option<(usize, usize)>, DecodeError>
             return Ok(Some((length, index + 1)));
         }
     }
-    if input.len() >= 4 { Err(Malformed("remaining length of more than four bytes")) } else { Ok(None) }
+    if input.len() >= 4 {
+        Err(Malformed("remaining length of more than four bytes"))
+    } else {
+        Ok(None)
+    }
 }
 
 fn decode_body(first: u8, mut body: Body) -> Result<Received, DecodeError> {
@@ -202,12 +211,19 @@ fn decode_body(first: u8, mut body: Body) -> Result<Received, DecodeError> {
         5 => Received::PubRec(body.packet_id()?),
         6 => Received::PubRel(body.packet_id()?),
         7 => Received::PubComp(body.packet_id()?),
-        8 => Received::Subscribe { packet_id: body.packet_id()?, filters: body.list(filter_with_qos)? },
+        8 => Received::Subscribe {
+            packet_id: body.packet_id()?,
+            filters: body.list(filter_with_qos)?,
+        },
         10 => Received::Unsubscribe { packet_id: body.packet_id()?, filters: body.list(filter)? },
         12 => Received::PingReq,
         _ => Received::Disconnect,
     };
-    if body.0.is_empty() { Ok(received) } else { Err(Malformed("bytes after the end of the packet")) }
+    if body.0.is_empty() {
+        Ok(received)
+    } else {
+        Err(Malformed("bytes after the end of the packet"))
+    }
 }
 
 fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
@@ -216,7 +232,9 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
     match (&name[..], level) {
         (b"MQTT", 4) => {}
         // 3.1, 5.0 and versions to come: the answer is a CONNACK that says so.
-        (b"MQTT", level) | (b"MQIsdp", level @ 3) => return Err(DecodeError::UnknownProtocol(level)),
+        (b"MQTT", level) | (b"MQIsdp", level @ 3) => {
+            return Err(DecodeError::UnknownProtocol(level));
+        }
         _ => return Err(Malformed("not the protocol name MQTT")),
     }
     let flags = body.byte()?;
@@ -241,12 +259,20 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
         Some(will)
     };
     let user_name = if flags & 0b1000_0000 == 0 { None } else { Some(body.text()?) };
-    // A password may be any bytes; ours are text, so whatever is lost here would have been refused anyway.
+    // A password may be any bytes; ours are text, so whatever is lost here would have been refused
+    // anyway.
     let password = match flags & 0b0100_0000 {
         0 => None,
         _ => Some(String::from_utf8_lossy(&body.binary()?).into_owned()),
     };
-    Ok(Connect { client_id, clean_session: flags & 0b10 != 0, keep_alive_s, will, user_name, password })
+    Ok(Connect {
+        client_id,
+        clean_session: flags & 0b10 != 0,
+        keep_alive_s,
+        will,
+        user_name,
+        password,
+    })
 }
 
 fn publish(first: u8, mut body: Body) -> Result<Publish, DecodeError> {
@@ -327,7 +353,10 @@ impl Body {
     }
 
     /// One or more of `item`, to the end.
-    fn list<T>(&mut self, item: fn(&mut Self) -> Result<T, DecodeError>) -> Result<Vec<T>, DecodeError> {
+    fn list<T>(
+        &mut self,
+        item: fn(&mut Self) -> Result<T, DecodeError>,
+    ) -> Result<Vec<T>, DecodeError> {
         let mut items = vec![item(self)?];
         while !self.0.is_empty() {
             items.push(item(self)?);

@@ -1,5 +1,6 @@
-//! What is to be said to a robot next: the newest desired state, and the questions that are not yet asked. A slow robot
-//! neither blocks whoever speaks to it nor fills memory. It knows nothing of MQTT.
+//! What is to be said to a robot next: the newest desired state, and the questions that are not yet
+//! asked. A slow robot neither blocks whoever speaks to it nor fills memory. It knows nothing of
+//! MQTT.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -36,7 +37,8 @@ impl Doorbell {
         self.waiting().state = None;
     }
 
-    /// Takes the payload, as soon as there is one. Cancel-safe: nothing is taken unless it is returned.
+    /// Takes the payload, as soon as there is one. Cancel-safe: nothing is taken unless it is
+    /// returned.
     pub(super) async fn answer(&self) -> Bytes {
         loop {
             if let Some(payload) = self.waiting().state.take() {
@@ -68,7 +70,8 @@ impl Doorbell {
     }
 
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -83,9 +86,13 @@ mod tests {
         doorbell.ring(Bytes::from_static(b"old"));
         doorbell.ring(Bytes::from_static(b"new"));
         assert_eq!(doorbell.answer().await, "new");
-        let accepted = (0..MAX_QUESTIONS + 3).filter(|number| doorbell.ask(number.to_string().into())).count();
+        let accepted =
+            (0..MAX_QUESTIONS + 3).filter(|number| doorbell.ask(number.to_string().into())).count();
         assert_eq!(accepted, MAX_QUESTIONS);
-        assert_eq!((doorbell.question().await, doorbell.question().await), ("0".into(), "1".into()));
+        assert_eq!(
+            (doorbell.question().await, doorbell.question().await),
+            ("0".into(), "1".into())
+        );
         assert!(doorbell.ask(Bytes::from_static(b"later")));
     }
 }

@@ -1,5 +1,6 @@
-//! Lets a client in: the TLS handshake where there is one, then one CONNECT, checked, admitted or refused with the right
-//! CONNACK. Until then a client gets little memory and little time. It never builds a session.
+//! Lets a client in: the TLS handshake where there is one, then one CONNECT, checked, admitted or
+//! refused with the right CONNACK. Until then a client gets little memory and little time. It never
+//! builds a session.
 
 use std::io;
 use std::net::SocketAddr;
@@ -47,13 +48,18 @@ pub(super) struct Guest {
 }
 
 impl Guest {
-    /// Asks once more, now that the guest has a seat: whose rights ended on the way to it was not there yet to be asked to
-    /// leave. Of robots only if one was put out meanwhile: they come in thousands.
+    /// Asks once more, now that the guest has a seat: whose rights ended on the way to it was not
+    /// there yet to be asked to leave. Of robots only if one was put out meanwhile: they come in
+    /// thousands.
     pub(super) async fn check_again(&self, context: &Context) -> Result<(), Rejection> {
         let before = match &self.visitor {
             Visitor::Operator(user) => Principal::Operator(user.clone()),
             Visitor::Robot { robot, token_number } if context.seats.put_out() != self.put_out => {
-                Principal::Robot { robot: robot.clone(), token_number: *token_number, is_first_use: false }
+                Principal::Robot {
+                    robot: robot.clone(),
+                    token_number: *token_number,
+                    is_first_use: false,
+                }
             }
             Visitor::Robot { .. } | Visitor::Canary => return Ok(()),
         };
@@ -91,7 +97,12 @@ pub(super) enum Rejection {
 impl Arrival {
     pub(super) fn new(context: &Context, peer: SocketAddr) -> Self {
         let deadline = tokio::time::Instant::now() + context.limits.connect_timeout;
-        Self { peer, proof: ClientProof::NotAsked, deadline, place: context.anteroom.enter(peer.ip(), Instant::now()) }
+        Self {
+            peer,
+            proof: ClientProof::NotAsked,
+            deadline,
+            place: context.anteroom.enter(peer.ip(), Instant::now()),
+        }
     }
 
     /// Waits for the client to take the next step, for as long as it has.
@@ -108,13 +119,19 @@ impl Arrival {
 
     /// Waits for whoever has to leave for this one, if somebody has.
     pub(super) async fn find_place(&self, claim: Claim) -> Result<OwnedSemaphorePermit, Rejection> {
-        let place = async { claim.place().await.ok_or(Rejection::Silent("comes when there is no place")) };
+        let place =
+            async { claim.place().await.ok_or(Rejection::Silent("comes when there is no place")) };
         self.step("comes when there is no place", place).await
     }
 
     /// The handshake of a client that has to speak TLS.
-    pub(super) async fn shake_hands<S>(&self, handshake: impl Future<Output = io::Result<S>>) -> Result<S, Rejection> {
-        let handshake = async { handshake.await.map_err(|_| Rejection::Silent("does not finish the TLS handshake")) };
+    pub(super) async fn shake_hands<S>(
+        &self,
+        handshake: impl Future<Output = io::Result<S>>,
+    ) -> Result<S, Rejection> {
+        let handshake = async {
+            handshake.await.map_err(|_| Rejection::Silent("does not finish the TLS handshake"))
+        };
         self.step("does not finish the TLS handshake in time", handshake).await
     }
 }
@@ -134,7 +151,9 @@ impl CanaryPass {
     /// Whether `password` is the one; if so it is used up.
     fn redeem(&self, password: &str) -> bool {
         let mut secret = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        let good = secret.as_ref().is_some_and(|secret| secret.as_bytes().ct_eq(password.as_bytes()).into());
+        let good = secret
+            .as_ref()
+            .is_some_and(|secret| secret.as_bytes().ct_eq(password.as_bytes()).into());
         if good {
             *secret = None;
         }
@@ -143,16 +162,24 @@ impl CanaryPass {
 }
 
 /// Reads CONNECT and finds out who it is.
-pub(super) async fn welcome<S>(context: &Arc<Context>, stream: &mut S, arrival: Arrival) -> Result<Guest, Rejection>
+pub(super) async fn welcome<S>(
+    context: &Arc<Context>,
+    stream: &mut S,
+    arrival: Arrival,
+) -> Result<Guest, Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let mut input = BytesMut::new();
-    let connect = arrival.step("sends no CONNECT in time", read_connect(stream, &mut input)).await?;
+    let connect =
+        arrival.step("sends no CONNECT in time", read_connect(stream, &mut input)).await?;
     let (peer, proof) = (arrival.peer, arrival.proof.clone());
     drop(arrival);
     if connect.client_id.is_empty() && !connect.clean_session {
-        return Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "an empty client id without a clean session"));
+        return Err(answer(
+            ConnectReturnCode::ClientIdentifierNotValid,
+            "an empty client id without a clean session",
+        ));
     }
     let login = Login {
         client_id: connect.client_id.clone(),
@@ -166,7 +193,10 @@ where
     if let Some(will) = &connect.will
         && may_publish(&visitor, &context.prefix, &will.topic).is_none()
     {
-        return Err(answer(ConnectReturnCode::NotAuthorized, "a will on a topic that is not its own"));
+        return Err(answer(
+            ConnectReturnCode::NotAuthorized,
+            "a will on a topic that is not its own",
+        ));
     }
     let watched = match &visitor {
         Visitor::Robot { robot, .. } => Some(watch(context, robot)?),
@@ -175,7 +205,9 @@ where
     let seat_name = match &visitor {
         Visitor::Robot { robot, .. } => SeatName::Robot(robot.clone()),
         Visitor::Canary => SeatName::Canary,
-        Visitor::Operator(user) if connect.client_id.is_empty() => SeatName::Unnamed(user.clone(), rand::random()),
+        Visitor::Operator(user) if connect.client_id.is_empty() => {
+            SeatName::Unnamed(user.clone(), rand::random())
+        }
         Visitor::Operator(user) => SeatName::Operator(user.clone(), connect.client_id.clone()),
     };
     // 3.1.2.10: one and a half times what the client promised.
@@ -194,7 +226,10 @@ fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
     if may_come && !matches!(watched.sent(SESSION_COST, 0, now), Verdict::Cut(_)) {
         return Ok(watched);
     }
-    Err(answer(ConnectReturnCode::ServiceUnavailable, "a robot that was cut off and comes back too early"))
+    Err(answer(
+        ConnectReturnCode::ServiceUnavailable,
+        "a robot that was cut off and comes back too early",
+    ))
 }
 
 /// A CONNACK.
@@ -204,10 +239,16 @@ pub(super) fn connack(code: ConnectReturnCode, output: &mut BytesMut) {
 }
 
 /// Tells the client why, as far as the protocol has an answer. Bounded by the write timeout.
-pub(super) async fn reject<S: AsyncWrite + Unpin>(context: &Context, stream: &mut S, rejection: Rejection) {
+pub(super) async fn reject<S: AsyncWrite + Unpin>(
+    context: &Context,
+    stream: &mut S,
+    rejection: Rejection,
+) {
     let code = match rejection {
         Rejection::Answered { code, .. } => code,
-        Rejection::Malformed(DecodeError::UnknownProtocol(_)) => ConnectReturnCode::RefusedProtocolVersion,
+        Rejection::Malformed(DecodeError::UnknownProtocol(_)) => {
+            ConnectReturnCode::RefusedProtocolVersion
+        }
         // A will to be retained.
         Rejection::Malformed(DecodeError::Retained) => ConnectReturnCode::NotAuthorized,
         Rejection::Malformed(_) | Rejection::Silent(_) => return,
@@ -222,7 +263,10 @@ fn answer(code: ConnectReturnCode, reason: &'static str) -> Rejection {
     Rejection::Answered { code, reason }
 }
 
-async fn read_connect<S: AsyncRead + Unpin>(stream: &mut S, input: &mut BytesMut) -> Result<Connect, Rejection> {
+async fn read_connect<S: AsyncRead + Unpin>(
+    stream: &mut S,
+    input: &mut BytesMut,
+) -> Result<Connect, Rejection> {
     loop {
         if input.first().is_some_and(|first| first >> 4 != 1) {
             return Err(Rejection::Silent("sends something before CONNECT"));
@@ -240,47 +284,65 @@ async fn read_connect<S: AsyncRead + Unpin>(stream: &mut S, input: &mut BytesMut
     }
 }
 
-async fn admit(context: &Arc<Context>, connect: &Connect, login: Login) -> Result<Visitor, Rejection> {
+async fn admit(
+    context: &Arc<Context>,
+    connect: &Connect,
+    login: Login,
+) -> Result<Visitor, Rejection> {
     if connect.client_id == CANARY_ID {
         let pass = connect.password.as_deref().unwrap_or_default();
         return match context.canary_pass.redeem(pass) {
             true => Ok(Visitor::Canary),
-            false => {
-                Err(answer(ConnectReturnCode::BadUserNamePassword, "the watchdog's client id without its password"))
-            }
+            false => Err(answer(
+                ConnectReturnCode::BadUserNamePassword,
+                "the watchdog's client id without its password",
+            )),
         };
     }
     match ask(context, login).await {
         Err(Refusal::BadCredentials) => {
             Err(answer(ConnectReturnCode::BadUserNamePassword, "a bad user name or password"))
         }
-        Err(Refusal::NotAuthorised) => Err(answer(ConnectReturnCode::NotAuthorized, "credentials that allow nothing")),
-        Err(Refusal::Unavailable) => {
-            Err(answer(ConnectReturnCode::ServiceUnavailable, "credentials that can't be checked now"))
+        Err(Refusal::NotAuthorised) => {
+            Err(answer(ConnectReturnCode::NotAuthorized, "credentials that allow nothing"))
         }
+        Err(Refusal::Unavailable) => Err(answer(
+            ConnectReturnCode::ServiceUnavailable,
+            "credentials that can't be checked now",
+        )),
         Ok(Principal::Operator(_)) if connect.client_id.len() > MAX_CLIENT_ID_BYTES => {
             Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is too long"))
         }
         Ok(Principal::Operator(user)) => Ok(Visitor::Operator(user)),
         // A robot's name on another robot's token, or the other way round.
-        Ok(Principal::Robot { robot, .. }) if connect.user_name.as_deref() != Some(robot.as_str()) => {
-            Err(answer(ConnectReturnCode::NotAuthorized, "a user name that is not the token's robot id"))
+        Ok(Principal::Robot { robot, .. })
+            if connect.user_name.as_deref() != Some(robot.as_str()) =>
+        {
+            Err(answer(
+                ConnectReturnCode::NotAuthorized,
+                "a user name that is not the token's robot id",
+            ))
         }
-        Ok(Principal::Robot { robot, .. }) if connect.client_id != robot.as_str() => {
-            Err(answer(ConnectReturnCode::ClientIdentifierNotValid, "a client id that is not the robot's id"))
+        Ok(Principal::Robot { robot, .. }) if connect.client_id != robot.as_str() => Err(answer(
+            ConnectReturnCode::ClientIdentifierNotValid,
+            "a client id that is not the robot's id",
+        )),
+        Ok(Principal::Robot { robot, token_number, .. }) => {
+            Ok(Visitor::Robot { robot, token_number })
         }
-        Ok(Principal::Robot { robot, token_number, .. }) => Ok(Visitor::Robot { robot, token_number }),
     }
 }
 
-/// Asks the gatekeeper who this is. That goes on to its end even if the client is not waited for any more: a robot's first use
-/// of a token has ended its others by then, and who came in by those has to go.
+/// Asks the gatekeeper who this is. That goes on to its end even if the client is not waited for
+/// any more: a robot's first use of a token has ended its others by then, and who came in by those
+/// has to go.
 async fn ask(context: &Arc<Context>, login: Login) -> Result<Principal, Refusal> {
     let shared = context.clone();
     let asked = tokio::spawn(async move {
         let principal = shared.gatekeeper.admit(login).await;
         if let Ok(Principal::Robot { robot, is_first_use: true, .. }) = &principal {
-            // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has none yet.
+            // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has
+            // none yet.
             shared.seats.ask_to_leave(robot);
         }
         principal

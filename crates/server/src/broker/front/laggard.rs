@@ -1,6 +1,6 @@
-//! Who holds up the others of a fan-out for too long: pure functions of how long each has. A listener is slow only compared
-//! with the others: time counts while at least half of them have all there is and wait. Where most are busy, it is
-//! the network that is slow.
+//! Who holds up the others of a fan-out for too long: pure functions of how long each has. A
+//! listener is slow only compared with the others: time counts while at least half of them have all
+//! there is and wait. Where most are busy, it is the network that is slow.
 
 use std::time::Duration;
 
@@ -30,11 +30,13 @@ impl Waiting {
     }
 
     fn total(&self, now: Instant) -> Duration {
-        self.before + self.since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
+        self.before
+            + self.since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
     }
 }
 
-/// How long the others have waited for one of them, on balance: it grows while they do, and shrinks as fast otherwise.
+/// How long the others have waited for one of them, on balance: it grows while they do, and shrinks
+/// as fast otherwise.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hold {
     balance: Duration,
@@ -66,7 +68,8 @@ impl Hold {
     }
 
     fn stuck(&self, now: Instant) -> Duration {
-        self.stuck + self.behind_since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
+        self.stuck
+            + self.behind_since.map_or(Duration::ZERO, |since| now.saturating_duration_since(since))
     }
 
     fn balance(&self, waiting: &Waiting, now: Instant) -> Duration {

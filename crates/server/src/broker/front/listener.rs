@@ -1,5 +1,5 @@
-//! Accepts connections and gives each a task of its own, so that no client waits for another: a TLS handshake is done in
-//! there too. It reads no byte.
+//! Accepts connections and gives each a task of its own, so that no client waits for another: a TLS
+//! handshake is done in there too. It reads no byte.
 
 use std::future::ready;
 use std::sync::Arc;
@@ -32,7 +32,8 @@ pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
             tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
             continue;
         };
-        // Small packets, each of which somebody waits for. If it can't be set, they come a little later.
+        // Small packets, each of which somebody waits for. If it can't be set, they come a little
+        // later.
         let _ = stream.set_nodelay(true);
         match front.context.tls.clone() {
             None => front.attend(peer, claim, ready(Ok((stream, ClientProof::NotAsked)))),

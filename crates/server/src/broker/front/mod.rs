@@ -1,7 +1,8 @@
-//! The MQTT front: all that lies between the network and the inbox or the router. rumqttd's own listeners must not face
-//! clients; what they get wrong is done here: admission, access, takeover, wills, time limits, bounds on memory.
-//! It never retains a message, so one that asks for that ends the session; and it never keeps a session beyond its
-//! connection: the wish for a lasting one is ignored.
+//! The MQTT front: all that lies between the network and the inbox or the router. rumqttd's own
+//! listeners must not face clients; what they get wrong is done here: admission, access, takeover,
+//! wills, time limits, bounds on memory. It never retains a message, so one that asks for that ends
+//! the session; and it never keeps a session beyond its connection: the wish for a lasting one is
+//! ignored.
 
 mod access;
 mod attendance;
@@ -166,7 +167,8 @@ impl Front {
         self.context.canary_pass.clone()
     }
 
-    /// Serves the connection that `handshake` ends in, if it does in time. False: there are too many connections.
+    /// Serves the connection that `handshake` ends in, if it does in time. False: there are too
+    /// many connections.
     pub(super) fn take_in<S>(
         &self,
         peer: SocketAddr,

@@ -1,5 +1,6 @@
-//! Log lines about clients that speak another version of MQTT. MQTT 3.1.1 answers them with return code 1 and no more, so
-//! the log is the only place that can name the client and the remedy. Anybody can cause such a line: there is one a minute.
+//! Log lines about clients that speak another version of MQTT. MQTT 3.1.1 answers them with return
+//! code 1 and no more, so the log is the only place that can name the client and the remedy.
+//! Anybody can cause such a line: there is one a minute.
 
 use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
@@ -28,7 +29,8 @@ impl OtherProtocols {
             _ => return,
         };
         let lines = self.0.lock();
-        if let Some(unreported) = lines.unwrap_or_else(PoisonError::into_inner).take(Instant::now()) {
+        if let Some(unreported) = lines.unwrap_or_else(PoisonError::into_inner).take(Instant::now())
+        {
             tracing::warn!(
                 %peer,
                 unreported,

@@ -1,5 +1,5 @@
-//! One session's messages to its client that are not yet acknowledged: packet ids, the window, the QoS 2 steps.
-//! It never holds a payload, since a clean session sends nothing again.
+//! One session's messages to its client that are not yet acknowledged: packet ids, the window, the
+//! QoS 2 steps. It never holds a payload, since a clean session sends nothing again.
 
 use std::collections::HashMap;
 
@@ -52,7 +52,8 @@ impl Outgoing {
         }
     }
 
-    /// A PUBACK came; true if it ends a message. Acknowledgements of what was not sent change nothing.
+    /// A PUBACK came; true if it ends a message. Acknowledgements of what was not sent change
+    /// nothing.
     pub(super) fn acknowledged(&mut self, id: u16) -> bool {
         self.end(id, Awaiting::Acknowledgement)
     }

@@ -1,5 +1,5 @@
-//! What a session has still to write: small packets, and at most one payload that it shares with other sessions, which is
-//! therefore never copied. It knows nothing of MQTT.
+//! What a session has still to write: small packets, and at most one payload that it shares with
+//! other sessions, which is therefore never copied. It knows nothing of MQTT.
 
 use std::io::IoSlice;
 
@@ -106,7 +106,8 @@ mod tests {
             while output.has_remaining() {
                 let mut slices = [IoSlice::new(&[]); 4];
                 let count = output.chunks_vectored(&mut slices);
-                let all: Vec<u8> = slices[..count].iter().flat_map(|slice| slice.iter().copied()).collect();
+                let all: Vec<u8> =
+                    slices[..count].iter().flat_map(|slice| slice.iter().copied()).collect();
                 assert!(all.starts_with(output.chunk()) && !output.chunk().is_empty());
                 let now = &all[..step.min(all.len())];
                 written.extend_from_slice(now);

@@ -1,6 +1,7 @@
-//! Who may hear the parts of which package, the few parts that are on their way, and how far each listener has come. The
-//! parts are held once, whatever the number of listeners, and no more of them than a window; a publisher waits for the
-//! slowest listener, and puts out who holds up the others. It never touches a socket.
+//! Who may hear the parts of which package, the few parts that are on their way, and how far each
+//! listener has come. The parts are held once, whatever the number of listeners, and no more of
+//! them than a window; a publisher waits for the slowest listener, and puts out who holds up the
+//! others. It never touches a socket.
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,8 +16,9 @@ use crate::broker::Part;
 
 /// Packages that are fanned out at the same time.
 const MAX_FAN_OUTS: usize = 4;
-/// Parts that the slowest listener may be behind, and the bytes of these parts, if it is not one alone. Fewer than the
-/// messages that a session may have under way, so that there is always room for a new desired state.
+/// Parts that the slowest listener may be behind, and the bytes of these parts, if it is not one
+/// alone. Fewer than the messages that a session may have under way, so that there is always room
+/// for a new desired state.
 const WINDOW_PARTS: u64 = super::outgoing::MAX_PARTS_IN_FLIGHT as u64;
 const WINDOW_BYTES: u64 = 4 * 1024 * 1024;
 
@@ -110,7 +112,8 @@ impl Grants {
         let window = (WINDOW_BYTES / part_bytes.max(1) as u64).clamp(1, WINDOW_PARTS);
         let progress = Progress::begin(robots, now);
         let (moved, joined) = (Notify::new(), Notify::new());
-        let grant = Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved, joined });
+        let grant =
+            Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved, joined });
         table.insert(digest, grant.clone());
         Ok(grant)
     }
@@ -120,7 +123,9 @@ impl Grants {
         lock(&self.0).remove(&grant.digest);
         let mut progress = grant.progress();
         progress.parts.clear();
-        for listening in std::mem::take(&mut progress.robots).into_values().filter_map(|permit| permit.listening) {
+        for listening in
+            std::mem::take(&mut progress.robots).into_values().filter_map(|permit| permit.listening)
+        {
             listening.news.notify_one();
         }
         (progress.listeners, progress.behind, progress.idle) = (0, 0, 0);
@@ -128,7 +133,10 @@ impl Grants {
 
     /// The package's grant, if `robot` has one.
     pub(super) fn of(&self, digest: &Digest, robot: &RobotId) -> Option<Arc<Grant>> {
-        lock(&self.0).get(digest).filter(|grant| grant.progress().robots.contains_key(robot)).cloned()
+        lock(&self.0)
+            .get(digest)
+            .filter(|grant| grant.progress().robots.contains_key(robot))
+            .cloned()
     }
 
     /// The bytes of the parts that are on their way.
@@ -175,7 +183,8 @@ impl Grant {
         self.progress().parts.iter().map(Part::len).sum()
     }
 
-    /// Waits until a robot has begun to listen since this was waited for last. For one caller at a time; cancel-safe.
+    /// Waits until a robot has begun to listen since this was waited for last. For one caller at a
+    /// time; cancel-safe.
     pub(in crate::broker) async fn joined(&self) {
         self.joined.notified().await;
     }
@@ -210,7 +219,8 @@ impl Grant {
         progress.parts.push_back(part);
         let Progress { sent, waiting, .. } = *progress;
         let mut behind = 0;
-        for listening in progress.robots.values_mut().filter_map(|permit| permit.listening.as_mut()) {
+        for listening in progress.robots.values_mut().filter_map(|permit| permit.listening.as_mut())
+        {
             listening.news.notify_one();
             if listening.lacks(sent) >= self.window {
                 listening.hold.set(true, &waiting, now);
@@ -226,7 +236,10 @@ impl Grant {
         let mut progress = self.progress();
         let Progress { all, waiting, .. } = *progress;
         let is_laggard = |listening: &Listening| listening.hold.is_too_long(&all, &waiting, now);
-        let slow = progress.robots.iter().filter(|(_, permit)| permit.listening.as_ref().is_some_and(is_laggard));
+        let slow = progress
+            .robots
+            .iter()
+            .filter(|(_, permit)| permit.listening.as_ref().is_some_and(is_laggard));
         let laggards: Vec<RobotId> = slow.map(|(robot, _)| robot.clone()).collect();
         for robot in &laggards {
             progress.remove(robot, self.window, now);
@@ -318,7 +331,8 @@ pub(super) enum Due {
 }
 
 impl Member {
-    /// The robot hears everything from now on; `news` tells its session. `None` if the grant was withdrawn meanwhile.
+    /// The robot hears everything from now on; `news` tells its session. `None` if the grant was
+    /// withdrawn meanwhile.
     pub(super) fn join(grant: Arc<Grant>, robot: &RobotId, news: Arc<Notify>) -> Option<Self> {
         let (now, mut progress) = (Instant::now(), grant.progress());
         progress.leave(robot, grant.window, now);
@@ -341,9 +355,12 @@ impl Member {
     pub(super) fn due(&self) -> Due {
         let progress = self.grant.progress();
         let permit = progress.robots.get(&self.robot);
-        let Some(listening) = permit.and_then(|permit| permit.listening.as_ref()) else { return Due::End };
+        let Some(listening) = permit.and_then(|permit| permit.listening.as_ref()) else {
+            return Due::End;
+        };
         let number = listening.taken + 1;
-        let from_the_end = progress.sent.checked_sub(number).and_then(|distance| usize::try_from(distance).ok());
+        let from_the_end =
+            progress.sent.checked_sub(number).and_then(|distance| usize::try_from(distance).ok());
         let part = from_the_end.and_then(|distance| progress.parts.iter().rev().nth(distance));
         part.map_or(Due::Nothing, |part| Due::Part(number, part.clone()))
     }
@@ -389,7 +406,8 @@ impl Drop for Member {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+    // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+    // half-done.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -412,7 +430,10 @@ mod tests {
             let grant = grants.of(&digest, robot).expect("granted");
             Member::join(grant, robot, Arc::default()).expect("granted")
         };
-        let part = |number: u8| Part { header: vec![number].into(), bytes: vec![0; 1024 * 1024 - 1].into() };
+        let part = |number: u8| Part {
+            header: vec![number].into(),
+            bytes: vec![0; 1024 * 1024 - 1].into(),
+        };
         let mut last = 0;
         let mut send = || {
             let has_room = grant.room().now_or_never().is_some();
@@ -443,7 +464,11 @@ mod tests {
         assert_eq!(second.due(), Due::End);
         assert!(send());
         drop(first);
-        assert_eq!((grant.listeners(), (0..100).filter(|_| send()).count()), (0, 100), "nobody to wait for");
+        assert_eq!(
+            (grant.listeners(), (0..100).filter(|_| send()).count()),
+            (0, 100),
+            "nobody to wait for"
+        );
         grants.close(&grant);
         assert!(grants.of(&digest, &quick).is_none());
         assert_eq!(grants.queued_bytes(), 0);
@@ -455,7 +480,9 @@ mod tests {
         let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
         let long_ago = now.checked_sub(seconds(20)).expect("the machine has run for that long");
         let digest = Digest::of(b"package");
-        let grant = grants.open(digest, 64 * 1024, QoS::AtLeastOnce, vec![robot.clone()], long_ago).expect("room");
+        let grant = grants
+            .open(digest, 64 * 1024, QoS::AtLeastOnce, vec![robot.clone()], long_ago)
+            .expect("room");
         let join = || Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
         let fill = |now| {
             for _ in 0..WINDOW_PARTS {
@@ -476,7 +503,9 @@ mod tests {
     fn acknowledgements_may_come_in_any_order() {
         let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
         let digest = Digest::of(b"package");
-        let grant = grants.open(digest, 64 * 1024, QoS::ExactlyOnce, vec![robot.clone()], now).expect("room");
+        let grant = grants
+            .open(digest, 64 * 1024, QoS::ExactlyOnce, vec![robot.clone()], now)
+            .expect("room");
         let member = Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
         for number in 1..=WINDOW_PARTS {
             assert!(grant.room().now_or_never().is_some());
@@ -485,7 +514,9 @@ mod tests {
         }
         for number in (2..=WINDOW_PARTS).rev() {
             member.acknowledged(number);
-            assert!(grant.room().now_or_never().is_none() && grant.all_idle().now_or_never().is_none());
+            assert!(
+                grant.room().now_or_never().is_none() && grant.all_idle().now_or_never().is_none()
+            );
         }
         member.acknowledged(1);
         assert!(grant.room().now_or_never().is_some() && grant.all_idle().now_or_never().is_some());

@@ -1,5 +1,6 @@
-//! How many connections there may be. When there are as many, whoever has been silent for longest gives way to a newcomer, so
-//! that those who say nothing keep nobody out. It never touches a socket.
+//! How many connections there may be. When there are as many, whoever has been silent for longest
+//! gives way to a newcomer, so that those who say nothing keep nobody out. It never touches a
+//! socket.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -34,7 +35,8 @@ impl Places {
         Self { free: Arc::new(Semaphore::new(most)), turns: Arc::new(Semaphore::new(MAX_WAITING)) }
     }
 
-    /// For one more connection; `None` if there is no place, and nobody in the anteroom who could give way.
+    /// For one more connection; `None` if there is no place, and nobody in the anteroom who could
+    /// give way.
     pub(super) fn claim(&self, anteroom: &Anteroom) -> Option<Claim> {
         if let Ok(place) = self.free.clone().try_acquire_owned() {
             return Some(Claim::Place(place));

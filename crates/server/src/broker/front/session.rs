@@ -1,5 +1,6 @@
-//! One client's session, from its seat to its end: a single task that reads, acts, answers and keeps the time.
-//! Everything it holds is bounded; it stops reading while a message is being stored or answers are not read.
+//! One client's session, from its seat to its end: a single task that reads, acts, answers and
+//! keeps the time. Everything it holds is bounded; it stops reading while a message is being stored
+//! or answers are not read.
 
 use std::collections::HashMap;
 use std::io;
@@ -10,8 +11,8 @@ use std::time::Duration;
 use bytes::{Bytes, BytesMut};
 use futures_util::future::BoxFuture;
 use rumqttd::protocol::{
-    ConnectReturnCode, Packet, PingResp, PubAck, PubAckReason, PubComp, PubCompReason, PubRec, PubRecReason, PubRel,
-    PubRelReason, QoS,
+    ConnectReturnCode, Packet, PingResp, PubAck, PubAckReason, PubComp, PubCompReason, PubRec,
+    PubRecReason, PubRel, PubRelReason, QoS,
 };
 use task_proto::topic::{RobotTopic, Topic};
 use task_proto::{Digest, RobotId};
@@ -110,7 +111,8 @@ where
     linger(&mut stream).await;
 }
 
-/// Everything before the session is live: who it is, the seat, and a link to the router if it needs one.
+/// Everything before the session is live: who it is, the seat, and a link to the router if it needs
+/// one.
 async fn enter<S>(
     context: &Arc<Context>,
     stream: &mut S,
@@ -121,7 +123,8 @@ where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     let guest = welcome(context, stream, arrival).await?;
-    let unavailable = |reason| Rejection::Answered { code: ConnectReturnCode::ServiceUnavailable, reason };
+    let unavailable =
+        |reason| Rejection::Answered { code: ConnectReturnCode::ServiceUnavailable, reason };
     let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
     let seat = seat.ok_or(unavailable("the person has as many sessions as there may be"))?;
     guest.check_again(context).await?;
@@ -137,8 +140,8 @@ where
     Ok((guest, seat, Some(listener)))
 }
 
-/// The session, and what must happen at its end in this order: the link to the router ends, the will is said, the inbox
-/// hears of the end, and the seat is free.
+/// The session, and what must happen at its end in this order: the link to the router ends, the
+/// will is said, the inbox hears of the end, and the seat is free.
 async fn live<S>(
     context: &Context,
     stream: &mut S,
@@ -150,7 +153,8 @@ async fn live<S>(
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    // It may have been meant for whoever had the seat before. Whoever is told of this session rings again.
+    // It may have been meant for whoever had the seat before. Whoever is told of this session rings
+    // again.
     seat.doorbell().forget_state();
     let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
     let (reader, writer) = tokio::io::split(stream);
@@ -196,7 +200,8 @@ where
     end
 }
 
-/// Lets the client read what was written last: closing with bytes unread on our side would reset the connection.
+/// Lets the client read what was written last: closing with bytes unread on our side would reset
+/// the connection.
 async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
     let read_out = async {
         stream.shutdown().await?;
@@ -276,14 +281,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             }
         };
         if !matches!(end, End::Deaf | End::Withdrawn) {
-            // What was answered before the end is still due. If it can't be had any more, the connection is over anyway.
+            // What was answered before the end is still due. If it can't be had any more, the
+            // connection is over anyway.
             let _ = timeout(LINGER, self.writer.write_all_buf(&mut self.output)).await;
         }
         end
     }
 
-    /// Waits for whatever comes first. Every branch is cancel-safe: bytes stay in the socket or the buffers, payloads in
-    /// the doorbell or the link, and what is being stored is polled in place.
+    /// Waits for whatever comes first. Every branch is cancel-safe: bytes stay in the socket or the
+    /// buffers, payloads in the doorbell or the link, and what is being stored is polled in place.
     async fn wait(&mut self) -> Woken {
         let (deadline, lateness) = self.deadline();
         let may_read = self.may_read();
@@ -368,7 +374,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     fn act_on_input(&mut self) -> Result<(), End> {
         while self.may_read() {
             let before = self.input.len();
-            let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)? else {
+            let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)?
+            else {
                 self.hear_progress();
                 break;
             };
@@ -472,7 +479,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
     /// Sends what is said to this robot alone.
     fn send_own(&mut self, last: RobotTopic, hearing: Hearing, payload: Bytes) {
-        if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing)) {
+        if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing))
+        {
             let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), last));
             self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
         }
@@ -494,15 +502,34 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         encode(packet, self.output.packets());
     }
 
-    fn message(&self, robot: &RobotId, token_number: u64, topic: RobotTopic, payload: Bytes) -> RobotMessage {
+    fn message(
+        &self,
+        robot: &RobotId,
+        token_number: u64,
+        topic: RobotTopic,
+        payload: Bytes,
+    ) -> RobotMessage {
         let (peer, connection) = (Some(self.peer), self.seat.number());
-        RobotMessage { robot: robot.clone(), topic, payload, peer, connection, token_number: Some(token_number) }
+        RobotMessage {
+            robot: robot.clone(),
+            topic,
+            payload,
+            peer,
+            connection,
+            token_number: Some(token_number),
+        }
     }
 
     async fn say_will(&mut self, will: Will) {
         match (may_publish(&self.visitor, &self.context.prefix, &will.topic), &self.visitor) {
             (Some(Route::Inbox(topic)), &Visitor::Robot { ref robot, token_number }) => {
-                if store(self.context, self.message(robot, token_number, topic, will.payload.clone())).await.is_err() {
+                if store(
+                    self.context,
+                    self.message(robot, token_number, topic, will.payload.clone()),
+                )
+                .await
+                .is_err()
+                {
                     tracing::warn!(%robot, "a robot's will could not be stored");
                     return;
                 }
@@ -516,12 +543,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
 
 /// Hands a message to the inbox, within the time it has.
 async fn store(context: &Context, message: RobotMessage) -> Result<(), NotStored> {
-    timeout(context.limits.inbox_timeout, context.inbox.receive(message)).await.unwrap_or(Err(NotStored))
+    timeout(context.limits.inbox_timeout, context.inbox.receive(message))
+        .await
+        .unwrap_or(Err(NotStored))
 }
 
-/// Writes some of what is there, and waits until the stream holds none of it back. What a call that is dropped has written
-/// is gone from `output`, and `is_flushed` says whether more is to be done.
-async fn write<W: AsyncWrite + Unpin>(writer: &mut W, output: &mut Output, is_flushed: &mut bool) -> io::Result<()> {
+/// Writes some of what is there, and waits until the stream holds none of it back. What a call that
+/// is dropped has written is gone from `output`, and `is_flushed` says whether more is to be done.
+async fn write<W: AsyncWrite + Unpin>(
+    writer: &mut W,
+    output: &mut Output,
+    is_flushed: &mut bool,
+) -> io::Result<()> {
     if !output.is_empty() {
         *is_flushed = false;
         if writer.write_buf(output).await? == 0 {

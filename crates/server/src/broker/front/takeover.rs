@@ -1,5 +1,6 @@
-//! Who has which seat: one session for each robot, and for each of a person's client ids, of which one person has only so
-//! many. A newcomer takes the seat over only after the session before it has fully ended. It never touches a socket.
+//! Who has which seat: one session for each robot, and for each of a person's client ids, of which
+//! one person has only so many. A newcomer takes the seat over only after the session before it has
+//! fully ended. It never touches a socket.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -12,7 +13,8 @@ use tokio_util::sync::CancellationToken;
 use super::doorbell::Doorbell;
 use super::traffic::Meter;
 
-/// What a session is known by. Robots and operators can't take over each other, whatever client id they give.
+/// What a session is known by. Robots and operators can't take over each other, whatever client id
+/// they give.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum SeatName {
     Robot(RobotId),
@@ -69,9 +71,9 @@ impl Seats {
         Arc::new(Self { table: Mutex::default(), most_of_a_person, put_out: AtomicU64::new(0) })
     }
 
-    /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want the same seat get it
-    /// one after another in the order of their arrival; all but the last find that they should leave again. `None`: the
-    /// person has as many others as there may be.
+    /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want
+    /// the same seat get it one after another in the order of their arrival; all but the last find
+    /// that they should leave again. `None`: the person has as many others as there may be.
     pub(super) async fn take(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Option<Seat> {
         let (seat, before) = self.claim(name, meter)?;
         if let Some(before) = before {
@@ -81,7 +83,11 @@ impl Seats {
         Some(seat)
     }
 
-    fn claim(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Option<(Seat, Option<Arc<Occupant>>)> {
+    fn claim(
+        self: &Arc<Self>,
+        name: SeatName,
+        meter: Arc<Meter>,
+    ) -> Option<(Seat, Option<Arc<Occupant>>)> {
         let mut table = self.table();
         if !table.occupants.contains_key(&name) && table.of_person(&name) >= self.most_of_a_person {
             return None;
@@ -104,12 +110,18 @@ impl Seats {
 
     /// The doorbell of the robot's session.
     pub(super) fn doorbell(&self, robot: &RobotId) -> Option<Arc<Doorbell>> {
-        self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.doorbell.clone())
+        self.table()
+            .occupants
+            .get(&SeatName::Robot(robot.clone()))
+            .map(|occupant| occupant.doorbell.clone())
     }
 
     /// The figures of the robot's session.
     pub(super) fn meter(&self, robot: &RobotId) -> Option<Arc<Meter>> {
-        self.table().occupants.get(&SeatName::Robot(robot.clone())).map(|occupant| occupant.meter.clone())
+        self.table()
+            .occupants
+            .get(&SeatName::Robot(robot.clone()))
+            .map(|occupant| occupant.meter.clone())
     }
 
     /// What the robot's session listens to.
@@ -118,7 +130,8 @@ impl Seats {
         occupant.map_or_else(Vec::new, |occupant| occupant.subscriptions().clone())
     }
 
-    /// How often a robot was put out so far. Who was let in before the number changed has to be asked again.
+    /// How often a robot was put out so far. Who was let in before the number changed has to be
+    /// asked again.
     pub(super) fn put_out(&self) -> u64 {
         self.put_out.load(Ordering::SeqCst)
     }
@@ -146,7 +159,8 @@ impl Seats {
     }
 
     fn table(&self) -> MutexGuard<'_, Table> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -216,7 +230,11 @@ impl Seat {
 impl Drop for Seat {
     fn drop(&mut self) {
         let mut table = self.seats.table();
-        if table.occupants.get(&self.name).is_some_and(|occupant| occupant.number == self.occupant.number) {
+        if table
+            .occupants
+            .get(&self.name)
+            .is_some_and(|occupant| occupant.number == self.occupant.number)
+        {
             table.occupants.remove(&self.name);
             table.given_back(&self.name);
         }
@@ -232,13 +250,16 @@ mod tests {
     #[tokio::test]
     async fn a_person_has_so_many_seats_and_the_others_theirs() {
         let seats = Seats::new(2);
-        let [alice, bob]: [UserName; 2] = ["alice", "bob"].map(|name| name.parse().expect("a name"));
+        let [alice, bob]: [UserName; 2] =
+            ["alice", "bob"].map(|name| name.parse().expect("a name"));
         let take = async |name: SeatName| seats.take(name, Arc::default()).await;
         let named = SeatName::Operator(alice.clone(), "one".to_owned());
         let first = take(named.clone()).await.expect("room");
         let second = take(SeatName::Unnamed(alice.clone(), 1)).await.expect("room");
         assert!(take(SeatName::Unnamed(alice.clone(), 2)).await.is_none());
-        for other in [SeatName::Unnamed(bob, 3), SeatName::Robot(RobotId::random()), SeatName::Canary] {
+        for other in
+            [SeatName::Unnamed(bob, 3), SeatName::Robot(RobotId::random()), SeatName::Canary]
+        {
             assert!(take(other).await.is_some());
         }
         // A seat that is taken over is the same one.

@@ -1,5 +1,6 @@
-//! What goes over MQTT, counted: bytes, packets, messages, acknowledgements, of each connection and of all. It only
-//! counts, with relaxed atomics; a reader sees figures that may be some packets apart from each other.
+//! What goes over MQTT, counted: bytes, packets, messages, acknowledgements, of each connection and
+//! of all. It only counts, with relaxed atomics; a reader sees figures that may be some packets
+//! apart from each other.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -45,8 +46,8 @@ impl Counters {
     }
 }
 
-/// One connection's figures. They count towards the totals from the moment it is known whose they are: the watchdog's
-/// never do.
+/// One connection's figures. They count towards the totals from the moment it is known whose they
+/// are: the watchdog's never do.
 #[derive(Default)]
 pub(super) struct Meter {
     own: Counters,
@@ -144,7 +145,11 @@ impl<S: AsyncRead + Unpin> AsyncRead for Metered<S> {
 }
 
 impl<S: AsyncWrite + Unpin> AsyncWrite for Metered<S> {
-    fn poll_write(self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<std::io::Result<usize>> {
+    fn poll_write(
+        self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<std::io::Result<usize>> {
         let this = self.get_mut();
         let polled = Pin::new(&mut this.stream).poll_write(context, bytes);
         if let Poll::Ready(Ok(written)) = polled {

@@ -1,5 +1,6 @@
-//! The server's API as the commands see it: one call, one method. It retries what may pass (a lost connection, a 5xx),
-//! always with the same idempotency key, and turns every refusal into an error with the server's own words.
+//! The server's API as the commands see it: one call, one method. It retries what may pass (a lost
+//! connection, a 5xx), always with the same idempotency key, and turns every refusal into an error
+//! with the server's own words.
 
 use std::cell::Cell;
 use std::net::IpAddr;
@@ -110,7 +111,9 @@ pub enum ClientError {
         url: String,
     },
     /// A pin for a server that would be spoken to unencrypted.
-    #[error("--pin: {url} does not encrypt, so nothing there can be recognised by a pin; use https://")]
+    #[error(
+        "--pin: {url} does not encrypt, so nothing there can be recognised by a pin; use https://"
+    )]
     PinInPlainText {
         /// What was given.
         url: String,
@@ -121,24 +124,33 @@ impl ClientError {
     /// The exit code's meaning.
     pub fn outcome(&self) -> Outcome {
         match self {
-            Self::Refused { status: StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN, .. } => Outcome::NotAllowed,
-            Self::Refused { status: StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY, .. }
+            Self::Refused { status: StatusCode::UNAUTHORIZED | StatusCode::FORBIDDEN, .. } => {
+                Outcome::NotAllowed
+            }
+            Self::Refused {
+                status: StatusCode::BAD_REQUEST | StatusCode::UNPROCESSABLE_ENTITY,
+                ..
+            }
             | Self::NoToken { .. }
             | Self::DataDirectory { .. }
             | Self::TokenFile { .. }
             | Self::Token { .. }
             | Self::Url { .. }
             | Self::PinInPlainText { .. } => Outcome::Usage,
-            Self::Refused { code, .. } if ["no_robots_match", "unknown_robots"].contains(&code.as_str()) => {
+            Self::Refused { code, .. }
+                if ["no_robots_match", "unknown_robots"].contains(&code.as_str()) =>
+            {
                 Outcome::Usage
             }
-            Self::Refused { .. } | Self::Unreachable { .. } | Self::NotTheServer { .. } | Self::NotServing { .. } => {
-                Outcome::Failed
-            }
+            Self::Refused { .. }
+            | Self::Unreachable { .. }
+            | Self::NotTheServer { .. }
+            | Self::NotServing { .. } => Outcome::Failed,
         }
     }
 
-    /// What it means where `robot` was named: that there is no such robot is said alike by all commands.
+    /// What it means where `robot` was named: that there is no such robot is said alike by all
+    /// commands.
     pub(in crate::commands) fn about(self, robot: &RobotName) -> CommandError {
         match self {
             Self::Refused { status: StatusCode::NOT_FOUND, .. } => unknown(robot),
@@ -165,8 +177,9 @@ impl Client {
 
     /// The same server, asked with the token that is kept for it.
     pub(crate) fn with_token(self, token: &str) -> Result<Self, ClientError> {
-        let token =
-            token.parse().map_err(|source| ClientError::Token { origin: "the kept token".to_owned(), source })?;
+        let token = token
+            .parse()
+            .map_err(|source| ClientError::Token { origin: "the kept token".to_owned(), source })?;
         Ok(Self { token: Some(token), ..self })
     }
 
@@ -174,9 +187,12 @@ impl Client {
     pub(crate) fn anonymous(connection: &Connection) -> Result<Self, CommandError> {
         let (base, known_pin) = find_server(connection, data_directory(connection).as_deref())?;
         let url = reqwest::Url::parse(&base).ok();
-        let is_http =
-            |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none();
-        let Some(url) = url.filter(is_http) else { return Err(ClientError::Url { url: base }.into()) };
+        let is_http = |url: &reqwest::Url| {
+            matches!(url.scheme(), "http" | "https") && url.has_host() && url.query().is_none()
+        };
+        let Some(url) = url.filter(is_http) else {
+            return Err(ClientError::Url { url: base }.into());
+        };
         if connection.pin.is_some() && url.scheme() == "http" {
             return Err(ClientError::PinInPlainText { url: base }.into());
         }
@@ -205,7 +221,8 @@ impl Client {
 
     /// A path of the server as a request has it, where its URL has one of its own.
     pub(crate) fn path(&self, path: &str) -> String {
-        let own = reqwest::Url::parse(&self.base).map(|url| url.path().trim_end_matches('/').to_owned());
+        let own =
+            reqwest::Url::parse(&self.base).map(|url| url.path().trim_end_matches('/').to_owned());
         format!("{}{path}", own.unwrap_or_default())
     }
 
@@ -238,9 +255,14 @@ impl Client {
     }
 
     /// Opens a stream, tried once. It may go on for as long as it likes.
-    pub(crate) async fn stream<Q: Serialize>(&self, path: &str, query: &Q) -> Result<Response, ClientError> {
+    pub(crate) async fn stream<Q: Serialize>(
+        &self,
+        path: &str,
+        query: &Q,
+    ) -> Result<Response, ClientError> {
         const FOR_EVER: Duration = Duration::from_secs(10 * 365 * 24 * 60 * 60);
-        let request = self.request(Method::GET, &format!("{BASE}{path}")).query(query).timeout(FOR_EVER);
+        let request =
+            self.request(Method::GET, &format!("{BASE}{path}")).query(query).timeout(FOR_EVER);
         let response = request.send().await.map_err(|source| self.unreachable(source))?;
         match response.status().is_success() {
             true => Ok(response),
@@ -257,7 +279,9 @@ impl Client {
         };
         match self.send(request).await {
             // It was there at the first try, whose answer was lost.
-            Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) if tried.get() > 1 => Ok(()),
+            Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) if tried.get() > 1 => {
+                Ok(())
+            }
             sent => sent.map(drop),
         }
     }
@@ -284,7 +308,11 @@ impl Client {
     }
 
     /// Asks for something that would be made twice if it were tried twice.
-    pub(crate) async fn once<B: Serialize, T: DeserializeOwned>(&self, path: &str, body: &B) -> Result<T, ClientError> {
+    pub(crate) async fn once<B: Serialize, T: DeserializeOwned>(
+        &self,
+        path: &str,
+        body: &B,
+    ) -> Result<T, ClientError> {
         let request = self.request(Method::POST, &format!("{BASE}{path}")).json(body);
         let response = request.send().await.map_err(|source| self.unreachable(source))?;
         match response.status().is_success() {
@@ -293,25 +321,35 @@ impl Client {
         }
     }
 
-    /// Orders something. However often it is tried, it is done once: `key` says that it is the same order.
+    /// Orders something. However often it is tried, it is done once: `key` says that it is the same
+    /// order.
     pub(crate) async fn order<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
         body: &B,
         key: &str,
     ) -> Result<T, ClientError> {
-        self.answer(|| self.request(Method::POST, &format!("{BASE}{path}")).header(IDEMPOTENCY_KEY, key).json(body))
-            .await
+        self.answer(|| {
+            self.request(Method::POST, &format!("{BASE}{path}"))
+                .header(IDEMPOTENCY_KEY, key)
+                .json(body)
+        })
+        .await
     }
 
-    /// Asks a robot something. Tried once only: the robot may have done what was asked though no answer came.
+    /// Asks a robot something. Tried once only: the robot may have done what was asked though no
+    /// answer came.
     pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, CommandError> {
-        self.once(&format!("/robots/{robot}/ask"), ask).await.map_err(|error: ClientError| error.about(robot))
+        self.once(&format!("/robots/{robot}/ask"), ask)
+            .await
+            .map_err(|error: ClientError| error.about(robot))
     }
 
-    /// A request with the token, to a path below the server's URL or to a whole URL of the same server.
+    /// A request with the token, to a path below the server's URL or to a whole URL of the same
+    /// server.
     pub(crate) fn request(&self, method: Method, path: &str) -> RequestBuilder {
-        let url = if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
+        let url =
+            if path.starts_with('/') { format!("{}{path}", self.base) } else { path.to_owned() };
         let request = self.http.request(method, url).timeout(ANSWER_TIMEOUT);
         match &self.token {
             Some(token) => request.bearer_auth(token.reveal()),
@@ -319,7 +357,10 @@ impl Client {
         }
     }
 
-    async fn answer<T: DeserializeOwned>(&self, request: impl Fn() -> RequestBuilder) -> Result<T, ClientError> {
+    async fn answer<T: DeserializeOwned>(
+        &self,
+        request: impl Fn() -> RequestBuilder,
+    ) -> Result<T, ClientError> {
         let response = self.send(request).await?;
         self.body(response).await
     }
@@ -336,8 +377,12 @@ impl Client {
         serde_json::from_slice(&body).map_err(|_| self.not_the_server(status))
     }
 
-    /// Sends until it is answered for good: success, or a refusal that trying again does not change.
-    pub(crate) async fn send(&self, request: impl Fn() -> RequestBuilder) -> Result<Response, ClientError> {
+    /// Sends until it is answered for good: success, or a refusal that trying again does not
+    /// change.
+    pub(crate) async fn send(
+        &self,
+        request: impl Fn() -> RequestBuilder,
+    ) -> Result<Response, ClientError> {
         let mut tried = 0;
         loop {
             tried += 1;
@@ -345,8 +390,13 @@ impl Client {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) => {
                     let (status, wait) = (response.status(), retry_after(&response));
-                    // A server in trouble may be back sooner than it thinks; one that refuses knows when it does not.
-                    let wait = if status.is_server_error() { wait.map(|wait| wait.min(MAX_PAUSE)) } else { wait };
+                    // A server in trouble may be back sooner than it thinks; one that refuses knows
+                    // when it does not.
+                    let wait = if status.is_server_error() {
+                        wait.map(|wait| wait.min(MAX_PAUSE))
+                    } else {
+                        wait
+                    };
                     let error = self.refusal(response).await;
                     if !(status.is_server_error() || status == StatusCode::TOO_MANY_REQUESTS) {
                         return Err(error);
@@ -389,7 +439,10 @@ impl Client {
         if let Ok(ErrorBody { error }) = serde_json::from_slice(&body) {
             return refused(&error.code, &error.message);
         }
-        match serde_json::from_slice::<RegistryErrors>(&body).ok().and_then(|errors| errors.errors.into_iter().next()) {
+        match serde_json::from_slice::<RegistryErrors>(&body)
+            .ok()
+            .and_then(|errors| errors.errors.into_iter().next())
+        {
             Some(error) => refused(&error.code.to_lowercase(), &error.message),
             None => self.not_the_server(status),
         }
@@ -412,7 +465,9 @@ fn hint(base: &str, error: &reqwest::Error) -> &'static str {
     let said = causes.map(ToString::to_string).collect::<Vec<_>>().join(": ");
     match base.starts_with("https:") {
         false if said.contains("invalid HTTP version") => " (it seems to encrypt: try https://)",
-        true if said.contains("InvalidContentType") => " (it does not seem to encrypt: try http://)",
+        true if said.contains("InvalidContentType") => {
+            " (it does not seem to encrypt: try http://)"
+        }
         true if said.contains("UnknownIssuer") => {
             " (nobody known here vouches for its certificate: give the pin that taskd serve printed, as --pin)"
         }
@@ -444,16 +499,19 @@ fn retry_after(response: &Response) -> Option<Duration> {
     Some(Duration::from_secs(seconds))
 }
 
-/// URL and pin of the server that serves from the directory, as it wrote them into there. What one wrote that was killed
-/// since does not count: by now anybody may listen there.
+/// URL and pin of the server that serves from the directory, as it wrote them into there. What one
+/// wrote that was killed since does not count: by now anybody may listen there.
 fn local_server(data: &Path) -> std::io::Result<Option<(String, Option<CaPin>)>> {
     let addresses = if is_locked(data)? { Addresses::published(data) } else { None };
     Ok(addresses.map(|addresses| (addresses.url(), addresses.ca_pin)))
 }
 
-/// What was said wins, then what runs on this machine, then what was signed in to. Who names a directory means the server
-/// that serves from it and no other.
-fn find_server(connection: &Connection, data: Option<&Path>) -> Result<(String, Option<CaPin>), ClientError> {
+/// What was said wins, then what runs on this machine, then what was signed in to. Who names a
+/// directory means the server that serves from it and no other.
+fn find_server(
+    connection: &Connection,
+    data: Option<&Path>,
+) -> Result<(String, Option<CaPin>), ClientError> {
     if let Some(url) = &connection.server {
         return Ok((url.trim_end_matches('/').to_owned(), None));
     }
@@ -465,7 +523,9 @@ fn find_server(connection: &Connection, data: Option<&Path>) -> Result<(String, 
         Some((_, local)) => local.ok().flatten(),
         None => None,
     };
-    if let Some(server) = local.or_else(|| if is_named { None } else { Some((last_server()?, None)) }) {
+    if let Some(server) =
+        local.or_else(|| if is_named { None } else { Some((last_server()?, None)) })
+    {
         return Ok(server);
     }
     match data.filter(|data| is_named || data.join(OPERATOR_TOKEN).exists()) {
@@ -479,8 +539,13 @@ pub(in crate::commands) fn data_directory(connection: &Connection) -> Option<Pat
     named.or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)))
 }
 
-/// What was said wins, then what was signed in to, then what lies where a server on this machine would put it.
-fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Result<Token, ClientError> {
+/// What was said wins, then what was signed in to, then what lies where a server on this machine
+/// would put it.
+fn find_token(
+    connection: &Connection,
+    data: Option<&Path>,
+    base: &str,
+) -> Result<Token, ClientError> {
     // Of a directory only the server that serves from it is shown the token.
     let data = data.filter(|data| serves_from(data, base));
     let is_said = connection.token.is_some() || connection.token_file.is_some();
@@ -509,7 +574,8 @@ fn find_token(connection: &Connection, data: Option<&Path>, base: &str) -> Resul
 /// Whether what is reached at `base` is the server that serves from `data`.
 fn serves_from(data: &Path, base: &str) -> bool {
     let Ok(Some((local, _))) = local_server(data) else { return false };
-    let port = |url: &str| reqwest::Url::parse(url).ok().and_then(|url| url.port_or_known_default());
+    let port =
+        |url: &str| reqwest::Url::parse(url).ok().and_then(|url| url.port_or_known_default());
     let is_here = reqwest::Url::parse(base).is_ok_and(|url| {
         let host = url.host_str().unwrap_or_default().trim_matches(['[', ']']);
         host == "localhost" || host.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
@@ -518,7 +584,8 @@ fn serves_from(data: &Path, base: &str) -> bool {
 }
 
 fn read_token(path: &Path) -> Result<String, ClientError> {
-    std::fs::read_to_string(path).map_err(|source| ClientError::TokenFile { path: path.to_owned(), source })
+    std::fs::read_to_string(path)
+        .map_err(|source| ClientError::TokenFile { path: path.to_owned(), source })
 }
 
 /// A key for an order that the operator gave none.
@@ -578,27 +645,34 @@ mod tests {
             keys.push(headers[IDEMPOTENCY_KEY].to_str().unwrap().to_owned());
             match keys.len() {
                 3 => axum::Json(keys.clone()).into_response(),
-                _ => (StatusCode::SERVICE_UNAVAILABLE, [(RETRY_AFTER, "0")], "busy").into_response(),
+                _ => {
+                    (StatusCode::SERVICE_UNAVAILABLE, [(RETRY_AFTER, "0")], "busy").into_response()
+                }
             }
         };
         let router = axum::Router::new()
             .route("/api/v1/orders", axum::routing::post(order))
             .route("/api/v1/there", axum::routing::delete(gone_with_the_answer))
             .route("/api/v1/refused", axum::routing::get(hostile_refusal))
-            .route("/api/v1/page", axum::routing::get(|| async { "<html>sign in to the hotel's network</html>" }));
+            .route(
+                "/api/v1/page",
+                axum::routing::get(|| async { "<html>sign in to the hotel's network</html>" }),
+            );
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         tokio::spawn(async move { axum::serve(listener, router).await });
         address
     }
 
-    /// Deletes and answers as a proxy does that lost its server; what is deleted is not there any more.
+    /// Deletes and answers as a proxy does that lost its server; what is deleted is not there any
+    /// more.
     async fn gone_with_the_answer() -> axum::response::Response {
         use std::sync::atomic::{AtomicBool, Ordering};
 
         use axum::response::IntoResponse as _;
         static WAS_ASKED: AtomicBool = AtomicBool::new(false);
-        let error = serde_json::json!({ "error": { "code": "not_found", "message": "there is none" } });
+        let error =
+            serde_json::json!({ "error": { "code": "not_found", "message": "there is none" } });
         match WAS_ASKED.swap(true, Ordering::SeqCst) {
             false => (StatusCode::BAD_GATEWAY, [(RETRY_AFTER, "0")], "").into_response(),
             true => (StatusCode::NOT_FOUND, axum::Json(error)).into_response(),
@@ -619,7 +693,8 @@ mod tests {
     #[tokio::test]
     async fn an_order_is_retried_with_the_same_key() {
         let client = client(busy_server().await);
-        let keys: Vec<String> = client.order("/orders", &serde_json::json!({}), "k1").await.unwrap();
+        let keys: Vec<String> =
+            client.order("/orders", &serde_json::json!({}), "k1").await.unwrap();
         assert_eq!(keys, ["k1", "k1", "k1"]);
     }
 
@@ -653,24 +728,39 @@ mod tests {
         let server = DataDirectory::open(dir.path()).unwrap();
         let (http, mqtt) = ("10.0.0.7:8081".to_owned(), "10.0.0.7:1884".to_owned());
         server.publish(&Addresses { http, mqtt, ca_pin: None }).unwrap();
-        let mut connection = Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
+        let mut connection =
+            Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
         let mut finds = |server: Option<&str>| {
             connection.server = server.map(str::to_owned);
             match Client::connect(&connection) {
                 Ok(client) => client.token.is_some(),
-                Err(CommandError::Client(ClientError::NoToken { .. } | ClientError::NotServing { .. })) => false,
+                Err(CommandError::Client(
+                    ClientError::NoToken { .. } | ClientError::NotServing { .. },
+                )) => false,
                 Err(other) => panic!("{other}"),
             }
         };
-        for own in [None, Some("http://10.0.0.7:8081"), Some("http://localhost:8081"), Some("http://[::1]:8081/")] {
+        for own in [
+            None,
+            Some("http://10.0.0.7:8081"),
+            Some("http://localhost:8081"),
+            Some("http://[::1]:8081/"),
+        ] {
             assert!(finds(own), "{own:?}");
         }
-        for other in ["https://10.0.0.8:8081", "http://localhost.example:8081", "http://127.0.0.1:9"] {
+        for other in
+            ["https://10.0.0.8:8081", "http://localhost.example:8081", "http://127.0.0.1:9"]
+        {
             assert!(!finds(Some(other)), "{other}");
         }
         // Killed, so that its addresses are still there: who listens there now is another.
         drop(server);
-        for anyone in [None, Some("http://10.0.0.7:8081"), Some("http://localhost:8081"), Some("http://127.0.0.1:9")] {
+        for anyone in [
+            None,
+            Some("http://10.0.0.7:8081"),
+            Some("http://localhost:8081"),
+            Some("http://127.0.0.1:9"),
+        ] {
             assert!(!finds(anyone), "{anyone:?}");
         }
     }
@@ -682,9 +772,15 @@ mod tests {
             let token = Some(Token::random(task_proto::token::TokenKind::Operator).reveal());
             Client::connect(&Connection { server: Some(url), token, pin, ..nothing_said() })
         };
-        let error = client(format!("https://{plain}"), None).unwrap().delete("/refused").await.unwrap_err();
-        assert!(error.to_string().ends_with("(it does not seem to encrypt: try http://)"), "{error}");
-        let refused = client(format!("http://{plain}"), Some(CaPin::of(b"an authority's key"))).err().unwrap();
+        let error =
+            client(format!("https://{plain}"), None).unwrap().delete("/refused").await.unwrap_err();
+        assert!(
+            error.to_string().ends_with("(it does not seem to encrypt: try http://)"),
+            "{error}"
+        );
+        let refused = client(format!("http://{plain}"), Some(CaPin::of(b"an authority's key")))
+            .err()
+            .unwrap();
         assert!(refused.to_string().starts_with("--pin: http://127.0.0.1:"), "{refused}");
         assert_eq!(refused.outcome(), Outcome::Usage);
     }
@@ -692,13 +788,18 @@ mod tests {
     #[test]
     fn the_server_on_this_machine_is_found_by_its_data_directory() {
         let dir = tempfile::tempdir().unwrap();
-        let connection = Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
+        let connection =
+            Connection { data: Some(dir.path().display().to_string()), ..nothing_said() };
         let found = || find_server(&connection, Some(dir.path()));
         let down = found().unwrap_err();
-        assert!(down.to_string().starts_with(&format!("no server is up that serves from {}", dir.path().display())));
+        assert!(
+            down.to_string()
+                .starts_with(&format!("no server is up that serves from {}", dir.path().display()))
+        );
         assert_eq!(down.outcome(), Outcome::Failed);
         let server = DataDirectory::open(dir.path()).unwrap();
-        let mut addresses = Addresses { http: "127.0.0.1:8081".to_owned(), mqtt: String::new(), ca_pin: None };
+        let mut addresses =
+            Addresses { http: "127.0.0.1:8081".to_owned(), mqtt: String::new(), ca_pin: None };
         server.publish(&addresses).unwrap();
         assert_eq!(found().unwrap(), ("http://127.0.0.1:8081".to_owned(), None));
         addresses.ca_pin = Some(CaPin::of(b"an authority's key"));

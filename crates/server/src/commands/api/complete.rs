@@ -1,5 +1,5 @@
-//! What shells complete live: names that the server knows now. The shell asks the program itself, so a server that is away
-//! or slow must cost little and never a word on the terminal.
+//! What shells complete live: names that the server knows now. The shell asks the program itself,
+//! so a server that is away or slow must cost little and never a word on the terminal.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -9,7 +9,9 @@ use std::time::Duration;
 use clap_complete::engine::{ArgValueCompleter, CompletionCandidate};
 use clap_complete::env::CompleteEnv;
 use serde::de::DeserializeOwned;
-use task_proto::api::{DeploymentList, EnrollmentTokenList, PackageList, RobotList, TokenList, UserList};
+use task_proto::api::{
+    DeploymentList, EnrollmentTokenList, PackageList, RobotList, TokenList, UserList,
+};
 use task_proto::request::{Answer, Ask};
 
 use super::client::Client;
@@ -80,7 +82,12 @@ pub(in crate::commands) fn deployments() -> ArgValueCompleter {
             let list: DeploymentList = get("/deployments")?;
             let named = list.deployments.iter().map(|deployment| {
                 let package = &deployment.package;
-                let what = format!("{} {}, {}", package.name, package.version, view::state(deployment.state));
+                let what = format!(
+                    "{} {}, {}",
+                    package.name,
+                    package.version,
+                    view::state(deployment.state)
+                );
                 (deployment.id.to_string(), what)
             });
             Some(named.collect())
@@ -93,7 +100,12 @@ pub(in crate::commands) fn users() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {
             let list: UserList = get("/users")?;
-            Some(list.users.iter().map(|user| (user.name.to_string(), user.roles.to_string())).collect())
+            Some(
+                list.users
+                    .iter()
+                    .map(|user| (user.name.to_string(), user.roles.to_string()))
+                    .collect(),
+            )
         })
     })
 }
@@ -103,7 +115,12 @@ pub(in crate::commands) fn tokens() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {
             let list: TokenList = get("/tokens")?;
-            Some(list.tokens.iter().map(|token| (token.id.to_string(), token.title.clone())).collect())
+            Some(
+                list.tokens
+                    .iter()
+                    .map(|token| (token.id.to_string(), token.title.clone()))
+                    .collect(),
+            )
         })
     })
 }
@@ -125,8 +142,11 @@ pub(in crate::commands) fn nodes() -> ArgValueCompleter {
             let words: Vec<String> = std::env::args().collect();
             let answer = ask(async move |client| {
                 let list: RobotList = client.get("/robots", &[]).await.ok()?;
-                let robot =
-                    list.robots.into_iter().map(|robot| robot.name).find(|name| words.contains(&name.to_string()))?;
+                let robot = list
+                    .robots
+                    .into_iter()
+                    .map(|robot| robot.name)
+                    .find(|name| words.contains(&name.to_string()))?;
                 client.ask(&robot, &Ask::Nodes).await.ok()
             })?;
             let Answer::Nodes { nodes, .. } = answer else { return None };
@@ -149,15 +169,24 @@ fn terms() -> Option<Candidates> {
     let mut terms = Candidates::from([("*".to_owned(), "all robots".to_owned())]);
     for robot in &list.robots {
         terms.insert(robot.name.to_string(), "a robot".to_owned());
-        terms.extend(robot.labels.iter().map(|(key, value)| (format!("{key}={value}"), "by a label".to_owned())));
+        terms.extend(
+            robot
+                .labels
+                .iter()
+                .map(|(key, value)| (format!("{key}={value}"), "by a label".to_owned())),
+        );
     }
     Some(terms)
 }
 
 /// Those of `find`'s names that begin as `current` does; none when they can't be had.
-fn candidates(current: &OsStr, find: impl FnOnce(&str) -> Option<Candidates>) -> Vec<CompletionCandidate> {
+fn candidates(
+    current: &OsStr,
+    find: impl FnOnce(&str) -> Option<Candidates>,
+) -> Vec<CompletionCandidate> {
     let Some(text) = current.to_str() else { return Vec::new() };
-    let found = find(text).unwrap_or_default().into_iter().filter(|(name, _)| name.starts_with(text));
+    let found =
+        find(text).unwrap_or_default().into_iter().filter(|(name, _)| name.starts_with(text));
     // A robot or a package may have chosen the words.
     let candidate = |(name, help): (String, String)| {
         let help = (!help.is_empty()).then(|| printable(&help).into());
@@ -187,10 +216,11 @@ where
 fn connection(words: impl Iterator<Item = String>) -> Connection {
     let words: Vec<String> = words.collect();
     let option = |name: &str| {
-        let mut found = words.iter().enumerate().filter_map(|(at, word)| match word.strip_prefix(name)? {
-            "" => words.get(at + 1).cloned(),
-            rest => rest.strip_prefix('=').map(str::to_owned),
-        });
+        let mut found =
+            words.iter().enumerate().filter_map(|(at, word)| match word.strip_prefix(name)? {
+                "" => words.get(at + 1).cloned(),
+                rest => rest.strip_prefix('=').map(str::to_owned),
+            });
         found.next_back()
     };
     let or_variable = |name: &str, variable: &str| {
@@ -214,8 +244,18 @@ mod tests {
 
     #[test]
     fn an_unfinished_line_says_which_server_is_meant() {
-        let words =
-            ["taskd", "--", "taskd", "--server", "http://a", "robot", "info", "--token-file=/t", "--token=x", "--data"];
+        let words = [
+            "taskd",
+            "--",
+            "taskd",
+            "--server",
+            "http://a",
+            "robot",
+            "info",
+            "--token-file=/t",
+            "--token=x",
+            "--data",
+        ];
         let connection = connection(words.map(str::to_owned).into_iter());
         assert_eq!(connection.server.as_deref(), Some("http://a"));
         assert_eq!(connection.token.as_deref(), Some("x"));
@@ -225,10 +265,15 @@ mod tests {
     #[test]
     fn names_are_taken_by_their_beginning_and_without_control_characters() {
         let found = || {
-            Some(Candidates::from([("atlas-1\u{1b}".to_owned(), String::new()), ("bolt".to_owned(), String::new())]))
+            Some(Candidates::from([
+                ("atlas-1\u{1b}".to_owned(), String::new()),
+                ("bolt".to_owned(), String::new()),
+            ]))
         };
-        let names: Vec<_> =
-            candidates(OsStr::new("at"), |_| found()).iter().map(|c| c.get_value().to_owned()).collect();
+        let names: Vec<_> = candidates(OsStr::new("at"), |_| found())
+            .iter()
+            .map(|c| c.get_value().to_owned())
+            .collect();
         assert_eq!(names, ["atlas-1 "]);
         assert!(candidates(OsStr::new(""), |_| None).is_empty());
     }

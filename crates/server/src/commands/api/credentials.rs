@@ -1,4 +1,5 @@
-//! Credentials of `taskd login`, in a file that only its owner may read, by server. They are made and ended elsewhere.
+//! Credentials of `taskd login`, in a file that only its owner may read, by server. They are made
+//! and ended elsewhere.
 
 use std::collections::BTreeMap;
 use std::fs::{DirBuilder, OpenOptions};
@@ -49,7 +50,8 @@ pub(in crate::commands) fn path() -> Option<PathBuf> {
 impl Kept {
     /// What is kept; nothing where there is no file yet.
     pub(in crate::commands) fn read(path: &Path) -> Result<Self, CommandError> {
-        let failed = |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
+        let failed =
+            |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
         match std::fs::read(path) {
             Ok(bytes) => serde_json::from_slice(&bytes).map_err(|error| failed(error.into())),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Self::default()),
@@ -63,11 +65,15 @@ impl Kept {
             let directory = path.parent().unwrap_or(Path::new("."));
             DirBuilder::new().recursive(true).mode(0o700).create(directory)?;
             let partial = path.with_extension(format!("{:08x}", rand::random::<u32>()));
-            let mut file = OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
+            let mut file =
+                OpenOptions::new().create_new(true).write(true).mode(0o600).open(&partial)?;
             file.write_all(&serde_json::to_vec_pretty(self)?)?;
             file.sync_all()?;
             std::fs::rename(&partial, path)
         };
-        written().map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })
+        written().map_err(|source| CommandError::Io {
+            what: format!("can't write {}", path.display()),
+            source,
+        })
     }
 }

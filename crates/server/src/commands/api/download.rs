@@ -18,38 +18,50 @@ const SILENCE: Duration = Duration::from_secs(60);
 /// The longest one file may take.
 const LONGEST: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// The bytes at `url` in a new file in `directory`, which is gone with its handle unless it is put somewhere.
+/// The bytes at `url` in a new file in `directory`, which is gone with its handle unless it is put
+/// somewhere.
 pub(in crate::commands) async fn download(
     session: &Session,
     url: &str,
     digest: Digest,
     directory: &Path,
 ) -> Result<NamedTempFile, CommandError> {
-    let failed = |source| CommandError::Io { what: format!("can't write to {}", directory.display()), source };
+    let failed = |source| CommandError::Io {
+        what: format!("can't write to {}", directory.display()),
+        source,
+    };
     // As any new file of this person, once it is whole.
     let readable = std::fs::Permissions::from_mode(0o666);
-    let file = tempfile::Builder::new().permissions(readable).tempfile_in(directory).map_err(failed)?;
+    let file =
+        tempfile::Builder::new().permissions(readable).tempfile_in(directory).map_err(failed)?;
     let mut writer = tokio::fs::File::from_std(file.reopen().map_err(failed)?);
     // A large file may take long, as long as it goes on.
-    let mut response = session.client.send(|| session.client.request(Method::GET, url).timeout(LONGEST)).await?;
+    let mut response =
+        session.client.send(|| session.client.request(Method::GET, url).timeout(LONGEST)).await?;
     let mut hash = Sha256::new();
     loop {
         let chunk = timeout(SILENCE, response.chunk()).await;
-        let chunk = chunk.map_err(|_| failed(std::io::Error::other("the server has stopped sending")))?;
-        let Some(chunk) = chunk.map_err(|source| session.client.unreachable(source))? else { break };
+        let chunk =
+            chunk.map_err(|_| failed(std::io::Error::other("the server has stopped sending")))?;
+        let Some(chunk) = chunk.map_err(|source| session.client.unreachable(source))? else {
+            break;
+        };
         hash.update(&chunk);
         writer.write_all(&chunk).await.map_err(failed)?;
     }
     writer.flush().await.map_err(failed)?;
     let got = Digest::from_sha256(hash.finalize().into());
     if got != digest {
-        return Err(failed(std::io::Error::other(format!("the bytes hash to {got}, not to {digest}"))));
+        return Err(failed(std::io::Error::other(format!(
+            "the bytes hash to {got}, not to {digest}"
+        ))));
     }
     Ok(file)
 }
 
 /// Puts what was fetched in its place, where it replaces what is there.
 pub(in crate::commands) fn put(file: NamedTempFile, path: &Path) -> Result<(), CommandError> {
-    let failed = |source| CommandError::Io { what: format!("can't write {}", path.display()), source };
+    let failed =
+        |source| CommandError::Io { what: format!("can't write {}", path.display()), source };
     file.persist(path).map(drop).map_err(|error| failed(error.error))
 }

@@ -17,9 +17,11 @@ impl Events {
         Self { response, buffer: Vec::new() }
     }
 
-    /// The next event of this type; others are passed over. `None` at the end, or when an event is too large.
-    /// Cancel-safe: what was read stays in the buffer.
-    pub(in crate::commands) async fn next<T: DeserializeOwned>(&mut self) -> Result<Option<T>, reqwest::Error> {
+    /// The next event of this type; others are passed over. `None` at the end, or when an event is
+    /// too large. Cancel-safe: what was read stays in the buffer.
+    pub(in crate::commands) async fn next<T: DeserializeOwned>(
+        &mut self,
+    ) -> Result<Option<T>, reqwest::Error> {
         loop {
             while let Some(event) = take_event(&mut self.buffer) {
                 if let Ok(event) = serde_json::from_slice(&event) {
@@ -41,7 +43,10 @@ fn take_event(buffer: &mut Vec<u8>) -> Option<Vec<u8>> {
     let end = buffer.windows(2).position(|pair| pair == b"\n\n")?;
     let event: Vec<u8> = buffer.drain(..end + 2).collect();
     let lines = event.split(|byte| *byte == b'\n');
-    let data: Vec<&[u8]> = lines.filter_map(|line| line.strip_prefix(b"data:")).map(<[u8]>::trim_ascii_start).collect();
+    let data: Vec<&[u8]> = lines
+        .filter_map(|line| line.strip_prefix(b"data:"))
+        .map(<[u8]>::trim_ascii_start)
+        .collect();
     Some(data.join(&b'\n'))
 }
 
@@ -51,7 +56,9 @@ mod tests {
 
     #[test]
     fn events_are_taken_whole_and_in_order() {
-        let mut buffer = b": hello\nretry: 2000\n\nevent: lines\ndata: {\"a\":\ndata:1}\n\nevent: x\nda".to_vec();
+        let mut buffer =
+            b": hello\nretry: 2000\n\nevent: lines\ndata: {\"a\":\ndata:1}\n\nevent: x\nda"
+                .to_vec();
         assert_eq!(take_event(&mut buffer), Some(Vec::new()));
         assert_eq!(take_event(&mut buffer), Some(b"{\"a\":\n1}".to_vec()));
         assert_eq!(take_event(&mut buffer), None);

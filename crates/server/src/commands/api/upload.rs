@@ -1,5 +1,5 @@
-//! Brings a package's blobs and manifest to the server's OCI store. What is there already is not sent again, and a blob
-//! streams from its file.
+//! Brings a package's blobs and manifest to the server's OCI store. What is there already is not
+//! sent again, and a blob streams from its file.
 
 use std::path::Path;
 
@@ -50,18 +50,30 @@ impl<'a> Upload<'a> {
     /// A directory's package, under its version or by its digest alone.
     pub(in crate::commands) fn of(packed: &'a Packed, tagged: bool) -> Self {
         let (config, manifest) = (&packed.config_bytes, &packed.manifest_bytes);
-        Self { package: &packed.package, config, manifest, content: Some(packed.content.path()), tagged, force: false }
+        Self {
+            package: &packed.package,
+            config,
+            manifest,
+            content: Some(packed.content.path()),
+            tagged,
+            force: false,
+        }
     }
 }
 
 /// Uploads what the server lacks, and says how much that was.
-pub(in crate::commands) async fn upload(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
+pub(in crate::commands) async fn upload(
+    client: &Client,
+    upload: &Upload<'_>,
+) -> Result<(), CommandError> {
     let package = upload.package;
     let name = package.name.as_str();
     check_version(client, upload).await?;
     let mut sent = 0;
     let content = upload.content.map(|path| (package.content, Source::File(path)));
-    for (blob, source) in [Some((package.config, Source::Bytes(upload.config))), content].into_iter().flatten() {
+    for (blob, source) in
+        [Some((package.config, Source::Bytes(upload.config))), content].into_iter().flatten()
+    {
         if !exists(client, &format!("/v2/{name}/blobs/{}", blob.digest)).await? {
             upload_blob(client, name, blob, &source).await?;
             sent += 1;
@@ -69,7 +81,10 @@ pub(in crate::commands) async fn upload(client: &Client, upload: &Upload<'_>) ->
     }
     put_manifest(client, upload).await?;
     match sent {
-        0 => say(&format!("{} {}: nothing to upload, the server has it already", package.name, package.version)),
+        0 => say(&format!(
+            "{} {}: nothing to upload, the server has it already",
+            package.name, package.version
+        )),
         _ => say(&format!(
             "{} {}: {sent} blobs transferred ({})",
             package.name,
@@ -119,17 +134,27 @@ async fn exists(client: &Client, path: &str) -> Result<bool, ClientError> {
 /// The status of an answer without a readable body, as a HEAD has.
 fn status_of(error: &ClientError) -> Option<StatusCode> {
     match error {
-        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => Some(*status),
+        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => {
+            Some(*status)
+        }
         _ => None,
     }
 }
 
-async fn upload_blob(client: &Client, name: &str, blob: BlobRef, source: &Source<'_>) -> Result<(), CommandError> {
+async fn upload_blob(
+    client: &Client,
+    name: &str,
+    blob: BlobRef,
+    source: &Source<'_>,
+) -> Result<(), CommandError> {
     let mut tried = 0;
     loop {
         tried += 1;
-        // Each try is an upload of its own: the server collects what a broken one left, and forgets all when it restarts.
-        let session = client.send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/"))).await?;
+        // Each try is an upload of its own: the server collects what a broken one left, and forgets
+        // all when it restarts.
+        let session = client
+            .send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/")))
+            .await?;
         let target = target(client, &session, blob)?;
         let request = client
             .request(Method::PUT, &target)
@@ -186,9 +211,10 @@ async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
     match source {
         Source::Bytes(bytes) => Ok(Body::from(bytes.to_vec())),
         Source::File(path) => {
-            let file = tokio::fs::File::open(path)
-                .await
-                .map_err(|source| CommandError::Io { what: "can't read the packed content".to_owned(), source })?;
+            let file = tokio::fs::File::open(path).await.map_err(|source| CommandError::Io {
+                what: "can't read the packed content".to_owned(),
+                source,
+            })?;
             let bar = progress::upload_bar(size);
             let chunks = ReaderStream::with_capacity(file, CHUNK_BYTES);
             Ok(Body::wrap_stream(chunks.inspect_ok(move |chunk| bar.inc(chunk.len() as u64))))
@@ -196,7 +222,8 @@ async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
     }
 }
 
-/// A version that is there with other content is refused before anything travels; the server has the last word.
+/// A version that is there with other content is refused before anything travels; the server has
+/// the last word.
 async fn check_version(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
     let package = upload.package;
     if !upload.tagged {
@@ -225,22 +252,35 @@ async fn check_version(client: &Client, upload: &Upload<'_>) -> Result<(), Comma
 }
 
 fn digest_of(response: &Response) -> Option<String> {
-    response.headers().get("docker-content-digest").and_then(|value| value.to_str().ok()).map(ToOwned::to_owned)
+    response
+        .headers()
+        .get("docker-content-digest")
+        .and_then(|value| value.to_str().ok())
+        .map(ToOwned::to_owned)
 }
 
-/// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not there already.
+/// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not
+/// there already.
 async fn put_manifest(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
     let Upload { package, manifest, tagged, force, .. } = upload;
-    let reference = if *tagged { package.version.to_string() } else { package.manifest.digest.to_string() };
+    let reference =
+        if *tagged { package.version.to_string() } else { package.manifest.digest.to_string() };
     let path = format!("/v2/{}/manifests/{reference}", package.name);
     match client.send(|| client.request(Method::HEAD, &path)).await {
-        Ok(response) if digest_of(&response) == Some(package.manifest.digest.to_string()) => return Ok(()),
+        Ok(response) if digest_of(&response) == Some(package.manifest.digest.to_string()) => {
+            return Ok(());
+        }
         Ok(_) => {}
         Err(error) if status_of(&error) == Some(StatusCode::NOT_FOUND) => {}
         Err(error) => return Err(error.into()),
     }
     let path = if *force { format!("{path}?force=true") } else { path };
-    let put = || client.request(Method::PUT, &path).header(CONTENT_TYPE, MANIFEST_TYPE).body(manifest.to_vec());
+    let put = || {
+        client
+            .request(Method::PUT, &path)
+            .header(CONTENT_TYPE, MANIFEST_TYPE)
+            .body(manifest.to_vec())
+    };
     client.send(put).await?;
     Ok(())
 }
@@ -258,7 +298,8 @@ mod tests {
     use crate::commands::Connection;
     use crate::commands::display::output::Format;
 
-    /// A server that forgets the first upload, as one that restarts does, and refuses all of the package `refused`.
+    /// A server that forgets the first upload, as one that restarts does, and refuses all of the
+    /// package `refused`.
     async fn forgetful_server(puts: Arc<AtomicU32>) -> std::net::SocketAddr {
         let begin = |axum::extract::Path(name): axum::extract::Path<String>| async move {
             (StatusCode::ACCEPTED, [(LOCATION, format!("/upload/{name}"))])

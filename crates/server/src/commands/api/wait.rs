@@ -1,5 +1,6 @@
-//! `--wait`: follows a deployment until every robot has settled or the time is over, and judges how it went. It asks the
-//! server again and again, so a server that restarts meanwhile costs time and nothing else.
+//! `--wait`: follows a deployment until every robot has settled or the time is over, and judges how
+//! it went. It asks the server again and again, so a server that restarts meanwhile costs time and
+//! nothing else.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -48,7 +49,8 @@ pub(in crate::commands) async fn until_settled(
     Ok(verdict.outcome)
 }
 
-/// Looks at the deployment until it is over or the time is; how it stood last, if the server has said it.
+/// Looks at the deployment until it is over or the time is; how it stood last, if the server has
+/// said it.
 async fn follow(
     session: &Session,
     id: &DeploymentId,
@@ -65,7 +67,11 @@ async fn follow(
             Ok(Err(_)) => pause = MAX_PAUSE,
             Ok(Ok(view)) => {
                 progress.show(&view);
-                pause = if latest.as_ref() == Some(&view) { (pause * 2).min(MAX_PAUSE) } else { MIN_PAUSE };
+                pause = if latest.as_ref() == Some(&view) {
+                    (pause * 2).min(MAX_PAUSE)
+                } else {
+                    MIN_PAUSE
+                };
                 let over = is_over(&view);
                 latest = Some(view);
                 if over {
@@ -82,10 +88,13 @@ async fn look(session: &Session, id: &DeploymentId) -> Result<DeploymentView, Cl
     session.client.get(&format!("/deployments/{id}"), &[]).await
 }
 
-/// Whether the server may answer if it is asked again: it is restarting, or something stands before it that is not it.
+/// Whether the server may answer if it is asked again: it is restarting, or something stands before
+/// it that is not it.
 pub(in crate::commands) fn may_pass(error: &ClientError) -> bool {
     match error {
-        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => status.is_server_error(),
+        ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => {
+            status.is_server_error()
+        }
         ClientError::Unreachable { .. } => true,
         _ => false,
     }
@@ -97,8 +106,12 @@ fn is_over(view: &DeploymentView) -> bool {
     match view.state {
         DeploymentState::Cancelled => true,
         // What is not released stays so until somebody resumes it.
-        DeploymentState::Paused => assignments.all(|a| !a.released || a.phase.is_settled(view.kind)),
-        DeploymentState::Active | DeploymentState::Settled => assignments.all(|a| a.phase.is_settled(view.kind)),
+        DeploymentState::Paused => {
+            assignments.all(|a| !a.released || a.phase.is_settled(view.kind))
+        }
+        DeploymentState::Active | DeploymentState::Settled => {
+            assignments.all(|a| a.phase.is_settled(view.kind))
+        }
     }
 }
 
@@ -110,8 +123,10 @@ struct Verdict {
 /// How it went: counts, and a line for each robot that did not make it.
 fn judge(view: &DeploymentView) -> Verdict {
     let assignments = view.assignments.as_deref().unwrap_or_default();
-    let (settled, open): (Vec<_>, Vec<_>) = assignments.iter().partition(|a| a.phase.is_settled(view.kind));
-    let (succeeded, failed): (Vec<_>, Vec<_>) = settled.into_iter().partition(|a| a.phase.is_success(view.kind));
+    let (settled, open): (Vec<_>, Vec<_>) =
+        assignments.iter().partition(|a| a.phase.is_settled(view.kind));
+    let (succeeded, failed): (Vec<_>, Vec<_>) =
+        settled.into_iter().partition(|a| a.phase.is_success(view.kind));
     let (waiting, open): (Vec<_>, Vec<_>) =
         open.into_iter().partition(|a| view.state == DeploymentState::Paused && !a.released);
     let (open, offline): (Vec<_>, Vec<_>) = open.into_iter().partition(|a| a.online);
@@ -132,7 +147,8 @@ fn judge(view: &DeploymentView) -> Verdict {
     if !failed.is_empty() && view.state != DeploymentState::Paused {
         lines.push(format!("once more where it failed: taskd deploy retry {}", view.id));
     }
-    let outcome = match (succeeded.len(), failed.len() + waiting.len(), open.len() + offline.len()) {
+    let outcome = match (succeeded.len(), failed.len() + waiting.len(), open.len() + offline.len())
+    {
         (_, _, 1..) if view.state != DeploymentState::Cancelled => Outcome::TimedOut,
         (1.., 0, 0) => Outcome::Succeeded,
         (1.., _, _) => Outcome::SomeFailed,
@@ -150,7 +166,10 @@ fn by_reason(assignments: &[&AssignmentView]) -> Vec<String> {
     }
     let mut reasons: Vec<_> = reasons.into_iter().collect();
     reasons.sort_by_key(|(_, robots)| std::cmp::Reverse(robots.len()));
-    reasons.into_iter().map(|(reason, robots)| format!("{}: {reason}", names(&robots, MAX_NAMES))).collect()
+    reasons
+        .into_iter()
+        .map(|(reason, robots)| format!("{}: {reason}", names(&robots, MAX_NAMES)))
+        .collect()
 }
 
 fn reason(assignment: &AssignmentView) -> String {
@@ -169,7 +188,11 @@ mod tests {
     use crate::commands::display::course::tests::{assignment, deployment};
 
     fn outcome(state: DeploymentState, phases: &[Phase]) -> Outcome {
-        judge(&deployment(state, phases.iter().map(|phase| assignment("a", *phase, true)).collect())).outcome
+        judge(&deployment(
+            state,
+            phases.iter().map(|phase| assignment("a", *phase, true)).collect(),
+        ))
+        .outcome
     }
 
     #[test]
@@ -217,10 +240,17 @@ mod tests {
     fn a_paused_deployment_is_over_when_what_began_has_settled() {
         let mut waiting = assignment("later", Phase::Assigned, true);
         waiting.released = false;
-        let view = deployment(DeploymentState::Paused, vec![assignment("bad", Phase::Failed, true), waiting]);
+        let view = deployment(
+            DeploymentState::Paused,
+            vec![assignment("bad", Phase::Failed, true), waiting],
+        );
         assert!(is_over(&view));
         let verdict = judge(&view);
         assert_eq!(verdict.outcome, Outcome::Failed);
-        assert!(verdict.text.contains("not begun: later; go on with `taskd deploy resume"), "{}", verdict.text);
+        assert!(
+            verdict.text.contains("not begun: later; go on with `taskd deploy resume"),
+            "{}",
+            verdict.text
+        );
     }
 }

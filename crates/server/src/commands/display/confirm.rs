@@ -8,13 +8,20 @@ use crate::commands::CommandError;
 /// Up to this many robots an order is carried out without asking.
 const ASK_ABOVE: usize = 10;
 
-/// Whether the order may go on: it means few robots, `--yes` was given, or the person at the terminal agrees.
-pub(in crate::commands) fn confirm(what: &str, robots: usize, yes: bool) -> Result<(), CommandError> {
+/// Whether the order may go on: it means few robots, `--yes` was given, or the person at the
+/// terminal agrees.
+pub(in crate::commands) fn confirm(
+    what: &str,
+    robots: usize,
+    yes: bool,
+) -> Result<(), CommandError> {
     if robots <= ASK_ABOVE || yes {
         return Ok(());
     }
     if !std::io::stdin().is_terminal() {
-        return Err(CommandError::Usage(format!("{what} means {robots} robots: give --yes for more than {ASK_ABOVE}")));
+        return Err(CommandError::Usage(format!(
+            "{what} means {robots} robots: give --yes for more than {ASK_ABOVE}"
+        )));
     }
     ask(&format!("{what} means {robots} robots. Go on? [y/N]"))
 }

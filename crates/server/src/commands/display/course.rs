@@ -1,4 +1,5 @@
-//! How a deployment goes on: what has travelled, how fast, and when it will have. Pure: time comes in.
+//! How a deployment goes on: what has travelled, how fast, and when it will have. Pure: time comes
+//! in.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -47,7 +48,8 @@ impl Course {
         }
         let (since, before) = self.seen[0];
         let (time, moved) = (now.saturating_sub(since), done - before);
-        let per_s = (time >= MIN_WINDOW && moved > 0).then(|| u128::from(moved) * 1000 / time.as_millis());
+        let per_s =
+            (time >= MIN_WINDOW && moved > 0).then(|| u128::from(moved) * 1000 / time.as_millis());
         let bytes_per_s = per_s.and_then(|rate| u64::try_from(rate).ok()).filter(|rate| *rate > 0);
         let left = bytes_per_s.map(|rate| Duration::from_secs((total - done).div_ceil(rate)));
         Estimate { done, total, bytes_per_s, left: left.filter(|left| !left.is_zero()) }
@@ -65,7 +67,11 @@ fn travelled(view: &DeploymentView) -> (u64, u64) {
             Phase::Unpacking | Phase::Building | Phase::Staged | Phase::Starting => size,
             Phase::Running | Phase::Succeeded | Phase::Stopped | Phase::RolledBack => size,
             // Whatever it got, no more is to come.
-            Phase::Failed | Phase::Unmet | Phase::Superseded | Phase::Cancelled | Phase::Expired => continue,
+            Phase::Failed
+            | Phase::Unmet
+            | Phase::Superseded
+            | Phase::Cancelled
+            | Phase::Expired => continue,
         };
         sum = (sum.0 + done, sum.1 + size);
     }
@@ -94,7 +100,11 @@ pub(in crate::commands) mod tests {
 
     use super::*;
 
-    pub(in crate::commands) fn assignment(name: &str, phase: Phase, online: bool) -> AssignmentView {
+    pub(in crate::commands) fn assignment(
+        name: &str,
+        phase: Phase,
+        online: bool,
+    ) -> AssignmentView {
         AssignmentView {
             robot: RobotId::random(),
             name: name.parse().unwrap(),
@@ -103,7 +113,8 @@ pub(in crate::commands) mod tests {
             delivery: None,
             phase,
             progress: None,
-            failure: (phase == Phase::Failed).then(|| Failure::new(FailureCode::BUILD_FAILED, "colcon said no")),
+            failure: (phase == Phase::Failed)
+                .then(|| Failure::new(FailureCode::BUILD_FAILED, "colcon said no")),
             attempts: 1,
             superseded_by: None,
             updated_at_ms: 0,
@@ -111,7 +122,10 @@ pub(in crate::commands) mod tests {
         }
     }
 
-    pub(in crate::commands) fn deployment(state: DeploymentState, assignments: Vec<AssignmentView>) -> DeploymentView {
+    pub(in crate::commands) fn deployment(
+        state: DeploymentState,
+        assignments: Vec<AssignmentView>,
+    ) -> DeploymentView {
         let blob = serde_json::json!({ "digest": Digest::of(b""), "size": 0 });
         let package = serde_json::json!({
             "name": "talker", "version": "1", "manifest": blob, "config": blob, "content": blob,

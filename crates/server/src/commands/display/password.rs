@@ -1,5 +1,5 @@
-//! Reads passwords: from the terminal, which does not show them, or from standard input. They are never arguments or
-//! variables, and never printed.
+//! Reads passwords: from the terminal, which does not show them, or from standard input. They are
+//! never arguments or variables, and never printed.
 
 use std::io::{self, BufRead as _, IsTerminal as _};
 
@@ -15,7 +15,8 @@ const MOST_BYTES: usize = 4 * 1024;
 /// Where a password is read. It is never an argument, which others could read.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct PasswordFrom {
-    /// Read the password from standard input, a line each (for one's own: the old one, then the new one)
+    /// Read the password from standard input, a line each (for one's own: the old one, then the new
+    /// one)
     #[arg(long)]
     pub password_stdin: bool,
 }
@@ -33,7 +34,9 @@ impl Secret {
 /// Asks for a password that is known.
 pub(in crate::commands) fn ask(from_stdin: bool, what: &str) -> Result<Secret, CommandError> {
     if !from_stdin && !io::stdin().is_terminal() {
-        return Err(CommandError::Usage(format!("{what}: there is no terminal to ask at, give --password-stdin")));
+        return Err(CommandError::Usage(format!(
+            "{what}: there is no terminal to ask at, give --password-stdin"
+        )));
     }
     if !from_stdin {
         say(&format!("{what}:"));
@@ -44,7 +47,8 @@ pub(in crate::commands) fn ask(from_stdin: bool, what: &str) -> Result<Secret, C
     drop(quiet);
     let failed = |source| CommandError::Io { what: "can't read the password".to_owned(), source };
     read.map_err(failed)?;
-    let text = String::from_utf8(line).map_err(|_| CommandError::Usage(format!("{what}: it is not UTF-8")))?;
+    let text = String::from_utf8(line)
+        .map_err(|_| CommandError::Usage(format!("{what}: it is not UTF-8")))?;
     let text = text.strip_suffix('\n').unwrap_or(&text);
     let text = text.strip_suffix('\r').unwrap_or(text);
     if text.is_empty() {

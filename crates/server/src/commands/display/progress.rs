@@ -1,4 +1,5 @@
-//! Progress on stderr: a bar per robot for a few robots, one bar for many, plain lines where nobody sees bars move.
+//! Progress on stderr: a bar per robot for a few robots, one bar for many, plain lines where nobody
+//! sees bars move.
 
 use std::collections::HashMap;
 
@@ -21,7 +22,9 @@ pub(in crate::commands) fn upload_bar(size: u64) -> ProgressBar {
     if !stderr_is_terminal() {
         return ProgressBar::hidden();
     }
-    let style = ProgressStyle::with_template("uploading {bar:30} {bytes}/{total_bytes} {binary_bytes_per_sec}");
+    let style = ProgressStyle::with_template(
+        "uploading {bar:30} {bytes}/{total_bytes} {binary_bytes_per_sec}",
+    );
     let bar = ProgressBar::new(size).with_finish(ProgressFinish::AndClear);
     if let Ok(style) = style {
         bar.set_style(style);
@@ -85,7 +88,9 @@ impl DeploymentProgress {
 
     fn show_robot(&mut self, assignment: &AssignmentView, is_settled: bool) {
         if !self.moving {
-            if self.said.insert(assignment.robot.clone(), assignment.phase) != Some(assignment.phase) {
+            if self.said.insert(assignment.robot.clone(), assignment.phase)
+                != Some(assignment.phase)
+            {
                 say(&line(assignment));
             }
             return;
@@ -107,7 +112,8 @@ impl DeploymentProgress {
     }
 
     fn show_summary(&mut self, view: &DeploymentView, assignments: &[AssignmentView]) {
-        let counts: Vec<_> = view.counts.iter().map(|count| format!("{} {}", count.count, count.phase)).collect();
+        let counts: Vec<_> =
+            view.counts.iter().map(|count| format!("{} {}", count.count, count.phase)).collect();
         let awaited = view.awaited();
         let mut text = counts.join(", ");
         for (title, robots) in [("waits for", &awaited.busy), ("offline", &awaited.offline)] {
@@ -125,7 +131,10 @@ impl DeploymentProgress {
         let bars = &self.bars;
         let bar = self.summary.get_or_insert_with(|| styled(bars));
         bar.set_length(assignments.len() as u64);
-        bar.set_position(assignments.iter().filter(|assignment| assignment.phase.is_settled(view.kind)).count() as u64);
+        bar.set_position(
+            assignments.iter().filter(|assignment| assignment.phase.is_settled(view.kind)).count()
+                as u64,
+        );
         bar.set_message(text);
     }
 
@@ -147,6 +156,7 @@ fn styled(bars: &MultiProgress) -> ProgressBar {
 
 fn line(assignment: &AssignmentView) -> String {
     let offline = if assignment.online { "" } else { " (offline)" };
-    let reason = assignment.failure.as_ref().map_or_else(String::new, |failure| format!(": {failure}"));
+    let reason =
+        assignment.failure.as_ref().map_or_else(String::new, |failure| format!(": {failure}"));
     printable(&format!("{} {}{offline}{reason}", assignment.name, assignment.phase))
 }

@@ -1,5 +1,6 @@
-//! Which log lines were printed, so that the past and the stream, which overlap, show each line once. The robot names no
-//! line by a number: a line is its time and its words, and two alike are two.
+//! Which log lines were printed, so that the past and the stream, which overlap, show each line
+//! once. The robot names no line by a number: a line is its time and its words, and two alike are
+//! two.
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::{HashMap, VecDeque};
@@ -41,11 +42,14 @@ impl Shown {
 
     /// Those lines of the past that were not printed and come after what was.
     pub(in crate::commands) fn missing(&mut self, past: &[LogLine]) -> Vec<LogLine> {
-        let is_known = |line: &LogLine| self.counts.get(&key(line)).is_some_and(|counts| counts.printed > 0);
+        let is_known =
+            |line: &LogLine| self.counts.get(&key(line)).is_some_and(|counts| counts.printed > 0);
         let newest_ms = self.newest_ms;
         // Before the first that was printed lies what nobody asked for.
         let begin = past.iter().position(is_known);
-        let begin = begin.or_else(|| past.iter().position(|line| line.at_ms > newest_ms)).unwrap_or(past.len());
+        let begin = begin
+            .or_else(|| past.iter().position(|line| line.at_ms > newest_ms))
+            .unwrap_or(past.len());
         let mut met: HashMap<u64, u32> = HashMap::new();
         let mut missing = Vec::new();
         for line in &past[begin..] {
@@ -100,8 +104,12 @@ mod tests {
     #[test]
     fn the_past_and_the_stream_overlap_without_gap_or_double() {
         let mut shown = Shown::default();
-        assert_eq!(texts(&shown.missing(&[line(1, "a"), line(2, "b"), line(2, "b")])), ["a", "b", "b"]);
-        let stream = [line(2, "b"), line(2, "b"), line(2, "b"), line(3, "c")].map(|line| shown.streamed(&line));
+        assert_eq!(
+            texts(&shown.missing(&[line(1, "a"), line(2, "b"), line(2, "b")])),
+            ["a", "b", "b"]
+        );
+        let stream = [line(2, "b"), line(2, "b"), line(2, "b"), line(3, "c")]
+            .map(|line| shown.streamed(&line));
         assert_eq!(stream, [false, false, true, true], "three alike are three");
     }
 
@@ -110,10 +118,21 @@ mod tests {
         let mut shown = Shown::default();
         shown.missing(&[line(10, "a"), line(11, "b")]);
         assert!(shown.streamed(&line(12, "c")));
-        let past = [line(8, "older"), line(10, "a"), line(11, "b"), line(12, "c"), line(13, "d"), line(14, "e")];
+        let past = [
+            line(8, "older"),
+            line(10, "a"),
+            line(11, "b"),
+            line(12, "c"),
+            line(13, "d"),
+            line(14, "e"),
+        ];
         assert_eq!(texts(&shown.missing(&past)), ["d", "e"]);
         assert!(!shown.streamed(&line(14, "e")), "it came late");
-        assert_eq!(texts(&shown.missing(&[line(9, "x"), line(30, "f")])), ["f"], "nothing of it is known any more");
+        assert_eq!(
+            texts(&shown.missing(&[line(9, "x"), line(30, "f")])),
+            ["f"],
+            "nothing of it is known any more"
+        );
         assert_eq!(texts(&shown.missing(&[])), Vec::<&str>::new());
     }
 

@@ -1,9 +1,11 @@
-//! How deployments and robots look to a person at the terminal. Text only; what is shown was asked for elsewhere.
+//! How deployments and robots look to a person at the terminal. Text only; what is shown was asked
+//! for elsewhere.
 
 use std::collections::BTreeMap;
 
 use task_proto::api::{
-    AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots, names,
+    AssignmentView, DeliveryDecision, DeploymentState, DeploymentView, MatchedRobot, MatchedRobots,
+    names,
 };
 use task_proto::desired::Delivery;
 use task_proto::report::Phase;
@@ -30,21 +32,32 @@ pub(in crate::commands) fn state(state: DeploymentState) -> &'static str {
 
 /// How many robots stand in which phase, on one line.
 pub(in crate::commands) fn phases(view: &DeploymentView) -> String {
-    let phases: Vec<_> = view.counts.iter().map(|count| format!("{}:{}", count.phase, count.count)).collect();
+    let phases: Vec<_> =
+        view.counts.iter().map(|count| format!("{}:{}", count.phase, count.count)).collect();
     phases.join(" ")
 }
 
 /// Prints a deployment: its facts, then a line per robot.
-pub(in crate::commands) fn print(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+pub(in crate::commands) fn print(
+    session: &Session,
+    view: &DeploymentView,
+) -> Result<(), CommandError> {
     print_with(session, view, &COLUMNS)
 }
 
 /// The same; it also says of each robot how its bytes travel.
-pub(in crate::commands) fn print_deliveries(session: &Session, view: &DeploymentView) -> Result<(), CommandError> {
+pub(in crate::commands) fn print_deliveries(
+    session: &Session,
+    view: &DeploymentView,
+) -> Result<(), CommandError> {
     print_with(session, view, &COLUMNS_WITH_DELIVERIES)
 }
 
-fn print_with(session: &Session, view: &DeploymentView, columns: &Columns) -> Result<(), CommandError> {
+fn print_with(
+    session: &Session,
+    view: &DeploymentView,
+    columns: &Columns,
+) -> Result<(), CommandError> {
     let name = |view: &DeploymentView| view.id.to_string();
     session.output.described(view, name, |view| {
         let mut text = describe(view);
@@ -57,16 +70,28 @@ fn print_with(session: &Session, view: &DeploymentView, columns: &Columns) -> Re
     })
 }
 
-const COLUMNS: Columns =
-    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail"], wide: &["delivery"] };
-const COLUMNS_WITH_DELIVERIES: Columns =
-    Columns { name: "robot", narrow: &["robot", "state", "phase", "progress", "detail", "delivery"], wide: &[] };
+const COLUMNS: Columns = Columns {
+    name: "robot",
+    narrow: &["robot", "state", "phase", "progress", "detail"],
+    wide: &["delivery"],
+};
+const COLUMNS_WITH_DELIVERIES: Columns = Columns {
+    name: "robot",
+    narrow: &["robot", "state", "phase", "progress", "detail", "delivery"],
+    wide: &[],
+};
 
 fn describe(view: &DeploymentView) -> String {
     let supersedes: Vec<_> = view.supersedes.iter().map(ToString::to_string).collect();
     let mut facts = vec![
         ("deployment", view.id.to_string()),
-        ("package", format!("{} {} {}", view.package.name, view.package.version, view.package.manifest.digest)),
+        (
+            "package",
+            format!(
+                "{} {} {}",
+                view.package.name, view.package.version, view.package.manifest.digest
+            ),
+        ),
         ("selector", view.selector.as_ref().map_or_else(|| "…".to_owned(), ToString::to_string)),
         ("delivery", view.delivery.to_string()),
         ("state", state(view.state).to_owned()),
@@ -87,7 +112,9 @@ fn describe(view: &DeploymentView) -> String {
         facts.push(("supersedes", supersedes.join(" ")));
     }
     let awaited = view.awaited();
-    for (title, robots) in [("waits for", &awaited.busy), ("next", &awaited.queued), ("offline", &awaited.offline)] {
+    for (title, robots) in
+        [("waits for", &awaited.busy), ("next", &awaited.queued), ("offline", &awaited.offline)]
+    {
         if view.state != DeploymentState::Cancelled && !robots.is_empty() {
             facts.push((title, names(robots, MAX_NAMES)));
         }
@@ -102,12 +129,18 @@ fn describe(view: &DeploymentView) -> String {
 fn mechanisms(assignments: &[AssignmentView]) -> Vec<String> {
     let mut ways: BTreeMap<(Delivery, &str), Vec<&str>> = BTreeMap::new();
     for decision in assignments.iter().filter_map(|assignment| assignment.delivery.as_ref()) {
-        ways.entry((decision.mechanism, decision.rule.as_str())).or_default().push(&decision.because);
+        ways.entry((decision.mechanism, decision.rule.as_str()))
+            .or_default()
+            .push(&decision.because);
     }
     let mut ways: Vec<_> = ways.into_iter().collect();
     ways.sort_by_key(|(_, reasons)| std::cmp::Reverse(reasons.len()));
     let line = |((mechanism, rule), reasons): ((Delivery, &str), Vec<&str>)| {
-        let count = if assignments.len() == 1 { String::new() } else { format!("{}, ", robots(reasons.len() as u64)) };
+        let count = if assignments.len() == 1 {
+            String::new()
+        } else {
+            format!("{}, ", robots(reasons.len() as u64))
+        };
         let is_one = reasons.iter().all(|reason| *reason == reasons[0]);
         let others = if is_one { "" } else { " and the like" };
         format!("{count}{mechanism}: {}, {}{others}", rule_shown(rule), reasons[0])
@@ -152,7 +185,9 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
         (Some(failure), _) => failure.to_string(),
         (None, Some(newer)) => format!("by {newer}"),
         (None, None) if assignment.phase.is_final() => "-".to_owned(),
-        (None, None) if !assignment.released && assignment.online => "waits for its batch".to_owned(),
+        (None, None) if !assignment.released && assignment.online => {
+            "waits for its batch".to_owned()
+        }
         (None, None) if !assignment.released => "begins when the robot is back".to_owned(),
         (None, None) => "-".to_owned(),
     };
@@ -161,14 +196,20 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
         assignment.name.to_string(),
         if assignment.online { "online" } else { "offline" }.to_owned(),
         assignment.phase.to_string(),
-        progress.map_or_else(|| "-".to_owned(), |p| format!("{}%", p.done.min(p.total) * 100 / p.total)),
+        progress.map_or_else(
+            || "-".to_owned(),
+            |p| format!("{}%", p.done.min(p.total) * 100 / p.total),
+        ),
         detail,
         way(assignment.delivery.as_ref()),
     ]
 }
 
 /// Lists the robots an order means.
-pub(in crate::commands) fn print_matched(session: &Session, matched: &MatchedRobots) -> Result<(), CommandError> {
+pub(in crate::commands) fn print_matched(
+    session: &Session,
+    matched: &MatchedRobots,
+) -> Result<(), CommandError> {
     let columns = Columns { name: "name", narrow: &["id", "name", "state"], wide: &[] };
     session.output.result(matched, &columns, |matched| {
         let row = |robot: &MatchedRobot| {
@@ -208,7 +249,11 @@ mod tests {
     #[test]
     fn ways_are_counted_and_explained() {
         let travelling = |mechanism, rule: &str, because: &str| AssignmentView {
-            delivery: Some(DeliveryDecision { mechanism, rule: rule.to_owned(), because: because.to_owned() }),
+            delivery: Some(DeliveryDecision {
+                mechanism,
+                rule: rule.to_owned(),
+                because: because.to_owned(),
+            }),
             ..assignment(Phase::Fetching, None)
         };
         let pull = || travelling(Delivery::PushPull, "otherwise", "size 9.7 MB > 256 KB");
@@ -243,7 +288,9 @@ mod tests {
         ];
         assert_eq!(deferred(&assignments[..2]), [""; 0]);
         assert_eq!(deferred(&assignments), ["2 robots: battery low", "1 robot: carries a load"]);
-        assignments.extend((0..MAX_REASONS).map(|n| assignment(Phase::Deferred, Some(&format!("load {n}")))));
+        assignments.extend(
+            (0..MAX_REASONS).map(|n| assignment(Phase::Deferred, Some(&format!("load {n}")))),
+        );
         let lines = deferred(&assignments);
         assert_eq!((lines.len(), lines[0].as_str()), (MAX_REASONS + 1, "2 robots: battery low"));
         assert_eq!(lines[MAX_REASONS], "2 robots: 2 other reasons, see below");

@@ -1,5 +1,6 @@
-//! `taskd key`: publishers' keys, which never leave their machine, and the list of the publishers that robots trust. A list
-//! is drafted, signed by as many keepers as it takes, each where their key is, and published.
+//! `taskd key`: publishers' keys, which never leave their machine, and the list of the publishers
+//! that robots trust. A list is drafted, signed by as many keepers as it takes, each where their
+//! key is, and published.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -10,7 +11,9 @@ use serde::{Deserialize, Serialize};
 use task_proto::Digest;
 use task_proto::envelope::{Envelope, PublicKey};
 use task_proto::oci::ImageManifest;
-use task_proto::publisher::{InvalidRole, LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, PublisherList, Role};
+use task_proto::publisher::{
+    InvalidRole, LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, PublisherList, Role,
+};
 
 use super::key_file;
 use crate::commands::api::client::{Client, ClientError};
@@ -36,7 +39,8 @@ pub enum Action {
     },
     /// Print the newest list of publishers on the server
     List,
-    /// Write the next list of publishers into a file, to be signed; what is not given is as in the newest
+    /// Write the next list of publishers into a file, to be signed; what is not given is as in the
+    /// newest
     Draft(Draft),
     /// Sign a drafted list, and say what it says
     Sign {
@@ -65,7 +69,8 @@ pub struct Draft {
     /// How many publishers must have signed a package
     #[arg(long, value_name = "N")]
     threshold: Option<u32>,
-    /// A key that signs lists; all that do are to be given [default for the first list: the publishers]
+    /// A key that signs lists; all that do are to be given [default for the first list: the
+    /// publishers]
     #[arg(long = "keeper", value_name = "KEY")]
     keepers: Vec<String>,
     /// How many keepers must have signed the next list
@@ -91,7 +96,10 @@ struct Tags {
     tags: Vec<String>,
 }
 
-pub(in crate::commands) async fn run(connection: &Connection, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    connection: &Connection,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     let output = Output::new(connection.output);
     match action {
         Action::New { file } => {
@@ -105,8 +113,9 @@ pub(in crate::commands) async fn run(connection: &Connection, action: Action) ->
         Action::Show { key } => print_key(&output, key_file::public(&key)?)?,
         Action::List => {
             let newest = newest(&Client::connect(connection)?).await?;
-            let newest =
-                newest.ok_or_else(|| CommandError::Usage("the server has no list of publishers".to_owned()))?;
+            let newest = newest.ok_or_else(|| {
+                CommandError::Usage("the server has no list of publishers".to_owned())
+            })?;
             output.described(&newest, version, describe)?;
         }
         Action::Draft(draft) => {
@@ -118,7 +127,8 @@ pub(in crate::commands) async fn run(connection: &Connection, action: Action) ->
         }
         Action::Sign { file, key } => {
             let mut envelope = read(&file)?;
-            let list = PublisherList::unverified(&envelope).map_err(|error| unusable(&file, &error))?;
+            let list =
+                PublisherList::unverified(&envelope).map_err(|error| unusable(&file, &error))?;
             let key = key_file::read(&key)?;
             envelope.sign_also(LIST_TYPE, &key).map_err(|error| unusable(&file, &error))?;
             write(&file, &envelope)?;
@@ -159,26 +169,41 @@ async fn newest(client: &Client) -> Result<Option<PublisherList>, CommandError> 
         Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) => return Ok(None),
         Err(error) => return Err(error.into()),
     };
-    let Some(version) = tags.tags.iter().filter_map(|tag| tag.parse::<u64>().ok()).max() else { return Ok(None) };
-    let manifest: ImageManifest = client.read(&format!("/v2/{LIST_REPOSITORY}/manifests/{version}")).await?;
+    let Some(version) = tags.tags.iter().filter_map(|tag| tag.parse::<u64>().ok()).max() else {
+        return Ok(None);
+    };
+    let manifest: ImageManifest =
+        client.read(&format!("/v2/{LIST_REPOSITORY}/manifests/{version}")).await?;
     let what = format!("version {version} of the list of publishers");
-    let blob = manifest.lone_envelope().ok_or_else(|| CommandError::Usage(format!("{what} is no signed document")))?;
-    let envelope: Envelope = client.read(&format!("/v2/{LIST_REPOSITORY}/blobs/{}", blob.digest)).await?;
+    let blob = manifest
+        .lone_envelope()
+        .ok_or_else(|| CommandError::Usage(format!("{what} is no signed document")))?;
+    let envelope: Envelope =
+        client.read(&format!("/v2/{LIST_REPOSITORY}/blobs/{}", blob.digest)).await?;
     let list = PublisherList::unverified(&envelope);
     list.map(Some).map_err(|error| CommandError::Usage(format!("{what}: {error}")))
 }
 
 /// The list after `newest` that the command line asks for.
-fn drafted(draft: &Draft, newest: Option<PublisherList>, now_ms: u64) -> Result<PublisherList, CommandError> {
+fn drafted(
+    draft: &Draft,
+    newest: Option<PublisherList>,
+    now_ms: u64,
+) -> Result<PublisherList, CommandError> {
     let before = newest.as_ref();
     let options = ("publisher", "threshold");
-    let publishers = role(options, &draft.publishers, draft.threshold, before.map(|list| &list.publishers))?;
+    let publishers =
+        role(options, &draft.publishers, draft.threshold, before.map(|list| &list.publishers))?;
     let keepers_before = before.map_or(&publishers, |list| &list.keepers);
     let options = ("keeper", "keeper-threshold");
     let keepers = role(options, &draft.keepers, draft.keeper_threshold, Some(keepers_before))?;
     let mut withdrawn = before.map(|list| list.withdrawn.clone()).unwrap_or_default();
-    withdrawn
-        .extend(draft.withdrawn.iter().filter(|digest| !before.is_some_and(|list| list.withdrawn.contains(digest))));
+    withdrawn.extend(
+        draft
+            .withdrawn
+            .iter()
+            .filter(|digest| !before.is_some_and(|list| list.withdrawn.contains(digest))),
+    );
     Ok(PublisherList {
         version: before.map_or(0, |list| list.version) + 1,
         issued_at_ms: now_ms,
@@ -210,14 +235,16 @@ fn role(
 }
 
 fn read(file: &Path) -> Result<Envelope, CommandError> {
-    let failed = |source| CommandError::Io { what: format!("can't read {}", file.display()), source };
+    let failed =
+        |source| CommandError::Io { what: format!("can't read {}", file.display()), source };
     let bytes = std::fs::read(file).map_err(failed)?;
     serde_json::from_slice(&bytes)
         .map_err(|_| CommandError::Usage(format!("{} is no draft of taskd key", file.display())))
 }
 
 fn write(file: &Path, envelope: &Envelope) -> Result<(), CommandError> {
-    let failed = |source| CommandError::Io { what: format!("can't write {}", file.display()), source };
+    let failed =
+        |source| CommandError::Io { what: format!("can't write {}", file.display()), source };
     let text = serde_json::to_string_pretty(envelope).expect("an envelope always has a JSON form");
     std::fs::write(file, format!("{text}\n")).map_err(failed)
 }
@@ -266,8 +293,12 @@ mod tests {
         assert_eq!((first.version, first.issued_at_ms, first.expires_at_ms), (1, 1000, 61_000));
         assert_eq!(first.keepers, first.publishers);
         let bad = [Digest::of(b"1"), Digest::of(b"2")];
-        let second = drafted(&draft(&[1, 2, 3], None, &bad[..1]), Some(first.clone()), 2000).expect("drafted");
-        assert_eq!((second.version, second.publishers.keys().len(), second.publishers.threshold()), (2, 3, 2));
+        let second = drafted(&draft(&[1, 2, 3], None, &bad[..1]), Some(first.clone()), 2000)
+            .expect("drafted");
+        assert_eq!(
+            (second.version, second.publishers.keys().len(), second.publishers.threshold()),
+            (2, 3, 2)
+        );
         assert_eq!(second.keepers, first.keepers, "another publisher is no keeper");
         let third = drafted(&draft(&[], None, &bad), Some(second.clone()), 3000).expect("drafted");
         assert_eq!((third.publishers, third.withdrawn), (second.publishers, bad.to_vec()));

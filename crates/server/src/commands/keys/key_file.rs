@@ -1,5 +1,5 @@
-//! A publisher's key on the disk: a file for its owner alone, and beside it one that everybody may read. The server never
-//! sees the first.
+//! A publisher's key on the disk: a file for its owner alone, and beside it one that everybody may
+//! read. The server never sees the first.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _, Write as _};
@@ -44,7 +44,8 @@ pub enum KeyError {
     NotPublic(String),
 }
 
-/// Makes a key: the private half at `path`, the public one at `path` and `.pub`. Nothing that is there is replaced.
+/// Makes a key: the private half at `path`, the public one at `path` and `.pub`. Nothing that is
+/// there is replaced.
 pub fn create(path: &Path) -> Result<PublicKey, KeyError> {
     let key = SigningKey::random();
     let private = format!("{PRIVATE}{}\n", hex(&key.to_bytes()));
@@ -73,7 +74,8 @@ pub fn read(path: &Path) -> Result<SigningKey, KeyError> {
     Ok(SigningKey::from_bytes(seed))
 }
 
-/// A public key as people name it: its text, or a file that holds it, or the private key beside such a file.
+/// A public key as people name it: its text, or a file that holds it, or the private key beside
+/// such a file.
 pub fn public(text: &str) -> Result<PublicKey, KeyError> {
     let from_file = |path: &Path| {
         let mut text = String::new();
@@ -81,7 +83,12 @@ pub fn public(text: &str) -> Result<PublicKey, KeyError> {
         text.trim().parse().ok()
     };
     let path = Path::new(text);
-    let key = text.trim().parse().ok().or_else(|| from_file(path)).or_else(|| from_file(&public_path(path)));
+    let key = text
+        .trim()
+        .parse()
+        .ok()
+        .or_else(|| from_file(path))
+        .or_else(|| from_file(&public_path(path)));
     key.ok_or_else(|| KeyError::NotPublic(text.chars().take(80).collect()))
 }
 
@@ -113,9 +120,12 @@ mod tests {
         let path = dir.path().join("ada.key");
         let made = create(&path).expect("made");
         assert_eq!(read(&path).expect("read").public_key(), made);
-        let mode = |path: &Path| std::fs::metadata(path).expect("there").permissions().mode() & 0o777;
+        let mode =
+            |path: &Path| std::fs::metadata(path).expect("there").permissions().mode() & 0o777;
         assert_eq!(mode(&path), 0o600);
-        for named in [made.to_string(), path.display().to_string(), format!("{}.pub", path.display())] {
+        for named in
+            [made.to_string(), path.display().to_string(), format!("{}.pub", path.display())]
+        {
             assert_eq!(public(&named).expect("named"), made, "{named}");
         }
         assert!(matches!(create(&path), Err(KeyError::Io { .. })), "a key is never replaced");

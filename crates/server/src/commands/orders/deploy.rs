@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use task_proto::DeploymentId;
-use task_proto::api::{DeploymentList, DeploymentView, MOST_ON_A_PAGE, MatchedRobots, RetryDeployment};
+use task_proto::api::{
+    DeploymentList, DeploymentView, MOST_ON_A_PAGE, MatchedRobots, RetryDeployment,
+};
 use task_proto::report::FailureCode;
 use task_proto::selector::Selector;
 
@@ -36,7 +38,8 @@ pub enum Action {
         #[arg(long)]
         robots: bool,
     },
-    /// Follow one until every robot has settled: what travels, how fast, for how long yet, and who failed for what reason
+    /// Follow one until every robot has settled: what travels, how fast, for how long yet, and who
+    /// failed for what reason
     Watch {
         /// Its id
         #[arg(add = complete::deployments())]
@@ -45,7 +48,8 @@ pub enum Action {
         #[arg(long, value_name = "TIME", value_parser = lifetime, default_value = "1d")]
         timeout: Duration,
     },
-    /// Interrupt one: where it is under way or has failed the version before it runs on; where it runs already it stays
+    /// Interrupt one: where it is under way or has failed the version before it runs on; where it
+    /// runs already it stays
     Cancel {
         /// Its id
         #[arg(add = complete::deployments())]
@@ -90,31 +94,40 @@ pub struct RetryOrder {
     idempotency_key: Option<String>,
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     let (deployment, verb) = match action {
         Action::List { limit } => {
             let list = newest(session, limit).await?;
-            session.output.result(&list, &COLUMNS, |list| list.deployments.iter().map(row).collect())?;
+            session
+                .output
+                .result(&list, &COLUMNS, |list| list.deployments.iter().map(row).collect())?;
             if list.next.is_some() {
                 say("older ones are left out; -n shows more");
             }
             return Ok(Outcome::Succeeded);
         }
         Action::Info { deployment, robots } => {
-            let view: DeploymentView = session.client.get(&format!("/deployments/{deployment}"), &[]).await?;
+            let view: DeploymentView =
+                session.client.get(&format!("/deployments/{deployment}"), &[]).await?;
             match robots {
                 true => view::print_deliveries(session, &view)?,
                 false => view::print(session, &view)?,
             }
             return Ok(Outcome::Succeeded);
         }
-        Action::Watch { deployment, timeout } => return wait::until_settled(session, &deployment, timeout).await,
+        Action::Watch { deployment, timeout } => {
+            return wait::until_settled(session, &deployment, timeout).await;
+        }
         Action::Retry(order) => return retry(session, order).await,
         Action::Cancel { deployment } => (deployment, "cancel"),
         Action::Resume { deployment } => (deployment, "resume"),
     };
     let path = format!("/deployments/{deployment}/{verb}");
-    let view: DeploymentView = session.client.order(&path, &serde_json::json!({}), &random_key()).await?;
+    let view: DeploymentView =
+        session.client.order(&path, &serde_json::json!({}), &random_key()).await?;
     view::print(session, &view)?;
     say(&format!("ordered: {verb} {deployment}"));
     Ok(Outcome::Succeeded)
@@ -141,8 +154,11 @@ async fn retry(session: &Session, order: RetryOrder) -> Result<Outcome, CommandE
     let path = format!("/deployments/{deployment}/retry");
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
     let ask = |dry_run| RetryDeployment { selector: on.clone(), code: code.clone(), dry_run };
-    let matched: MatchedRobots = match session.client.order(&path, &ask(true), &random_key()).await {
-        Err(ClientError::Refused { code, .. }) if code == "nothing_to_retry" => MatchedRobots::default(),
+    let matched: MatchedRobots = match session.client.order(&path, &ask(true), &random_key()).await
+    {
+        Err(ClientError::Refused { code, .. }) if code == "nothing_to_retry" => {
+            MatchedRobots::default()
+        }
         answer => answer?,
     };
     if matched.robots.is_empty() && !may_be_repeated {
@@ -158,7 +174,10 @@ async fn retry(session: &Session, order: RetryOrder) -> Result<Outcome, CommandE
     let key = idempotency_key.unwrap_or_else(random_key);
     let ordered: DeploymentView = session.client.order(&path, &ask(false), &key).await?;
     let count = robots(ordered.counts.iter().map(|count| count.count).sum());
-    say(&format!("deployment {}: {} {} to {count}", ordered.id, ordered.package.name, ordered.package.version));
+    say(&format!(
+        "deployment {}: {} {} to {count}",
+        ordered.id, ordered.package.name, ordered.package.version
+    ));
     if wait {
         return wait::until_settled(session, &ordered.id, timeout).await;
     }

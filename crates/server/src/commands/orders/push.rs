@@ -1,4 +1,5 @@
-//! `taskd push` and `taskd pack`: from a directory to a package, to the server and, with `--to`, to robots.
+//! `taskd push` and `taskd pack`: from a directory to a package, to the server and, with `--to`, to
+//! robots.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -6,7 +7,8 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use task_proto::RepositoryName;
 use task_proto::api::{
-    AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY, names,
+    AssignmentView, CreateDeployment, DeliveryChoice, DeploymentView, MAX_PRIORITY, MIN_PRIORITY,
+    names,
 };
 use task_proto::desired::PackageRef;
 use task_proto::envelope::SigningKey;
@@ -30,7 +32,8 @@ use crate::package::{self, Launch, Packed};
 pub struct Push {
     /// The package's directory, with task.toml, package.xml or both
     dir: PathBuf,
-    /// Deploy it to these robots: *, names, label=value, !term for all but; without it the package is only uploaded
+    /// Deploy it to these robots: *, names, label=value, !term for all but; without it the package
+    /// is only uploaded
     #[arg(long, value_name = "SELECTOR", add = complete::selectors())]
     to: Option<Selector>,
     /// Wait until it runs (a job: has succeeded) everywhere
@@ -61,7 +64,8 @@ pub struct Push {
     /// Sign it with this private key, of taskd key new; may be repeated
     #[arg(long = "sign", value_name = "KEY")]
     keys: Vec<PathBuf>,
-    /// Take the version from a package with other content; robots that have that one are marked as outdated
+    /// Take the version from a package with other content; robots that have that one are marked as
+    /// outdated
     #[arg(long)]
     force: bool,
     /// Only check the package and list the robots that are meant
@@ -112,11 +116,16 @@ pub struct Pack {
     out: Option<PathBuf>,
 }
 
-pub(in crate::commands) async fn run(session: &Session, push: Push) -> Result<Outcome, CommandError> {
-    // Before anything is done: a key that can't be used must not leave a package without its signature on the server.
+pub(in crate::commands) async fn run(
+    session: &Session,
+    push: Push,
+) -> Result<Outcome, CommandError> {
+    // Before anything is done: a key that can't be used must not leave a package without its
+    // signature on the server.
     let keys = push.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let matched = match &push.to {
-        // An order that may have been carried out before is known to the server, also where its robots are gone.
+        // An order that may have been carried out before is known to the server, also where its
+        // robots are gone.
         Some(selector) if push.idempotency_key.is_some() && !push.dry_run => {
             Some(selection::named(selection::matching(session, selector).await?.robots))
         }
@@ -130,7 +139,11 @@ pub(in crate::commands) async fn run(session: &Session, push: Push) -> Result<Ou
         return Ok(Outcome::Succeeded);
     }
     if let (Some(selector), Some(matched)) = (&push.to, &matched) {
-        confirm(&format!("push {} to {selector}", packed.package.name), matched.robots.len(), push.yes)?;
+        confirm(
+            &format!("push {} to {selector}", packed.package.name),
+            matched.robots.len(),
+            push.yes,
+        )?;
     }
     let package = upload::Upload { force: push.force, ..upload::Upload::of(&packed, true) };
     upload::upload(&session.client, &package).await?;
@@ -154,7 +167,10 @@ pub(in crate::commands) async fn run(session: &Session, push: Push) -> Result<Ou
     let key = push.idempotency_key.unwrap_or_else(client::random_key);
     let ordered: DeploymentView = session.client.order("/deployments", &order, &key).await?;
     let count = robots(ordered.counts.iter().map(|count| count.count).sum());
-    say(&format!("deployment {}: {} {} to {count}", ordered.id, order.package, ordered.package.version));
+    say(&format!(
+        "deployment {}: {} {} to {count}",
+        ordered.id, order.package, ordered.package.version
+    ));
     for superseded in &ordered.supersedes {
         say(&format!("it supersedes {superseded}"));
     }
@@ -170,9 +186,13 @@ pub(in crate::commands) async fn run(session: &Session, push: Push) -> Result<Ou
 pub(in crate::commands) fn say_running(ordered: &DeploymentView) {
     const MAX_NAMES: usize = 5;
     let assignments = ordered.assignments.as_deref().unwrap_or_default();
-    let running: Vec<&AssignmentView> = assignments.iter().filter(|one| one.phase == Phase::Running).collect();
+    let running: Vec<&AssignmentView> =
+        assignments.iter().filter(|one| one.phase == Phase::Running).collect();
     if !running.is_empty() {
-        say(&format!("already running on {}; --restart runs it anew there", names(&running, MAX_NAMES)));
+        say(&format!(
+            "already running on {}; --restart runs it anew there",
+            names(&running, MAX_NAMES)
+        ));
     }
 }
 
@@ -186,13 +206,17 @@ pub(in crate::commands) async fn sign(
     for key in keys {
         let envelope = PackageStatement { package: package.clone() }.seal(key);
         let about = (Some(package.manifest), None);
-        upload::upload_signed(&session.client, &repository, SIGNATURE_ARTIFACT, &envelope, about).await?;
+        upload::upload_signed(&session.client, &repository, SIGNATURE_ARTIFACT, &envelope, about)
+            .await?;
         say(&format!("{} {}: signed by {}", package.name, package.version, key.public_key().id()));
     }
     Ok(())
 }
 
-pub(in crate::commands) async fn packed(dir: PathBuf, launch: Option<Launch>) -> Result<Packed, CommandError> {
+pub(in crate::commands) async fn packed(
+    dir: PathBuf,
+    launch: Option<Launch>,
+) -> Result<Packed, CommandError> {
     let packing = tokio::task::spawn_blocking(move || match &launch {
         Some(launch) => package::pack_to_launch(&dir, launch),
         None => package::pack(&dir),
@@ -204,11 +228,16 @@ pub(in crate::commands) async fn packed(dir: PathBuf, launch: Option<Launch>) ->
     Ok(packed)
 }
 
-pub(in crate::commands) async fn pack(output: &Output, pack: Pack) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn pack(
+    output: &Output,
+    pack: Pack,
+) -> Result<Outcome, CommandError> {
     let packed = packed(pack.dir, None).await?;
     if let Some(path) = &pack.out {
-        std::fs::copy(packed.content.path(), path)
-            .map_err(|source| CommandError::Io { what: format!("can't write {}", path.display()), source })?;
+        std::fs::copy(packed.content.path(), path).map_err(|source| CommandError::Io {
+            what: format!("can't write {}", path.display()),
+            source,
+        })?;
     }
     output.described(&packed.package, reference, |_| describe(&packed))?;
     Ok(Outcome::Succeeded)

@@ -1,5 +1,6 @@
-//! `taskd run`: what `ros2 launch` is on one's own machine, on a robot. The launch file and its arguments become part of the
-//! package that is ordered, so that the robot, its restarts and whoever looks later all see what was meant.
+//! `taskd run`: what `ros2 launch` is on one's own machine, on a robot. The launch file and its
+//! arguments become part of the package that is ordered, so that the robot, its restarts and
+//! whoever looks later all see what was meant.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -30,16 +31,19 @@ pub struct RunOrder {
     /// The robot's name or id
     #[arg(add = complete::robots())]
     robot: RobotName,
-    /// A package's directory (with a / in it, or .), or a package on the server as NAME, NAME:VERSION or NAME@DIGEST
+    /// A package's directory (with a / in it, or .), or a package on the server as NAME,
+    /// NAME:VERSION or NAME@DIGEST
     #[arg(value_name = "PKG", add = complete::packages(), value_hint = clap::ValueHint::DirPath)]
     package: String,
-    /// The launch file's name; without it the package runs as its own [run] says, which needs no ros2 launch if that is a command
+    /// The launch file's name; without it the package runs as its own [run] says, which needs no
+    /// ros2 launch if that is a command
     #[arg(value_name = "FILE.launch.py")]
     file: Option<String>,
     /// Launch arguments; those of the package's own launch file stay where nothing else is said
     #[arg(value_name = "ARG:=VALUE")]
     arguments: Vec<Argument>,
-    /// The ROS package that has the launch file [default: that of the package's own launch file, else the one of its name]
+    /// The ROS package that has the launch file [default: that of the package's own launch file,
+    /// else the one of its name]
     #[arg(long, value_name = "NAME", requires = "file")]
     ros_package: Option<String>,
     /// Show what the robot's task says once it runs, until Ctrl-C; it runs on
@@ -70,22 +74,33 @@ impl FromStr for Argument {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
         match text.split_once(":=") {
-            Some((name, value)) if !name.is_empty() => Ok(Self { name: name.to_owned(), value: value.to_owned() }),
+            Some((name, value)) if !name.is_empty() => {
+                Ok(Self { name: name.to_owned(), value: value.to_owned() })
+            }
             _ => Err("expected ARG:=VALUE, as ros2 launch takes it".to_owned()),
         }
     }
 }
 
-pub(in crate::commands) async fn run(session: &Session, order: RunOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    order: RunOrder,
+) -> Result<Outcome, CommandError> {
     let keys = order.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let robot = selection::one(session, &order.robot).await?;
-    let arguments: BTreeMap<String, String> =
-        order.arguments.iter().map(|argument| (argument.name.clone(), argument.value.clone())).collect();
+    let arguments: BTreeMap<String, String> = order
+        .arguments
+        .iter()
+        .map(|argument| (argument.name.clone(), argument.value.clone()))
+        .collect();
     let file = order.file.clone();
     if let Some(argument) = file.as_ref().filter(|file| file.contains(":=")) {
-        return Err(CommandError::Usage(format!("{argument}: FILE.launch.py comes before the arguments for it")));
+        return Err(CommandError::Usage(format!(
+            "{argument}: FILE.launch.py comes before the arguments for it"
+        )));
     }
-    let launch = file.map(|file| Launch { ros_package: order.ros_package.clone(), file, arguments });
+    let launch =
+        file.map(|file| Launch { ros_package: order.ros_package.clone(), file, arguments });
     let package = match order.package.contains('/') || order.package == "." {
         true => {
             let packed = packed(PathBuf::from(&order.package), launch).await?;
@@ -95,13 +110,18 @@ pub(in crate::commands) async fn run(session: &Session, order: RunOrder) -> Resu
         false => stored(session, &order.package, launch).await?,
     };
     sign(session, &package, &keys).await?;
-    let selector = robot.id.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
+    let selector =
+        robot.id.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
     let create = CreateDeployment {
         restart: order.restart,
         ..CreateDeployment::new(package.name.clone(), package.manifest.digest, selector)
     };
-    let ordered: DeploymentView = session.client.order("/deployments", &create, &client::random_key()).await?;
-    say(&format!("deployment {}: {} {} to {}", ordered.id, package.name, package.version, robot.name));
+    let ordered: DeploymentView =
+        session.client.order("/deployments", &create, &client::random_key()).await?;
+    say(&format!(
+        "deployment {}: {} {} to {}",
+        ordered.id, package.name, package.version, robot.name
+    ));
     say_running(&ordered);
     if order.detach {
         view::print(session, &ordered)?;
@@ -118,8 +138,13 @@ pub(in crate::commands) async fn run(session: &Session, order: RunOrder) -> Resu
 }
 
 /// A package on the server, with this launch file instead of its own.
-async fn stored(session: &Session, text: &str, launch: Option<Launch>) -> Result<PackageRef, CommandError> {
-    let named: PackageName = text.parse().map_err(|error| CommandError::Usage(format!("PKG: {error}")))?;
+async fn stored(
+    session: &Session,
+    text: &str,
+    launch: Option<Launch>,
+) -> Result<PackageRef, CommandError> {
+    let named: PackageName =
+        text.parse().map_err(|error| CommandError::Usage(format!("PKG: {error}")))?;
     let stored = find(session, &named).await?;
     let Some(launch) = launch else { return Ok(stored.package) };
     let manifest = launch.put_into(stored.manifest);
@@ -141,12 +166,22 @@ async fn stored(session: &Session, text: &str, launch: Option<Launch>) -> Result
 }
 
 /// Says that the version before goes on, where the new one could not take its place.
-async fn say_what_still_runs(session: &Session, robot: &RobotId, ordered: &DeploymentView) -> Result<(), CommandError> {
+async fn say_what_still_runs(
+    session: &Session,
+    robot: &RobotId,
+    ordered: &DeploymentView,
+) -> Result<(), CommandError> {
     let robot: RobotView = session.client.get(&format!("/robots/{robot}"), &[]).await?;
-    let Some(task) = robot.tasks.iter().find(|task| task.task == ordered.package.name) else { return Ok(()) };
-    let Some(active) = task.active.as_ref().filter(|active| active.deployment != ordered.id) else { return Ok(()) };
-    let digest = active.manifest.map_or_else(String::new, |digest| format!(" ({})", short(&digest)));
-    let why = task.failure.as_ref().map_or_else(|| task.phase.to_string(), |failure| failure.to_string());
+    let Some(task) = robot.tasks.iter().find(|task| task.task == ordered.package.name) else {
+        return Ok(());
+    };
+    let Some(active) = task.active.as_ref().filter(|active| active.deployment != ordered.id) else {
+        return Ok(());
+    };
+    let digest =
+        active.manifest.map_or_else(String::new, |digest| format!(" ({})", short(&digest)));
+    let why =
+        task.failure.as_ref().map_or_else(|| task.phase.to_string(), |failure| failure.to_string());
     say(&printable(&format!(
         "{} still runs {} {}{digest}, which it had before; the new one does not run: {why}",
         robot.name, task.task, active.version
@@ -160,7 +195,8 @@ mod tests {
 
     #[test]
     fn arguments_are_written_as_for_ros2_launch() {
-        let argument = |text: &str| text.parse::<Argument>().map(|argument| (argument.name, argument.value));
+        let argument =
+            |text: &str| text.parse::<Argument>().map(|argument| (argument.name, argument.value));
         assert_eq!(argument("map:=a:=b"), Ok(("map".to_owned(), "a:=b".to_owned())));
         assert_eq!(argument("use_sim_time:="), Ok(("use_sim_time".to_owned(), String::new())));
         assert!(argument(":=x").is_err() && argument("map=x").is_err());

@@ -4,7 +4,9 @@ use std::time::Duration;
 
 use clap::Args;
 use task_proto::TaskName;
-use task_proto::api::{DeploymentView, MatchedRobot, MatchedRobots, OrderTask, RobotView, RolledBack};
+use task_proto::api::{
+    DeploymentView, MatchedRobot, MatchedRobots, OrderTask, RobotView, RolledBack,
+};
 use task_proto::selector::Selector;
 use tokio::time::{Instant, sleep, timeout_at};
 
@@ -71,12 +73,19 @@ impl Verb {
     }
 }
 
-pub(in crate::commands) async fn run(session: &Session, verb: Verb, order: TaskOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    verb: Verb,
+    order: TaskOrder,
+) -> Result<Outcome, CommandError> {
     give(session, verb, order).await?;
     Ok(Outcome::Succeeded)
 }
 
-pub(in crate::commands) async fn remove(session: &Session, order: RemoveOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn remove(
+    session: &Session,
+    order: RemoveOrder,
+) -> Result<Outcome, CommandError> {
     let RemoveOrder { order, wait, timeout } = order;
     let task = order.task.clone();
     let ordered = give(session, Verb::Remove, order).await?;
@@ -87,7 +96,10 @@ pub(in crate::commands) async fn remove(session: &Session, order: RemoveOrder) -
 }
 
 /// Brings each robot back to the package it had before the one it has now.
-pub(in crate::commands) async fn roll_back(session: &Session, order: TaskOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn roll_back(
+    session: &Session,
+    order: TaskOrder,
+) -> Result<Outcome, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
     let path = format!("/tasks/{task}/rollback");
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
@@ -102,7 +114,9 @@ pub(in crate::commands) async fn roll_back(session: &Session, order: TaskOrder) 
     };
     if meant.robots.is_empty() && !may_be_repeated {
         say_without(&meant.without);
-        return Err(CommandError::Usage(format!("no robot that {on} selects has an earlier version of {task}")));
+        return Err(CommandError::Usage(format!(
+            "no robot that {on} selects has an earlier version of {task}"
+        )));
     }
     if dry_run {
         print_matched(session, &MatchedRobots { robots: meant.robots })?;
@@ -113,14 +127,19 @@ pub(in crate::commands) async fn roll_back(session: &Session, order: TaskOrder) 
     let order = OrderTask { selector: on, dry_run: false };
     let key = idempotency_key.unwrap_or_else(random_key);
     let back: RolledBack = session.client.order(&path, &order, &key).await?;
-    session.output.result(&back, &ROLLED_BACK, |back| back.deployments.iter().map(rolled_back_row).collect())?;
+    session.output.result(&back, &ROLLED_BACK, |back| {
+        back.deployments.iter().map(rolled_back_row).collect()
+    })?;
     say_without(&back.without);
     say(&format!("ordered: rollback {task} on {}", robots(back.robots.len() as u64)));
     Ok(Outcome::Succeeded)
 }
 
-const ROLLED_BACK: Columns =
-    Columns { name: "deployment", narrow: &["deployment", "package", "version", "robots"], wide: &["manifest"] };
+const ROLLED_BACK: Columns = Columns {
+    name: "deployment",
+    narrow: &["deployment", "package", "version", "robots"],
+    wide: &["manifest"],
+};
 
 fn rolled_back_row(deployment: &DeploymentView) -> Vec<String> {
     let package = &deployment.package;
@@ -138,7 +157,8 @@ fn say_without(without: &[MatchedRobot]) {
     if without.is_empty() {
         return;
     }
-    let mut names: Vec<&str> = without.iter().take(MAX_NAMES).map(|robot| robot.name.as_str()).collect();
+    let mut names: Vec<&str> =
+        without.iter().take(MAX_NAMES).map(|robot| robot.name.as_str()).collect();
     let more = without.len().saturating_sub(MAX_NAMES);
     let and_more = format!("and {more} more");
     if more > 0 {
@@ -147,8 +167,8 @@ fn say_without(without: &[MatchedRobot]) {
     say(&format!("no earlier version ran on {}", names.join(", ")));
 }
 
-/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not, whoever was labelled or named
-/// anew may have.
+/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not,
+/// whoever was labelled or named anew may have.
 async fn until_gone(
     session: &Session,
     task: &TaskName,
@@ -164,11 +184,16 @@ async fn until_gone(
             Ok(Err(CommandError::Client(error))) if wait::may_pass(&error) => {}
             Ok(Err(error)) => return Err(error),
             Ok(Ok(list)) => {
-                let is_meant = |robot: &RobotView| ordered.robots.iter().any(|meant| meant.id == robot.id);
+                let is_meant =
+                    |robot: &RobotView| ordered.robots.iter().any(|meant| meant.id == robot.id);
                 let robots = list.robots.into_iter().filter(is_meant);
-                let robots: Vec<RobotView> = robots.filter(|robot| has_still(robot, task)).collect();
+                let robots: Vec<RobotView> =
+                    robots.filter(|robot| has_still(robot, task)).collect();
                 if robots.is_empty() {
-                    say(&format!("{task} is gone from {}", self::robots(ordered.robots.len() as u64)));
+                    say(&format!(
+                        "{task} is gone from {}",
+                        self::robots(ordered.robots.len() as u64)
+                    ));
                     return Ok(Outcome::Succeeded);
                 }
                 left = Some(robots);
@@ -180,7 +205,11 @@ async fn until_gone(
         None => say("timed out: the server did not say how the robots stand"),
         Some(left) => {
             for robot in left {
-                let why = if robot.online { "not done in time" } else { "offline, follows when it is back" };
+                let why = if robot.online {
+                    "not done in time"
+                } else {
+                    "offline, follows when it is back"
+                };
                 say(&format!("{}: {why}", robot.name));
             }
         }
@@ -188,36 +217,46 @@ async fn until_gone(
     Ok(Outcome::TimedOut)
 }
 
-/// These robots, whatever becomes of their names and labels; where they are too many to be listed in a question, all.
+/// These robots, whatever becomes of their names and labels; where they are too many to be listed
+/// in a question, all.
 fn by_id(robots: &[MatchedRobot]) -> Selector {
     const MAX_LISTED: usize = 200;
-    let ids: Vec<&str> = robots.iter().take(MAX_LISTED + 1).map(|robot| robot.id.as_str()).collect();
+    let ids: Vec<&str> =
+        robots.iter().take(MAX_LISTED + 1).map(|robot| robot.id.as_str()).collect();
     let listed = if ids.len() > MAX_LISTED { "*".to_owned() } else { ids.join(",") };
     listed.parse().expect("ids are a selector")
 }
 
 /// Whether the robot has not followed its newest order yet, or is still getting rid of the task.
 fn has_still(robot: &RobotView, task: &TaskName) -> bool {
-    robot.observed_generation < robot.generation || robot.tasks.iter().any(|known| known.task == *task)
+    robot.observed_generation < robot.generation
+        || robot.tasks.iter().any(|known| known.task == *task)
 }
 
-/// Whether the server means that there is nobody to order something of. Of an order that may have been carried out before,
-/// robots may be gone by now.
+/// Whether the server means that there is nobody to order something of. Of an order that may have
+/// been carried out before, robots may be gone by now.
 fn is_nobody(code: &str, may_be_repeated: bool) -> bool {
     code == "no_robots_match" || (may_be_repeated && code == "unknown_robots")
 }
 
 /// Gives the order; the robots it was for.
-async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<MatchedRobots, CommandError> {
+async fn give(
+    session: &Session,
+    verb: Verb,
+    order: TaskOrder,
+) -> Result<MatchedRobots, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
     let path = format!("/tasks/{task}/{}", verb.as_str());
-    // With a key this may be an order that was carried out before, whose tasks are gone by now: the server knows.
+    // With a key this may be an order that was carried out before, whose tasks are gone by now: the
+    // server knows.
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
     let key = idempotency_key.unwrap_or_else(random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
     // A dry run is no order, so it gets a key of its own.
     let matched: MatchedRobots = match session.client.order(&path, &ask, &random_key()).await {
-        Err(ClientError::Refused { code, .. }) if is_nobody(&code, may_be_repeated) => MatchedRobots::default(),
+        Err(ClientError::Refused { code, .. }) if is_nobody(&code, may_be_repeated) => {
+            MatchedRobots::default()
+        }
         answer => answer?,
     };
     if matched.robots.is_empty() && !may_be_repeated {
@@ -228,7 +267,8 @@ async fn give(session: &Session, verb: Verb, order: TaskOrder) -> Result<Matched
         return Ok(matched);
     }
     confirm(&format!("{} {task} on {on}", verb.as_str()), matched.robots.len(), yes)?;
-    let ordered: MatchedRobots = session.client.order(&path, &OrderTask { selector: on, dry_run: false }, &key).await?;
+    let ordered: MatchedRobots =
+        session.client.order(&path, &OrderTask { selector: on, dry_run: false }, &key).await?;
     print_matched(session, &ordered)?;
     let offline = ordered.robots.iter().filter(|robot| !robot.online).count();
     say(&format!("ordered: {} {task} on {}", verb.as_str(), robots(ordered.robots.len() as u64)));

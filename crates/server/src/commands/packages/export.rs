@@ -1,5 +1,5 @@
-//! `taskd package export`: a package's files out of the store. The bytes are proven by their digest before anything is
-//! unpacked, as strictly as on a robot, and what is there is there whole.
+//! `taskd package export`: a package's files out of the store. The bytes are proven by their digest
+//! before anything is unpacked, as strictly as on a robot, and what is there is there whole.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -14,16 +14,29 @@ use crate::commands::display::output::say;
 use crate::commands::{CommandError, Session};
 
 /// Writes the package to `to`: an archive by its ending, else a directory.
-pub(in crate::commands) async fn export(session: &Session, view: &PackageView, to: &Path) -> Result<(), CommandError> {
+pub(in crate::commands) async fn export(
+    session: &Session,
+    view: &PackageView,
+    to: &Path,
+) -> Result<(), CommandError> {
     let package = &view.package;
-    let failed = |source| CommandError::Io { what: format!("can't write {}", to.display()), source };
-    let ending = |end: &str| to.file_name().is_some_and(|name| name.to_string_lossy().ends_with(end));
+    let failed =
+        |source| CommandError::Io { what: format!("can't write {}", to.display()), source };
+    let ending =
+        |end: &str| to.file_name().is_some_and(|name| name.to_string_lossy().ends_with(end));
     let (is_tar, is_compressed) = (ending(".tar"), ending(".tar.zst"));
     let is_taken = to.exists() && !to.read_dir().is_ok_and(|mut entries| entries.next().is_none());
     if !is_tar && !is_compressed && is_taken {
-        return Err(CommandError::Usage(format!("{} is there already and is not empty", to.display())));
+        return Err(CommandError::Usage(format!(
+            "{} is there already and is not empty",
+            to.display()
+        )));
     }
-    let parent = to.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new(".")).to_owned();
+    let parent = to
+        .parent()
+        .filter(|parent| !parent.as_os_str().is_empty())
+        .unwrap_or(Path::new("."))
+        .to_owned();
     std::fs::create_dir_all(&parent).map_err(failed)?;
     let url = format!("/v2/{}/blobs/{}", package.name, package.content.digest);
     let content = download(session, &url, package.content.digest, &parent).await?;
@@ -53,7 +66,8 @@ fn write_tree(mut content: File, view: &PackageView, parent: &Path, to: &Path) -
     let beside = tempfile::Builder::new().prefix(".taskd-").tempdir_in(parent)?;
     let tree = beside.path().join("package");
     let facts = &view.manifest.content;
-    unpack(&mut content, view.package.content.size, facts, &Limits::default(), &tree).map_err(io::Error::other)?;
+    unpack(&mut content, view.package.content.size, facts, &Limits::default(), &tree)
+        .map_err(io::Error::other)?;
     // In the place of an empty directory, or of none.
     std::fs::rename(&tree, to)
 }

@@ -42,11 +42,16 @@ pub enum Action {
     },
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::List { robot, task } => {
             let list = list(session, robot.as_ref(), task.as_ref()).await?;
-            session.output.result(&list, &COLUMNS, |list| list.outputs.iter().flat_map(rows).collect())?;
+            session
+                .output
+                .result(&list, &COLUMNS, |list| list.outputs.iter().flat_map(rows).collect())?;
         }
         Action::Get { robot, task, run, into } => {
             let list = list(session, Some(&robot), Some(&task)).await?;
@@ -57,13 +62,19 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
             };
             let Some(view) = found else {
                 let which = run.map_or_else(String::new, |run| format!(" of the run {run}"));
-                return Err(CommandError::Usage(format!("{robot} has brought back nothing{which} of the task {task}")));
+                return Err(CommandError::Usage(format!(
+                    "{robot} has brought back nothing{which} of the task {task}"
+                )));
             };
             for file in &view.output.files {
                 fetch(session, view, file, &into).await?;
             }
             let files = view.output.files.len();
-            say(&format!("{files} file{} in {}", if files == 1 { "" } else { "s" }, into.display()));
+            say(&format!(
+                "{files} file{} in {}",
+                if files == 1 { "" } else { "s" },
+                into.display()
+            ));
         }
     }
     Ok(Outcome::Succeeded)
@@ -108,13 +119,19 @@ fn rows(view: &OutputView) -> Vec<Vec<String>> {
 }
 
 /// Fetches one file beside its place and moves it there once its bytes are proven.
-async fn fetch(session: &Session, view: &OutputView, file: &OutputFile, into: &Path) -> Result<(), CommandError> {
+async fn fetch(
+    session: &Session,
+    view: &OutputView,
+    file: &OutputFile,
+    into: &Path,
+) -> Result<(), CommandError> {
     // An output's path has no `..` and is not absolute, so this stays below `into`.
     let path = into.join(file.path.as_str());
     let parent = path.parent().unwrap_or(into);
-    tokio::fs::create_dir_all(parent)
-        .await
-        .map_err(|source| CommandError::Io { what: format!("can't make {}", parent.display()), source })?;
+    tokio::fs::create_dir_all(parent).await.map_err(|source| CommandError::Io {
+        what: format!("can't make {}", parent.display()),
+        source,
+    })?;
     let (robot, task) = (&view.output.robot_id, &view.output.task);
     let url = format!("/v2/outputs/{robot}/{task}/blobs/{}", file.blob.digest);
     put(download(session, &url, file.blob.digest, parent).await?, &path)?;

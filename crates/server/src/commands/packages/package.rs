@@ -5,7 +5,8 @@ use std::str::FromStr;
 
 use clap::Subcommand;
 use task_proto::api::{
-    PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageVersions, PackageView,
+    PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList, PackageVersions,
+    PackageView,
 };
 use task_proto::manifest::{BuildTool, TaskKind, TaskManifest};
 use task_proto::{Digest, TaskName};
@@ -60,8 +61,8 @@ pub enum Action {
         /// Its name, NAME:VERSION or NAME@DIGEST; a name alone is its newest version
         #[arg(add = complete::packages())]
         package: PackageName,
-        /// A directory that does not exist yet or is empty, or a file that ends with .tar or .tar.zst [default: a directory
-        /// of the package's name]
+        /// A directory that does not exist yet or is empty, or a file that ends with .tar or
+        /// .tar.zst [default: a directory of the package's name]
         to: Option<PathBuf>,
     },
 }
@@ -104,7 +105,10 @@ impl std::fmt::Display for PackageName {
     }
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::List { name } => list(session, name.as_ref()).await?,
         Action::Info { package } => info(session, &package).await?,
@@ -112,7 +116,9 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
         Action::Diff { from, to } => diff(session, &from, &to).await?,
         Action::Rm { package, yes } => {
             let Some(version) = &package.version else {
-                let text = format!("{package}: say which version, as {package}:VERSION (taskd package list {package})");
+                let text = format!(
+                    "{package}: say which version, as {package}:VERSION (taskd package list {package})"
+                );
                 return Err(CommandError::Usage(text));
             };
             always(&format!("delete the package {package}"), yes)?;
@@ -129,14 +135,18 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
 }
 
 /// The version that is meant, the newest where none is named.
-pub(in crate::commands) async fn find(session: &Session, package: &PackageName) -> Result<PackageView, CommandError> {
+pub(in crate::commands) async fn find(
+    session: &Session,
+    package: &PackageName,
+) -> Result<PackageView, CommandError> {
     let list: PackageList = session.client.get("/packages", &[]).await?;
     let is_meant = |view: &PackageView| {
         let known = &view.package;
         let version = package.version.as_deref();
         known.name == package.name
-            && version
-                .is_none_or(|version| version == known.version.as_str() || version == known.manifest.digest.to_string())
+            && version.is_none_or(|version| {
+                version == known.version.as_str() || version == known.manifest.digest.to_string()
+            })
     };
     let found = list.packages.into_iter().find(is_meant);
     found.ok_or_else(|| CommandError::Usage(format!("the server has no package {package}")))
@@ -202,13 +212,14 @@ const VERSIONS: Columns = Columns {
 };
 
 async fn info(session: &Session, package: &PackageName) -> Result<(), CommandError> {
-    let versions: PackageVersions = session.client.get(&format!("/packages/{}", package.name), &[]).await?;
+    let versions: PackageVersions =
+        session.client.get(&format!("/packages/{}", package.name), &[]).await?;
     if package.version.is_some() {
         let view = find(session, package).await?;
         let name = |view: &PackageView| format!("{}:{}", view.package.name, view.package.version);
-        return session
-            .output
-            .described(&view, name, |view| describe(view, used(&versions, &view.package.manifest.digest)));
+        return session.output.described(&view, name, |view| {
+            describe(view, used(&versions, &view.package.manifest.digest))
+        });
     }
     session.output.result(&versions, &VERSIONS, |versions| {
         let row = |view: &PackageView| {
@@ -232,7 +243,11 @@ async fn info(session: &Session, package: &PackageName) -> Result<(), CommandErr
 
 /// On how many robots it should run.
 fn used(versions: &PackageVersions, digest: &Digest) -> u64 {
-    versions.running.iter().find(|running| running.manifest == *digest).map_or(0, |running| running.robots)
+    versions
+        .running
+        .iter()
+        .find(|running| running.manifest == *digest)
+        .map_or(0, |running| running.robots)
 }
 
 fn describe(view: &PackageView, used: u64) -> String {
@@ -253,7 +268,8 @@ fn describe(view: &PackageView, used: u64) -> String {
         ("build", tool(manifest).to_owned()),
         ("run", run),
     ];
-    let arguments: Vec<String> = manifest.run.args.iter().map(|(name, value)| format!("{name}:={value}")).collect();
+    let arguments: Vec<String> =
+        manifest.run.args.iter().map(|(name, value)| format!("{name}:={value}")).collect();
     let labels = manifest.requires.labels.iter().map(|(key, value)| format!("{key}={value}"));
     let lists = [
         ("arguments", arguments),
@@ -269,16 +285,28 @@ fn describe(view: &PackageView, used: u64) -> String {
                 .collect(),
         ),
         ("lifecycle", manifest.ready.lifecycle.clone()),
-        ("needs", labels.chain(manifest.requires.ros_distro.clone()).chain(manifest.requires.arch.clone()).collect()),
+        (
+            "needs",
+            labels
+                .chain(manifest.requires.ros_distro.clone())
+                .chain(manifest.requires.arch.clone())
+                .collect(),
+        ),
         ("depends on", manifest.exec_depends.clone()),
         ("outputs", manifest.outputs.paths.clone()),
     ];
-    shown.extend(lists.into_iter().filter(|(_, list)| !list.is_empty()).map(|(key, list)| (key, list.join(" "))));
+    shown.extend(
+        lists
+            .into_iter()
+            .filter(|(_, list)| !list.is_empty())
+            .map(|(key, list)| (key, list.join(" "))),
+    );
     shown.push(("ordered for", robots(used)));
     facts(shown)
 }
 
-const FILES: Columns = Columns { name: "path", narrow: &["mode", "size", "path"], wide: &["digest"] };
+const FILES: Columns =
+    Columns { name: "path", narrow: &["mode", "size", "path"], wide: &["digest"] };
 
 async fn files(session: &Session, package: &PackageName) -> Result<(), CommandError> {
     let digest = find(session, package).await?.package.manifest.digest;
@@ -314,7 +342,8 @@ fn permissions(mode: u32) -> String {
     (0..9).zip("rwxrwxrwx".chars()).map(letter).collect()
 }
 
-const DIFFERENCES: Columns = Columns { name: "path", narrow: &["change", "path", "from", "to"], wide: &["digest"] };
+const DIFFERENCES: Columns =
+    Columns { name: "path", narrow: &["change", "path", "from", "to"], wide: &["digest"] };
 
 async fn diff(session: &Session, from: &PackageName, to: &str) -> Result<(), CommandError> {
     let Some(version) = &from.version else {
@@ -326,13 +355,19 @@ async fn diff(session: &Session, from: &PackageName, to: &str) -> Result<(), Com
         _ => to.to_owned(),
     };
     let path = format!("/packages/{}/diff", from.name);
-    let diff: PackageDiff = session.client.get(&path, &[("from", version.clone()), ("to", to)]).await?;
+    let diff: PackageDiff =
+        session.client.get(&path, &[("from", version.clone()), ("to", to)]).await?;
     session.output.result(&diff, &DIFFERENCES, difference_rows)?;
     if diff.manifest_changed {
         say("the manifests differ as well: see taskd package info");
     }
     let count = diff.added.len() + diff.removed.len() + diff.changed.len();
-    say(&format!("{} added, {} removed, {} changed", diff.added.len(), diff.removed.len(), diff.changed.len()));
+    say(&format!(
+        "{} added, {} removed, {} changed",
+        diff.added.len(),
+        diff.removed.len(),
+        diff.changed.len()
+    ));
     if count == 0 && !diff.manifest_changed {
         say("nothing differs");
     }
@@ -346,16 +381,23 @@ fn difference_rows(diff: &PackageDiff) -> Vec<Vec<String>> {
         let digest = digest.map_or_else(|| "-".to_owned(), Digest::to_string);
         vec![change.to_owned(), path.to_owned(), shown(from), shown(to), digest]
     };
-    let mut rows: Vec<_> = diff.added.iter().map(|file| row("added", &file.path, None, Some(file))).collect();
+    let mut rows: Vec<_> =
+        diff.added.iter().map(|file| row("added", &file.path, None, Some(file))).collect();
     rows.extend(diff.removed.iter().map(|file| row("removed", &file.path, Some(file), None)));
-    rows.extend(diff.changed.iter().map(|file| row("changed", &file.path, Some(&file.from), Some(&file.to))));
+    rows.extend(
+        diff.changed
+            .iter()
+            .map(|file| row("changed", &file.path, Some(&file.from), Some(&file.to))),
+    );
     rows.sort_by(|a, b| a[1].cmp(&b[1]));
     rows
 }
 
 fn content_of(file: &PackageFile) -> String {
     match (file.kind, &file.target) {
-        (PackageFileKind::File, _) if file.mode & 0o111 != 0 => format!("{}, executable", bytes(file.size)),
+        (PackageFileKind::File, _) if file.mode & 0o111 != 0 => {
+            format!("{}, executable", bytes(file.size))
+        }
         (PackageFileKind::File, _) => bytes(file.size),
         (PackageFileKind::Directory, _) => "directory".to_owned(),
         (PackageFileKind::Link, target) => format!("-> {}", target.as_deref().unwrap_or("?")),

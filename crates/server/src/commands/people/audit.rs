@@ -59,7 +59,10 @@ impl FromStr for Expected {
     }
 }
 
-pub(in crate::commands) async fn run(connection: &Connection, order: AuditOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    connection: &Connection,
+    order: AuditOrder,
+) -> Result<Outcome, CommandError> {
     if let Some(path) = &order.file {
         return verify_file(path, order.expect);
     }
@@ -71,9 +74,9 @@ pub(in crate::commands) async fn run(connection: &Connection, order: AuditOrder)
         return export(&session).await;
     }
     let page = newest(&session, order).await?;
-    session
-        .output
-        .result(&page, &COLUMNS, |page| page.records.iter().rev().filter_map(AuditRecord::read).map(row).collect())?;
+    session.output.result(&page, &COLUMNS, |page| {
+        page.records.iter().rev().filter_map(AuditRecord::read).map(row).collect()
+    })?;
     Ok(Outcome::Succeeded)
 }
 
@@ -100,7 +103,8 @@ async fn newest(session: &Session, order: AuditOrder) -> Result<AuditPage, Comma
 const COLUMNS: Columns = Columns::of(&["number", "time", "who", "from", "act", "target", "detail"]);
 
 fn row(entry: AuditEntry) -> Vec<String> {
-    let detail: Vec<String> = entry.detail.iter().map(|(key, value)| format!("{key}={value}")).collect();
+    let detail: Vec<String> =
+        entry.detail.iter().map(|(key, value)| format!("{key}={value}")).collect();
     vec![
         entry.number.to_string(),
         time(entry.at_ms),
@@ -146,19 +150,28 @@ async fn verify(session: &Session, expected: Option<Expected>) -> Result<Outcome
     }
 }
 
-fn verify_file(path: &std::path::Path, expected: Option<Expected>) -> Result<Outcome, CommandError> {
-    let failed = |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
+fn verify_file(
+    path: &std::path::Path,
+    expected: Option<Expected>,
+) -> Result<Outcome, CommandError> {
+    let failed =
+        |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
     let mut reader = BufReader::new(std::fs::File::open(path).map_err(failed)?);
     let mut verified = Verified::new(expected);
     loop {
         let mut line = Vec::new();
-        let read = std::io::Read::take(&mut reader, MOST_LINE_BYTES).read_until(b'\n', &mut line).map_err(failed)?;
+        let read = std::io::Read::take(&mut reader, MOST_LINE_BYTES)
+            .read_until(b'\n', &mut line)
+            .map_err(failed)?;
         if read == 0 {
             return verified.finish();
         }
         let record: AuditRecord = serde_json::from_slice(&line).map_err(|error| {
             let number = verified.link.number + 1;
-            CommandError::Usage(format!("{}, line {number}: it is no record of an export: {error}", path.display()))
+            CommandError::Usage(format!(
+                "{}, line {number}: it is no record of an export: {error}",
+                path.display()
+            ))
         })?;
         verified.follow(&record)?;
     }
@@ -178,8 +191,13 @@ impl Verified {
     fn follow(&mut self, record: &AuditRecord) -> Result<(), CommandError> {
         self.link = self.link.follow(record).map_err(broken)?;
         match self.expected {
-            Some(expected) if expected.number == self.link.number && expected.digest != self.link.digest => {
-                Err(CommandError::Broken(format!("entry {} is not the one that was seen before", expected.number)))
+            Some(expected)
+                if expected.number == self.link.number && expected.digest != self.link.digest =>
+            {
+                Err(CommandError::Broken(format!(
+                    "entry {} is not the one that was seen before",
+                    expected.number
+                )))
             }
             _ => Ok(()),
         }
@@ -189,10 +207,15 @@ impl Verified {
         let Self { link, expected } = self;
         if let Some(expected) = expected.filter(|expected| expected.number > link.number) {
             let (number, last) = (expected.number, link.number);
-            return Err(CommandError::Broken(format!("entry {number} was seen before, and now the last is {last}")));
+            return Err(CommandError::Broken(format!(
+                "entry {number} was seen before, and now the last is {last}"
+            )));
         }
         stream_text(&format!("{}:{}\n", link.number, link.digest))?;
-        say(&format!("all {} entries hold; give the line above to --expect next time", link.number));
+        say(&format!(
+            "all {} entries hold; give the line above to --expect next time",
+            link.number
+        ));
         Ok(Outcome::Succeeded)
     }
 }

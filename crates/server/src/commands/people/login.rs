@@ -1,5 +1,5 @@
-//! `taskd login` and `taskd logout`: exchanges name and password for a token, which is kept in a file of its owner's, by
-//! server, until it is signed out or ends.
+//! `taskd login` and `taskd logout`: exchanges name and password for a token, which is kept in a
+//! file of its owner's, by server, until it is signed out or ends.
 
 use std::time::Duration;
 
@@ -26,10 +26,15 @@ pub struct LoginOrder {
     from: PasswordFrom,
 }
 
-pub(in crate::commands) async fn log_in(connection: &Connection, order: LoginOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn log_in(
+    connection: &Connection,
+    order: LoginOrder,
+) -> Result<Outcome, CommandError> {
     let client = Client::anonymous(connection)?;
-    let path = path().ok_or_else(|| CommandError::Usage("neither XDG_CONFIG_HOME nor HOME is set".to_owned()))?;
-    let password = password::ask(order.from.password_stdin, &format!("password of {}", order.user))?.reveal();
+    let path = path()
+        .ok_or_else(|| CommandError::Usage("neither XDG_CONFIG_HOME nor HOME is set".to_owned()))?;
+    let password =
+        password::ask(order.from.password_stdin, &format!("password of {}", order.user))?.reveal();
     let request = LogIn { user: order.user, password, ttl_s: order.ttl.map(|ttl| ttl.as_secs()) };
     let token: AccessToken = client.once("/login", &request).await?;
     let mut kept = Kept::read(&path)?;
@@ -39,7 +44,12 @@ pub(in crate::commands) async fn log_in(connection: &Connection, order: LoginOrd
         kept.pins.insert(client.base().to_owned(), pin);
     }
     kept.write(&path)?;
-    say(&format!("signed in at {} as {} until {}", client.base(), token.user, time(token.expires_at_ms)));
+    say(&format!(
+        "signed in at {} as {} until {}",
+        client.base(),
+        token.user,
+        time(token.expires_at_ms)
+    ));
     Ok(Outcome::Succeeded)
 }
 
@@ -49,7 +59,8 @@ pub(in crate::commands) async fn log_out(connection: &Connection) -> Result<Outc
     let unknown = || CommandError::Usage(format!("you are not signed in at {base}"));
     let path = path().ok_or_else(unknown)?;
     let token = Kept::read(&path)?.servers.remove(&base).ok_or_else(unknown)?;
-    // It may have ended by itself, which comes to the same. One that the server may still take is not forgotten.
+    // It may have ended by itself, which comes to the same. One that the server may still take is
+    // not forgotten.
     match client.with_token(&token)?.delete("/session").await {
         Err(error) if error.outcome() != Outcome::NotAllowed => return Err(error.into()),
         _ => {}

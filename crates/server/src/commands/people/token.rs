@@ -49,13 +49,20 @@ pub enum Action {
     },
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::Create { title, user, role, robots, ttl } => {
             let ttl_s = ttl.map(|ttl| ttl.as_secs());
             let order = CreateToken { user, title, roles: role, scope: robots, ttl_s };
             let token: AccessToken = session.client.once("/tokens", &order).await?;
-            session.output.described(&token, |token| token.id.to_string(), |token| token.token.clone())?;
+            session.output.described(
+                &token,
+                |token| token.id.to_string(),
+                |token| token.token.clone(),
+            )?;
             say(&format!(
                 "{} of {}, valid until {}; it is not shown again",
                 token.id,
@@ -64,7 +71,8 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
             ));
         }
         Action::List { all } => {
-            let list: TokenList = session.client.get("/tokens", &[("all", all.to_string())]).await?;
+            let list: TokenList =
+                session.client.get("/tokens", &[("all", all.to_string())]).await?;
             session.output.result(&list, &COLUMNS, |list| list.tokens.iter().map(row).collect())?;
         }
         Action::Revoke { id } => {
@@ -75,7 +83,8 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
     Ok(Outcome::Succeeded)
 }
 
-const COLUMNS: Columns = Columns::of(&["id", "user", "origin", "title", "roles", "robots", "made", "ends"]);
+const COLUMNS: Columns =
+    Columns::of(&["id", "user", "origin", "title", "roles", "robots", "made", "ends"]);
 
 fn row(token: &TokenView) -> Vec<String> {
     let origin = match token.origin {

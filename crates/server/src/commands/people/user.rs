@@ -65,13 +65,19 @@ pub enum Action {
     },
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     let client = &session.client;
     match action {
         Action::Add { name, role, robots, no_password, from } => {
             let password = match no_password {
                 true => None,
-                false => Some(password::new_one(from.password_stdin, &format!("password of {name}"))?.reveal()),
+                false => Some(
+                    password::new_one(from.password_stdin, &format!("password of {name}"))?
+                        .reveal(),
+                ),
             };
             let order = AddUser { name, roles: role, scope: robots, password };
             let view: UserView = client.once("/users", &order).await?;
@@ -92,14 +98,16 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
             say(&format!("removed {name}; their tokens have ended"));
         }
         Action::Passwd { name: Some(name), from } => {
-            let password = password::new_one(from.password_stdin, &format!("new password of {name}"))?.reveal();
+            let password =
+                password::new_one(from.password_stdin, &format!("new password of {name}"))?
+                    .reveal();
             client.put(&format!("/users/{name}/password"), &SetPassword { password }).await?;
             say(&format!("set; what {name} was signed in to is signed out"));
         }
         Action::Passwd { name: None, from } => {
             let me: Me = client.get("/me", &[]).await?;
-            let old =
-                password::ask(from.password_stdin, &format!("old password of {}", me.name)).map(Secret::reveal)?;
+            let old = password::ask(from.password_stdin, &format!("old password of {}", me.name))
+                .map(Secret::reveal)?;
             let new = password::new_one(from.password_stdin, "new password")?.reveal();
             client.put("/password", &ChangePassword { old, new }).await?;
             say("set; you are signed out everywhere else");
@@ -113,7 +121,8 @@ pub(in crate::commands) async fn who_am_i(session: &Session) -> Result<Outcome, 
     let me: Me = session.client.get("/me", &[]).await?;
     let name = |me: &Me| me.name.to_string();
     session.output.described(&me, name, |me| {
-        let permissions: Vec<&str> = me.permissions.iter().map(|permission| permission.as_str()).collect();
+        let permissions: Vec<&str> =
+            me.permissions.iter().map(|permission| permission.as_str()).collect();
         let scope: Vec<String> = me.scope.iter().map(Selector::to_string).collect();
         facts([
             ("name", me.name.to_string()),

@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use clap::Subcommand;
 use task_proto::TokenId;
-use task_proto::api::{CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView};
+use task_proto::api::{
+    CreateEnrollmentToken, EnrollmentToken, EnrollmentTokenList, EnrollmentTokenView,
+};
 use task_proto::id::{LabelKey, LabelValue};
 
 use crate::commands::api::complete;
@@ -28,9 +30,9 @@ impl FromStr for Uses {
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
             "unlimited" => Ok(Self::Unlimited),
-            text => at_least_one(text)
-                .map(Self::Number)
-                .map_err(|_| format!("{text:?} is neither a whole number, at least 1, nor \"unlimited\"")),
+            text => at_least_one(text).map(Self::Number).map_err(|_| {
+                format!("{text:?} is neither a whole number, at least 1, nor \"unlimited\"")
+            }),
         }
     }
 }
@@ -52,7 +54,8 @@ pub enum Action {
         /// A label that each robot that uses it gets; may be repeated
         #[arg(long = "label", value_name = "KEY=VALUE", value_parser = label)]
         labels: Vec<(LabelKey, LabelValue)>,
-        /// Let each new robot that uses it wait until an administrator approves it (taskd robot approve)
+        /// Let each new robot that uses it wait until an administrator approves it (taskd robot
+        /// approve)
         #[arg(long)]
         approval: bool,
     },
@@ -66,7 +69,10 @@ pub enum Action {
     },
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::Create { robot, uses, ttl, labels, approval } => {
             let ttl_s = ttl.map(|ttl| ttl.as_secs());
@@ -78,11 +84,20 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
             let labels = labels.into_iter().collect();
             let request = CreateEnrollmentToken { robot, uses, unlimited, ttl_s, labels, approval };
             let key = crate::commands::api::client::random_key();
-            let token: EnrollmentToken = session.client.order("/enrollment-tokens", &request, &key).await?;
-            session.output.described(&token, |token| token.id.clone(), |token| token.token.clone())?;
-            let good_for = token.uses_left.map_or_else(|| "any number of robots".to_owned(), robots);
+            let token: EnrollmentToken =
+                session.client.order("/enrollment-tokens", &request, &key).await?;
+            session.output.described(
+                &token,
+                |token| token.id.clone(),
+                |token| token.token.clone(),
+            )?;
+            let good_for =
+                token.uses_left.map_or_else(|| "any number of robots".to_owned(), robots);
             let until = time(token.expires_at_ms);
-            say(&format!("{}, good for {good_for}, valid until {until}; it is not shown again", token.id));
+            say(&format!(
+                "{}, good for {good_for}, valid until {until}; it is not shown again",
+                token.id
+            ));
         }
         Action::List => {
             let list: EnrollmentTokenList = session.client.get("/enrollment-tokens", &[]).await?;
@@ -96,7 +111,8 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
     Ok(Outcome::Succeeded)
 }
 
-const COLUMNS: Columns = Columns::of(&["id", "robot", "labels", "uses left", "approval", "made", "ends"]);
+const COLUMNS: Columns =
+    Columns::of(&["id", "robot", "labels", "uses left", "approval", "made", "ends"]);
 
 fn row(token: &EnrollmentTokenView) -> Vec<String> {
     let labels: Vec<_> = token.labels.iter().map(|(key, value)| format!("{key}={value}")).collect();

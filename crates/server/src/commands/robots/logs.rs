@@ -1,5 +1,6 @@
-//! `taskd logs`: what a robot's tasks said, and with `-f` what they say. It joins the two without a gap: the stream is
-//! opened first, the past is asked for when the robot has said that it publishes, and again whenever the stream broke.
+//! `taskd logs`: what a robot's tasks said, and with `-f` what they say. It joins the two without a
+//! gap: the stream is opened first, the past is asked for when the robot has said that it
+//! publishes, and again whenever the stream broke.
 
 use std::time::Duration;
 
@@ -45,14 +46,21 @@ pub struct LogsOrder {
     lines: Option<u64>,
 }
 
-pub(in crate::commands) async fn run(session: &Session, order: LogsOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    order: LogsOrder,
+) -> Result<Outcome, CommandError> {
     if session.output.format() == Format::Name {
-        return Err(CommandError::Usage("-o name: lines of a log have no names; give table, wide or json".to_owned()));
+        return Err(CommandError::Usage(
+            "-o name: lines of a log have no names; give table, wide or json".to_owned(),
+        ));
     }
     if order.follow {
         return follow(session, &order).await;
     }
-    let view = past(session, &order, order.since, order.lines).await.map_err(|error| error.about(&order.robot))?;
+    let view = past(session, &order, order.since, order.lines)
+        .await
+        .map_err(|error| error.about(&order.robot))?;
     explain(&view);
     match session.output.format() {
         Format::Json => session.output.json(&view)?,
@@ -68,7 +76,11 @@ pub(in crate::commands) async fn follow_task(
     task: TaskName,
 ) -> Result<Outcome, CommandError> {
     let level = LogLevel::Info;
-    follow(session, &LogsOrder { robot, task: Some(task), follow: true, level, since: None, lines: None }).await
+    follow(
+        session,
+        &LogsOrder { robot, task: Some(task), follow: true, level, since: None, lines: None },
+    )
+    .await
 }
 
 async fn past(
@@ -93,7 +105,11 @@ fn explain(view: &LogsView) {
         let reason = view.reason.as_deref().unwrap_or("the robot did not answer");
         say(&match view.lines.is_empty() {
             true => format!("{}; the server remembers nothing of it", printable(reason)),
-            false => format!("{}; this is what the server remembers, {} old", printable(reason), age(view.age_ms)),
+            false => format!(
+                "{}; this is what the server remembers, {} old",
+                printable(reason),
+                age(view.age_ms)
+            ),
         });
     }
     say_left_out(view.suppressed);
@@ -101,7 +117,9 @@ fn explain(view: &LogsView) {
 
 fn say_left_out(count: u64) {
     if count > 0 {
-        say(&format!("{count} more lines were left out because they were too many; the robot keeps them"));
+        say(&format!(
+            "{count} more lines were left out because they were too many; the robot keeps them"
+        ));
     }
 }
 
@@ -126,13 +144,19 @@ async fn follow(session: &Session, order: &LogsOrder) -> Result<Outcome, Command
     let mut screen = Screen::new(session);
     let mut broken: Option<String> = None;
     loop {
-        let query =
-            LogsQuery { task: order.task.clone(), level: Some(order.level), follow: true, ..LogsQuery::default() };
+        let query = LogsQuery {
+            task: order.task.clone(),
+            level: Some(order.level),
+            follow: true,
+            ..LogsQuery::default()
+        };
         let opened = session.client.stream(&format!("/robots/{}/logs", order.robot), &query).await;
         let left = match opened {
             Ok(response) => listen(session, order, Events::of(response), &mut screen).await?,
             // What never worked is not waited for.
-            Err(error) if screen.heard_at.is_none() || !wait::may_pass(&error) => return Err(error.about(&order.robot)),
+            Err(error) if screen.heard_at.is_none() || !wait::may_pass(&error) => {
+                return Err(error.about(&order.robot));
+            }
             Err(error) => Left::Broken(error.to_string()),
         };
         match left {
@@ -158,8 +182,12 @@ async fn listen(
     loop {
         let event = match tokio::time::timeout(SILENCE, events.next::<LogEvent>()).await {
             Ok(Ok(Some(event))) => event,
-            Ok(Ok(None)) | Err(_) => return Ok(Left::Broken("the server has ended the stream".to_owned())),
-            Ok(Err(error)) => return Ok(Left::Broken(session.client.unreachable(error).to_string())),
+            Ok(Ok(None)) | Err(_) => {
+                return Ok(Left::Broken("the server has ended the stream".to_owned()));
+            }
+            Ok(Err(error)) => {
+                return Ok(Left::Broken(session.client.unreachable(error).to_string()));
+            }
         };
         let goes_on = match event {
             LogEvent::Following => {
@@ -170,7 +198,11 @@ async fn listen(
                 say(&format!("{}; waiting for it", printable(&reason)));
                 away = Some(reason);
                 // Until it comes, what the server remembers is all there is.
-                if screen.heard_at.is_some() { true } else { catch_up(session, order, screen).await? }
+                if screen.heard_at.is_some() {
+                    true
+                } else {
+                    catch_up(session, order, screen).await?
+                }
             }
             LogEvent::Away { .. } => true,
             LogEvent::Lines { lines, suppressed } => {
@@ -184,8 +216,13 @@ async fn listen(
     }
 }
 
-/// Prints what was said before the stream began, or while it was broken; false when nobody reads any more.
-async fn catch_up(session: &Session, order: &LogsOrder, screen: &mut Screen) -> Result<bool, CommandError> {
+/// Prints what was said before the stream began, or while it was broken; false when nobody reads
+/// any more.
+async fn catch_up(
+    session: &Session,
+    order: &LogsOrder,
+    screen: &mut Screen,
+) -> Result<bool, CommandError> {
     // So many lines are asked for of the past, not of what a break has left out.
     let (since, lines) = match screen.heard_at {
         Some(heard_at) => (Some(heard_at.elapsed() + OVERLAP), None),
@@ -216,12 +253,20 @@ impl Screen {
     fn new(session: &Session) -> Self {
         let colours = session.output.has_colours();
         let shown = Shown::default();
-        Self { format: session.output.format(), colours, task_width: 0, node_width: 0, shown, heard_at: None }
+        Self {
+            format: session.output.format(),
+            colours,
+            task_width: 0,
+            node_width: 0,
+            shown,
+            heard_at: None,
+        }
     }
 
     /// Prints lines that came by the stream, unless the past had them.
     fn print_new(&mut self, lines: &[LogLine]) -> Result<bool, CommandError> {
-        let new: Vec<LogLine> = lines.iter().filter(|line| self.shown.streamed(line)).cloned().collect();
+        let new: Vec<LogLine> =
+            lines.iter().filter(|line| self.shown.streamed(line)).cloned().collect();
         self.heard_at = Some(Instant::now());
         self.print(&new)
     }
@@ -237,7 +282,8 @@ impl Screen {
         let width = |text: Option<&str>| text.map_or(1, |text| text.chars().count()).min(32);
         for line in lines {
             self.task_width = self.task_width.max(width(line.task.as_ref().map(TaskName::as_str)));
-            self.node_width = self.node_width.max(width(line.node.as_ref().map(|node| node.as_str())));
+            self.node_width =
+                self.node_width.max(width(line.node.as_ref().map(|node| node.as_str())));
         }
         let mut text = String::new();
         for line in lines {
@@ -261,7 +307,10 @@ impl Screen {
             None => level,
         };
         let (day, time) = (&time[..10], &time[11..]);
-        format!("{day} {time}  {level}  {task:<task_width$}  {node:<node_width$}  {}", printable(&line.text))
+        format!(
+            "{day} {time}  {level}  {task:<task_width$}  {node:<node_width$}  {}",
+            printable(&line.text)
+        )
     }
 }
 
@@ -305,6 +354,9 @@ mod tests {
 
     #[test]
     fn ages_are_said_in_one_unit() {
-        assert_eq!([0, 119_000, 600_000, 7_200_000, 200_000_000].map(age), ["0 s", "119 s", "10 min", "2 h", "2 days"]);
+        assert_eq!(
+            [0, 119_000, 600_000, 7_200_000, 200_000_000].map(age),
+            ["0 s", "119 s", "10 min", "2 h", "2 days"]
+        );
     }
 }

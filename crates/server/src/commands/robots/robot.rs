@@ -4,7 +4,9 @@ use std::str::FromStr;
 
 use clap::{ArgGroup, Subcommand};
 use task_proto::RobotName;
-use task_proto::api::{BulkLabels, BulkRemove, EditRobot, MatchedRobot, MatchedRobots, PendingRobotList, RobotView};
+use task_proto::api::{
+    BulkLabels, BulkRemove, EditRobot, MatchedRobot, MatchedRobots, PendingRobotList, RobotView,
+};
 use task_proto::id::{LabelKey, LabelValue, Labels};
 use task_proto::selector::Selector;
 
@@ -27,7 +29,8 @@ const MAX_NAMED: usize = 10;
 pub enum Action {
     /// List robots
     List {
-        /// Which robots: *, names, label=value; commas separate alternatives, & joins conditions, ! takes away
+        /// Which robots: *, names, label=value; commas separate alternatives, & joins conditions, !
+        /// takes away
         #[arg(default_value = "*", add = complete::selectors())]
         selector: Selector,
     },
@@ -46,8 +49,8 @@ pub enum Action {
         /// The name it has from now on
         #[arg(long, value_name = "NAME")]
         name: Option<RobotName>,
-        /// A setting: underlays, workspace, ros_domain_id, forward_level or limits.…; what the robot has of its own in
-        /// agent.toml wins; may be repeated
+        /// A setting: underlays, workspace, ros_domain_id, forward_level or limits.…; what the
+        /// robot has of its own in agent.toml wins; may be repeated
         #[arg(long = "set", value_name = "KEY=VALUE")]
         settings: Vec<Setting>,
         /// The key of a setting that the robot is to have no more from here; may be repeated
@@ -84,7 +87,8 @@ pub enum Action {
         /// Its name or id
         robot: RobotName,
     },
-    /// End a robot's tokens and whatever it does by them, now; it comes back only by enrolling with a token made for it
+    /// End a robot's tokens and whatever it does by them, now; it comes back only by enrolling with
+    /// a token made for it
     Revoke {
         /// Its name or id
         #[arg(add = complete::robots())]
@@ -121,14 +125,21 @@ impl FromStr for LabelChange {
     fn from_str(text: &str) -> Result<Self, String> {
         let invalid = |error: task_proto::id::InvalidId| error.to_string();
         match (text.split_once('='), text.strip_suffix('-')) {
-            (Some((key, value)), _) => Ok(Self::Set(key.parse().map_err(invalid)?, value.parse().map_err(invalid)?)),
+            (Some((key, value)), _) => {
+                Ok(Self::Set(key.parse().map_err(invalid)?, value.parse().map_err(invalid)?))
+            }
             (None, Some(key)) => Ok(Self::Remove(key.parse().map_err(invalid)?)),
-            (None, None) => Err("expected KEY=VALUE to set a label, or KEY- to take it away".to_owned()),
+            (None, None) => {
+                Err("expected KEY=VALUE to set a label, or KEY- to take it away".to_owned())
+            }
         }
     }
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::List { selector } => {
             let list = matching(session, &selector).await?;
@@ -149,14 +160,19 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
                 false => Some(changed(robot.settings.as_ref(), &settings, &unset)?),
             };
             let edit = EditRobot { name, settings, ..EditRobot::default() };
-            let robot: RobotView = session.client.change(&format!("/robots/{}", robot.id), &edit).await?;
+            let robot: RobotView =
+                session.client.change(&format!("/robots/{}", robot.id), &edit).await?;
             print(session, &robot)?;
         }
         Action::Top(order) => return top::run(session, order).await,
-        Action::Label { selector, labels, dry_run, yes } => label(session, selector, labels, dry_run, yes).await?,
+        Action::Label { selector, labels, dry_run, yes } => {
+            label(session, selector, labels, dry_run, yes).await?
+        }
         Action::Pending => {
             let list: PendingRobotList = session.client.get("/pending-robots", &[]).await?;
-            session.output.result(&list, &PENDING, |list| list.robots.iter().map(pending_row).collect())?;
+            session
+                .output
+                .result(&list, &PENDING, |list| list.robots.iter().map(pending_row).collect())?;
         }
         Action::Approve { robots } => {
             for robot in robots {
@@ -175,7 +191,10 @@ pub(in crate::commands) async fn run(session: &Session, action: Action) -> Resul
             always(&format!("revoke the robot {}", robot.name), yes)?;
             session.client.act(&format!("/robots/{}/revoke", robot.id)).await?;
             say(&format!("revoked {} ({})", robot.name, robot.id));
-            say(&format!("it comes back with: taskd enroll-token create --uses 1 --robot {}", robot.name));
+            say(&format!(
+                "it comes back with: taskd enroll-token create --uses 1 --robot {}",
+                robot.name
+            ));
         }
         Action::Rm { selector, dry_run, yes } => remove(session, selector, dry_run, yes).await?,
     }
@@ -216,7 +235,12 @@ async fn label(
     Ok(())
 }
 
-async fn remove(session: &Session, selector: Selector, dry_run: bool, yes: bool) -> Result<(), CommandError> {
+async fn remove(
+    session: &Session,
+    selector: Selector,
+    dry_run: bool,
+    yes: bool,
+) -> Result<(), CommandError> {
     let matched = matched(session, &selector).await?;
     if dry_run {
         return print_matched(session, &matched);

@@ -1,4 +1,5 @@
-//! Robots' settings as they are typed: `workspace=/home/robot/ws`, by the keys of the robot's own property file.
+//! Robots' settings as they are typed: `workspace=/home/robot/ws`, by the keys of the robot's own
+//! property file.
 
 use std::str::FromStr;
 
@@ -22,7 +23,10 @@ impl FromStr for Setting {
             Some((key, value)) if !key.is_empty() && !value.is_empty() => {
                 Ok(Self { key: key.to_owned(), value: value.to_owned() })
             }
-            _ => Err("expected KEY=VALUE, like workspace=/home/robot/ws or limits.log_bytes=1000000".to_owned()),
+            _ => {
+                Err("expected KEY=VALUE, like workspace=/home/robot/ws or limits.log_bytes=1000000"
+                    .to_owned())
+            }
         }
     }
 }
@@ -51,8 +55,10 @@ pub(in crate::commands) fn changed(
         }
         put(&mut values, key, Some(typed(key, value)));
     }
-    let read: RobotSettings = serde_path_to_error::deserialize(Value::Object(values))
-        .map_err(|error| wrong(format!("{}: {}", error.path(), in_file_words(&error.inner().to_string()))))?;
+    let read: RobotSettings =
+        serde_path_to_error::deserialize(Value::Object(values)).map_err(|error| {
+            wrong(format!("{}: {}", error.path(), in_file_words(&error.inner().to_string())))
+        })?;
     read.check().map_err(|error| wrong(error.to_string()))?;
     Ok((!read.is_empty()).then_some(read))
 }
@@ -64,7 +70,11 @@ pub(in crate::commands) fn shown(settings: &RobotSettings) -> String {
         for (key, value) in values {
             match value {
                 Value::Object(table) => {
-                    texts.extend(table.iter().map(|(inner, value)| format!("{key}.{inner}={}", plain(value))));
+                    texts.extend(
+                        table
+                            .iter()
+                            .map(|(inner, value)| format!("{key}.{inner}={}", plain(value))),
+                    );
                 }
                 value => texts.push(format!("{key}={}", plain(&value))),
             }
@@ -118,11 +128,18 @@ mod tests {
 
     #[test]
     fn settings_are_typed_by_their_keys() {
-        let read = set(&["underlays=/a/setup.bash, /b/setup.bash", "ros_domain_id=7", "limits.log_bytes=5000000"]);
+        let read = set(&[
+            "underlays=/a/setup.bash, /b/setup.bash",
+            "ros_domain_id=7",
+            "limits.log_bytes=5000000",
+        ]);
         let read = read.expect("good").expect("some");
         assert_eq!((read.underlays.as_ref().map(Vec::len), read.ros_domain_id), (Some(2), Some(7)));
         assert_eq!(read.limits.log_bytes, Some(5_000_000));
-        assert_eq!(shown(&read), "limits.log_bytes=5000000 ros_domain_id=7 underlays=/a/setup.bash,/b/setup.bash");
+        assert_eq!(
+            shown(&read),
+            "limits.log_bytes=5000000 ros_domain_id=7 underlays=/a/setup.bash,/b/setup.bash"
+        );
         let unset = ["underlays", "ros_domain_id", "limits.log_bytes"].map(str::to_owned);
         assert_eq!(changed(Some(&read), &[], &unset).expect("good"), None);
         let kept = changed(Some(&read), &[], &unset[..2]).expect("good").expect("some");
@@ -137,7 +154,10 @@ mod tests {
             ("workspace=ws", "workspace: "),
             ("ros_domain_id=400", "ros_domain_id: 400 is not between"),
             ("ros_domain_id=x", "ros_domain_id: "),
-            ("limits.log_bytes=1MB", "limits.log_bytes: invalid type: string \"1MB\", expected a whole number"),
+            (
+                "limits.log_bytes=1MB",
+                "limits.log_bytes: invalid type: string \"1MB\", expected a whole number",
+            ),
         ] {
             let error = set(&[text]).expect_err(text);
             assert!(error.starts_with(said), "{text}: {error}");

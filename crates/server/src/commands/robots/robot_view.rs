@@ -15,9 +15,21 @@ pub(in crate::commands) const COLUMNS: Columns = Columns {
     narrow: &["id", "name", "address", "state", "last seen", "tasks"],
     wide: &["mac", "labels", "agent", "arch", "ros", "rtt", "disk free"],
 };
-pub(in crate::commands) const PENDING: Columns =
-    Columns { name: "name", narrow: &["id", "name", "mac", "labels", "address", "token", "since"], wide: &[] };
-const TASKS: Columns = Columns::of(&["task", "version", "wanted", "run", "phase", "restarts", "deployment", "problem"]);
+pub(in crate::commands) const PENDING: Columns = Columns {
+    name: "name",
+    narrow: &["id", "name", "mac", "labels", "address", "token", "since"],
+    wide: &[],
+};
+const TASKS: Columns = Columns::of(&[
+    "task",
+    "version",
+    "wanted",
+    "run",
+    "phase",
+    "restarts",
+    "deployment",
+    "problem",
+]);
 
 pub(in crate::commands) fn row(robot: &RobotView) -> Vec<String> {
     let tasks: Vec<_> = robot.tasks.iter().map(standing).collect();
@@ -100,15 +112,27 @@ pub(in crate::commands) fn describe(robot: &RobotView, output: &Output) -> Strin
         ("last seen", robot.last_seen_ms.map_or_else(|| "never".to_owned(), time)),
         ("enrolled", time(robot.enrolled_at_ms)),
         ("labels", shown_labels(&robot.labels)),
-        ("generation", format!("{} ordered, {} observed", robot.generation, robot.observed_generation)),
+        (
+            "generation",
+            format!("{} ordered, {} observed", robot.generation, robot.observed_generation),
+        ),
     ];
     if let Some(host) = &robot.host {
-        facts.push(("host", format!("{} {} agent {}", host.hostname, host.arch, host.agent_version)));
-        facts.push(("ros", if host.ros_distros.is_empty() { "-".to_owned() } else { host.ros_distros.join(" ") }));
+        facts.push((
+            "host",
+            format!("{} {} agent {}", host.hostname, host.arch, host.agent_version),
+        ));
+        facts.push((
+            "ros",
+            if host.ros_distros.is_empty() { "-".to_owned() } else { host.ros_distros.join(" ") },
+        ));
         if let Some(ros) = &host.ros {
             facts.push(("ros in use", ros_in_use(ros)));
         }
-        facts.push(("isolation", if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned()));
+        facts.push((
+            "isolation",
+            if host.isolation == Isolation::Cgroup { "cgroup" } else { "none" }.to_owned(),
+        ));
         if let Some(accounts) = host.accounts {
             facts.push(("accounts", task_accounts(accounts).to_owned()));
         }
@@ -130,7 +154,9 @@ pub(in crate::commands) fn describe(robot: &RobotView, output: &Output) -> Strin
     if let Some(effective) = &robot.effective_settings {
         facts.push(("settings", shown(&effective.values)));
         facts.extend((!effective.own.is_empty()).then(|| ("robot's own", effective.own.join(" "))));
-        facts.extend((!effective.refused.is_empty()).then(|| ("not taken", effective.refused.join(" "))));
+        facts.extend(
+            (!effective.refused.is_empty()).then(|| ("not taken", effective.refused.join(" "))),
+        );
     }
     if let Some(mqtt) = &robot.mqtt {
         facts.push(("connected", time(mqtt.since_ms)));
@@ -158,7 +184,9 @@ fn publishers(version: Option<u64>) -> String {
 
 /// What transfers have shown of a robot's way to the server, in words.
 fn measured(link: &LinkFacts) -> String {
-    let counted = |count: u32, one: &str, many: &str| format!("{count} {}", if count == 1 { one } else { many });
+    let counted = |count: u32, one: &str, many: &str| {
+        format!("{count} {}", if count == 1 { one } else { many })
+    };
     let parts = [
         link.throughput_bytes_per_s.map(|rate| Unit::BytesPerSecond.show(rate)),
         link.rtt_ms.map(|rtt_ms| format!("rtt {}", Unit::Milliseconds.show(rtt_ms.into()))),
@@ -183,7 +211,11 @@ fn task_row(task: &RobotTask) -> Vec<String> {
     };
     vec![
         task.task.to_string(),
-        if task.outdated { format!("{} (outdated)", task.version) } else { task.version.to_string() },
+        if task.outdated {
+            format!("{} (outdated)", task.version)
+        } else {
+            task.version.to_string()
+        },
         wanted.to_owned(),
         task.run.to_string(),
         task.phase.to_string(),
@@ -198,7 +230,10 @@ fn problem(task: &RobotTask) -> String {
     match (&task.failure, &task.degraded) {
         (Some(failure), _) => match still_running(task) {
             Some(earlier) => {
-                format!("{failure}; {} still runs, from deployment {}", earlier.version, earlier.deployment)
+                format!(
+                    "{failure}; {} still runs, from deployment {}",
+                    earlier.version, earlier.deployment
+                )
             }
             None => failure.to_string(),
         },
@@ -213,8 +248,19 @@ mod tests {
 
     #[test]
     fn a_link_is_told_as_far_as_it_was_measured() {
-        let link = LinkFacts { throughput_bytes_per_s: Some(2 << 20), rtt_ms: Some(31), reconnects: 1, losses: 2 };
-        assert_eq!(measured(&link), "2 MB/s, rtt 31 ms, 2 transfers broke off, 1 session lost in an hour");
-        assert_eq!(measured(&LinkFacts::default()), "0 transfers broke off, 0 sessions lost in an hour");
+        let link = LinkFacts {
+            throughput_bytes_per_s: Some(2 << 20),
+            rtt_ms: Some(31),
+            reconnects: 1,
+            losses: 2,
+        };
+        assert_eq!(
+            measured(&link),
+            "2 MB/s, rtt 31 ms, 2 transfers broke off, 1 session lost in an hour"
+        );
+        assert_eq!(
+            measured(&LinkFacts::default()),
+            "0 transfers broke off, 0 sessions lost in an hour"
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! `taskd node|topic|param|lifecycle`: what a robot's ROS graph shows, and what can be done to its nodes from here. Each
-//! asks the robot itself, once; nothing of it lasts beyond a restart of the task.
+//! `taskd node|topic|param|lifecycle`: what a robot's ROS graph shows, and what can be done to its
+//! nodes from here. Each asks the robot itself, once; nothing of it lasts beyond a restart of the
+//! task.
 
 use clap::Subcommand;
 use task_proto::RobotName;
@@ -118,14 +119,19 @@ impl From<TransitionName> for Transition {
     }
 }
 
-pub(in crate::commands) async fn node(session: &Session, action: NodeAction) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn node(
+    session: &Session,
+    action: NodeAction,
+) -> Result<Outcome, CommandError> {
     match action {
         NodeAction::List { robot } => {
             let answer = session.client.ask(&robot, &Ask::Nodes).await?;
             say_age(&answer);
-            session.output.result(&answer, &Columns::of(&["node", "task", "state"]), |answer| match answer {
-                Answer::Nodes { nodes, .. } => nodes.iter().map(node_row).collect(),
-                _ => Vec::new(),
+            session.output.result(&answer, &Columns::of(&["node", "task", "state"]), |answer| {
+                match answer {
+                    Answer::Nodes { nodes, .. } => nodes.iter().map(node_row).collect(),
+                    _ => Vec::new(),
+                }
             })?;
         }
         NodeAction::Info { robot, node } => {
@@ -135,7 +141,9 @@ pub(in crate::commands) async fn node(session: &Session, action: NodeAction) -> 
                 &answer,
                 |_| node.to_string(),
                 |answer| match answer {
-                    Answer::Node { nodes, .. } => nodes.iter().map(describe).collect::<Vec<_>>().join("\n"),
+                    Answer::Node { nodes, .. } => {
+                        nodes.iter().map(describe).collect::<Vec<_>>().join("\n")
+                    }
                     _ => String::new(),
                 },
             )?;
@@ -144,20 +152,28 @@ pub(in crate::commands) async fn node(session: &Session, action: NodeAction) -> 
     Ok(Outcome::Succeeded)
 }
 
-pub(in crate::commands) async fn topic(session: &Session, action: TopicAction) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn topic(
+    session: &Session,
+    action: TopicAction,
+) -> Result<Outcome, CommandError> {
     let TopicAction::List { robot } = action;
     let answer = session.client.ask(&robot, &Ask::Topics).await?;
     say_age(&answer);
-    session.output.result(&answer, &Columns::of(&["topic", "type", "publishers", "subscriptions"]), |answer| {
-        match answer {
+    session.output.result(
+        &answer,
+        &Columns::of(&["topic", "type", "publishers", "subscriptions"]),
+        |answer| match answer {
             Answer::Topics { topics, .. } => topics.iter().map(topic_row).collect(),
             _ => Vec::new(),
-        }
-    })?;
+        },
+    )?;
     Ok(Outcome::Succeeded)
 }
 
-pub(in crate::commands) async fn param(session: &Session, action: ParamAction) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn param(
+    session: &Session,
+    action: ParamAction,
+) -> Result<Outcome, CommandError> {
     let (robot, ask) = match action {
         ParamAction::List { robot, node } => (robot, Ask::Parameters { node }),
         ParamAction::Get { robot, node, name } => (robot, Ask::Parameter { node, name }),
@@ -168,18 +184,27 @@ pub(in crate::commands) async fn param(session: &Session, action: ParamAction) -
     };
     let answer = session.client.ask(&robot, &ask).await?;
     let row = |parameter: &Parameter| vec![parameter.name.clone(), parameter.value.to_string()];
-    session.output.result(&answer, &Columns::of(&["parameter", "value"]), |answer| match answer {
-        Answer::Parameters { parameters } => parameters.iter().map(row).collect(),
-        Answer::ParameterSet { parameter } => vec![row(parameter)],
-        _ => Vec::new(),
-    })?;
+    session.output.result(
+        &answer,
+        &Columns::of(&["parameter", "value"]),
+        |answer| match answer {
+            Answer::Parameters { parameters } => parameters.iter().map(row).collect(),
+            Answer::ParameterSet { parameter } => vec![row(parameter)],
+            _ => Vec::new(),
+        },
+    )?;
     Ok(Outcome::Succeeded)
 }
 
-pub(in crate::commands) async fn lifecycle(session: &Session, order: LifecycleOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn lifecycle(
+    session: &Session,
+    order: LifecycleOrder,
+) -> Result<Outcome, CommandError> {
     let LifecycleOrder { robot, node, transition } = order;
-    let answer =
-        session.client.ask(&robot, &Ask::Lifecycle { node: node.clone(), transition: transition.into() }).await?;
+    let answer = session
+        .client
+        .ask(&robot, &Ask::Lifecycle { node: node.clone(), transition: transition.into() })
+        .await?;
     session.output.described(
         &answer,
         |_| node.to_string(),
@@ -192,7 +217,10 @@ pub(in crate::commands) async fn lifecycle(session: &Session, order: LifecycleOr
 }
 
 fn say_age(answer: &Answer) {
-    if let Answer::Nodes { age_ms, .. } | Answer::Node { age_ms, .. } | Answer::Topics { age_ms, .. } = answer {
+    if let Answer::Nodes { age_ms, .. }
+    | Answer::Node { age_ms, .. }
+    | Answer::Topics { age_ms, .. } = answer
+    {
         // Tenths are enough, and a count of milliseconds fits a float exactly.
         say(&format!("the graph as it was {:.1} s ago", *age_ms as f64 / 1000.0));
     }
@@ -225,7 +253,12 @@ fn topic_row(topic: &TopicSummary) -> Vec<String> {
         let names: Vec<_> = names.iter().map(GraphName::as_str).collect();
         if names.is_empty() { "-".to_owned() } else { names.join(" ") }
     };
-    vec![topic.name.to_string(), topic.types.join(" "), names(&topic.publishers), names(&topic.subscriptions)]
+    vec![
+        topic.name.to_string(),
+        topic.types.join(" "),
+        names(&topic.publishers),
+        names(&topic.subscriptions),
+    ]
 }
 
 fn describe(detail: &NodeDetail) -> String {
@@ -237,12 +270,18 @@ fn describe(detail: &NodeDetail) -> String {
     if let Some(state) = node.lifecycle {
         text.push_str(&format!("  state: {}\n", state.as_str()));
     }
-    let lists = [("publishes", publishers), ("subscribes to", subscriptions), ("offers", services), ("calls", clients)];
+    let lists = [
+        ("publishes", publishers),
+        ("subscribes to", subscriptions),
+        ("offers", services),
+        ("calls", clients),
+    ];
     for (what, endpoints) in lists {
         if !endpoints.is_empty() {
             text.push_str(&format!("  {what}:\n"));
         }
-        let line = |endpoint: &Endpoint| format!("    {}  {}\n", endpoint.name, printable(&endpoint.kind));
+        let line =
+            |endpoint: &Endpoint| format!("    {}  {}\n", endpoint.name, printable(&endpoint.kind));
         text.extend(endpoints.iter().map(line));
     }
     text

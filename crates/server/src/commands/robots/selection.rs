@@ -1,4 +1,5 @@
-//! The robots that a selector or a name means, as the server knows them now. Nothing is done to them here.
+//! The robots that a selector or a name means, as the server knows them now. Nothing is done to
+//! them here.
 
 use task_proto::RobotName;
 use task_proto::api::{MatchedRobot, MatchedRobots, RobotList, RobotView};
@@ -8,7 +9,10 @@ use crate::commands::api::client::{nobody, unknown};
 use crate::commands::{CommandError, Session};
 
 /// The robots that `selector` means now.
-pub(in crate::commands) async fn matching(session: &Session, selector: &Selector) -> Result<RobotList, CommandError> {
+pub(in crate::commands) async fn matching(
+    session: &Session,
+    selector: &Selector,
+) -> Result<RobotList, CommandError> {
     Ok(session.client.get("/robots", &[("selector", selector.to_string())]).await?)
 }
 
@@ -29,17 +33,24 @@ pub(in crate::commands) async fn matched(
 
 /// Robots as an order lists them.
 pub(in crate::commands) fn named(robots: Vec<RobotView>) -> MatchedRobots {
-    let matched = |robot: RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
+    let matched =
+        |robot: RobotView| MatchedRobot { id: robot.id, name: robot.name, online: robot.online };
     MatchedRobots { robots: robots.into_iter().map(matched).collect() }
 }
 
 /// The one robot of this name or id.
-pub(in crate::commands) async fn one(session: &Session, name: &RobotName) -> Result<RobotView, CommandError> {
-    let selector = name.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
+pub(in crate::commands) async fn one(
+    session: &Session,
+    name: &RobotName,
+) -> Result<RobotView, CommandError> {
+    let selector =
+        name.as_str().parse().map_err(|error| CommandError::Usage(format!("{error}")))?;
     let mut robots = matching(session, &selector).await?.robots;
     match robots.len() {
         0 => Err(unknown(name)),
         1 => Ok(robots.remove(0)),
-        _ => Err(CommandError::Usage(format!("{name} is the name of one robot and the id of another"))),
+        _ => Err(CommandError::Usage(format!(
+            "{name} is the name of one robot and the id of another"
+        ))),
     }
 }

@@ -32,7 +32,10 @@ pub struct TopOrder {
     follow: bool,
 }
 
-pub(in crate::commands) async fn run(session: &Session, order: TopOrder) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    order: TopOrder,
+) -> Result<Outcome, CommandError> {
     if !order.follow {
         let list = sorted(selection::matching(session, &order.selector).await?);
         print(session, &list)?;
@@ -42,8 +45,10 @@ pub(in crate::commands) async fn run(session: &Session, order: TopOrder) -> Resu
         match selection::matching(session, &order.selector).await {
             Ok(list) => {
                 // Where it does not stay on a screen, each look stands below the one before.
-                let stays = session.output.has_colours() && session.output.format() == Format::Table;
-                if !stream_text(if stays { CLEAR } else { "" })? || !print(session, &sorted(list))? {
+                let stays =
+                    session.output.has_colours() && session.output.format() == Format::Table;
+                if !stream_text(if stays { CLEAR } else { "" })? || !print(session, &sorted(list))?
+                {
                     return Ok(Outcome::Succeeded);
                 }
             }
@@ -60,8 +65,11 @@ pub(in crate::commands) async fn run(session: &Session, order: TopOrder) -> Resu
 
 /// The busiest first, and at the end those that say nothing.
 fn sorted(mut list: RobotList) -> RobotList {
-    let busy = |robot: &RobotView| robot.vitals.and_then(|vitals| vitals.cpu_percent).unwrap_or(-1.0);
-    list.robots.sort_by(|one, other| busy(other).total_cmp(&busy(one)).then_with(|| one.name.cmp(&other.name)));
+    let busy =
+        |robot: &RobotView| robot.vitals.and_then(|vitals| vitals.cpu_percent).unwrap_or(-1.0);
+    list.robots.sort_by(|one, other| {
+        busy(other).total_cmp(&busy(one)).then_with(|| one.name.cmp(&other.name))
+    });
     list
 }
 
@@ -74,14 +82,18 @@ const COLUMNS: Columns = Columns {
 /// False when nobody reads any more.
 fn print(session: &Session, list: &RobotList) -> Result<bool, CommandError> {
     let now_ms = Clock::system().now_ms();
-    session.output.listed(list, &COLUMNS, |list| list.robots.iter().map(|robot| row(robot, now_ms)).collect())
+    session
+        .output
+        .listed(list, &COLUMNS, |list| list.robots.iter().map(|robot| row(robot, now_ms)).collect())
 }
 
 fn row(robot: &RobotView, now_ms: u64) -> Vec<String> {
     let vitals = robot.vitals.unwrap_or_default();
     let shown = |text: Option<String>| text.unwrap_or_else(|| "-".to_owned());
-    let Vitals { memory_used_bytes, memory_total_bytes, disk_used_bytes, disk_total_bytes, .. } = vitals;
-    let age = robot.vitals.map(|vitals| span(Duration::from_millis(now_ms.saturating_sub(vitals.at_ms))));
+    let Vitals { memory_used_bytes, memory_total_bytes, disk_used_bytes, disk_total_bytes, .. } =
+        vitals;
+    let age =
+        robot.vitals.map(|vitals| span(Duration::from_millis(now_ms.saturating_sub(vitals.at_ms))));
     let per_s = |rate: Option<u64>| shown(rate.map(|rate| format!("{}/s", bytes(rate))));
     vec![
         robot.name.to_string(),
@@ -104,7 +116,8 @@ fn row(robot: &RobotView, now_ms: u64) -> Vec<String> {
 pub(in crate::commands) fn summary(vitals: &Vitals) -> String {
     let parts = [
         vitals.cpu_percent.map(|percent| format!("processors {percent:.0}%")),
-        share(vitals.memory_used_bytes, vitals.memory_total_bytes).map(|share| format!("memory {share}")),
+        share(vitals.memory_used_bytes, vitals.memory_total_bytes)
+            .map(|share| format!("memory {share}")),
         share(vitals.disk_used_bytes, vitals.disk_total_bytes).map(|share| format!("disk {share}")),
         vitals.temperature_c.map(|degrees| format!("{degrees:.0} °C")),
     ];

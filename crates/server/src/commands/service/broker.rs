@@ -19,7 +19,10 @@ pub enum Action {
     Nats,
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     let files = async || session.client.get::<BrokerFiles>("/broker", &[]).await;
     let text = match action {
         Action::Acl => files().await?.acl,

@@ -18,7 +18,10 @@ pub enum Action {
     Rules,
 }
 
-pub(in crate::commands) async fn run(session: &Session, action: Action) -> Result<Outcome, CommandError> {
+pub(in crate::commands) async fn run(
+    session: &Session,
+    action: Action,
+) -> Result<Outcome, CommandError> {
     match action {
         Action::Info => {
             let info: ServerInfo = session.client.get("/server", &[]).await?;
@@ -38,13 +41,25 @@ fn describe(info: &ServerInfo) -> String {
         ("mqtt", info.mqtt.clone()),
         ("tls", info.ca_pin.map_or_else(|| "off".to_owned(), |pin| format!("pin {pin}"))),
         ("robots", format!("{} connected", traffic.robots_connected)),
-        ("connections", format!("{} accepted, {} refused", traffic.connections_accepted, traffic.connections_refused)),
-        ("messages", format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped)),
+        (
+            "connections",
+            format!(
+                "{} accepted, {} refused",
+                traffic.connections_accepted, traffic.connections_refused
+            ),
+        ),
+        (
+            "messages",
+            format!("{} refused, {} dropped", traffic.messages_refused, traffic.messages_dropped),
+        ),
         ("in", inward(&traffic.all)),
         ("out", outward(&traffic.all)),
         (
             "misbehaved",
-            format!("{} slowed, {} cut off, {} turned away", conduct.slowed, conduct.cut, conduct.turned_away),
+            format!(
+                "{} slowed, {} cut off, {} turned away",
+                conduct.slowed, conduct.cut, conduct.turned_away
+            ),
         ),
         ("http", format!("{} connections, {} requests", http.connections, http.requests)),
         ("http in", bytes(http.bytes_in)),

@@ -1,9 +1,11 @@
-//! `taskd status`, and what `taskd server` shows of sessions and rules: how the server and the ways to the robots do.
+//! `taskd status`, and what `taskd server` shows of sessions and rules: how the server and the ways
+//! to the robots do.
 
 use std::time::Duration;
 
 use task_proto::api::{
-    DatabaseStatus, ListenerView, RobotSession, RuleView, ServerRules, ServerStatus, SessionList, SiteStatus,
+    DatabaseStatus, ListenerView, RobotSession, RuleView, ServerRules, ServerStatus, SessionList,
+    SiteStatus,
 };
 use task_proto::time::span;
 
@@ -33,13 +35,31 @@ pub(in crate::commands) async fn status(session: &Session) -> Result<Outcome, Co
 }
 
 fn describe(status: &ServerStatus) -> String {
-    let ServerStatus { robots, mqtt, http, transfers, reports, database, disk, broker, listeners, .. } = status;
+    let ServerStatus {
+        robots,
+        mqtt,
+        http,
+        transfers,
+        reports,
+        database,
+        disk,
+        broker,
+        listeners,
+        ..
+    } = status;
     let latency = match (reports.latency_ms_p50, reports.latency_ms_p99) {
-        (Some(half), Some(most)) => format!(", stored within {half:.1} ms (p50), {most:.1} ms (p99)"),
+        (Some(half), Some(most)) => {
+            format!(", stored within {half:.1} ms (p50), {most:.1} ms (p99)")
+        }
         _ => String::new(),
     };
     let listener = |listener: &ListenerView| {
-        format!("{} {}{}", listener.kind, listener.address, if listener.tls { " (TLS)" } else { "" })
+        format!(
+            "{} {}{}",
+            listener.kind,
+            listener.address,
+            if listener.tls { " (TLS)" } else { "" }
+        )
     };
     let size = database.size_bytes.map_or_else(String::new, |size| format!(", {}", bytes(size)));
     let health = if broker.healthy { "ready" } else { "not ready" };
@@ -50,7 +70,10 @@ fn describe(status: &ServerStatus) -> String {
         ("listens", listeners.iter().map(listener).collect::<Vec<_>>().join(", ")),
         (
             "robots",
-            format!("{} of {} online, {} connected over MQTT", robots.online, robots.known, mqtt.robots_connected),
+            format!(
+                "{} of {} online, {} connected over MQTT",
+                robots.online, robots.known, mqtt.robots_connected
+            ),
         ),
         (
             "transfers",
@@ -63,10 +86,23 @@ fn describe(status: &ServerStatus) -> String {
         ),
         ("reports", format!("{:.1}/s{latency}", reports.per_s)),
         ("mqtt", format!("{} in, {} out", bytes(mqtt.all.bytes_in), bytes(mqtt.all.bytes_out))),
-        ("http", format!("{} requests, {} in, {} out", http.requests, bytes(http.bytes_in), bytes(http.bytes_out))),
+        (
+            "http",
+            format!(
+                "{} requests, {} in, {} out",
+                http.requests,
+                bytes(http.bytes_in),
+                bytes(http.bytes_out)
+            ),
+        ),
         (
             "database",
-            format!("{}{size}, answers in {:.1} ms{}", database.kind, database.latency_ms, integrity(database)),
+            format!(
+                "{}{size}, answers in {:.1} ms{}",
+                database.kind,
+                database.latency_ms,
+                integrity(database)
+            ),
         ),
         (
             "disk",
@@ -82,7 +118,9 @@ fn describe(status: &ServerStatus) -> String {
 }
 
 /// For the line about the database: whether it is sound, as far as that is known.
-fn integrity(DatabaseStatus { problem, fully_checked_at_ms, guard, .. }: &DatabaseStatus) -> String {
+fn integrity(
+    DatabaseStatus { problem, fully_checked_at_ms, guard, .. }: &DatabaseStatus,
+) -> String {
     let known = match (problem, fully_checked_at_ms) {
         (Some(problem), _) => Some(format!("NOT READY: {problem}")),
         (None, Some(at_ms)) => Some(format!("checked in full {}", time(*at_ms))),
@@ -102,8 +140,11 @@ fn site_row(site: &SiteStatus) -> Vec<String> {
     ]
 }
 
-const SESSIONS: Columns =
-    Columns { name: "robot", narrow: &["robot", "address", "since", "listens to"], wide: &["id", "in", "out"] };
+const SESSIONS: Columns = Columns {
+    name: "robot",
+    narrow: &["robot", "address", "since", "listens to"],
+    wide: &["id", "in", "out"],
+};
 
 /// Who is connected, and to what each listens.
 pub(in crate::commands) async fn sessions(session: &Session) -> Result<Outcome, CommandError> {
@@ -123,7 +164,8 @@ pub(in crate::commands) async fn sessions(session: &Session) -> Result<Outcome, 
 }
 
 fn session_row(session: &RobotSession) -> Vec<String> {
-    let filters = session.subscriptions.iter().map(|to| format!("{} (QoS {})", to.topic_filter, to.qos));
+    let filters =
+        session.subscriptions.iter().map(|to| format!("{} (QoS {})", to.topic_filter, to.qos));
     vec![
         session.name.to_string(),
         session.address.clone().unwrap_or_else(|| "-".to_owned()),
@@ -135,17 +177,28 @@ fn session_row(session: &RobotSession) -> Vec<String> {
     ]
 }
 
-const RULES: Columns = Columns { name: "name", narrow: &["order", "name", "mechanism", "condition"], wide: &["whose"] };
+const RULES: Columns = Columns {
+    name: "name",
+    narrow: &["order", "name", "mechanism", "condition"],
+    wide: &["whose"],
+};
 const LIMITS: Columns = Columns::of(&["limit", "value"]);
 
 /// By what rules bytes travel, and the limits that hold.
 pub(in crate::commands) async fn rules(session: &Session) -> Result<Outcome, CommandError> {
     let rules: ServerRules = session.client.get("/server/rules", &[]).await?;
-    let names = |rules: &ServerRules| rules.rules.iter().map(|rule| rule.name.clone()).collect::<Vec<_>>().join("\n");
+    let names = |rules: &ServerRules| {
+        rules.rules.iter().map(|rule| rule.name.clone()).collect::<Vec<_>>().join("\n")
+    };
     session.output.described(&rules, names, |rules| {
         let rows: Vec<_> = rules.rules.iter().map(rule_row).collect();
-        let limits: Vec<_> = rules.limits.iter().map(|limit| vec![limit.key.clone(), limit.value.clone()]).collect();
-        format!("{}\n{}", session.output.table(&RULES, &rows), session.output.table(&LIMITS, &limits))
+        let limits: Vec<_> =
+            rules.limits.iter().map(|limit| vec![limit.key.clone(), limit.value.clone()]).collect();
+        format!(
+            "{}\n{}",
+            session.output.table(&RULES, &rows),
+            session.output.table(&LIMITS, &limits)
+        )
     })?;
     Ok(Outcome::Succeeded)
 }

@@ -21,7 +21,8 @@ struct Versions {
 pub(in crate::commands) async fn run(connection: &Connection) -> Result<Outcome, CommandError> {
     let server = async {
         let client = Client::connect(connection).ok()?;
-        let info: ServerInfo = tokio::time::timeout(PATIENCE, client.get("/server", &[])).await.ok()?.ok()?;
+        let info: ServerInfo =
+            tokio::time::timeout(PATIENCE, client.get("/server", &[])).await.ok()?.ok()?;
         Some(info.version)
     };
     let versions = Versions { taskd: env!("CARGO_PKG_VERSION"), server: server.await };

@@ -1,5 +1,6 @@
-//! Signing in by the provider: the browser is sent there, and comes back with a code that is exchanged for a session like any
-//! other. Whatever comes of it, the browser ends at the page, which says it in words of its own.
+//! Signing in by the provider: the browser is sent there, and comes back with a code that is
+//! exchanged for a session like any other. Whatever comes of it, the browser ends at the page,
+//! which says it in words of its own.
 
 use std::error::Error;
 use std::net::{IpAddr, SocketAddr};
@@ -19,7 +20,8 @@ use crate::http::extract::QueryParams;
 use crate::orders::actions::ActionError;
 use crate::orders::actions::sign_in::ProviderUser;
 
-/// The cookie of a browser that is away at the provider. It has to be sent when that sends the browser back.
+/// The cookie of a browser that is away at the provider. It has to be sent when that sends the
+/// browser back.
 const COOKIE: &str = "taskd_sign_in";
 const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Lax; Path=/api/v1/oidc";
 /// How long it may be away.
@@ -70,7 +72,9 @@ pub(in crate::http) async fn finish(
 }
 
 fn configured(app: &App) -> Result<&Provider, ApiError> {
-    app.provider.as_deref().ok_or_else(|| ApiError::not_found("no provider is configured to sign in by"))
+    app.provider
+        .as_deref()
+        .ok_or_else(|| ApiError::not_found("no provider is configured to sign in by"))
 }
 
 /// The session's cookie; or else the code of what the page is to say.
@@ -81,14 +85,19 @@ async fn sign_in(
     answered: Answered,
     address: IpAddr,
 ) -> Result<String, &'static str> {
-    // In another browser, or a second time, an answer is worth nothing: nobody signs somebody else in.
+    // In another browser, or a second time, an answer is worth nothing: nobody signs somebody else
+    // in.
     let attempt = cookie(headers, COOKIE).and_then(Attempt::kept);
-    let is_own = |attempt: &Attempt| answered.state.as_deref().is_some_and(|state| attempt.has_state(state));
+    let is_own =
+        |attempt: &Attempt| answered.state.as_deref().is_some_and(|state| attempt.has_state(state));
     let attempt = attempt.filter(is_own).ok_or("expired")?;
     // Only now, or a foreign page could have its visitors' address blocked.
     app.actions.begin_provider_sign_in(address).await.map_err(|error| refused(app, error))?;
     if answered.iss.is_some_and(|issuer| issuer != provider.settings().issuer) {
-        return Err(failed(&OidcError::Unusable { what: "answer", reason: "it is another issuer's".to_owned() }));
+        return Err(failed(&OidcError::Unusable {
+            what: "answer",
+            reason: "it is another issuer's".to_owned(),
+        }));
     }
     let code = match (answered.code, answered.error) {
         (Some(code), None) => code,
@@ -98,8 +107,12 @@ async fn sign_in(
     let claims = provider.who(&attempt, &code, now_ms).await.map_err(|error| failed(&error))?;
     let name = claims.get(&provider.settings().name_claim).and_then(|name| name.as_str());
     let name: Option<UserName> = name.and_then(|name| name.to_lowercase().parse().ok());
-    let who = ProviderUser { subject: format!("{} {}", provider.settings().issuer, claims.subject()), name };
-    let signed_in = app.actions.sign_in_by_provider(&who, provider.rule_for(&claims), address).await;
+    let who = ProviderUser {
+        subject: format!("{} {}", provider.settings().issuer, claims.subject()),
+        name,
+    };
+    let signed_in =
+        app.actions.sign_in_by_provider(&who, provider.rule_for(&claims), address).await;
     let signed_in = signed_in.map_err(|error| refused(app, error))?;
     if signed_in.has_other_rights {
         app.broker.disconnect_person(&signed_in.user);
@@ -123,7 +136,10 @@ fn refused(app: &App, error: ActionError) -> &'static str {
         ActionError::NoName => "no_name",
         ActionError::UserExists(_) => "name_taken",
         error => {
-            tracing::error!(error = &error as &dyn Error, "somebody could not be signed in by the provider");
+            tracing::error!(
+                error = &error as &dyn Error,
+                "somebody could not be signed in by the provider"
+            );
             "failed"
         }
     }
@@ -139,6 +155,7 @@ fn kept(app: &App, value: &str, max_age_s: u64) -> String {
 
 fn sent_to(address: &str, cookies: &[String]) -> Response {
     let cookies = cookies.iter().map(|cookie| (header::SET_COOKIE, cookie.clone()));
-    let headers: Vec<_> = [(header::LOCATION, address.to_owned())].into_iter().chain(cookies).collect();
+    let headers: Vec<_> =
+        [(header::LOCATION, address.to_owned())].into_iter().chain(cookies).collect();
     (StatusCode::SEE_OTHER, AppendHeaders(headers)).into_response()
 }

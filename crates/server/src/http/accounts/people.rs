@@ -1,5 +1,5 @@
-//! People: who they are, how they sign in by the command line, their tokens, and what they did. What concerns someone's
-//! rights ends the MQTT sessions that they have by their old ones.
+//! People: who they are, how they sign in by the command line, their tokens, and what they did.
+//! What concerns someone's rights ends the MQTT sessions that they have by their old ones.
 
 use std::net::SocketAddr;
 
@@ -8,8 +8,8 @@ use axum::extract::{ConnectInfo, State};
 use axum::response::NoContent;
 use serde::Deserialize;
 use task_proto::api::{
-    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me, SetPassword,
-    TokenList, TokenOrigin, UserList, UserView,
+    AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me,
+    SetPassword, TokenList, TokenOrigin, UserList, UserView,
 };
 use task_proto::person::Permission;
 use task_proto::{TokenId, UserName};
@@ -25,7 +25,8 @@ use crate::http::openapi::Created;
 /// Says who is asking, and what they may.
 #[utoipa::path(get, path = "/api/v1/me", tag = "people")]
 pub(in crate::http) async fn me(by: Person) -> Json<Me> {
-    let permissions = Permission::ALL.into_iter().filter(|&permission| by.may(permission)).collect();
+    let permissions =
+        Permission::ALL.into_iter().filter(|&permission| by.may(permission)).collect();
     let Person { name, roles, scope, token, .. } = by;
     Json(Me { name, roles, permissions, scope: scope.selectors().to_vec(), token })
 }
@@ -112,7 +113,8 @@ pub(in crate::http) async fn log_in(
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     JsonBody(order): JsonBody<LogIn>,
 ) -> Result<Created<AccessToken>, ApiError> {
-    let signed_in = app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
+    let signed_in =
+        app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
     let id = signed_in.token.id().parse().map_err(|error| ApiError::internal(&error))?;
     let (token, expires_at_ms) = (signed_in.token.reveal(), signed_in.expires_at_ms);
     Ok(Created(AccessToken { id, token, user: signed_in.user, expires_at_ms }))
@@ -170,7 +172,9 @@ pub(in crate::http) async fn audit(
     QueryParams(query): QueryParams<AuditQuery>,
 ) -> Result<Json<AuditPage>, ApiError> {
     let texts = [("who", &query.who), ("target", &query.target), ("act", &query.act)];
-    if let Some((key, _)) = texts.iter().find(|(_, text)| text.as_ref().is_some_and(|text| text.contains('\0'))) {
+    if let Some((key, _)) =
+        texts.iter().find(|(_, text)| text.as_ref().is_some_and(|text| text.contains('\0')))
+    {
         return Err(ApiError::invalid(format!("{key}: it has a control character")));
     }
     Ok(Json(app.store.audit(&query).await?))

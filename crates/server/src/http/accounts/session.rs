@@ -1,5 +1,6 @@
-//! Signing in at the page: a name and a password, or a person's token, is exchanged for a cookie that scripts can't read. Sessions are kept in
-//! memory only, so a restart of the server signs everybody out.
+//! Signing in at the page: a name and a password, or a person's token, is exchanged for a cookie
+//! that scripts can't read. Sessions are kept in memory only, so a restart of the server signs
+//! everybody out.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -68,18 +69,23 @@ pub struct Session {
 impl Sessions {
     /// Begins a session and gives the cookie's value.
     fn begin(&self, token: Token, user: UserName, now_ms: u64) -> String {
-        let id = format!("{}.{:032x}{:032x}", self.run, rand::random::<u128>(), rand::random::<u128>());
+        let id =
+            format!("{}.{:032x}{:032x}", self.run, rand::random::<u128>(), rand::random::<u128>());
         let mut sessions = self.lock();
         sessions.retain(|_, entry| entry.session.expires_at_ms > now_ms);
         let is_own = |entry: &Entry| entry.session.user == user;
         let own = sessions.values().filter(|entry| is_own(entry)).count();
         if own >= MOST_OF_ONE || sessions.len() >= MOST_SESSIONS {
-            let candidates = sessions.iter().filter(|(_, entry)| own < MOST_OF_ONE || is_own(entry));
-            let oldest = candidates.min_by_key(|(_, entry)| entry.session.expires_at_ms).map(|(key, _)| *key);
+            let candidates =
+                sessions.iter().filter(|(_, entry)| own < MOST_OF_ONE || is_own(entry));
+            let oldest = candidates
+                .min_by_key(|(_, entry)| entry.session.expires_at_ms)
+                .map(|(key, _)| *key);
             oldest.map(|key| sessions.remove(&key));
         }
         let ended = CancellationToken::new();
-        let session = Session { token, user, expires_at_ms: now_ms + LIFETIME_MS, ended: ended.clone() };
+        let session =
+            Session { token, user, expires_at_ms: now_ms + LIFETIME_MS, ended: ended.clone() };
         sessions.insert(Digest::of(id.as_bytes()), Entry { session, _end: ended.drop_guard() });
         id
     }
@@ -87,13 +93,18 @@ impl Sessions {
     /// The session of a request's cookie, if it has one that lives.
     pub fn find(&self, headers: &HeaderMap, now_ms: u64) -> Option<Session> {
         let key = Digest::of(cookie(headers, COOKIE)?.as_bytes());
-        self.lock().get(&key).map(|entry| &entry.session).filter(|session| session.expires_at_ms > now_ms).cloned()
+        self.lock()
+            .get(&key)
+            .map(|entry| &entry.session)
+            .filter(|session| session.expires_at_ms > now_ms)
+            .cloned()
     }
 
     /// Whether a request's cookie is that of a session that an earlier run of the server began.
     fn is_of_earlier_run(&self, headers: &HeaderMap) -> bool {
-        let run =
-            cookie(headers, COOKIE).filter(|id| !id.is_empty()).map(|id| id.split_once('.').unwrap_or_default().0);
+        let run = cookie(headers, COOKIE)
+            .filter(|id| !id.is_empty())
+            .map(|id| id.split_once('.').unwrap_or_default().0);
         run.is_some_and(|run| run != self.run)
     }
 
@@ -111,13 +122,21 @@ impl Sessions {
 /// The value of a request's cookie.
 pub(in crate::http) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str> {
     let lines = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
-    let mut pairs = lines.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
+    let mut pairs =
+        lines.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
     pairs.find(|(name, _)| *name == wanted).map(|(_, value)| value)
 }
 
 /// A cookie as it is set. Where browsers come by an encrypted way they are to send it on no other.
-pub(in crate::http) fn set_cookie(app: &App, name: &str, value: &str, attributes: &str, max_age_s: u64) -> String {
-    let is_behind_tls = app.provider.as_ref().is_some_and(|it| it.settings().public_url.starts_with("https:"));
+pub(in crate::http) fn set_cookie(
+    app: &App,
+    name: &str,
+    value: &str,
+    attributes: &str,
+    max_age_s: u64,
+) -> String {
+    let is_behind_tls =
+        app.provider.as_ref().is_some_and(|it| it.settings().public_url.starts_with("https:"));
     let secure = if app.ca_pin.is_some() || is_behind_tls { "; Secure" } else { "" };
     format!("{name}={value}; {attributes}; Max-Age={max_age_s}{secure}")
 }
@@ -147,19 +166,25 @@ pub(in crate::http) async fn sign_in(
     headers: HeaderMap,
     JsonBody(request): JsonBody<SignIn>,
 ) -> Result<Response, ApiError> {
-    // A foreign page must not sign its visitor in as someone else. Programs send no Origin and are not concerned.
+    // A foreign page must not sign its visitor in as someone else. Programs send no Origin and are
+    // not concerned.
     if headers.contains_key(header::ORIGIN) {
         require_same_origin(&headers)?;
     }
     let now_ms = app.clock.now_ms();
     let (token, user) = match request {
-        SignIn { token: Some(token), user: None, password: None } => known_token(&app, &token, now_ms).await?,
+        SignIn { token: Some(token), user: None, password: None } => {
+            known_token(&app, &token, now_ms).await?
+        }
         SignIn { token: None, user: Some(user), password: Some(password) } => {
             let order = LogIn { user, password, ttl_s: None };
-            let signed_in = app.actions.sign_in(&order, TokenOrigin::Page, peer.ip().to_canonical()).await?;
+            let signed_in =
+                app.actions.sign_in(&order, TokenOrigin::Page, peer.ip().to_canonical()).await?;
             (signed_in.token, order.user)
         }
-        _ => return Err(ApiError::invalid("user: expected a user and a password, or else a token")),
+        _ => {
+            return Err(ApiError::invalid("user: expected a user and a password, or else a token"));
+        }
     };
     let cookie = begin_session(&app, &headers, token, user, now_ms);
     let expires_at_ms = Some(now_ms + LIFETIME_MS);
@@ -168,10 +193,13 @@ pub(in crate::http) async fn sign_in(
 }
 
 async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserName), ApiError> {
-    let token: Token = text.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
+    let token: Token =
+        text.parse().map_err(|error| ApiError::unauthorized(format!("token: {error}")))?;
     match app.store.token_holder(&token, now_ms).await? {
         Some(TokenHolder::Person(person)) => Ok((token, person.name)),
-        _ => Err(ApiError::unauthorized("token: it is unknown, expired or revoked, or not a person's")),
+        _ => Err(ApiError::unauthorized(
+            "token: it is unknown, expired or revoked, or not a person's",
+        )),
     }
 }
 
@@ -182,9 +210,13 @@ fn provider_view(app: &App) -> Option<ProviderView> {
     Some(ProviderView { title: settings.title.clone(), url })
 }
 
-/// Tells until when the caller is signed in, or else whether they were until the server was restarted.
+/// Tells until when the caller is signed in, or else whether they were until the server was
+/// restarted.
 #[utoipa::path(get, path = "/api/v1/session", tag = "session")]
-pub(in crate::http) async fn show(State(app): State<App>, headers: HeaderMap) -> Result<Json<SessionView>, ApiError> {
+pub(in crate::http) async fn show(
+    State(app): State<App>,
+    headers: HeaderMap,
+) -> Result<Json<SessionView>, ApiError> {
     let now_ms = app.clock.now_ms();
     let provider = provider_view(&app);
     let Some(session) = app.sessions.find(&headers, now_ms) else {
@@ -250,7 +282,8 @@ mod tests {
         before.end(&headers);
         assert!(!before.is_of_earlier_run(&headers), "it ended otherwise");
         assert!(
-            !now.is_of_earlier_run(&HeaderMap::new()) && !now.is_of_earlier_run(&with_cookie(format!("{COOKIE}=")))
+            !now.is_of_earlier_run(&HeaderMap::new())
+                && !now.is_of_earlier_run(&with_cookie(format!("{COOKIE}=")))
         );
     }
 
@@ -262,9 +295,16 @@ mod tests {
             sessions.begin(Token::random(TokenKind::Operator), user("alice"), now_ms);
         }
         assert_eq!(sessions.lock().len(), MOST_OF_ONE + 1);
-        assert!(sessions.find(&with_cookie(format!("{COOKIE}={bob}")), 1).is_some(), "nobody signs others out");
+        assert!(
+            sessions.find(&with_cookie(format!("{COOKIE}={bob}")), 1).is_some(),
+            "nobody signs others out"
+        );
         for now_ms in 0..2 * MOST_SESSIONS as u64 {
-            sessions.begin(Token::random(TokenKind::Operator), user(&format!("user{now_ms}")), now_ms);
+            sessions.begin(
+                Token::random(TokenKind::Operator),
+                user(&format!("user{now_ms}")),
+                now_ms,
+            );
         }
         assert_eq!(sessions.lock().len(), MOST_SESSIONS);
     }

@@ -1,12 +1,14 @@
-//! Failed authentications, counted by address in windows of a minute. A token that is good always gets in; only the
-//! answers to wrong ones change. Memory is bounded: beyond the most addresses, all others share one count.
+//! Failed authentications, counted by address in windows of a minute. A token that is good always
+//! gets in; only the answers to wrong ones change. Memory is bounded: beyond the most addresses,
+//! all others share one count.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
 use std::sync::{Mutex, PoisonError};
 
 const WINDOW_MS: u64 = 60_000;
-/// Failures from one address in a window that are answered in the ordinary way. A NAT may hide a fleet, so it is high.
+/// Failures from one address in a window that are answered in the ordinary way. A NAT may hide a
+/// fleet, so it is high.
 const MOST_FAILURES: u32 = 1_000;
 const MOST_ADDRESSES: usize = 4_096;
 /// Whose count addresses share that came too late for their own.
@@ -29,8 +31,10 @@ impl FailedAttempts {
         if now_ms.saturating_sub(window.began_ms) >= WINDOW_MS {
             *window = Window { began_ms: now_ms, failures: HashMap::new() };
         }
-        let is_full = window.failures.len() >= MOST_ADDRESSES && !window.failures.contains_key(&address);
-        let count = window.failures.entry(if is_full { EVERYBODY_ELSE } else { address }).or_default();
+        let is_full =
+            window.failures.len() >= MOST_ADDRESSES && !window.failures.contains_key(&address);
+        let count =
+            window.failures.entry(if is_full { EVERYBODY_ELSE } else { address }).or_default();
         *count = count.saturating_add(1);
         *count > MOST_FAILURES
     }

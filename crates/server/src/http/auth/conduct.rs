@@ -1,5 +1,5 @@
-//! Holds robots up that ask or report too often, each on its own, and refuses those that go on with it. What tells a robot to
-//! stop something is never refused for long.
+//! Holds robots up that ask or report too often, each on its own, and refuses those that go on with
+//! it. What tells a robot to stop something is never refused for long.
 
 use http::Method;
 use task_proto::RobotId;
@@ -10,7 +10,12 @@ use crate::http::error::ApiError;
 use crate::limits::conduct::{Verdict, Way};
 
 /// Waits until it is the robot's turn; an error says when it is.
-pub(in crate::http) async fn hold_up(app: &App, robot: &RobotId, way: Way, method: &Method) -> Result<(), ApiError> {
+pub(in crate::http) async fn hold_up(
+    app: &App,
+    robot: &RobotId,
+    way: Way,
+    method: &Method,
+) -> Result<(), ApiError> {
     let now = Instant::now();
     let watched = app.conduct.watch(robot, way, now);
     // Whoever only asks is told what to do, as often as it is its turn.
@@ -31,6 +36,8 @@ pub(in crate::http) async fn hold_up(app: &App, robot: &RobotId, way: Way, metho
 
 fn too_often(until: Instant, now: Instant) -> ApiError {
     let seconds = until.duration_since(now).as_secs() + 1;
-    let error = ApiError::too_many(format!("this robot asks or reports too often: try again in {seconds} s"));
+    let error = ApiError::too_many(format!(
+        "this robot asks or reports too often: try again in {seconds} s"
+    ));
     ApiError { retry_after_s: seconds, ..error }
 }

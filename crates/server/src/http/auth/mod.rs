@@ -45,7 +45,8 @@ pub(super) const COOKIE: &str = "taskd_session";
 pub enum Access {
     /// Everybody, known or not.
     Anyone,
-    /// A person, by a token or a signed-in page, who has the permission. Which robots it holds for is the handler's to look at.
+    /// A person, by a token or a signed-in page, who has the permission. Which robots it holds for
+    /// is the handler's to look at.
     Person(Permission),
     /// The robot that the path's `{robot}` names, and no other.
     OwnRobot,
@@ -55,7 +56,8 @@ pub enum Access {
     PersonOrRobot,
 }
 
-/// Which of its tokens a robot called with, by number. Handlers for robots may take it as an extension.
+/// Which of its tokens a robot called with, by number. Handlers for robots may take it as an
+/// extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TokenNumber(pub u64);
 
@@ -102,7 +104,9 @@ impl Caller {
     fn may(&self, access: Access, own: Option<&str>) -> bool {
         match access {
             Access::Anyone => true,
-            Access::Person(permission) => matches!(self, Self::Person(person) if person.may(permission)),
+            Access::Person(permission) => {
+                matches!(self, Self::Person(person) if person.may(permission))
+            }
             Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
             Access::Enrolment => matches!(self, Self::Enrolment(_)),
             Access::PersonOrRobot => matches!(self, Self::Person(_) | Self::Robot(_)),
@@ -115,7 +119,11 @@ impl<S: Sync> FromRequestParts<S> for Caller {
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
         // Absent only if a handler was mounted without the guard: then nobody is let in.
-        parts.extensions.get::<Self>().cloned().ok_or_else(|| ApiError::unauthorized("this route has no guard"))
+        parts
+            .extensions
+            .get::<Self>()
+            .cloned()
+            .ok_or_else(|| ApiError::unauthorized("this route has no guard"))
     }
 }
 
@@ -139,7 +147,8 @@ pub(super) struct Gate {
     pub(super) waits_for_robot: bool,
 }
 
-/// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too long.
+/// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too
+/// long.
 pub(super) async fn guard(
     State(gate): State<Gate>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -152,7 +161,9 @@ pub(super) async fn guard(
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
     let begun = match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
-        Ok((caller, token_number)) => begin(&gate, caller, request.method()).await.map(|begun| (begun, token_number)),
+        Ok((caller, token_number)) => {
+            begin(&gate, caller, request.method()).await.map(|begun| (begun, token_number))
+        }
         Err(error) => Err(error),
     };
     let (Begun { mut caller, counted }, token_number) = match begun {
@@ -165,7 +176,8 @@ pub(super) async fn guard(
     }
     request.extensions_mut().insert(caller);
     request.extensions_mut().insert(token_number);
-    let answer = answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
+    let answer =
+        answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
     let Some(deadline) = gate.deadline else { return answer.await };
     tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
         if !gate.app.store.state().is_there() {
@@ -211,7 +223,8 @@ async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, Ap
     Ok(Begun { caller, counted })
 }
 
-/// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has limits of its own.
+/// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has
+/// limits of its own.
 fn way_of(access: Access, method: &Method) -> Option<Way> {
     match access {
         Access::OwnRobot => Some(Way::Http),
@@ -220,8 +233,9 @@ fn way_of(access: Access, method: &Method) -> Option<Way> {
     }
 }
 
-/// The handler's answer. What changes something goes on to its end even if nobody waits for it any more: what is done after a
-/// commit, like cutting off whoever has lost their rights, belongs to it. Only its body has to have come by then.
+/// The handler's answer. What changes something goes on to its end even if nobody waits for it any
+/// more: what is done after a commit, like cutting off whoever has lost their rights, belongs to
+/// it. Only its body has to have come by then.
 async fn answered(
     request: Request,
     next: Next,
@@ -241,9 +255,12 @@ async fn answered(
     }
 }
 
-/// Runs the handler. What people only ask for leaves some of the database's connections to robots and orders.
+/// Runs the handler. What people only ask for leaves some of the database's connections to robots
+/// and orders.
 async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> Response {
-    let Some((app, Counted { person, kind, under_way })) = counted else { return next.run(request).await };
+    let Some((app, Counted { person, kind, under_way })) = counted else {
+        return next.run(request).await;
+    };
     let response = match kind {
         RequestKind::Order => next.run(request).await,
         _ => with_shared_reads(next.run(request)).await,
@@ -276,7 +293,12 @@ struct Showing<'a> {
 
 impl<'a> Showing<'a> {
     fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
-        Self { method: request.method(), headers: request.headers(), proof, connection: request.extensions().get() }
+        Self {
+            method: request.method(),
+            headers: request.headers(),
+            proof,
+            connection: request.extensions().get(),
+        }
     }
 }
 
@@ -291,7 +313,9 @@ async fn admit(
     }
     match identify_on_connection(&gate.app, &showing).await {
         Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
-        Ok((Caller::Anyone, _)) => Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …")),
+        Ok((Caller::Anyone, _)) => {
+            Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …"))
+        }
         Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
             Err(not_permitted(&person, permission))
         }
@@ -300,7 +324,11 @@ async fn admit(
         Err(error) if error.code == ROBOT_REVOKED => Err(error),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
-            Err(if is_too_many { ApiError::too_many("too many wrong tokens from this address") } else { error })
+            Err(if is_too_many {
+                ApiError::too_many("too many wrong tokens from this address")
+            } else {
+                error
+            })
         }
         Err(error) => Err(error),
     }
@@ -310,20 +338,33 @@ async fn admit(
 pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError {
     let (name, roles) = (&person.name, &person.roles);
     ApiError::forbidden(if person.roles.allow(permission) {
-        format!("{name} is limited to the robots {:?}, and this concerns all of them", person.scope.to_string())
+        format!(
+            "{name} is limited to the robots {:?}, and this concerns all of them",
+            person.scope.to_string()
+        )
     } else {
         format!("{name} has no permission to {permission} (roles: {roles})")
     })
 }
 
-/// Who calls. From now on the connection counts for them, and if it is a robot, it is cut when the robot is put out. What
-/// comes without a token changes nothing: a connection stays with the last one that was shown on it.
-async fn identify_on_connection(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
+/// Who calls. From now on the connection counts for them, and if it is a robot, it is cut when the
+/// robot is put out. What comes without a token changes nothing: a connection stays with the last
+/// one that was shown on it.
+async fn identify_on_connection(
+    app: &App,
+    showing: &Showing<'_>,
+) -> Result<(Caller, TokenNumber), ApiError> {
     let arrival = app.http_connections.arrival();
     let identified = identify(app, showing).await?;
-    let (Some(connection), Some(holder)) = (showing.connection, identified.0.holder()) else { return Ok(identified) };
+    let (Some(connection), Some(holder)) = (showing.connection, identified.0.holder()) else {
+        return Ok(identified);
+    };
     let is_still_good = arrival.identified(&holder, connection);
-    if is_still_good || !matches!(holder, Holder::Robot(_)) { Ok(identified) } else { identify(app, showing).await }
+    if is_still_good || !matches!(holder, Holder::Robot(_)) {
+        Ok(identified)
+    } else {
+        identify(app, showing).await
+    }
 }
 
 /// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
@@ -333,8 +374,8 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
     let is_read = matches!(*method, Method::GET | Method::HEAD);
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         let Presented { text, is_from_browser } = presented(value)?;
-        // Browsers keep a password for a site and send it along with whatever another page makes them send. Programs send no
-        // origin.
+        // Browsers keep a password for a site and send it along with whatever another page makes
+        // them send. Programs send no origin.
         if is_from_browser && !is_read && comes_from_page(headers) {
             require_same_origin(headers)?;
         }
@@ -357,12 +398,14 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
         TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
         TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
-        TokenHolder::Robot { robot, token_number, .. } => (Caller::Robot(robot), TokenNumber(token_number)),
+        TokenHolder::Robot { robot, token_number, .. } => {
+            (Caller::Robot(robot), TokenNumber(token_number))
+        }
     })
 }
 
-/// Whose token this is, if it is good. Goes on to its end even if the client does not wait for it: a robot's first use of a
-/// token has ended its others by then, and who came in by those has to go.
+/// Whose token this is, if it is good. Goes on to its end even if the client does not wait for it:
+/// a robot's first use of a token has ended its others by then, and who came in by those has to go.
 async fn let_in(
     app: &App,
     token: &Token,
@@ -376,16 +419,21 @@ async fn let_in(
         None => None,
     };
     let admitting = tokio::spawn(async move {
-        let Some(Admitted { holder, is_first_use }) = app.store.admit(&token, &proof, now_ms).await? else {
+        let Some(Admitted { holder, is_first_use }) =
+            app.store.admit(&token, &proof, now_ms).await?
+        else {
             return Ok(None);
         };
-        if let Some(connection) = connection.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. })) {
+        if let Some(connection) =
+            connection.as_ref().filter(|_| !matches!(holder, TokenHolder::Pending { .. }))
+        {
             connection.authenticate();
         }
         if let TokenHolder::Robot { robot, .. } = &holder
             && is_first_use
         {
-            // Whoever is connected came in by the token that has just ended; this request's own connection stays.
+            // Whoever is connected came in by the token that has just ended; this request's own
+            // connection stays.
             app.broker.disconnect(robot);
             if let Some(connection) = connection {
                 connection.release();
@@ -421,7 +469,9 @@ struct Presented {
 
 fn presented(value: &HeaderValue) -> Result<Presented, ApiError> {
     let presented = value.to_str().ok().and_then(presented_token);
-    presented.ok_or_else(|| ApiError::unauthorized("Authorization: expected Bearer or Basic and a token"))
+    presented.ok_or_else(|| {
+        ApiError::unauthorized("Authorization: expected Bearer or Basic and a token")
+    })
 }
 
 /// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.
@@ -450,10 +500,16 @@ pub(super) fn require_same_origin(headers: &HeaderMap) -> Result<(), ApiError> {
     let text = |name| headers.get(name).and_then(|value: &http::HeaderValue| value.to_str().ok());
     let is_same = match (text(SEC_FETCH_SITE), text(header::ORIGIN)) {
         (Some(site), _) => site == "same-origin",
-        (None, Some(origin)) => origin.split_once("://").map(|(_, host)| host) == text(header::HOST),
+        (None, Some(origin)) => {
+            origin.split_once("://").map(|(_, host)| host) == text(header::HOST)
+        }
         (None, None) => false,
     };
-    if is_same { Ok(()) } else { Err(ApiError::forbidden("Origin: a page may only call its own server")) }
+    if is_same {
+        Ok(())
+    } else {
+        Err(ApiError::forbidden("Origin: a page may only call its own server"))
+    }
 }
 
 #[cfg(test)]
@@ -462,12 +518,16 @@ mod tests {
 
     #[test]
     fn tokens_come_as_bearer_or_as_a_password() {
-        let token = |text: &str, is_from_browser| Some(Presented { text: text.to_owned(), is_from_browser });
+        let token = |text: &str, is_from_browser| {
+            Some(Presented { text: text.to_owned(), is_from_browser })
+        };
         assert_eq!(presented_token("Bearer abc"), token("abc", false));
         assert_eq!(presented_token("bearer  abc "), token("abc", false));
         let basic = format!("Basic {}", STANDARD.encode("anyone:a:b"));
         assert_eq!(presented_token(&basic), token("a:b", true));
-        for bad in ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))] {
+        for bad in
+            ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))]
+        {
             assert_eq!(presented_token(bad), None, "{bad:?}");
         }
     }
@@ -477,7 +537,9 @@ mod tests {
         let check = |pairs: &[(&'static str, &'static str)]| {
             let headers: HeaderMap = pairs
                 .iter()
-                .map(|(name, value)| (http::HeaderName::from_static(name), http::HeaderValue::from_static(value)))
+                .map(|(name, value)| {
+                    (http::HeaderName::from_static(name), http::HeaderValue::from_static(value))
+                })
                 .collect();
             require_same_origin(&headers).is_ok()
         };
@@ -488,6 +550,10 @@ mod tests {
         assert!(!check(&[host, ("origin", "null")]));
         assert!(!check(&[host, ("origin", "http://evil.example")]));
         assert!(!check(&[host, ("origin", "http://fleet.example:9090")]));
-        assert!(!check(&[host, ("origin", "http://fleet.example:8080"), ("sec-fetch-site", "cross-site")]));
+        assert!(!check(&[
+            host,
+            ("origin", "http://fleet.example:8080"),
+            ("sec-fetch-site", "cross-site")
+        ]));
     }
 }

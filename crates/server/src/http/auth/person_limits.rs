@@ -1,6 +1,7 @@
-//! How much one person may ask of the server at a time, with all of their tokens and sessions together, so that nobody's
-//! requests wait long behind those of another: requests per second, and requests under way. Orders are counted apart from
-//! everything else, so that a person's own reads never keep them from stopping a robot.
+//! How much one person may ask of the server at a time, with all of their tokens and sessions
+//! together, so that nobody's requests wait long behind those of another: requests per second, and
+//! requests under way. Orders are counted apart from everything else, so that a person's own reads
+//! never keep them from stopping a robot.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -49,7 +50,9 @@ impl RequestKind {
     /// Of a request for a route with this access. `is_stream`: the route has no deadline.
     pub(in crate::http) fn of(access: Access, method: &Method, is_stream: bool) -> Self {
         match access {
-            Access::Person(Permission::Operate | Permission::Maintain) if !method.is_safe() => Self::Order,
+            Access::Person(Permission::Operate | Permission::Maintain) if !method.is_safe() => {
+                Self::Order
+            }
             Access::PersonOrRobot if !method.is_safe() => Self::Upload,
             _ if is_stream => Self::Stream,
             _ if method.is_safe() => Self::Read,
@@ -77,7 +80,9 @@ pub struct PersonLimits {
 
 /// A request under way; dropping it ends that.
 #[derive(Debug)]
-pub(in crate::http) struct UnderWay(#[expect(dead_code, reason = "it is held, not read")] Option<OwnedSemaphorePermit>);
+pub(in crate::http) struct UnderWay(
+    #[expect(dead_code, reason = "it is held, not read")] Option<OwnedSemaphorePermit>,
+);
 
 impl PersonLimits {
     /// Nobody has asked for anything yet.
@@ -87,22 +92,30 @@ impl PersonLimits {
     }
 
     /// Waits for the turn of a request, for a moment.
-    pub(in crate::http) async fn begin(&self, person: &UserName, kind: RequestKind) -> Result<UnderWay, ApiError> {
+    pub(in crate::http) async fn begin(
+        &self,
+        person: &UserName,
+        kind: RequestKind,
+    ) -> Result<UnderWay, ApiError> {
         let now = Instant::now();
         match self.limiter(kind).ask(person.clone(), now) {
             Turn::At(at) if at > now => sleep_until(at).await,
             Turn::At(_) => {}
             Turn::Refused(until) => {
                 let seconds = until.duration_since(now).as_secs() + 1;
-                let error = ApiError::too_many(format!("{person} sends too many requests: try again in {seconds} s"));
+                let error = ApiError::too_many(format!(
+                    "{person} sends too many requests: try again in {seconds} s"
+                ));
                 return Err(ApiError { retry_after_s: seconds, ..error });
             }
         }
         let ended = timeout(PATIENCE, self.under_way(person, kind).acquire_owned()).await;
         // The semaphore is never closed.
         ended.map(|permit| UnderWay(permit.ok())).map_err(|_| {
-            let message =
-                format!("{person} has {} requests under way already: try again when one has ended", kind.limit());
+            let message = format!(
+                "{person} has {} requests under way already: try again when one has ended",
+                kind.limit()
+            );
             ApiError { retry_after_s: 1, ..ApiError::too_many(message) }
         })
     }
@@ -125,11 +138,14 @@ impl PersonLimits {
             // Whoever waits for one or has one holds it too.
             all.retain(|_, semaphore| Arc::strong_count(semaphore) > 1);
         }
-        all.entry((person.clone(), kind)).or_insert_with(|| Arc::new(Semaphore::new(kind.limit()))).clone()
+        all.entry((person.clone(), kind))
+            .or_insert_with(|| Arc::new(Semaphore::new(kind.limit())))
+            .clone()
     }
 
     fn lock(&self) -> MutexGuard<'_, HashMap<(UserName, RequestKind), Arc<Semaphore>>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -144,7 +160,11 @@ mod tests {
         name.parse().expect("a name")
     }
 
-    fn begun(limits: &PersonLimits, name: &str, kind: RequestKind) -> Option<Result<UnderWay, ApiError>> {
+    fn begun(
+        limits: &PersonLimits,
+        name: &str,
+        kind: RequestKind,
+    ) -> Option<Result<UnderWay, ApiError>> {
         limits.begin(&person(name), kind).now_or_never()
     }
 
@@ -152,7 +172,8 @@ mod tests {
     async fn reads_that_use_up_their_rate_leave_orders_and_others_theirs() {
         let limits = PersonLimits::new(PersonRates { requests_per_s: 1 });
         limits.answered(&person("alice"), RequestKind::Read, 1 << 30);
-        let refused = begun(&limits, "alice", RequestKind::Change).expect("at once").expect_err("refused");
+        let refused =
+            begun(&limits, "alice", RequestKind::Change).expect("at once").expect_err("refused");
         assert_eq!(refused.status, http::StatusCode::TOO_MANY_REQUESTS);
         assert!((10..=11).contains(&refused.retry_after_s), "{}", refused.retry_after_s);
         for (name, kind) in [("alice", RequestKind::Order), ("bob", RequestKind::Read)] {
@@ -163,11 +184,15 @@ mod tests {
     #[tokio::test]
     async fn request_beyond_the_limit_waits_for_one_of_its_kind_to_end() {
         let limits = PersonLimits::new(PersonRates::default());
-        let start = |_| begun(&limits, "alice", RequestKind::Read).expect("at once").expect("begun");
+        let start =
+            |_| begun(&limits, "alice", RequestKind::Read).expect("at once").expect("begun");
         let mut reads: Vec<_> = (0..UNDER_WAY).map(start).collect();
         assert!(begun(&limits, "alice", RequestKind::Read).is_none(), "it waits");
-        for (name, kind) in [("alice", RequestKind::Order), ("alice", RequestKind::Stream), ("bob", RequestKind::Read)]
-        {
+        for (name, kind) in [
+            ("alice", RequestKind::Order),
+            ("alice", RequestKind::Stream),
+            ("bob", RequestKind::Read),
+        ] {
             begun(&limits, name, kind).expect("at once").expect("begun");
         }
         reads.pop();
@@ -184,6 +209,9 @@ mod tests {
         assert_eq!(kind(Permission::Maintain, Method::DELETE), RequestKind::Order);
         assert_eq!(kind(Permission::Read, Method::GET), RequestKind::Read);
         assert_eq!(kind(Permission::Read, Method::POST), RequestKind::Change);
-        assert_eq!(RequestKind::of(Access::PersonOrRobot, &Method::PATCH, true), RequestKind::Upload);
+        assert_eq!(
+            RequestKind::of(Access::PersonOrRobot, &Method::PATCH, true),
+            RequestKind::Upload
+        );
     }
 }

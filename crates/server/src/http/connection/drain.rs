@@ -1,6 +1,7 @@
-//! Reads to its end what a handler left of a request's body. Otherwise the connection would have to be closed under a
-//! client that was refused early: it would see a reset instead of the refusal, or its next request would get no answer.
-//! Many clients read no answer before all of their body is sent, so how long it is does not matter, but how long it takes.
+//! Reads to its end what a handler left of a request's body. Otherwise the connection would have to
+//! be closed under a client that was refused early: it would see a reset instead of the refusal, or
+//! its next request would get no answer. Many clients read no answer before all of their body is
+//! sent, so how long it is does not matter, but how long it takes.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -17,7 +18,8 @@ use http_body::{Frame, SizeHint};
 const PATIENCE: Duration = Duration::from_secs(30);
 /// How long its sender may be silent.
 const SILENCE: Duration = Duration::from_secs(5);
-/// After how long the refusal has gone out: asked for more before it, a client that has announced its body sends all of it.
+/// After how long the refusal has gone out: asked for more before it, a client that has announced
+/// its body sends all of it.
 const HEAD_START: Duration = Duration::from_millis(100);
 
 /// Wraps the body of a request; for `axum::middleware::map_request`, outermost.

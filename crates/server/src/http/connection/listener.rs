@@ -1,5 +1,5 @@
-//! The accept loop: how many connections there are, how long a client may dawdle, also in its TLS handshake, and how they
-//! end. It knows no routes.
+//! The accept loop: how many connections there are, how long a client may dawdle, also in its TLS
+//! handshake, and how they end. It knows no routes.
 
 use std::convert::Infallible;
 use std::io;
@@ -32,19 +32,23 @@ use crate::net::anteroom::{Anteroom, Place};
 use crate::net::http_connections::{Connection, HttpConnections};
 use crate::net::tls::{ClientProof, Tls};
 
-/// How long a connection on which no good token was shown is left when its place is needed: enough to sign in, or to get a page.
+/// How long a connection on which no good token was shown is left when its place is needed: enough
+/// to sign in, or to get a page.
 const GRACE: Duration = Duration::from_secs(3);
-/// How long a request's head may take, also the first one of a connection, and how long one is kept without a request.
+/// How long a request's head may take, also the first one of a connection, and how long one is kept
+/// without a request.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
 /// How long a client may pause within a body it sends.
 const BODY_PAUSE: Duration = Duration::from_secs(30);
-/// What has to come of a body in each [`BODY_PAUSE`] that it is waited for, less than the slowest of links brings.
+/// What has to come of a body in each [`BODY_PAUSE`] that it is waited for, less than the slowest
+/// of links brings.
 const LEAST_BODY_BYTES: usize = 16 * 1024;
 /// How long a client may leave our bytes unread.
 const WRITE_PAUSE: Duration = Duration::from_secs(60);
 /// A request's head may be no larger.
 const MOST_HEAD_BYTES: usize = 64 * 1024;
-/// This share of all connections, one in so many, is kept free of holders that have more than theirs.
+/// This share of all connections, one in so many, is kept free of holders that have more than
+/// theirs.
 const RESERVED_SHARE: usize = 16;
 /// How long the listener rests after it has cut a connection for another.
 const CUT_PAUSE: Duration = Duration::from_millis(1);
@@ -56,12 +60,15 @@ const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 /// How many connections there may be.
 #[derive(Debug, Clone)]
 pub struct Limits {
-    /// At a time. When nearly all are taken, the holder with the most loses its oldest. Where none has more than its share,
-    /// those without a request end, those without a good token in any case, and more wait in the listener's backlog.
+    /// At a time. When nearly all are taken, the holder with the most loses its oldest. Where none
+    /// has more than its share, those without a request end, those without a good token in any
+    /// case, and more wait in the listener's backlog.
     pub max_connections: usize,
-    /// Those of one address on which no good token was shown yet; a further one takes the place of the oldest.
+    /// Those of one address on which no good token was shown yet; a further one takes the place of
+    /// the oldest.
     pub max_silent_per_address: usize,
-    /// Whose connections are many clients': they count as silent until their first request, and end between requests only.
+    /// Whose connections are many clients': they count as silent until their first request, and end
+    /// between requests only.
     pub proxies: Arc<[IpAddr]>,
     /// How long a TLS handshake may take.
     pub handshake_timeout: Duration,
@@ -117,7 +124,15 @@ pub async fn serve(
     let connections = TaskTracker::new();
     let abort = CancellationToken::new();
     let Limits { handshake_timeout, proxies, .. } = limits;
-    let site = Arc::new(Site { router, tls, handshake_timeout, proxies, traffic, stop, abort: abort.clone() });
+    let site = Arc::new(Site {
+        router,
+        tls,
+        handshake_timeout,
+        proxies,
+        traffic,
+        stop,
+        abort: abort.clone(),
+    });
     loop {
         let (stream, peer, place) = tokio::select! {
             () = site.stop.cancelled() => break,
@@ -125,9 +140,16 @@ pub async fn serve(
         };
         let silent = anteroom.enter(peer.ip(), Instant::now());
         let proof = ClientProof::NotAsked;
-        let guest = Guest { peer, silent, proof, crowded: places.crowded.subscribe(), handle: Connection::default() };
+        let guest = Guest {
+            peer,
+            silent,
+            proof,
+            crowded: places.crowded.subscribe(),
+            handle: Connection::default(),
+        };
         let site = site.clone();
-        // Two kinds of task, so that a plain connection's does not need the room of an encrypted one's.
+        // Two kinds of task, so that a plain connection's does not need the room of an encrypted
+        // one's.
         if site.tls.is_some() {
             connections.spawn(async move {
                 site.attend_encrypted(stream, guest).await;
@@ -176,9 +198,11 @@ impl Site {
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let Guest { peer, silent, proof, crowded, handle } = guest;
-        let (spoken, is_proxy) = (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
+        let (spoken, is_proxy) =
+            (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
-        let origin = Origin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
+        let origin =
+            Origin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
         let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
         let stranger = async {
             tokio::select! {
@@ -223,15 +247,22 @@ struct Places {
 
 impl Places {
     fn new(most: usize, registry: Arc<HttpConnections>) -> Self {
-        Self { free: Arc::new(Semaphore::new(most)), most, crowded: watch::Sender::new(false), registry }
+        Self {
+            free: Arc::new(Semaphore::new(most)),
+            most,
+            crowded: watch::Sender::new(false),
+            registry,
+        }
     }
 
-    /// Takes one. The last ones are not for a holder that has more than its share: it loses its oldest connection for each
-    /// newcomer. Where no holder has more and none is left, connections without a request have to end.
+    /// Takes one. The last ones are not for a holder that has more than its share: it loses its
+    /// oldest connection for each newcomer. Where no holder has more and none is left, connections
+    /// without a request have to end.
     async fn take(&self) -> Option<OwnedSemaphorePermit> {
         if let Ok(place) = self.free.clone().try_acquire_owned() {
             let left = self.free.available_permits();
-            self.crowded.send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
+            self.crowded
+                .send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
             if left < self.most / RESERVED_SHARE {
                 self.cut_one().await;
             }
@@ -241,16 +272,18 @@ impl Places {
             if !self.cut_one().await {
                 self.crowded.send_replace(true);
             }
-            // By the next look strangers may have shown whose they are. The semaphore is never closed, so there is always a
-            // permit; without one the connection would only be uncounted.
+            // By the next look strangers may have shown whose they are. The semaphore is never
+            // closed, so there is always a permit; without one the connection would only be
+            // uncounted.
             if let Ok(place) = timeout(LOOK_AGAIN, self.free.clone().acquire_owned()).await {
                 return place.ok();
             }
         }
     }
 
-    /// Cuts the oldest connection of the holder with the most, if that is more than its share. A holder that comes again as
-    /// soon as it is cut would otherwise keep the whole server busy with it.
+    /// Cuts the oldest connection of the holder with the most, if that is more than its share. A
+    /// holder that comes again as soon as it is cut would otherwise keep the whole server busy with
+    /// it.
     async fn cut_one(&self) -> bool {
         let is_cut = self.registry.cut_oldest_of_largest(self.most);
         if is_cut {
@@ -260,9 +293,13 @@ impl Places {
     }
 }
 
-/// Resolves when a connection has to end as soon as it has no request: the server stops, or the places are needed and this
-/// one has had its turn.
-async fn asked_to_end(stop: &CancellationToken, spoken: &CancellationToken, crowded: watch::Receiver<bool>) {
+/// Resolves when a connection has to end as soon as it has no request: the server stops, or the
+/// places are needed and this one has had its turn.
+async fn asked_to_end(
+    stop: &CancellationToken,
+    spoken: &CancellationToken,
+    crowded: watch::Receiver<bool>,
+) {
     let needed = async {
         spoken.cancelled().await;
         needed(crowded).await;
@@ -273,8 +310,9 @@ async fn asked_to_end(stop: &CancellationToken, spoken: &CancellationToken, crow
     }
 }
 
-/// Resolves when a connection on which no good token was shown has to go, whatever it does: a neighbour needs its place, or
-/// anybody does. What it could do would otherwise take as long as whoever is behind it likes.
+/// Resolves when a connection on which no good token was shown has to go, whatever it does: a
+/// neighbour needs its place, or anybody does. What it could do would otherwise take as long as
+/// whoever is behind it likes.
 async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
     let needed = async {
         needed(crowded).await;
@@ -294,7 +332,10 @@ async fn needed(mut crowded: watch::Receiver<bool>) {
     }
 }
 
-async fn accept(listener: &TcpListener, places: &Places) -> (TcpStream, SocketAddr, Option<OwnedSemaphorePermit>) {
+async fn accept(
+    listener: &TcpListener,
+    places: &Places,
+) -> (TcpStream, SocketAddr, Option<OwnedSemaphorePermit>) {
     let place = places.take().await;
     loop {
         match listener.accept().await {
@@ -313,7 +354,8 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-/// Marks a request whose connection is not encrypted: only the kernel reads the bytes of its answer.
+/// Marks a request whose connection is not encrypted: only the kernel reads the bytes of its
+/// answer.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::http) struct Unencrypted;
 
@@ -344,7 +386,12 @@ fn connection<S>(
     traffic: Arc<HttpTotals>,
 ) -> http1::UpgradeableConnection<
     TokioIo<S>,
-    impl hyper::service::Service<Request<Incoming>, Response = http::Response<Body>, Error = Infallible, Future: Send>,
+    impl hyper::service::Service<
+        Request<Incoming>,
+        Response = http::Response<Body>,
+        Error = Infallible,
+        Future: Send,
+    >,
 >
 where
     S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
@@ -364,7 +411,8 @@ where
         .with_upgrades()
 }
 
-/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose bytes are counted.
+/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose
+/// bytes are counted.
 struct PatientStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
@@ -373,7 +421,11 @@ struct PatientStream {
 }
 
 impl PatientStream {
-    fn watch_write(&mut self, context: &mut Context<'_>, polled: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
+    fn watch_write(
+        &mut self,
+        context: &mut Context<'_>,
+        polled: Poll<io::Result<usize>>,
+    ) -> Poll<io::Result<usize>> {
         if let Poll::Ready(written) = &polled {
             let bytes = *written.as_ref().unwrap_or(&0);
             self.traffic.bytes_out(bytes);
@@ -400,7 +452,11 @@ impl AsyncRead for PatientStream {
 }
 
 impl AsyncWrite for PatientStream {
-    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
         let polled = Pin::new(&mut self.stream).poll_write(context, bytes);
         self.watch_write(context, polled)
     }
@@ -427,8 +483,8 @@ impl AsyncWrite for PatientStream {
     }
 }
 
-/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while it was waited for, or too little
-/// in all the time that it was waited for.
+/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while it was
+/// waited for, or too little in all the time that it was waited for.
 struct PatientBody {
     body: Incoming,
     waiting: Option<Wait>,
@@ -441,7 +497,8 @@ struct Wait {
     timer: Pin<Box<Sleep>>,
 }
 
-/// How fast a body comes. Only the time in which it is waited for counts: a slow server is not the client's fault.
+/// How fast a body comes. Only the time in which it is waited for counts: a slow server is not the
+/// client's fault.
 #[derive(Default)]
 struct BodyPace {
     waited: Duration,
@@ -477,13 +534,15 @@ impl http_body::Body for PatientBody {
         let too_slow = || Poll::Ready(Some(Err(io::Error::from(io::ErrorKind::TimedOut).into())));
         if let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) {
             let waited = self.waiting.take().map_or(Duration::ZERO, |wait| wait.since.elapsed());
-            let bytes = frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()).map(Bytes::len);
+            let bytes =
+                frame.as_ref().and_then(|frame| frame.as_ref().ok()?.data_ref()).map(Bytes::len);
             return match bytes {
                 Some(bytes) if !self.pace.count(waited, bytes) => too_slow(),
                 _ => Poll::Ready(frame.map(|frame| frame.map_err(Into::into))),
             };
         }
-        let new = || Wait { since: Instant::now(), timer: Box::pin(tokio::time::sleep(BODY_PAUSE)) };
+        let new =
+            || Wait { since: Instant::now(), timer: Box::pin(tokio::time::sleep(BODY_PAUSE)) };
         ready!(self.waiting.get_or_insert_with(new).timer.poll_unpin(context));
         too_slow()
     }

@@ -1,5 +1,6 @@
-//! Where a request really came from when a reverse proxy stands before the server: what a proxy that is trusted by its address
-//! says in `X-Forwarded-For`. From anybody else the header says nothing.
+//! Where a request really came from when a reverse proxy stands before the server: what a proxy
+//! that is trusted by its address says in `X-Forwarded-For`. From anybody else the header says
+//! nothing.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -10,9 +11,14 @@ use http::HeaderMap;
 /// The addresses of proxies that are believed.
 pub(in crate::http) type TrustedProxies = Arc<[IpAddr]>;
 
-/// Puts the address of whoever asked the proxy in the place of the proxy's. Of their port nothing is known.
-pub(in crate::http) async fn see_through(State(trusted): State<TrustedProxies>, mut request: Request) -> Request {
-    let Some(ConnectInfo(peer)) = request.extensions().get::<ConnectInfo<SocketAddr>>().copied() else {
+/// Puts the address of whoever asked the proxy in the place of the proxy's. Of their port nothing
+/// is known.
+pub(in crate::http) async fn see_through(
+    State(trusted): State<TrustedProxies>,
+    mut request: Request,
+) -> Request {
+    let Some(ConnectInfo(peer)) = request.extensions().get::<ConnectInfo<SocketAddr>>().copied()
+    else {
         return request;
     };
     if let Some(address) = forwarded_for(&trusted, peer.ip(), request.headers()) {
@@ -21,8 +27,8 @@ pub(in crate::http) async fn see_through(State(trusted): State<TrustedProxies>, 
     request
 }
 
-/// The last address on the list that is not a trusted proxy's: what stands before it anybody could have written, and is not
-/// looked at.
+/// The last address on the list that is not a trusted proxy's: what stands before it anybody could
+/// have written, and is not looked at.
 fn forwarded_for(trusted: &[IpAddr], peer: IpAddr, headers: &HeaderMap) -> Option<IpAddr> {
     if !trusted.contains(&peer.to_canonical()) {
         return None;
@@ -48,19 +54,25 @@ mod tests {
     }
 
     fn found_in(peer: &str, lines: &[&[u8]]) -> Option<String> {
-        let trusted: Vec<IpAddr> = ["10.0.0.1", "10.0.0.2"].map(|text| text.parse().expect("an address")).into();
+        let trusted: Vec<IpAddr> =
+            ["10.0.0.1", "10.0.0.2"].map(|text| text.parse().expect("an address")).into();
         let mut headers = HeaderMap::new();
         for line in lines {
-            headers.append("x-forwarded-for", http::HeaderValue::from_bytes(line).expect("a value"));
+            headers
+                .append("x-forwarded-for", http::HeaderValue::from_bytes(line).expect("a value"));
         }
-        forwarded_for(&trusted, peer.parse().expect("an address"), &headers).map(|address| address.to_string())
+        forwarded_for(&trusted, peer.parse().expect("an address"), &headers)
+            .map(|address| address.to_string())
     }
 
     #[test]
     fn only_what_a_trusted_proxy_wrote_counts() {
         assert_eq!(found("10.0.0.1", &["192.0.2.7"]).as_deref(), Some("192.0.2.7"));
         assert_eq!(found("::ffff:10.0.0.1", &["192.0.2.7"]).as_deref(), Some("192.0.2.7"));
-        assert_eq!(found("10.0.0.1", &["1.1.1.1, 192.0.2.7, 10.0.0.2"]).as_deref(), Some("192.0.2.7"));
+        assert_eq!(
+            found("10.0.0.1", &["1.1.1.1, 192.0.2.7, 10.0.0.2"]).as_deref(),
+            Some("192.0.2.7")
+        );
         assert_eq!(found("10.0.0.1", &["1.1.1.1", "2001:db8::7"]).as_deref(), Some("2001:db8::7"));
         assert_eq!(found("192.0.2.9", &["192.0.2.7"]), None);
         assert_eq!(found("10.0.0.1", &[]), None);
@@ -72,8 +84,14 @@ mod tests {
     fn what_stands_before_it_hides_nothing() {
         let foreign: &[u8] = b"caf\xe9, \xff";
         assert_eq!(found_in("10.0.0.1", &[foreign, b"192.0.2.7"]).as_deref(), Some("192.0.2.7"));
-        assert_eq!(found_in("10.0.0.1", &[b"\xff,192.0.2.7, 10.0.0.2"]).as_deref(), Some("192.0.2.7"));
-        assert_eq!(found("10.0.0.1", &["nonsense", "192.0.2.7", "10.0.0.2"]).as_deref(), Some("192.0.2.7"));
+        assert_eq!(
+            found_in("10.0.0.1", &[b"\xff,192.0.2.7, 10.0.0.2"]).as_deref(),
+            Some("192.0.2.7")
+        );
+        assert_eq!(
+            found("10.0.0.1", &["nonsense", "192.0.2.7", "10.0.0.2"]).as_deref(),
+            Some("192.0.2.7")
+        );
         assert_eq!(found_in("10.0.0.1", &[b"192.0.2.7, \xff"]), None);
         assert_eq!(found_in("10.0.0.1", &[b"192.0.2.7", foreign]), None);
     }

@@ -1,4 +1,5 @@
-//! What goes over HTTP, counted at the sockets: heads, bodies and whatever was sent in vain. It only counts.
+//! What goes over HTTP, counted at the sockets: heads, bodies and whatever was sent in vain. It
+//! only counts.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 

@@ -1,4 +1,5 @@
-//! Questions to one robot: passed on, answered by the robot itself. What changes something takes more than looking.
+//! Questions to one robot: passed on, answered by the robot itself. What changes something takes
+//! more than looking.
 
 use std::time::Duration;
 
@@ -63,7 +64,9 @@ impl From<RequestError> for ApiError {
         match error {
             RequestError::NotConnected => Self::conflict("robot_offline", message),
             RequestError::Busy => Self::unavailable(message),
-            RequestError::TimedOut { .. } => Self::new(StatusCode::GATEWAY_TIMEOUT, "robot_silent", message),
+            RequestError::TimedOut { .. } => {
+                Self::new(StatusCode::GATEWAY_TIMEOUT, "robot_silent", message)
+            }
             RequestError::Refused(refusal) => Self::conflict(code(&refusal), message),
             RequestError::Unwritable(_) => Self::internal(&error),
         }

@@ -21,9 +21,13 @@ pub(in crate::http) async fn endpoint(
 }
 
 /// The same, for whoever answers the robot something else as well.
-pub(in crate::http) async fn endpoint_of(app: &App, robot: &RobotId) -> Result<MqttEndpoint, ApiError> {
+pub(in crate::http) async fn endpoint_of(
+    app: &App,
+    robot: &RobotId,
+) -> Result<MqttEndpoint, ApiError> {
     let credential = app.store.broker_credential(robot).await?;
-    let credential = credential.ok_or_else(|| ApiError::not_found(format!("there is no robot {robot}")))?;
+    let credential =
+        credential.ok_or_else(|| ApiError::not_found(format!("there is no robot {robot}")))?;
     Ok(app.mqtt.endpoint_of(&credential))
 }
 
@@ -54,7 +58,10 @@ async fn made<T: Send + 'static>(
     let (robots, access) = (app.store.broker_credentials().await?, app.mqtt.clone());
     // A hash for each robot: too long for a thread that serves others.
     let made = tokio::task::spawn_blocking(move || make(&access, &robots)).await;
-    made.ok().flatten().map(Json).ok_or_else(|| ApiError::unavailable("the files could not be made"))
+    made.ok()
+        .flatten()
+        .map(Json)
+        .ok_or_else(|| ApiError::unavailable("the files could not be made"))
 }
 
 /// Tests the external brokers with two accounts that are there for nothing else.

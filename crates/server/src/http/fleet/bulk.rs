@@ -40,7 +40,8 @@ pub(in crate::http) async fn remove(
     if order.dry_run {
         return Ok(completed(&app, app.actions.matching_robots(&by, &order.selector).await?));
     }
-    let removed = app.actions.remove_robots(&by, order_key(&headers)?.as_ref(), &order.selector).await?;
+    let removed =
+        app.actions.remove_robots(&by, order_key(&headers)?.as_ref(), &order.selector).await?;
     let answer = completed(&app, removed);
     answer.robots.iter().for_each(|robot| gone(&app, &robot.id));
     Ok(answer)

@@ -1,4 +1,5 @@
-//! Enrolment: tokens for robots to come, the robots that come with them, and those that wait to be approved.
+//! Enrolment: tokens for robots to come, the robots that come with them, and those that wait to be
+//! approved.
 
 use std::net::SocketAddr;
 
@@ -6,8 +7,8 @@ use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::NoContent;
 use task_proto::api::{
-    CreateEnrollmentToken, EnrollRequest, EnrollResponse, EnrollmentToken, EnrollmentTokenList, FeedKind,
-    PendingRobotList,
+    CreateEnrollmentToken, EnrollRequest, EnrollResponse, EnrollmentToken, EnrollmentTokenList,
+    FeedKind, PendingRobotList,
 };
 use task_proto::{RobotName, TokenId};
 
@@ -37,9 +38,19 @@ pub(in crate::http) async fn enroll(
     let enrolled = app.actions.enroll(&token, &request, Some(peer.ip().to_canonical())).await?;
     let mqtt = endpoint_of(&app, &enrolled.robot_id).await?;
     let text = format!("registered from {}", peer.ip().to_canonical());
-    app.changes.happened(Happening::Robot(enrolled.robot_id.clone(), FeedKind::RobotEnrolled, text));
+    app.changes.happened(Happening::Robot(
+        enrolled.robot_id.clone(),
+        FeedKind::RobotEnrolled,
+        text,
+    ));
     let (token, awaits_approval) = (enrolled.token.reveal(), enrolled.awaits_approval);
-    let answer = EnrollResponse { robot_id: enrolled.robot_id, name: enrolled.name, token, mqtt, awaits_approval };
+    let answer = EnrollResponse {
+        robot_id: enrolled.robot_id,
+        name: enrolled.name,
+        token,
+        mqtt,
+        awaits_approval,
+    };
     Ok(Created(answer))
 }
 
@@ -56,7 +67,9 @@ pub(in crate::http) async fn create_token(
 
 /// Lists the enrolment tokens that are good for something.
 #[utoipa::path(get, path = "/api/v1/enrollment-tokens", tag = "enrolment")]
-pub(in crate::http) async fn tokens(State(app): State<App>) -> Result<Json<EnrollmentTokenList>, ApiError> {
+pub(in crate::http) async fn tokens(
+    State(app): State<App>,
+) -> Result<Json<EnrollmentTokenList>, ApiError> {
     Ok(Json(app.actions.enrollment_tokens().await?))
 }
 
@@ -73,7 +86,9 @@ pub(in crate::http) async fn revoke_token(
 
 /// Lists the robots that wait to be approved.
 #[utoipa::path(get, path = "/api/v1/pending-robots", tag = "enrolment")]
-pub(in crate::http) async fn pending(State(app): State<App>) -> Result<Json<PendingRobotList>, ApiError> {
+pub(in crate::http) async fn pending(
+    State(app): State<App>,
+) -> Result<Json<PendingRobotList>, ApiError> {
     Ok(Json(app.actions.pending_robots().await?))
 }
 

@@ -38,7 +38,9 @@ pub(in crate::http) async fn feed(
 ) -> Result<Json<FeedPage>, ApiError> {
     let limit = query.limit.map_or(LISTED, |limit| limit as usize);
     if !(1..=MAX_FEED_ENTRIES).contains(&limit) {
-        return Err(ApiError::invalid(format!("limit: expected 1 to {MAX_FEED_ENTRIES}, not {limit}")));
+        return Err(ApiError::invalid(format!(
+            "limit: expected 1 to {MAX_FEED_ENTRIES}, not {limit}"
+        )));
     }
     let mut theirs = HashSet::new();
     let mut known = HashSet::new();
@@ -46,8 +48,8 @@ pub(in crate::http) async fn feed(
         theirs.extend(app.store.robots_in(&by.scope).await?);
         known.extend(app.store.robots_in(&Scope::everything()).await?);
     }
-    // What a robot is labelled now counts, as everywhere else. An entry knows what it was labelled then: all that is left of
-    // one that was removed.
+    // What a robot is labelled now counts, as everywhere else. An entry knows what it was labelled
+    // then: all that is left of one that was removed.
     let is_theirs_now = |robot: &KnownRobot| match known.contains(&robot.id) {
         true => theirs.contains(&robot.id),
         false => by.scope.covers(&robot.id, &robot.name, &robot.labels),

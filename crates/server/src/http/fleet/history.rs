@@ -45,7 +45,9 @@ pub(in crate::http) async fn tasks(
     let id = find(&app, &by, &robot).await?;
     let limit = query.limit.unwrap_or(LISTED);
     if !(1..=MOST_LISTED).contains(&limit) {
-        return Err(ApiError::invalid(format!("limit: {limit} is not between 1 and {MOST_LISTED}")));
+        return Err(ApiError::invalid(format!(
+            "limit: {limit} is not between 1 and {MOST_LISTED}"
+        )));
     }
     let asked = HistoryQuery { task: query.task.as_ref(), before: query.before.as_ref(), limit };
     let page = app.store.task_history(&id, asked).await?.ok_or_else(|| {

@@ -1,5 +1,6 @@
-//! Robots' log lines: what was said, from the robot or else from memory, and what is said from now on. While anyone
-//! follows a robot one task here keeps asking it to publish; when nobody does, it ends.
+//! Robots' log lines: what was said, from the robot or else from memory, and what is said from now
+//! on. While anyone follows a robot one task here keeps asking it to publish; when nobody does, it
+//! ends.
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -82,10 +83,18 @@ async fn newest(
     let ask = Ask::Logs { task: task.clone(), level: *level, since_ms, max_lines };
     let reason = match app.requests.ask(&app.broker, robot, ask, PATIENCE).await {
         Ok(Answer::Logs(LogBatch { lines, suppressed, .. })) => {
-            return Ok(LogsView { from: LogsFrom::Robot, age_ms: 0, reason: None, lines, suppressed });
+            return Ok(LogsView {
+                from: LogsFrom::Robot,
+                age_ms: 0,
+                reason: None,
+                lines,
+                suppressed,
+            });
         }
         Ok(_) => "the robot gave another answer".to_owned(),
-        Err(error @ RequestError::Refused(_)) if is_about_the_question(&error) => return Err(error.into()),
+        Err(error @ RequestError::Refused(_)) if is_about_the_question(&error) => {
+            return Err(error.into());
+        }
         Err(error) => error.to_string(),
     };
     Ok(remembered(app, robot, &filter, since_ms, max_lines, reason))
@@ -106,17 +115,30 @@ fn remembered(
 ) -> LogsView {
     let Some(kept) = app.logs.remembered(robot) else {
         let (lines, age_ms) = (Vec::new(), 0);
-        return LogsView { from: LogsFrom::Server, age_ms, reason: Some(reason), lines, suppressed: 0 };
+        return LogsView {
+            from: LogsFrom::Server,
+            age_ms,
+            reason: Some(reason),
+            lines,
+            suppressed: 0,
+        };
     };
     let age_ms = app.clock.now_ms().saturating_sub(kept.received_ms);
     // What the robot's clock shows now, if it goes on as it went.
     let robot_now_ms = kept.robot_ms.saturating_add(age_ms);
     let oldest_ms = since_ms.map_or(0, |since_ms| robot_now_ms.saturating_sub(since_ms));
-    let wanted = kept.lines.into_iter().filter(|line| line.at_ms >= oldest_ms && filter.wants(line));
+    let wanted =
+        kept.lines.into_iter().filter(|line| line.at_ms >= oldest_ms && filter.wants(line));
     let mut lines: Vec<LogLine> = wanted.collect();
     let surplus = lines.len().saturating_sub(usize::try_from(max_lines).unwrap_or(usize::MAX));
     lines.drain(..surplus);
-    LogsView { from: LogsFrom::Server, age_ms, reason: Some(reason), lines, suppressed: kept.suppressed }
+    LogsView {
+        from: LogsFrom::Server,
+        age_ms,
+        reason: Some(reason),
+        lines,
+        suppressed: kept.suppressed,
+    }
 }
 
 fn stream(
@@ -148,15 +170,20 @@ fn stream(
         };
         std::future::ready(event.map(|event| Ok(sent(&event))))
     });
-    // A first line, so that proxies pass the headers on and the listener knows that it is connected.
-    let greeting =
-        futures_util::stream::iter([Ok(SentEvent::default().retry(Duration::from_secs(2)).comment("hello"))]);
-    Ok(Sse::new(greeting.chain(events).take_until(end)).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
+    // A first line, so that proxies pass the headers on and the listener knows that it is
+    // connected.
+    let greeting = futures_util::stream::iter([Ok(SentEvent::default()
+        .retry(Duration::from_secs(2))
+        .comment("hello"))]);
+    Ok(Sse::new(greeting.chain(events).take_until(end))
+        .keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 
 fn lines(batch: &LogBatch, filter: &Filter) -> Option<LogEvent> {
-    let lines: Vec<LogLine> = batch.lines.iter().filter(|line| filter.wants(line)).cloned().collect();
-    (!lines.is_empty() || batch.suppressed > 0).then_some(LogEvent::Lines { lines, suppressed: batch.suppressed })
+    let lines: Vec<LogLine> =
+        batch.lines.iter().filter(|line| filter.wants(line)).cloned().collect();
+    (!lines.is_empty() || batch.suppressed > 0)
+        .then_some(LogEvent::Lines { lines, suppressed: batch.suppressed })
 }
 
 fn sent(event: &LogEvent) -> SentEvent {
@@ -173,8 +200,10 @@ fn sent(event: &LogEvent) -> SentEvent {
 async fn keep_following(app: App, robot: RobotId) {
     let mut connection = None;
     while let Some(level) = app.logs.wanted(&robot) {
-        let ask = Ask::Follow { level, lease_ms: u64::try_from(LEASE.as_millis()).unwrap_or(u64::MAX) };
-        let now = app.presence.get(&robot, app.clock.now_ms()).and_then(|sighting| sighting.connection);
+        let ask =
+            Ask::Follow { level, lease_ms: u64::try_from(LEASE.as_millis()).unwrap_or(u64::MAX) };
+        let now =
+            app.presence.get(&robot, app.clock.now_ms()).and_then(|sighting| sighting.connection);
         let pause = match app.requests.ask(&app.broker, &robot, ask, PATIENCE).await {
             Ok(_) => {
                 // By another connection than the last time: what it said in between is not known.

@@ -1,5 +1,5 @@
-//! The way to MQTT over the HTTP port: a WebSocket, for robots that reach nothing else. Who comes in is the broker's own
-//! affair, as at its own port.
+//! The way to MQTT over the HTTP port: a WebSocket, for robots that reach nothing else. Who comes
+//! in is the broker's own affair, as at its own port.
 
 use std::io;
 use std::net::SocketAddr;
@@ -36,7 +36,9 @@ pub(in crate::http) async fn upgrade(
         Ok((WebSocket::server(TokioIo::new(stream)), proof))
     };
     if !app.broker.take_in(peer, handshake) {
-        return Err(ApiError::unavailable("MQTT is served elsewhere, or to as many as there may be"));
+        return Err(ApiError::unavailable(
+            "MQTT is served elsewhere, or to as many as there may be",
+        ));
     }
     let mut response = Response::new(Body::empty());
     *response.status_mut() = StatusCode::SWITCHING_PROTOCOLS;

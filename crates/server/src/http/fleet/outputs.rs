@@ -1,4 +1,5 @@
-//! What tasks brought back, as the operator's commands and the page list it. The bytes are the registry's.
+//! What tasks brought back, as the operator's commands and the page list it. The bytes are the
+//! registry's.
 
 use axum::Json;
 use axum::extract::State;
@@ -38,5 +39,7 @@ pub(in crate::http) async fn list(
         None => None,
     };
     let scope = if robot.is_some() { &Scope::everything() } else { &by.scope };
-    Ok(Json(OutputList { outputs: app.store.outputs(robot.as_ref(), query.task.as_ref(), scope).await? }))
+    Ok(Json(OutputList {
+        outputs: app.store.outputs(robot.as_ref(), query.task.as_ref(), scope).await?,
+    }))
 }

@@ -9,7 +9,8 @@ use axum::{Extension, Json};
 use http::{HeaderMap, StatusCode, Uri, header};
 use serde::Deserialize;
 use task_proto::api::{
-    EditRobot, FeedKind, INSTANCE_HEADER, MqttConnection, PLACE_HEADER, ReportReply, RobotList, RobotToken, RobotView,
+    EditRobot, FeedKind, INSTANCE_HEADER, MqttConnection, PLACE_HEADER, ReportReply, RobotList,
+    RobotToken, RobotView,
 };
 use task_proto::envelope::Envelope;
 use task_proto::report::Report;
@@ -61,12 +62,18 @@ async fn listed(app: &App, by: &Person, query: &ListQuery) -> Result<RobotList, 
     let mut list = match (page_limit(query.limit)?, after) {
         (Some(limit), after) => {
             let page = app.store.robots_page(&by.scope, selector, after, limit as usize).await?;
-            RobotList { robots: page.robots, next: page.next, total: Some(page.total), ..RobotList::default() }
+            RobotList {
+                robots: page.robots,
+                next: page.next,
+                total: Some(page.total),
+                ..RobotList::default()
+            }
         }
         (None, None) => {
             let mut robots = app.store.robots().await?;
             robots.retain(|RobotView { id, name, labels, .. }| {
-                by.scope.covers(id, name, labels) && selector.is_none_or(|selector| selector.matches(id, name, labels))
+                by.scope.covers(id, name, labels)
+                    && selector.is_none_or(|selector| selector.matches(id, name, labels))
             });
             RobotList { robots, ..RobotList::default() }
         }
@@ -76,7 +83,9 @@ async fn listed(app: &App, by: &Person, query: &ListQuery) -> Result<RobotList, 
         list.unknown = app.store.unknown_robots(selector, &by.scope).await?;
     }
     let now_ms = app.clock.now_ms();
-    list.robots.iter_mut().for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, &app.vitals, now_ms));
+    list.robots
+        .iter_mut()
+        .for_each(|robot| complete_robot(robot, &app.presence, &app.conduct, &app.vitals, now_ms));
     Ok(list)
 }
 
@@ -89,9 +98,11 @@ pub(in crate::http) async fn show(
 ) -> Result<Json<RobotView>, ApiError> {
     let id = find(&app, &by, &robot).await?;
     let mut view = view(&app, &id).await?;
-    let since_ms = app.presence.get(&id, app.clock.now_ms()).and_then(|sighting| sighting.connected_since_ms);
-    view.mqtt =
-        since_ms.zip(app.broker.traffic_of(&id)).map(|(since_ms, traffic)| MqttConnection { since_ms, traffic });
+    let since_ms =
+        app.presence.get(&id, app.clock.now_ms()).and_then(|sighting| sighting.connected_since_ms);
+    view.mqtt = since_ms
+        .zip(app.broker.traffic_of(&id))
+        .map(|(since_ms, traffic)| MqttConnection { since_ms, traffic });
     Ok(Json(view))
 }
 
@@ -134,7 +145,11 @@ pub(in crate::http) async fn revoke(
     put_out(&app, &id);
     // One that polled would count as there for a while.
     app.presence.forget(&id);
-    app.changes.happened(Happening::Robot(id.clone(), FeedKind::RobotRevoked, "was put out".to_owned()));
+    app.changes.happened(Happening::Robot(
+        id.clone(),
+        FeedKind::RobotRevoked,
+        "was put out".to_owned(),
+    ));
     app.changes.announce(Change::Robot(id));
     Ok(NoContent)
 }
@@ -176,9 +191,11 @@ pub(in crate::http) async fn desired(
     }
     let desired = app.actions.desired(&robot).await?;
     let body = serde_json::to_vec(&desired.envelope).map_err(|error| ApiError::internal(&error))?;
-    // The same generation is signed again before its lifetime ends, so the tag covers the signature as well.
+    // The same generation is signed again before its lifetime ends, so the tag covers the signature
+    // as well.
     let tag = format!("\"{}-{}\"", desired.generation, &Digest::of(&body).hex()[..16]);
-    let is_known = headers.get(header::IF_NONE_MATCH).is_some_and(|value| value.as_bytes() == tag.as_bytes());
+    let is_known =
+        headers.get(header::IF_NONE_MATCH).is_some_and(|value| value.as_bytes() == tag.as_bytes());
     let caching = [(header::ETAG, tag), (header::CACHE_CONTROL, "no-cache".to_owned())];
     if is_known {
         return Ok((StatusCode::NOT_MODIFIED, caching).into_response());
@@ -199,11 +216,19 @@ pub(in crate::http) async fn report(
     TolerantJson(report): TolerantJson<Report>,
 ) -> Result<Json<ReportReply>, ApiError> {
     if report.robot_id != robot {
-        return Err(ApiError::invalid(format!("robot_id: the report is by {}, not by {robot}", report.robot_id)));
+        return Err(ApiError::invalid(format!(
+            "robot_id: the report is by {}, not by {robot}",
+            report.robot_id
+        )));
     }
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
-    if !is_served(&app, &robot, peer, Some(Claim { instance: report.instance.clone(), place: report.place })) {
+    if !is_served(
+        &app,
+        &robot,
+        peer,
+        Some(Claim { instance: report.instance.clone(), place: report.place }),
+    ) {
         return Err(waits());
     }
     Ok(Json(app.reports.submit(report, token_number).await?))
@@ -240,9 +265,14 @@ fn claim_in(headers: &HeaderMap) -> Result<Option<Claim>, ApiError> {
 /// Whether what asks in the robot's name is the agent that has its work.
 fn is_served(app: &App, robot: &RobotId, peer: SocketAddr, claim: Option<Claim>) -> bool {
     match claim {
-        Some(claim) => {
-            uplink::claimed(&app.presence, &app.changes, robot, (Some(peer), None), claim, app.clock.now_ms())
-        }
+        Some(claim) => uplink::claimed(
+            &app.presence,
+            &app.changes,
+            robot,
+            (Some(peer), None),
+            claim,
+            app.clock.now_ms(),
+        ),
         None => !app.presence.takes_a_claim(robot),
     }
 }
@@ -253,9 +283,14 @@ fn waits() -> ApiError {
 }
 
 /// The robot that a person names, which must be one of theirs.
-pub(in crate::http) async fn find(app: &App, by: &Person, id_or_name: &RobotName) -> Result<RobotId, ApiError> {
+pub(in crate::http) async fn find(
+    app: &App,
+    by: &Person,
+    id_or_name: &RobotName,
+) -> Result<RobotId, ApiError> {
     let found = app.store.find_robot(id_or_name.as_str()).await?;
-    let found = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))?;
+    let found =
+        found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id_or_name}")))?;
     if by.scope.covers(&found.id, &found.name, &found.labels) {
         return Ok(found.id);
     }

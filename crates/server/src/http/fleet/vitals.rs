@@ -26,7 +26,10 @@ pub(in crate::http) async fn telemetry(
     TolerantJson(said): TolerantJson<Telemetry>,
 ) -> Result<NoContent, ApiError> {
     if said.robot_id != robot {
-        return Err(ApiError::invalid(format!("robot_id: the vitals are of {}, not of {robot}", said.robot_id)));
+        return Err(ApiError::invalid(format!(
+            "robot_id: the vitals are of {}, not of {robot}",
+            said.robot_id
+        )));
     }
     let now_ms = app.clock.now_ms();
     uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);

@@ -1,5 +1,6 @@
-//! One operation as it is described: what the handler's attribute says, what its arguments and its answer show, and what the
-//! table says of the route. What all routes of a kind answer is said here once.
+//! One operation as it is described: what the handler's attribute says, what its arguments and its
+//! answer show, and what the table says of the route. What all routes of a kind answer is said here
+//! once.
 
 use std::collections::BTreeMap;
 
@@ -12,7 +13,8 @@ use utoipa::openapi::path::{HttpMethod, Operation, Parameter, ParameterBuilder, 
 use utoipa::openapi::request_body::RequestBodyBuilder;
 use utoipa::openapi::schema::{AdditionalProperties, SchemaType, Type};
 use utoipa::openapi::{
-    ContentBuilder, HeaderBuilder, Object, Ref, RefOr, Required, Response, ResponseBuilder, Schema, SecurityRequirement,
+    ContentBuilder, HeaderBuilder, Object, Ref, RefOr, Required, Response, ResponseBuilder, Schema,
+    SecurityRequirement,
 };
 use utoipa::{IntoParams, PartialSchema as _, ToSchema};
 
@@ -22,9 +24,13 @@ use super::super::auth::Access;
 /// The header of every order.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Header)]
-#[expect(dead_code, reason = "it is read from the headers, after it is known whether the order is a dry run")]
+#[expect(
+    dead_code,
+    reason = "it is read from the headers, after it is known whether the order is a dry run"
+)]
 pub(in crate::http) struct OrderKey {
-    /// Makes the order safe to repeat: the same key gives the same answer. 1 to 128 visible characters. A dry run needs none.
+    /// Makes the order safe to repeat: the same key gives the same answer. 1 to 128 visible
+    /// characters. A dry run needs none.
     #[param(
         rename = "Idempotency-Key",
         required = false,
@@ -61,11 +67,20 @@ impl Draft {
             Some(Method::PATCH) => HttpMethod::Patch,
             Some(_) => HttpMethod::Delete,
         };
-        let mut draft = Self { path, method, operation: Operation::new(), schemas: BTreeMap::new(), path_parameters };
+        let mut draft = Self {
+            path,
+            method,
+            operation: Operation::new(),
+            schemas: BTreeMap::new(),
+            path_parameters,
+        };
         (route.describe)(&mut draft);
         draft.guarded_by(route.access);
         if route.deadline.is_some() && route.access != Access::Anyone {
-            draft.refusal(StatusCode::REQUEST_TIMEOUT, "It took too long to arrive or to be answered.");
+            draft.refusal(
+                StatusCode::REQUEST_TIMEOUT,
+                "It took too long to arrive or to be answered.",
+            );
         }
         draft.complete_refusals(route.access);
         for parameter in draft.operation.parameters.iter_mut().flatten() {
@@ -86,7 +101,11 @@ impl Draft {
             self.path.trim_end_matches('/'),
             "the table has another path"
         );
-        debug_assert!(P::methods() == [self.method.clone()], "the table has another method at {}", self.path);
+        debug_assert!(
+            P::methods() == [self.method.clone()],
+            "the table has another method at {}",
+            self.path
+        );
         self.operation = P::operation();
         self.operation.tags = Some(P::tags().into_iter().map(str::to_owned).collect());
         self.operation.operation_id = Some(id.to_owned());
@@ -113,9 +132,14 @@ impl Draft {
             object.additional_properties = Some(Box::new(AdditionalProperties::FreeForm(false)));
         }
         let content = ContentBuilder::new().schema(Some(schema)).build();
-        let body = RequestBodyBuilder::new().content("application/json", content).required(Some(Required::True));
+        let body = RequestBodyBuilder::new()
+            .content("application/json", content)
+            .required(Some(Required::True));
         self.operation.request_body = Some(RefOr::T(body.build()));
-        self.refusal(StatusCode::BAD_REQUEST, "The request does not parse; the message names the field.");
+        self.refusal(
+            StatusCode::BAD_REQUEST,
+            "The request does not parse; the message names the field.",
+        );
         self.refusal(StatusCode::PAYLOAD_TOO_LARGE, "The body is larger than this route allows.");
         self.refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, "The body is not `application/json`.");
     }
@@ -123,14 +147,20 @@ impl Draft {
     /// The next parameter of the path is one of these.
     pub(super) fn takes_path<T: ToSchema>(&mut self) {
         let Some(name) = self.path_parameters.next() else { return };
-        self.refusal(StatusCode::NOT_FOUND, "There is no such thing, or no thing can have such a name.");
+        self.refusal(
+            StatusCode::NOT_FOUND,
+            "There is no such thing, or no thing can have such a name.",
+        );
         let mut described = self.operation.parameters.iter().flatten();
         if described.any(|known| matches!(known, RefOr::T(known) if known.name == name)) {
             return;
         }
         let schema = T::schema();
         let text = description(&schema);
-        let parameter = ParameterBuilder::new().name(name).parameter_in(ParameterIn::Path).required(Required::True);
+        let parameter = ParameterBuilder::new()
+            .name(name)
+            .parameter_in(ParameterIn::Path)
+            .required(Required::True);
         self.add_parameter(parameter.description(text).schema(Some(schema)).build());
     }
 
@@ -139,7 +169,10 @@ impl Draft {
         for parameter in T::into_params(|| Some(ParameterIn::Query)) {
             self.add_parameter(parameter);
         }
-        self.refusal(StatusCode::BAD_REQUEST, "The request does not parse; the message names the field.");
+        self.refusal(
+            StatusCode::BAD_REQUEST,
+            "The request does not parse; the message names the field.",
+        );
     }
 
     fn add_parameter(&mut self, parameter: Parameter) {
@@ -151,7 +184,8 @@ impl Draft {
         let schema = self.component::<T>();
         let content = ContentBuilder::new().schema(Some(schema)).build();
         let text = self.schemas.get(T::name().as_ref()).and_then(description);
-        let response = ResponseBuilder::new().description(text.unwrap_or_else(|| status.to_string()));
+        let response =
+            ResponseBuilder::new().description(text.unwrap_or_else(|| status.to_string()));
         self.answer(status, response.content("application/json", content).build());
     }
 
@@ -162,7 +196,11 @@ impl Draft {
 
     fn answer(&mut self, status: StatusCode, response: Response) {
         // What the attribute says of it is said with more knowledge.
-        self.operation.responses.responses.entry(status.as_str().to_owned()).or_insert(RefOr::T(response));
+        self.operation
+            .responses
+            .responses
+            .entry(status.as_str().to_owned())
+            .or_insert(RefOr::T(response));
     }
 
     /// Answers so as well.
@@ -191,14 +229,20 @@ impl Draft {
             Access::Person(permission) => format!("Takes the permission `{permission}`."),
             Access::OwnRobot => "For the robot itself, by its token.".to_owned(),
             Access::Enrolment => "Takes an enrolment token.".to_owned(),
-            Access::PersonOrRobot => "For people and robots, each of whom sees their own.".to_owned(),
+            Access::PersonOrRobot => {
+                "For people and robots, each of whom sees their own.".to_owned()
+            }
         };
         let description = self.operation.description.take().filter(|text| !text.is_empty());
-        self.operation.description = Some(description.map_or(caller.clone(), |text| format!("{text}\n\n{caller}")));
+        self.operation.description =
+            Some(description.map_or(caller.clone(), |text| format!("{text}\n\n{caller}")));
         if access == Access::Anyone {
             return;
         }
-        self.refusal(StatusCode::UNAUTHORIZED, "No token, or one that is unknown, expired or revoked.");
+        self.refusal(
+            StatusCode::UNAUTHORIZED,
+            "No token, or one that is unknown, expired or revoked.",
+        );
         self.refusal(StatusCode::FORBIDDEN, "The caller may not do that, or not to this robot.");
         self.refusal(
             StatusCode::TOO_MANY_REQUESTS,
@@ -207,7 +251,8 @@ impl Draft {
         self.refusal(StatusCode::INTERNAL_SERVER_ERROR, "The server failed; its log says why.");
     }
 
-    /// Every refusal that does not say otherwise has the API's one error body, and the headers that belong to it.
+    /// Every refusal that does not say otherwise has the API's one error body, and the headers that
+    /// belong to it.
     fn complete_refusals(&mut self, access: Access) {
         // The registry's errors are as its own specification says.
         let error = match access {

@@ -1,5 +1,5 @@
-//! What a handler's own types say of it: each argument of what it takes, its answer of what it gives. A handler whose types
-//! say nothing of a body gets it from its attribute.
+//! What a handler's own types say of it: each argument of what it takes, its answer of what it
+//! gives. A handler whose types say nothing of a body gets it from its attribute.
 
 use std::net::SocketAddr;
 

@@ -1,5 +1,6 @@
-//! The API's description, OpenAPI 3.1: written from the table of routes, from what each handler takes and gives, and from
-//! what its attribute says beside that. It is the same for everybody, and holds no data.
+//! The API's description, OpenAPI 3.1: written from the table of routes, from what each handler
+//! takes and gives, and from what its attribute says beside that. It is the same for everybody, and
+//! holds no data.
 
 mod draft;
 mod handler;
@@ -42,7 +43,9 @@ const ABOUT: &str = "Distributes task packages to fleets of robots. Times are mi
 /// The document's text and its tag; it is the same as long as the server runs.
 static DOCUMENT: LazyLock<(Bytes, String)> = LazyLock::new(|| {
     // By way of a value, whose fields are sorted, it is the same text each time the server starts.
-    let text = serde_json::to_value(document(&routes())).map(|document| document.to_string()).unwrap_or_default();
+    let text = serde_json::to_value(document(&routes()))
+        .map(|document| document.to_string())
+        .unwrap_or_default();
     let tag = format!("\"{}\"", Digest::of(text.as_bytes()).hex());
     (Bytes::from(text), tag)
 });
@@ -96,7 +99,9 @@ pub(super) fn document(routes: &[Route]) -> OpenApi {
                 .license(Some(License::new(env!("CARGO_PKG_LICENSE"))))
                 .build(),
         )
-        .tags(Some(TAGS.map(|(name, text)| TagBuilder::new().name(name).description(Some(text)).build())))
+        .tags(Some(
+            TAGS.map(|(name, text)| TagBuilder::new().name(name).description(Some(text)).build()),
+        ))
         .paths(paths)
         .components(Some(components))
         .build()
@@ -104,7 +109,8 @@ pub(super) fn document(routes: &[Route]) -> OpenApi {
 
 /// All of them, each once: what answers with and without a slash at its end is one.
 fn described(routes: &[Route]) -> impl Iterator<Item = &Route> {
-    let has_longer = |path: &str| routes.iter().any(|other| other.path.strip_suffix('/') == Some(path));
+    let has_longer =
+        |path: &str| routes.iter().any(|other| other.path.strip_suffix('/') == Some(path));
     routes.iter().filter(move |route| !has_longer(route.path))
 }
 
@@ -150,38 +156,62 @@ mod tests {
     fn every_route_is_described() {
         let document = as_json();
         let described = operations(&document);
-        assert_eq!(described.len(), super::described(&routes()).count(), "each route has an operation of its own");
-        let ids: BTreeSet<&str> = described.iter().filter_map(|(_, it)| it["operationId"].as_str()).collect();
+        assert_eq!(
+            described.len(),
+            super::described(&routes()).count(),
+            "each route has an operation of its own"
+        );
+        let ids: BTreeSet<&str> =
+            described.iter().filter_map(|(_, it)| it["operationId"].as_str()).collect();
         assert_eq!(ids.len(), described.len(), "no two operations have one name");
         let tags: BTreeSet<&str> = TAGS.iter().map(|(name, _)| *name).collect();
         for (name, operation) in described {
             let text = |field: &str| operation[field].as_str().unwrap_or_default();
             assert!(text("summary").len() > 10, "{name} says what it does: {:?}", text("summary"));
-            assert!(text("description").contains(|c: char| c.is_alphabetic()), "{name} says who may call it");
+            assert!(
+                text("description").contains(|c: char| c.is_alphabetic()),
+                "{name} says who may call it"
+            );
             let tag = operation["tags"].as_array().and_then(|tags| tags.first()?.as_str());
-            assert!(tag.is_some_and(|tag| tags.contains(tag)), "{name} belongs to a group that is known: {tag:?}");
+            assert!(
+                tag.is_some_and(|tag| tags.contains(tag)),
+                "{name} belongs to a group that is known: {tag:?}"
+            );
             let answers = operation["responses"].as_object().expect("answers");
-            assert!(answers.keys().any(|status| status.starts_with(['1', '2', '3'])), "{name} can succeed");
+            assert!(
+                answers.keys().any(|status| status.starts_with(['1', '2', '3'])),
+                "{name} can succeed"
+            );
             for (status, answer) in answers {
                 assert!(
                     !answer["description"].as_str().unwrap_or_default().is_empty(),
                     "{name}: {status} is explained"
                 );
                 let has_body = !matches!(status.as_str(), "101" | "204" | "303" | "304");
-                let schemas = answer["content"]
-                    .as_object()
-                    .map_or(0, |content| content.values().filter(|media| media["schema"].is_object()).count());
+                let schemas = answer["content"].as_object().map_or(0, |content| {
+                    content.values().filter(|media| media["schema"].is_object()).count()
+                });
                 assert_eq!(schemas > 0, has_body, "{name}: {status} says what its body is");
             }
-            let parameters: Vec<&str> = operation["parameters"].as_array().map_or(Vec::new(), |parameters| {
-                parameters
-                    .iter()
-                    .inspect(|it| assert!(it["description"].is_string(), "{name}: {} is explained", it["name"]))
-                    .filter_map(|it| it["name"].as_str())
-                    .collect()
+            let parameters: Vec<&str> =
+                operation["parameters"].as_array().map_or(Vec::new(), |parameters| {
+                    parameters
+                        .iter()
+                        .inspect(|it| {
+                            assert!(
+                                it["description"].is_string(),
+                                "{name}: {} is explained",
+                                it["name"]
+                            )
+                        })
+                        .filter_map(|it| it["name"].as_str())
+                        .collect()
+                });
+            let in_path =
+                name.split(['/', ' ']).filter_map(|part| part.strip_prefix('{')?.strip_suffix('}'));
+            in_path.for_each(|wanted| {
+                assert!(parameters.contains(&wanted), "{name}: {wanted} is described")
             });
-            let in_path = name.split(['/', ' ']).filter_map(|part| part.strip_prefix('{')?.strip_suffix('}'));
-            in_path.for_each(|wanted| assert!(parameters.contains(&wanted), "{name}: {wanted} is described"));
         }
     }
 
@@ -190,14 +220,21 @@ mod tests {
         let document = as_json();
         for (name, operation) in operations(&document) {
             let is_for_anyone = operation["x-caller"] == "anyone";
-            assert_eq!(operation["security"].as_array().is_some_and(Vec::is_empty), is_for_anyone, "{name}");
+            assert_eq!(
+                operation["security"].as_array().is_some_and(Vec::is_empty),
+                is_for_anyone,
+                "{name}"
+            );
             for status in ["401", "403", "429", "500"] {
                 let answer = &operation["responses"][status];
                 assert!(is_for_anyone || answer.is_object(), "{name} may answer {status}");
             }
             if operation["requestBody"].is_object() {
                 for status in ["400", "413", "415"] {
-                    assert!(operation["responses"][status].is_object(), "{name} may answer {status}");
+                    assert!(
+                        operation["responses"][status].is_object(),
+                        "{name} may answer {status}"
+                    );
                 }
             }
         }

@@ -7,7 +7,8 @@ use http::{HeaderMap, StatusCode, Uri};
 use serde::Deserialize;
 use task_proto::DeploymentId;
 use task_proto::api::{
-    CreateDeployment, DeploymentList, DeploymentView, IDEMPOTENCY_KEY, MatchedRobots, RetryDeployment,
+    CreateDeployment, DeploymentList, DeploymentView, IDEMPOTENCY_KEY, MatchedRobots,
+    RetryDeployment,
 };
 
 use crate::http::App;
@@ -109,10 +110,15 @@ pub(in crate::http) async fn create(
     let key = idempotency_key(headers.get(IDEMPOTENCY_KEY))?;
     let id = match app.store.package(&order.package, &order.manifest).await? {
         Some(package) => app.actions.create_deployment(&by, &key, &order, &package).await?,
-        None => app.actions.deployment_ordered_before(&by, &key, &order).await?.ok_or_else(|| {
-            let message = format!("manifest: there is no package {} with manifest {}", order.package, order.manifest);
-            ApiError::new(StatusCode::NOT_FOUND, "package_not_found", message)
-        })?,
+        None => {
+            app.actions.deployment_ordered_before(&by, &key, &order).await?.ok_or_else(|| {
+                let message = format!(
+                    "manifest: there is no package {} with manifest {}",
+                    order.package, order.manifest
+                );
+                ApiError::new(StatusCode::NOT_FOUND, "package_not_found", message)
+            })?
+        }
     };
     Ok((StatusCode::CREATED, Json(view(&app, &by, &id).await?)).into_response())
 }
@@ -167,16 +173,27 @@ pub(in crate::http) async fn retry(
 }
 
 /// A deployment as far as it concerns the person, without timelines.
-pub(in crate::http) async fn view(app: &App, by: &Person, id: &DeploymentId) -> Result<DeploymentView, ApiError> {
+pub(in crate::http) async fn view(
+    app: &App,
+    by: &Person,
+    id: &DeploymentId,
+) -> Result<DeploymentView, ApiError> {
     seen(app, by, id, false).await
 }
 
-async fn seen(app: &App, by: &Person, id: &DeploymentId, with_timelines: bool) -> Result<DeploymentView, ApiError> {
+async fn seen(
+    app: &App,
+    by: &Person,
+    id: &DeploymentId,
+    with_timelines: bool,
+) -> Result<DeploymentView, ApiError> {
     let found = app.store.deployment(id, with_timelines).await?;
-    let mut view = found.ok_or_else(|| ApiError::not_found(format!("there is no deployment {id}")))?;
+    let mut view =
+        found.ok_or_else(|| ApiError::not_found(format!("there is no deployment {id}")))?;
     if !by.scope.is_everything() {
         let robots = app.store.robots_in(&by.scope).await?.into_iter().collect();
-        view = narrowed(view, &robots).ok_or_else(|| ApiError::out_of_scope(format!("deployment {id}"), by))?;
+        view = narrowed(view, &robots)
+            .ok_or_else(|| ApiError::out_of_scope(format!("deployment {id}"), by))?;
     }
     complete_deployment(&mut view, &app.presence, app.clock.now_ms());
     Ok(view)

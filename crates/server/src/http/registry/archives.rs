@@ -1,5 +1,5 @@
-//! Reads whole archives from the blob store for those who ask over HTTP: a few at a time, on threads of their own, and for no
-//! longer than the request is waited for.
+//! Reads whole archives from the blob store for those who ask over HTTP: a few at a time, on
+//! threads of their own, and for no longer than the request is waited for.
 
 use std::io::{self, Read};
 use std::sync::Arc;

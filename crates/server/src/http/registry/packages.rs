@@ -1,5 +1,5 @@
-//! Packages, as the operator's commands and the page show them: versions, what is in them, what differs, where they run.
-//! Their bytes are the registry's.
+//! Packages, as the operator's commands and the page show them: versions, what is in them, what
+//! differs, where they run. Their bytes are the registry's.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -11,7 +11,9 @@ use axum::response::NoContent;
 use http::StatusCode;
 use serde::Deserialize;
 use task_archive::UnpackError;
-use task_proto::api::{PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView};
+use task_proto::api::{
+    PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView,
+};
 use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 use utoipa::{IntoParams, ToSchema};
 
@@ -111,7 +113,8 @@ pub(in crate::http) async fn diff(
     QueryParams(query): QueryParams<DiffQuery>,
 ) -> Result<Json<PackageDiff>, ApiError> {
     let named = |key: &str, text: &str| {
-        text.parse::<PackageReference>().map_err(|error| ApiError::invalid(format!("{key}: {error}")))
+        text.parse::<PackageReference>()
+            .map_err(|error| ApiError::invalid(format!("{key}: {error}")))
     };
     let (from, to) = (named("from", &query.from)?, named("to", &query.to)?);
     let (from, to) = (find(&app, &name, &from).await?, find(&app, &name, &to).await?);
@@ -134,8 +137,14 @@ pub(in crate::http) async fn remove(
     let _hold = app.blobs.hold_collection().await;
     let package = find(&app, &name, &version).await?.package;
     let (digest, now_ms) = (package.manifest.digest, app.clock.now_ms());
-    let deed = Deed::by(&by, Act::ManifestDelete, &name).with("manifest", digest).with("version", &package.version);
-    match app.store.delete_manifest(&RepositoryName::of_package(&name), &digest, &deed, now_ms).await? {
+    let deed = Deed::by(&by, Act::ManifestDelete, &name)
+        .with("manifest", digest)
+        .with("version", &package.version);
+    match app
+        .store
+        .delete_manifest(&RepositoryName::of_package(&name), &digest, &deed, now_ms)
+        .await?
+    {
         Deletion::Unknown => return Err(unknown(&name, &version)),
         Deletion::InUse(users) => {
             let message = in_use(&by, &format!("{name} {}", package.version), &users);
@@ -143,7 +152,8 @@ pub(in crate::http) async fn remove(
         }
         Deletion::Deleted(parts) => {
             app.changes.announce(Change::Package(name));
-            // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+            // An order that looked the package up a moment ago still finds its bytes: they stay for
+            // a while.
             for blob in parts.into_iter().chain([digest]) {
                 app.blobs.touch(blob, now_ms).await?;
             }
@@ -152,19 +162,32 @@ pub(in crate::http) async fn remove(
     Ok(NoContent)
 }
 
-async fn find(app: &App, name: &TaskName, version: &PackageReference) -> Result<PackageView, ApiError> {
+async fn find(
+    app: &App,
+    name: &TaskName,
+    version: &PackageReference,
+) -> Result<PackageView, ApiError> {
     app.store.find_package(name, &version.0).await?.ok_or_else(|| unknown(name, version))
 }
 
 fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
-    ApiError::new(StatusCode::NOT_FOUND, "package_not_found", format!("there is no package {name} {version}"))
+    ApiError::new(
+        StatusCode::NOT_FOUND,
+        "package_not_found",
+        format!("there is no package {name} {version}"),
+    )
 }
 
-/// Says who keeps a package in use; of robots that are none of the person's, and deployments for none of theirs, only how many.
+/// Says who keeps a package in use; of robots that are none of the person's, and deployments for
+/// none of theirs, only how many.
 pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
-    let own = users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
-    let (ids, names): (HashSet<&RobotId>, Vec<&str>) = own.map(|robot| (&robot.id, robot.name.as_str())).unzip();
-    let is_own = |robots: &[RobotId]| by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot));
+    let own =
+        users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
+    let (ids, names): (HashSet<&RobotId>, Vec<&str>) =
+        own.map(|robot| (&robot.id, robot.name.as_str())).unzip();
+    let is_own = |robots: &[RobotId]| {
+        by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot))
+    };
     let deployments = users.deployments.iter().filter(|(_, robots)| is_own(robots));
     let deployments: Vec<&str> = deployments.map(|(id, _)| id.as_str()).take(MOST_NAMED).collect();
     let robots: Vec<&str> = names.into_iter().take(MOST_NAMED).collect();
@@ -188,7 +211,11 @@ async fn listed(app: &App, view: &PackageView) -> Result<Vec<PackageFile>, ApiEr
     let gone = || ApiError::not_found(format!("the content of {} is gone", view.package.name));
     let blob = app.blobs.get(content.digest).await?.ok_or_else(gone)?;
     let facts = view.manifest.content;
-    let listed = app.uploads.readers.read(&blob, move |bytes| contents::list(bytes, content.size, &facts)).await;
+    let listed = app
+        .uploads
+        .readers
+        .read(&blob, move |bytes| contents::list(bytes, content.size, &facts))
+        .await;
     listed.map_err(|error| match error {
         UnpackError::Refused(refusal) => {
             ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, "archive_refused", refusal.to_string())

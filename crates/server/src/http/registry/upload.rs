@@ -1,5 +1,6 @@
-//! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like `taskd push` does, and put
-//! into the registry. The archive is by a browser, and believed in nothing.
+//! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like
+//! `taskd push` does, and put into the registry. The archive is by a browser, and believed in
+//! nothing.
 
 use std::collections::HashSet;
 use std::io::{self, Read};
@@ -34,7 +35,8 @@ use crate::package::{PackageError, Packed, pack_into};
 /// Archives that are unpacked and packed at the same time.
 const AT_ONCE: usize = 2;
 /// With whoever has a place.
-const PATIENCE: Patience = Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
+const PATIENCE: Patience =
+    Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
 /// Pieces of a body that wait to be unpacked.
 const WAITING: usize = 16;
 /// What an archive may have beside what is in it.
@@ -66,17 +68,27 @@ impl UploadSpace {
         let limits = Limits::default();
         let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
         let places = Arc::new(Semaphore::new(AT_ONCE));
-        Self { directory, limits, places, uploading: Arc::default(), readers: ArchiveReaders::default() }
+        Self {
+            directory,
+            limits,
+            places,
+            uploading: Arc::default(),
+            readers: ArchiveReaders::default(),
+        }
     }
 
     /// A place for one archive of this person, who may have one at a time.
     fn place(&self, person: &UserName) -> Result<UploadPlace, ApiError> {
         if !locked(&self.uploading).insert(person.clone()) {
-            return Err(ApiError::too_many(format!("{person} uploads a package already; wait until it is there")));
+            return Err(ApiError::too_many(format!(
+                "{person} uploads a package already; wait until it is there"
+            )));
         }
         let own = OwnUpload { uploading: self.uploading.clone(), person: person.clone() };
         let place = self.places.clone().try_acquire_owned().map_err(|_| {
-            ApiError::too_many(format!("{AT_ONCE} packages are being uploaded already; try again in a moment"))
+            ApiError::too_many(format!(
+                "{AT_ONCE} packages are being uploaded already; try again in a moment"
+            ))
         })?;
         Ok(UploadPlace { _own: own, _place: place })
     }
@@ -120,13 +132,15 @@ enum UploadError {
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct UploadQuery {
-    /// Whether the package may take its version from one with other content, which is outdated by that.
+    /// Whether the package may take its version from one with other content, which is outdated by
+    /// that.
     #[serde(default)]
     #[param(required = false)]
     force: bool,
 }
 
-/// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as `taskd push` would.
+/// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as
+/// `taskd push` would.
 #[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
     request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
         content((String = "application/x-tar"), (String = "application/zstd"))),
@@ -156,18 +170,24 @@ fn too_slow(message: &str) -> ApiError {
 }
 
 fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
-    let content_type = headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
+    let content_type =
+        headers.get(header::CONTENT_TYPE).and_then(|value| value.to_str().ok()).unwrap_or_default();
     match content_type.split(';').next().unwrap_or_default().trim().to_ascii_lowercase().as_str() {
         "application/x-tar" => Ok(Compression::None),
         "application/zstd" => Ok(Compression::Zstd),
         _ => {
             let message = "Content-Type: expected application/x-tar or application/zstd";
-            Err(ApiError::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, "unsupported_media_type", message))
+            Err(ApiError::new(
+                StatusCode::UNSUPPORTED_MEDIA_TYPE,
+                "unsupported_media_type",
+                message,
+            ))
         }
     }
 }
 
-/// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes away, so its place must as well.
+/// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes
+/// away, so its place must as well.
 async fn receive(
     app: &App,
     place: UploadPlace,
@@ -178,15 +198,18 @@ async fn receive(
     let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
     // What is unpacked is packed again beside it.
     let room = app.blobs.room_for_people() / 2;
-    let (limits, is_short) = (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
+    let (limits, is_short) =
+        (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
     let most = limits.bytes.saturating_add(OVERHEAD_BYTES);
     let work = tokio::task::spawn_blocking(move || {
-        packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory).map(|it| (it, place))
+        packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory)
+            .map(|it| (it, place))
     });
     let (fed, worked) = tokio::join!(feed(body, sender, most, PATIENCE), work);
     let of_disk = |error: ApiError| match error.status {
         StatusCode::PAYLOAD_TOO_LARGE if is_short => {
-            OciError::from(BlobError::DiskReserved { reserve: app.blobs.settings().reserve_bytes }).into()
+            OciError::from(BlobError::DiskReserved { reserve: app.blobs.settings().reserve_bytes })
+                .into()
         }
         _ => error,
     };
@@ -199,7 +222,12 @@ async fn receive(
 }
 
 /// Hands the body on, until it ends or nobody takes any more of it.
-async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64, patience: Patience) -> Result<(), ApiError> {
+async fn feed(
+    body: Body,
+    sender: mpsc::Sender<Bytes>,
+    most: u64,
+    patience: Patience,
+) -> Result<(), ApiError> {
     let (mut chunks, mut taken) = (body.into_data_stream(), 0);
     let handing_on = async {
         loop {
@@ -211,7 +239,9 @@ async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64, patience: Pati
             };
             taken += chunk.len() as u64;
             if taken > most {
-                let message = format!("the archive has more than {most} bytes, the most that this server takes");
+                let message = format!(
+                    "the archive has more than {most} bytes, the most that this server takes"
+                );
                 return Err(too_large(message));
             }
             if sender.send(chunk).await.is_err() {
@@ -219,7 +249,9 @@ async fn feed(body: Body, sender: mpsc::Sender<Bytes>, most: u64, patience: Pati
             }
         }
     };
-    timeout(patience.whole, handing_on).await.unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
+    timeout(patience.whole, handing_on)
+        .await
+        .unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
 }
 
 /// A body as a thread reads it. It ends where the sender is gone.
@@ -242,7 +274,12 @@ impl Read for Arriving {
     }
 }
 
-fn packed(body: Arriving, compression: Compression, limits: &Limits, directory: &Path) -> Result<Packed, UploadError> {
+fn packed(
+    body: Arriving,
+    compression: Compression,
+    limits: &Limits,
+    directory: &Path,
+) -> Result<Packed, UploadError> {
     let temporary = TempDir::new_in(directory)?;
     let unpacked = temporary.path().join("package");
     unpack_unannounced(body, compression, limits, &unpacked)?;
@@ -250,7 +287,8 @@ fn packed(body: Arriving, compression: Compression, limits: &Limits, directory: 
     Ok(pack_into(&package, directory)?)
 }
 
-/// The directory in `unpacked`, if there is nothing else: whoever archives a directory mostly has its name in the archive.
+/// The directory in `unpacked`, if there is nothing else: whoever archives a directory mostly has
+/// its name in the archive.
 fn only_directory(unpacked: &Path) -> io::Result<Option<PathBuf>> {
     let mut entries = std::fs::read_dir(unpacked)?;
     match (entries.next().transpose()?, entries.next()) {
@@ -260,7 +298,8 @@ fn only_directory(unpacked: &Path) -> io::Result<Option<PathBuf>> {
 }
 
 fn refused(error: UploadError) -> ApiError {
-    let unprocessable = |code, message| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, code, message);
+    let unprocessable =
+        |code, message| ApiError::new(StatusCode::UNPROCESSABLE_ENTITY, code, message);
     let source = match &error {
         UploadError::Unpack(UnpackError::Refused(refusal @ Refusal::Limit { .. })) => {
             return too_large(refusal.to_string());
@@ -299,7 +338,10 @@ mod tests {
     async fn told(body: Body, patience: Patience) -> String {
         let (sender, mut receiver) = mpsc::channel(WAITING);
         let fed = async {
-            tokio::join!(feed(body, sender, 1 << 20, patience), async { while receiver.recv().await.is_some() {} }).0
+            tokio::join!(feed(body, sender, 1 << 20, patience), async {
+                while receiver.recv().await.is_some() {}
+            })
+            .0
         };
         let error = timeout(LONG, fed).await.expect("an end").expect_err("let go");
         assert_eq!(error.status, StatusCode::REQUEST_TIMEOUT);
@@ -315,7 +357,8 @@ mod tests {
             tokio::task::yield_now().await;
             Some((Ok::<_, Infallible>(Bytes::new()), ()))
         });
-        let said = told(Body::from_stream(endless), Patience { silence: 2 * LONG, whole: SHORT }).await;
+        let said =
+            told(Body::from_stream(endless), Patience { silence: 2 * LONG, whole: SHORT }).await;
         assert!(said.contains("longer than an hour"), "{said}");
     }
 }

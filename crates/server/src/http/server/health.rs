@@ -16,7 +16,8 @@ pub(in crate::http) async fn healthz() -> Json<Value> {
     Json(json!({ "status": "ok" }))
 }
 
-/// Says whether database, broker and disk were well when they were checked last, a few seconds ago, and names the problems.
+/// Says whether database, broker and disk were well when they were checked last, a few seconds ago,
+/// and names the problems.
 #[utoipa::path(get, path = "/readyz", tag = "server",
     responses((status = 200, description = "All of them were.", body = Value,
             example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
@@ -28,7 +29,8 @@ pub(in crate::http) async fn readyz(State(app): State<App>) -> Response {
     for (component, problem) in verdicts {
         body[component.as_str()] = problem.unwrap_or_else(|| "ok".to_owned()).into();
     }
-    (if is_ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }, Json(body)).into_response()
+    (if is_ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }, Json(body))
+        .into_response()
 }
 
 /// Says what the server is, where MQTT listens and what went over it.

@@ -1,5 +1,6 @@
-//! Whether the server can do its work. One background job checks the parts that it needs and keeps the last verdict on each;
-//! `/readyz` only reads the verdicts, so a request costs nothing, however many come. Other jobs add components of their own.
+//! Whether the server can do its work. One background job checks the parts that it needs and keeps
+//! the last verdict on each; `/readyz` only reads the verdicts, so a request costs nothing, however
+//! many come. Other jobs add components of their own.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -46,7 +47,8 @@ impl Component {
     }
 }
 
-/// The last verdict on each component: `None` where it is well, otherwise the problem. Clones share the verdicts.
+/// The last verdict on each component: `None` where it is well, otherwise the problem. Clones share
+/// the verdicts.
 #[derive(Debug, Clone, Default)]
 pub struct Readiness(Arc<Mutex<BTreeMap<Component, Option<String>>>>);
 
@@ -82,12 +84,17 @@ pub struct ReadinessCheck {
 impl ReadinessCheck {
     /// Checks everything once.
     pub async fn check(&mut self) {
-        let (database, disk) = tokio::join!(timeout(PATIENCE, self.store.ping()), self.disk.problem());
+        let (database, disk) =
+            tokio::join!(timeout(PATIENCE, self.store.ping()), self.disk.problem());
         self.readiness.set(
             Component::Database,
             match database {
                 Ok(Ok(())) => self.store.state().problem(),
-                Ok(Err(_)) => self.store.state().problem().or_else(|| Some("it refuses a statement".to_owned())),
+                Ok(Err(_)) => self
+                    .store
+                    .state()
+                    .problem()
+                    .or_else(|| Some("it refuses a statement".to_owned())),
                 Err(_) => Some("it does not answer".to_owned()),
             },
         );
@@ -95,7 +102,8 @@ impl ReadinessCheck {
         self.readiness.set(Component::Broker, broker_problem(&self.broker.health().borrow()));
     }
 
-    /// Checks the database and the disk at intervals, and the broker whenever its health changes, until `stop`.
+    /// Checks the database and the disk at intervals, and the broker whenever its health changes,
+    /// until `stop`.
     pub async fn run(mut self, stop: CancellationToken) {
         let mut health = self.broker.health();
         let mut ticks = interval(CHECK_INTERVAL);
@@ -121,8 +129,8 @@ fn broker_problem(health: &Health) -> Option<String> {
     }
 }
 
-/// Writes a small file into the data directory, one write at a time: a file system that hangs holds one thread, not one
-/// for each check.
+/// Writes a small file into the data directory, one write at a time: a file system that hangs holds
+/// one thread, not one for each check.
 pub struct DiskProbe {
     data: PathBuf,
     patience: Duration,
@@ -138,7 +146,9 @@ impl DiskProbe {
     /// The reason why the directory can't be written, if it can't.
     async fn problem(&mut self) -> Option<String> {
         let data = self.data.clone();
-        let probe = self.running.get_or_insert_with(|| tokio::task::spawn_blocking(move || probe_disk(&data)));
+        let probe = self
+            .running
+            .get_or_insert_with(|| tokio::task::spawn_blocking(move || probe_disk(&data)));
         let finished = timeout(self.patience, probe).await.ok();
         if finished.is_some() {
             self.running = None;
@@ -149,7 +159,9 @@ impl DiskProbe {
                 let free = room(&self.data).map_or(0, |(free, _)| free);
                 Some(format!("the data directory's disk is full: {free} bytes are free"))
             }
-            Some(Ok(Err(error))) => Some(format!("the data directory can't be written: {}", error.kind())),
+            Some(Ok(Err(error))) => {
+                Some(format!("the data directory can't be written: {}", error.kind()))
+            }
             Some(Err(_)) => Some("the data directory can't be checked".to_owned()),
             None => Some("the data directory does not answer".to_owned()),
         }
@@ -190,10 +202,16 @@ mod tests {
             held.await.expect("released");
             Ok(())
         });
-        let mut probe =
-            DiskProbe { data: data.path().to_owned(), patience: Duration::from_millis(1), running: Some(hanging) };
+        let mut probe = DiskProbe {
+            data: data.path().to_owned(),
+            patience: Duration::from_millis(1),
+            running: Some(hanging),
+        };
         for _ in 0..3 {
-            assert_eq!(probe.problem().await.as_deref(), Some("the data directory does not answer"));
+            assert_eq!(
+                probe.problem().await.as_deref(),
+                Some("the data directory does not answer")
+            );
         }
         assert!(!data.path().join(".ready").exists(), "a second write was begun");
         release.send(()).expect("it waits");

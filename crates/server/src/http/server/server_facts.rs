@@ -1,5 +1,5 @@
-//! What holds for as long as the server runs: since when it does, where it listens, by which rules it decides and what it
-//! allows. Made once, from the configuration; nothing in it is secret.
+//! What holds for as long as the server runs: since when it does, where it listens, by which rules
+//! it decides and what it allows. Made once, from the configuration; nothing in it is secret.
 
 use std::time::Duration;
 
@@ -36,7 +36,9 @@ impl ServerFacts {
 fn limits(config: &Config, blobs: BlobSettings) -> Vec<LimitView> {
     let limit = |key: &str, value: String| LimitView { key: key.to_owned(), value };
     let count = |most: Option<u64>| most.map_or("none".to_owned(), |most| most.to_string());
-    let speed = |most: Option<u64>| most.map_or("none".to_owned(), |most| format!("{}/s", shown_bytes(most)));
+    let speed = |most: Option<u64>| {
+        most.map_or("none".to_owned(), |most| format!("{}/s", shown_bytes(most)))
+    };
     let seconds = |time: Duration| format!("{} s", time.as_secs());
     let (transfers, robots, delivery) = (&config.transfers, &config.robots, &config.delivery);
     let mut limits = vec![
@@ -61,7 +63,10 @@ fn limits(config: &Config, blobs: BlobSettings) -> Vec<LimitView> {
     ];
     for (site, of_site) in &transfers.sites {
         limits.push(limit(&format!("transfers.sites.{site}.max"), count(of_site.max)));
-        limits.push(limit(&format!("transfers.sites.{site}.bytes_per_s"), speed(of_site.bytes_per_s)));
+        limits.push(limit(
+            &format!("transfers.sites.{site}.bytes_per_s"),
+            speed(of_site.bytes_per_s),
+        ));
     }
     limits
 }

@@ -1,5 +1,6 @@
-//! How the server and its network do: figures gathered when somebody asks, who is connected, and the rules. The sizes of
-//! database and packages are found out at most every half minute, however many ask.
+//! How the server and its network do: figures gathered when somebody asks, who is connected, and
+//! the rules. The sizes of database and packages are found out at most every half minute, however
+//! many ask.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -9,8 +10,8 @@ use axum::extract::State;
 use serde::Deserialize;
 use task_proto::RobotName;
 use task_proto::api::{
-    BrokerStatus, DatabaseStatus, DiskStatus, MAX_SITES, RobotCounts, RobotSession, ServerRules, ServerStatus,
-    SessionList, SiteStatus, TransferStatus,
+    BrokerStatus, DatabaseStatus, DiskStatus, MAX_SITES, RobotCounts, RobotSession, ServerRules,
+    ServerStatus, SessionList, SiteStatus, TransferStatus,
 };
 use task_proto::id::LabelValue;
 use task_proto::report::LinkFacts;
@@ -43,7 +44,10 @@ struct Slow {
 
 /// Shows how the server and its network do.
 #[utoipa::path(get, path = "/api/v1/server/status", tag = "server")]
-pub(in crate::http) async fn status(State(app): State<App>, by: Person) -> Result<Json<ServerStatus>, ApiError> {
+pub(in crate::http) async fn status(
+    State(app): State<App>,
+    by: Person,
+) -> Result<Json<ServerStatus>, ApiError> {
     let now_ms = app.clock.now_ms();
     let robots = app.store.robots_and_links(&by.scope).await?;
     let asked = Instant::now();
@@ -103,7 +107,11 @@ fn broker(app: &App) -> BrokerStatus {
         Health::Recovering(seen) | Health::Failed(seen) => Some(seen.clone()),
     };
     let healthy = trouble.is_none();
-    BrokerStatus { kind: kind.to_owned(), healthy, detail: trouble.unwrap_or_else(|| app.broker.address()) }
+    BrokerStatus {
+        kind: kind.to_owned(),
+        healthy,
+        detail: trouble.unwrap_or_else(|| app.broker.address()),
+    }
 }
 
 /// What transfers to robots have shown, by site.
@@ -174,7 +182,10 @@ pub(in crate::http) async fn sessions(
     let total = robots.len() as u64;
     robots.retain(|robot| query.after.as_ref().is_none_or(|after| robot.name > *after));
     robots.sort_by(|one, other| one.name.cmp(&other.name));
-    let next = robots.get(limit.saturating_sub(1)).filter(|_| robots.len() > limit).map(|last| last.name.clone());
+    let next = robots
+        .get(limit.saturating_sub(1))
+        .filter(|_| robots.len() > limit)
+        .map(|last| last.name.clone());
     let session = |KnownRobot { id, name, .. }: KnownRobot| {
         let sighting = app.presence.get(&id, now_ms)?;
         Some(RobotSession {

@@ -1,5 +1,6 @@
-//! The page: the files of `ui/`, embedded in the binary. It serves what was there when the server was built and never
-//! looks at the disk, so there is no path that could lead anywhere else. Who may do what is decided behind the API.
+//! The page: the files of `ui/`, embedded in the binary. It serves what was there when the server
+//! was built and never looks at the disk, so there is no path that could lead anywhere else. Who
+//! may do what is decided behind the API.
 
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
@@ -13,7 +14,8 @@ use crate::http::extract::PathParam;
 #[folder = "ui/"]
 struct Files;
 
-/// The browser asks each time and is told that nothing has changed: a new server brings a new page at once.
+/// The browser asks each time and is told that nothing has changed: a new server brings a new page
+/// at once.
 const REVALIDATED: &str = "no-cache";
 /// Paths below `vendor/` name the version, so what is there never changes.
 const IMMUTABLE: &str = "public, max-age=31536000, immutable";
@@ -44,7 +46,10 @@ pub async fn docs(headers: HeaderMap) -> Result<Response, ApiError> {
     params(("file" = String, Path, description = "Its path, which may have slashes.")),
     responses((status = 200, description = "The file.", body = String, content_type = "text/plain"),
         (status = 304, description = "It is still the one that `If-None-Match` names.")))]
-pub async fn file(PathParam(path): PathParam<String>, headers: HeaderMap) -> Result<Response, ApiError> {
+pub async fn file(
+    PathParam(path): PathParam<String>,
+    headers: HeaderMap,
+) -> Result<Response, ApiError> {
     serve(&path, &headers)
 }
 
@@ -57,17 +62,23 @@ fn serve(path: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
     if is_known(headers, &tag) {
         return Ok((StatusCode::NOT_MODIFIED, caching, policy).into_response());
     }
-    Ok((caching, policy, [(header::CONTENT_TYPE, content_type(path))], file.data.into_owned()).into_response())
+    Ok((caching, policy, [(header::CONTENT_TYPE, content_type(path))], file.data.into_owned())
+        .into_response())
 }
 
 fn tag(file: &EmbeddedFile) -> String {
     format!("\"{}\"", Digest::from_sha256(file.metadata.sha256_hash()).hex())
 }
 
-/// Whether the caller has the file already: one of its tags is this one, compared weakly as RFC 9110 asks for.
+/// Whether the caller has the file already: one of its tags is this one, compared weakly as RFC
+/// 9110 asks for.
 pub fn is_known(headers: &HeaderMap, tag: &str) -> bool {
-    let given = headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
-    given.flat_map(|tags| tags.split(',')).map(str::trim).any(|one| one == "*" || one.trim_start_matches("W/") == tag)
+    let given =
+        headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
+    given
+        .flat_map(|tags| tags.split(','))
+        .map(str::trim)
+        .any(|one| one == "*" || one.trim_start_matches("W/") == tag)
 }
 
 fn content_type(path: &str) -> &'static str {
@@ -95,10 +106,16 @@ mod tests {
         assert_eq!(text(&page, header::CACHE_CONTROL), "no-cache");
         let tag = text(&page, header::ETAG);
         for known in [tag.to_owned(), format!("\"other\", W/{tag}"), "*".to_owned()] {
-            let headers = HeaderMap::from_iter([(header::IF_NONE_MATCH, known.parse().expect("a header"))]);
-            assert_eq!(serve("index.html", &headers).expect("there").status(), StatusCode::NOT_MODIFIED, "{known}");
+            let headers =
+                HeaderMap::from_iter([(header::IF_NONE_MATCH, known.parse().expect("a header"))]);
+            assert_eq!(
+                serve("index.html", &headers).expect("there").status(),
+                StatusCode::NOT_MODIFIED,
+                "{known}"
+            );
         }
-        let headers = HeaderMap::from_iter([(header::IF_NONE_MATCH, "\"other\"".parse().expect("a header"))]);
+        let headers =
+            HeaderMap::from_iter([(header::IF_NONE_MATCH, "\"other\"".parse().expect("a header"))]);
         assert_eq!(serve("index.html", &headers).expect("there").status(), StatusCode::OK);
     }
 
@@ -112,9 +129,17 @@ mod tests {
 
     #[test]
     fn no_path_leads_out() {
-        for path in
-            ["", "/", ".", "..", "../Cargo.toml", "vendor/../index.html", "/etc/passwd", "index.html/", "vendor"]
-        {
+        for path in [
+            "",
+            "/",
+            ".",
+            "..",
+            "../Cargo.toml",
+            "vendor/../index.html",
+            "/etc/passwd",
+            "index.html/",
+            "vendor",
+        ] {
             let refused = serve(path, &HeaderMap::new()).expect_err(path);
             assert_eq!(refused.status, StatusCode::NOT_FOUND, "{path}");
         }
@@ -124,8 +149,12 @@ mod tests {
     fn the_page_asks_no_other_host_and_has_no_inline_code() {
         for path in Files::iter().filter(|path| !path.starts_with("vendor/")) {
             let file = Files::get(&path).expect("there");
-            let text = std::str::from_utf8(&file.data).expect("text").replace("http://www.w3.org/2000/svg", "");
-            for bad in ["https://", "http://", "style=\"", "onclick=", "unsafeHTML", "innerHTML", "eval("] {
+            let text = std::str::from_utf8(&file.data)
+                .expect("text")
+                .replace("http://www.w3.org/2000/svg", "");
+            for bad in
+                ["https://", "http://", "style=\"", "onclick=", "unsafeHTML", "innerHTML", "eval("]
+            {
                 assert!(!text.contains(bad), "{path} contains {bad}");
             }
         }

@@ -1,5 +1,5 @@
-//! The course of one package's fan-out: when to publish which parts, and which robots to give up on. It decides only; the
-//! time and what happens are told to it.
+//! The course of one package's fan-out: when to publish which parts, and which robots to give up
+//! on. It decides only; the time and what happens are told to it.
 //!
 //! ```text
 //! gathering ──all listen, or enough waited──► publishing ──all sent──► collecting ──nobody is left──► over
@@ -18,7 +18,8 @@ const GATHER_MS: u64 = 2_000;
 const GATHER_MOST_MS: u64 = 10_000;
 /// How long a robot may be away before it is given up on.
 const AWAY_MS: u64 = 10_000;
-/// How long the slower ones are waited for once somebody has said what it lacks. Robots say so 2 s after the last part.
+/// How long the slower ones are waited for once somebody has said what it lacks. Robots say so 2 s
+/// after the last part.
 const COLLECT_MS: u64 = 3_000;
 /// How long a robot that listens may neither have all nor say what it lacks.
 const SILENT_MS: u64 = 30_000;
@@ -109,11 +110,18 @@ impl Course {
         Self { parts, stage, robots: BTreeMap::new(), given_up: Vec::new() }
     }
 
-    /// These robots, and no others, still need it. Returns the new ones and those that do not need it any more.
-    pub(super) fn set_robots(&mut self, robots: &BTreeSet<RobotId>, now_ms: u64) -> (Vec<RobotId>, Vec<RobotId>) {
-        let gone: Vec<RobotId> = self.robots.keys().filter(|robot| !robots.contains(*robot)).cloned().collect();
+    /// These robots, and no others, still need it. Returns the new ones and those that do not need
+    /// it any more.
+    pub(super) fn set_robots(
+        &mut self,
+        robots: &BTreeSet<RobotId>,
+        now_ms: u64,
+    ) -> (Vec<RobotId>, Vec<RobotId>) {
+        let gone: Vec<RobotId> =
+            self.robots.keys().filter(|robot| !robots.contains(*robot)).cloned().collect();
         self.robots.retain(|robot, _| robots.contains(robot));
-        let new: Vec<RobotId> = robots.iter().filter(|robot| !self.robots.contains_key(*robot)).cloned().collect();
+        let new: Vec<RobotId> =
+            robots.iter().filter(|robot| !self.robots.contains_key(*robot)).cloned().collect();
         for robot in &new {
             self.robots.insert(robot.clone(), Standing { since_ms: now_ms, ..Standing::default() });
         }
@@ -136,7 +144,9 @@ impl Course {
 
     /// A robot says what it lacks.
     pub(super) fn lacks(&mut self, robot: &RobotId, missing: Vec<PartRange>, now_ms: u64) {
-        let Some(standing) = self.robots.get_mut(robot).filter(|_| !missing.is_empty()) else { return };
+        let Some(standing) = self.robots.get_mut(robot).filter(|_| !missing.is_empty()) else {
+            return;
+        };
         standing.lacks = Some(missing);
         if let Stage::Collecting { asked_ms, .. } = &mut self.stage {
             asked_ms.get_or_insert(now_ms);
@@ -188,7 +198,8 @@ impl Course {
                 }
                 Stage::Publishing => false,
                 Stage::Collecting { asked_ms, .. } => {
-                    asking == listening || asked_ms.is_some_and(|asked_ms| now_ms >= asked_ms + COLLECT_MS)
+                    asking == listening
+                        || asked_ms.is_some_and(|asked_ms| now_ms >= asked_ms + COLLECT_MS)
                 }
             };
         if !is_time {
@@ -209,7 +220,8 @@ impl Course {
         for (robot, standing) in &mut self.robots {
             let Some(lacks) = standing.lacks.take() else { continue };
             standing.rounds += 1;
-            standing.useless = if standing.lacked.as_ref() == Some(&lacks) { standing.useless + 1 } else { 0 };
+            standing.useless =
+                if standing.lacked.as_ref() == Some(&lacks) { standing.useless + 1 } else { 0 };
             if standing.rounds > MAX_ROUNDS {
                 tired.push((robot.clone(), GivenUp::Rounds));
             } else if standing.useless >= MAX_USELESS {
@@ -245,8 +257,11 @@ impl Course {
             true if is_silent && standing.lacks.is_none() => Some(GivenUp::Silent),
             _ => None,
         };
-        let absent: Vec<_> =
-            self.robots.iter().filter_map(|(robot, standing)| Some((robot.clone(), why(standing)?))).collect();
+        let absent: Vec<_> = self
+            .robots
+            .iter()
+            .filter_map(|(robot, standing)| Some((robot.clone(), why(standing)?)))
+            .collect();
         for (robot, why) in absent {
             self.give_up(robot, why);
         }
@@ -344,7 +359,10 @@ mod tests {
             assert_eq!(step, Step::Publish(vec![expected..=99]), "turn {turn}");
             course.sent(now_ms);
         }
-        assert_eq!(course.take_given_up(), [(all[0].clone(), GivenUp::HeldUp), (all[1].clone(), GivenUp::Useless)]);
+        assert_eq!(
+            course.take_given_up(),
+            [(all[0].clone(), GivenUp::HeldUp), (all[1].clone(), GivenUp::Useless)]
+        );
         assert_eq!(course.next(now_ms + SILENT_MS), Step::Over);
         let silent = [(all[2].clone(), GivenUp::Silent), (all[3].clone(), GivenUp::Silent)];
         assert_eq!(course.take_given_up(), silent);

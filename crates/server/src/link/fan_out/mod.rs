@@ -1,6 +1,7 @@
-//! Direct-push: brings packages inside MQTT messages to the robots for which that was decided. What is to be done is read
-//! from the database, so a fan-out that a restart interrupted begins again; a robot that can't be kept up to date is told to
-//! pull instead. It decides for no robot how its bytes travel at first.
+//! Direct-push: brings packages inside MQTT messages to the robots for which that was decided. What
+//! is to be done is read from the database, so a fan-out that a restart interrupted begins again; a
+//! robot that can't be kept up to date is told to pull instead. It decides for no robot how its
+//! bytes travel at first.
 
 mod course;
 mod package;
@@ -28,8 +29,9 @@ use crate::store::{Store, StoreError};
 const MAX_AT_ONCE: usize = 4;
 /// How often it is looked for something to do, if nothing has changed.
 const LOOK_INTERVAL: Duration = Duration::from_secs(5);
-/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at together. Robots that hear of
-/// an order ask for its parts at once, and are refused until it is seen here.
+/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at
+/// together. Robots that hear of an order ask for its parts at once, and are refused until it is
+/// seen here.
 const LOOK_PAUSE: Duration = Duration::from_millis(25);
 
 /// What fanning out needs. Clones share it.
@@ -80,7 +82,9 @@ impl FanOutWorker {
             let looked_at = Instant::now();
             match self.wanted().await {
                 Ok(wanted) => self.begin(wanted, &mut under_way),
-                Err(error) => error.log("what is to be fanned out could not be read; it is tried again"),
+                Err(error) => {
+                    error.log("what is to be fanned out could not be read; it is tried again")
+                }
             }
             loop {
                 tokio::select! {
@@ -107,7 +111,9 @@ impl FanOutWorker {
         for (deployment, package) in self.store.direct_pushes().await? {
             match wanted.iter_mut().find(|other| other.content == package.content) {
                 Some(other) => other.deployments.push(deployment),
-                None => wanted.push(Wanted { content: package.content, deployments: vec![deployment] }),
+                None => {
+                    wanted.push(Wanted { content: package.content, deployments: vec![deployment] })
+                }
             }
         }
         Ok(wanted)

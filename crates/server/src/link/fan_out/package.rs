@@ -1,5 +1,5 @@
-//! One package's fan-out from its first listener to its last: reads slices of the blob, publishes them as parts, and keeps
-//! the broker's grant what the database says.
+//! One package's fan-out from its first listener to its last: reads slices of the blob, publishes
+//! them as parts, and keeps the broker's grant what the database says.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -87,20 +87,29 @@ impl FanOutWorker {
     }
 
     /// `None`: there is nothing that could be sent.
-    async fn prepare(&self, content: BlobRef, changed: Arc<Notify>) -> Result<Option<Package<'_>>, Interrupted> {
-        let Some(blob) = self.blobs.get(content.digest).await?.filter(|blob| blob.size() == content.size) else {
+    async fn prepare(
+        &self,
+        content: BlobRef,
+        changed: Arc<Notify>,
+    ) -> Result<Option<Package<'_>>, Interrupted> {
+        let Some(blob) =
+            self.blobs.get(content.digest).await?.filter(|blob| blob.size() == content.size)
+        else {
             return Ok(None);
         };
         // So many parts that a robot could not remember them would be made larger.
         let least = u32::try_from(content.size.div_ceil(u64::from(MAX_PARTS))).unwrap_or(u32::MAX);
-        let Ok(cut) = Cut::new(content.size, self.settings.part_bytes.max(least)) else { return Ok(None) };
+        let Ok(cut) = Cut::new(content.size, self.settings.part_bytes.max(least)) else {
+            return Ok(None);
+        };
         let qos = match self.settings.qos {
             0 => PartQos::AtMostOnce,
             1 => PartQos::AtLeastOnce,
             _ => PartQos::ExactlyOnce,
         };
         let largest = u64::from(cut.part_bytes()).min(content.size);
-        let settings = FanOutSettings { part_bytes: usize::try_from(largest).unwrap_or(usize::MAX), qos };
+        let settings =
+            FanOutSettings { part_bytes: usize::try_from(largest).unwrap_or(usize::MAX), qos };
         let fan_out = self.broker.fan_out(content.digest, settings, Vec::new())?;
         Ok(Some(Package {
             worker: self,
@@ -175,7 +184,8 @@ impl Package<'_> {
         Ok(())
     }
 
-    /// Takes note of everything that may have happened, and tells those that were given up on to pull.
+    /// Takes note of everything that may have happened, and tells those that were given up on to
+    /// pull.
     async fn sync(&mut self) -> Result<(), Interrupted> {
         let now_ms = self.now_ms();
         self.is_stale |= tokio::select! {

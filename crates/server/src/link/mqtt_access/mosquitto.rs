@@ -10,15 +10,16 @@ use super::{Account, External};
 use crate::broker::CANARY_LEVEL;
 use crate::domain::broker_url::BrokerUrl;
 
-/// As many as `mosquitto_passwd` makes. They only make guessing slower, and nobody guesses 256 bits.
+/// As many as `mosquitto_passwd` makes. They only make guessing slower, and nobody guesses 256
+/// bits.
 const DERIVED_ITERATIONS: u32 = 101;
 /// The server's own password was thought up by a person.
 const SERVER_ITERATIONS: u32 = 20_000;
 /// The length mosquitto reads.
 const SALT_BYTES: usize = 12;
 
-/// One line of a mosquitto password file. The salt follows from user and password, so that the same robots make the same
-/// file and a changed file means a changed password.
+/// One line of a mosquitto password file. The salt follows from user and password, so that the same
+/// robots make the same file and a changed file means a changed password.
 pub(super) fn passwd_line(external: &External, account: &Account) -> String {
     let Account { user_name, password, .. } = account;
     let iterations = if account.is_derived() { DERIVED_ITERATIONS } else { SERVER_ITERATIONS };
@@ -44,8 +45,9 @@ fn pbkdf2(password: &[u8], salt: &[u8], iterations: u32) -> [u8; 64] {
     all
 }
 
-/// A mosquitto ACL file: robots on their own topics by name, `%u` being the robot id; the server on what it needs of all.
-/// Patterns hold for every user of the broker, of whom only robots have such names.
+/// A mosquitto ACL file: robots on their own topics by name, `%u` being the robot id; the server on
+/// what it needs of all. Patterns hold for every user of the broker, of whom only robots have such
+/// names.
 pub(super) fn acl(user_name: &str, prefix: &TopicPrefix) -> String {
     format!(
         "# Written by `taskd broker acl`.\n\
@@ -72,7 +74,9 @@ pub(super) fn acl(user_name: &str, prefix: &TopicPrefix) -> String {
 /// The listener at `url`, with the rules that the server relies on.
 pub(super) fn conf(url: &BrokerUrl) -> String {
     let tls = match url.tls {
-        true => "certfile /etc/mosquitto/certs/broker.pem\nkeyfile /etc/mosquitto/certs/broker.key\n",
+        true => {
+            "certfile /etc/mosquitto/certs/broker.pem\nkeyfile /etc/mosquitto/certs/broker.key\n"
+        }
         false => "",
     };
     format!(
@@ -100,7 +104,8 @@ mod tests {
 
     #[test]
     fn the_hash_is_the_known_one() {
-        // PBKDF2-HMAC-SHA-512 of "password" and "salt", one and two iterations, begins so in every implementation.
+        // PBKDF2-HMAC-SHA-512 of "password" and "salt", one and two iterations, begins so in every
+        // implementation.
         let hex = |iterations| {
             let bytes = pbkdf2(b"password", b"salt", iterations);
             bytes[..8].iter().map(|byte| format!("{byte:02x}")).collect::<String>()

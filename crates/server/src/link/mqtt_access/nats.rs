@@ -1,7 +1,9 @@
-//! The `authorization` block of a NATS server: each account with a bcrypt hash of its password and the subjects that MQTT
-//! maps its topics to. What is not in the lists is denied, NATS' own subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) included; and so
-//! is every protocol but MQTT: a NATS client with a robot's password could read other robots' sessions there. There is no
-//! list of what is denied: one with `$MQTT.>` would also deny the subscriptions that NATS makes for each MQTT session.
+//! The `authorization` block of a NATS server: each account with a bcrypt hash of its password and
+//! the subjects that MQTT maps its topics to. What is not in the lists is denied, NATS' own
+//! subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) included; and so is every protocol but MQTT: a NATS
+//! client with a robot's password could read other robots' sessions there. There is no list of what
+//! is denied: one with `$MQTT.>` would also deny the subscriptions that NATS makes for each MQTT
+//! session.
 
 use std::fmt::Write as _;
 
@@ -25,7 +27,8 @@ pub(super) fn authorization(
     for account in accounts {
         let hash = hash(external, account)?;
         let (publish, subscribe) = subjects(account, prefix);
-        // Names are letters, digits and a few signs, and so are subjects: nothing needs to be escaped.
+        // Names are letters, digits and a few signs, and so are subjects: nothing needs to be
+        // escaped.
         let _ = writeln!(
             text,
             "    {{ user: \"{}\", password: \"{hash}\", allowed_connection_types: [\"MQTT\"], permissions: {{\n      \
@@ -49,17 +52,20 @@ fn hash(external: &External, account: &Account) -> Result<String, bcrypt::Bcrypt
 /// What the account may publish and subscribe to, as lists of quoted subjects.
 fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
     let prefix = subject(prefix.as_str());
-    let list =
-        |subjects: Vec<String>| subjects.iter().map(|subject| format!("\"{subject}\"")).collect::<Vec<_>>().join(", ");
+    let list = |subjects: Vec<String>| {
+        subjects.iter().map(|subject| format!("\"{subject}\"")).collect::<Vec<_>>().join(", ")
+    };
     let of_robot = |robot: &str, topics: &[RobotTopic]| -> Vec<String> {
         topics.iter().map(|topic| format!("{prefix}.r.{robot}.{}", topic.as_str())).collect()
     };
     let to_robots = [RobotTopic::Desired, RobotTopic::Request];
-    let from_robots = [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
+    let from_robots =
+        [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
     let (parts, canary) = (format!("{prefix}.p.*"), format!("{prefix}.{CANARY_LEVEL}"));
     match account.role {
         Role::Server => {
-            let (mut publish, mut subscribe) = (of_robot("*", &to_robots), of_robot("*", &from_robots));
+            let (mut publish, mut subscribe) =
+                (of_robot("*", &to_robots), of_robot("*", &from_robots));
             publish.extend([parts, canary.clone()]);
             subscribe.push(canary);
             (list(publish), list(subscribe))

@@ -1,4 +1,5 @@
-//! The body of a robot's transfer: as fast as the limits allow, and part of the count until its end.
+//! The body of a robot's transfer: as fast as the limits allow, and part of the count until its
+//! end.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -31,10 +32,16 @@ impl<B: Body<Data = Bytes> + Unpin> Body for TransferBody<B> {
     type Data = Bytes;
     type Error = B::Error;
 
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, B::Error>>> {
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<Result<Frame<Bytes>, B::Error>>> {
         let this = &mut *self;
         while this.held.is_empty() {
-            match ready!(Pin::new(&mut this.body).poll_frame(context)).transpose()?.map(Frame::into_data) {
+            match ready!(Pin::new(&mut this.body).poll_frame(context))
+                .transpose()?
+                .map(Frame::into_data)
+            {
                 Some(Ok(bytes)) => this.held = bytes,
                 Some(Err(trailers)) => return Poll::Ready(Some(Ok(trailers))),
                 None => return Poll::Ready(None),

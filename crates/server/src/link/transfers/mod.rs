@@ -1,6 +1,6 @@
-//! Robots that pull blobs over HTTP: how many at once, how fast together, and who is next. A robot that has to wait does so
-//! for a moment; then it is told when to come back, and keeps its place. One that takes next to nothing while others wait is
-//! cut off. It knows no blobs and no answers.
+//! Robots that pull blobs over HTTP: how many at once, how fast together, and who is next. A robot
+//! that has to wait does so for a moment; then it is told when to come back, and keeps its place.
+//! One that takes next to nothing while others wait is cut off. It knows no blobs and no answers.
 
 mod body;
 mod pace;
@@ -87,14 +87,23 @@ pub struct Transfer {
 }
 
 impl Transfers {
-    /// None yet, and no more than `limits` allow. The value of `site_label` says on which site a robot is.
+    /// None yet, and no more than `limits` allow. The value of `site_label` says on which site a
+    /// robot is.
     pub fn new(limits: &TransferLimits, site_label: LabelKey) -> Self {
         let now = Instant::now();
-        let pace = |bytes_per_s: Option<u64>| bytes_per_s.map(|bytes_per_s| Pace::new(bytes_per_s, now));
-        let sites = limits.sites.iter().filter_map(|(site, limits)| Some((site.clone(), pace(limits.bytes_per_s)?)));
+        let pace =
+            |bytes_per_s: Option<u64>| bytes_per_s.map(|bytes_per_s| Pace::new(bytes_per_s, now));
+        let sites = limits
+            .sites
+            .iter()
+            .filter_map(|(site, limits)| Some((site.clone(), pace(limits.bytes_per_s)?)));
         let paces = Paces { all: pace(limits.all.bytes_per_s), sites: sites.collect() };
-        let turns =
-            Turns { queue: Queue::new(limits), asking: HashMap::new(), carried: HashMap::new(), last_number: 0 };
+        let turns = Turns {
+            queue: Queue::new(limits),
+            asking: HashMap::new(),
+            carried: HashMap::new(),
+            last_number: 0,
+        };
         let (turns, paces) = (Mutex::new(turns), Mutex::new(paces));
         let (sent, looks) = (AtomicU64::new(0), Mutex::default());
         Self { shared: Arc::new(Shared { started: now, site_label, turns, paces, sent, looks }) }
@@ -118,13 +127,15 @@ impl Transfers {
     /// What all together got a second, lately; see [`Transfers::look`].
     pub fn bytes_per_s(&self) -> u64 {
         let looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
-        let (Some((from, sent_before)), Some((to, sent))) = (looks.front(), looks.back()) else { return 0 };
+        let (Some((from, sent_before)), Some((to, sent))) = (looks.front(), looks.back()) else {
+            return 0;
+        };
         let seconds = to.duration_since(*from).as_secs_f64();
         if seconds > 0.0 { (sent.saturating_sub(*sent_before) as f64 / seconds) as u64 } else { 0 }
     }
 
-    /// Looks how much was sent so far, and ends transfers that take next to nothing while others wait. To be called every
-    /// second or so: the speed shown is over the last looks.
+    /// Looks how much was sent so far, and ends transfers that take next to nothing while others
+    /// wait. To be called every second or so: the speed shown is over the last looks.
     pub fn look(&self) {
         self.shared.end_too_slow(self.shared.now_ms());
         let mut looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
@@ -135,7 +146,12 @@ impl Transfers {
     }
 
     /// Waits for `robot`'s turn to pull `blob`, for a moment.
-    pub async fn admit(&self, robot: &RobotId, blob: Digest, claim: &Claim) -> Result<Transfer, NotYet> {
+    pub async fn admit(
+        &self,
+        robot: &RobotId,
+        blob: Digest,
+        claim: &Claim,
+    ) -> Result<Transfer, NotYet> {
         let place = Place { robot: robot.clone(), blob };
         let (tell, mut told) = oneshot::channel();
         let asking = {
@@ -197,7 +213,8 @@ impl Shared {
         }
     }
 
-    /// Begins what may begin. Whoever is told and has gone meanwhile gives the turn back by dropping it.
+    /// Begins what may begin. Whoever is told and has gone meanwhile gives the turn back by
+    /// dropping it.
     fn begin_what_may(self: &Arc<Self>) {
         let now_ms = self.now_ms();
         let told: Vec<_> = {
@@ -218,7 +235,8 @@ impl Shared {
     }
 
     fn turns(&self) -> MutexGuard<'_, Turns> {
-        // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.turns.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -235,7 +253,9 @@ impl Transfer {
         let mut turns = self.shared.turns();
         turns.last_number += 1;
         let number = turns.last_number;
-        turns.carried.insert(number, Carried { robot: self.turn.robot.clone(), connection, progress });
+        turns
+            .carried
+            .insert(number, Carried { robot: self.turn.robot.clone(), connection, progress });
         drop(turns);
         self.number = Some(number);
         self
@@ -284,7 +304,8 @@ mod tests {
         let transfers = Transfers::new(&limits, "site".parse().expect("valid"));
         let (robot, other, claim) = (RobotId::random(), RobotId::random(), Claim::default());
         let (blob, connection) = (Digest::of(b"x"), Connection::default());
-        let stalled = transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&connection));
+        let stalled =
+            transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&connection));
         let mut again = Box::pin(transfers.admit(&robot, Digest::of(b"y"), &claim));
         assert!(poll!(again.as_mut()).is_pending());
         transfers.shared.end_too_slow(60_000);

@@ -1,5 +1,5 @@
-//! How fast bytes may go: a token bucket that says when the next ones are due. Who asks first goes first, so transfers that
-//! take turns get equal shares. It never waits.
+//! How fast bytes may go: a token bucket that says when the next ones are due. Who asks first goes
+//! first, so transfers that take turns get equal shares. It never waits.
 
 use std::time::Duration;
 
@@ -10,7 +10,8 @@ const BURST: Duration = Duration::from_millis(100);
 /// The largest and the smallest piece that is asked for at a time.
 const MAX_PIECE_BYTES: u64 = 256 * 1024;
 const MIN_PIECE_BYTES: u64 = 1024;
-/// How many pieces a second each transfer should get: long pauses would look like a dead connection.
+/// How many pieces a second each transfer should get: long pauses would look like a dead
+/// connection.
 const PIECES_PER_S: u64 = 4;
 
 /// One limit on bytes per second.
@@ -46,7 +47,10 @@ mod tests {
     fn bytes_go_no_faster_than_the_pace_and_pauses_are_not_saved_up() {
         let now = Instant::now();
         let mut pace = Pace::new(1_000_000, now);
-        assert_eq!(pace.reserve(500_000, now + Duration::from_secs(60)), now + Duration::from_secs(60));
+        assert_eq!(
+            pace.reserve(500_000, now + Duration::from_secs(60)),
+            now + Duration::from_secs(60)
+        );
         let later = now + Duration::from_secs(60);
         assert_eq!(pace.reserve(500_000, later), later + Duration::from_millis(400));
         assert_eq!(pace.reserve(1, later), later + Duration::from_millis(900));
@@ -55,6 +59,9 @@ mod tests {
     #[test]
     fn pieces_are_small_enough_for_all_to_get_some_every_second() {
         let pace = Pace::new(4_000_000, Instant::now());
-        assert_eq!((pace.piece(1), pace.piece(10), pace.piece(100_000)), (256 * 1024, 100_000, 1024));
+        assert_eq!(
+            (pace.piece(1), pace.piece(10), pace.piece(100_000)),
+            (256 * 1024, 100_000, 1024)
+        );
     }
 }

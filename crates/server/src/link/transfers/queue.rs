@@ -1,11 +1,12 @@
-//! Who pulls next: transfers that run, robots that wait for one, and in which order. It decides only; time and chance are
-//! given to it, and it neither waits nor sends.
+//! Who pulls next: transfers that run, robots that wait for one, and in which order. It decides
+//! only; time and chance are given to it, and it neither waits nor sends.
 //!
-//! A place in the queue belongs to a robot and a blob, whether the robot asks just now or was told to come back later. Where
-//! the next in line is away, one behind it that is there goes first; after a few times its transfer is kept free.
+//! A place in the queue belongs to a robot and a blob, whether the robot asks just now or was told
+//! to come back later. Where the next in line is away, one behind it that is there goes first;
+//! after a few times its transfer is kept free.
 //!
-//! A robot that has a turn gets another only while there is more room than all others that wait would take, and loses one in
-//! which it takes next to nothing while others wait.
+//! A robot that has a turn gets another only while there is more room than all others that wait
+//! would take, and loses one in which it takes next to nothing while others wait.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -26,7 +27,8 @@ const LOOK_INTERVAL_MS: u64 = 1_000;
 /// The shortest and the longest time to stay away.
 const MIN_AWAY_MS: u64 = 1_000;
 const MAX_AWAY_MS: u64 = 60_000;
-/// What a transfer has to take, and in which time, as robots ask it of the server; else it ends when others wait.
+/// What a transfer has to take, and in which time, as robots ask it of the server; else it ends
+/// when others wait.
 const LEAST_BYTES: u64 = 16 * 1024;
 const LEAST_WITHIN_MS: u64 = 30_000;
 /// What a transfer is taken to last before any has ended.
@@ -125,7 +127,10 @@ struct Free<'a> {
 
 impl<'a> Free<'a> {
     fn of(all: &Load, sites: &'a HashMap<LabelValue, Load>) -> Self {
-        Self { all: all.free(), sites: sites.iter().map(|(site, load)| (site, load.free())).collect() }
+        Self {
+            all: all.free(),
+            sites: sites.iter().map(|(site, load)| (site, load.free())).collect(),
+        }
     }
 
     fn is_on(&self, site: Option<&LabelValue>) -> bool {
@@ -190,8 +195,9 @@ impl Queue {
         self.waiting.values().any(|waiting| waiting.place.robot != *robot)
     }
 
-    /// A robot asks. Its request waits from now on, in the place that it has if it was here before; an earlier request of
-    /// the same place waits no longer. `None`: there are as many places as there may be.
+    /// A robot asks. Its request waits from now on, in the place that it has if it was here before;
+    /// an earlier request of the same place waits no longer. `None`: there are as many places as
+    /// there may be.
     pub(super) fn ask(&mut self, place: Place, claim: &Claim, now_ms: u64) -> Option<Asking> {
         self.forget_lost(now_ms);
         let before = self.ranks.remove(&place);
@@ -204,12 +210,16 @@ impl Queue {
             self.asking.remove(&earlier);
         }
         let arrival = before.map_or(asking.0, |rank| rank.arrival);
-        let rank = Rank { priority: Reverse(claim.priority), deployment: claim.deployment, arrival };
+        let rank =
+            Rank { priority: Reverse(claim.priority), deployment: claim.deployment, arrival };
         self.ranks.insert(place.clone(), rank);
         self.asking.insert(asking, rank);
         let passed = waited.map_or(0, |waited| waited.passed);
         let site = claim.site.clone();
-        self.waiting.insert(rank, Waiting { place, site, asking: Some(asking), lost_at_ms: u64::MAX, passed });
+        self.waiting.insert(
+            rank,
+            Waiting { place, site, asking: Some(asking), lost_at_ms: u64::MAX, passed },
+        );
         Some(asking)
     }
 
@@ -251,12 +261,18 @@ impl Queue {
         // Those that are away would take as much, each robot once.
         for waiting in away.iter().filter_map(|rank| self.waiting.get(rank)) {
             let robot = &waiting.place.robot;
-            if free.is_on(waiting.site.as_ref()) && !served.contains(robot) && kept_for.insert(robot) {
+            if free.is_on(waiting.site.as_ref())
+                && !served.contains(robot)
+                && kept_for.insert(robot)
+            {
                 free.take(waiting.site.as_ref());
             }
         }
         for rank in further {
-            let Some(waiting) = self.waiting.get(&rank).filter(|waiting| waiting.asking.is_some()) else { continue };
+            let Some(waiting) = self.waiting.get(&rank).filter(|waiting| waiting.asking.is_some())
+            else {
+                continue;
+            };
             if free.is_on(waiting.site.as_ref()) {
                 free.take(waiting.site.as_ref());
                 begun.push((rank, 0));
@@ -265,21 +281,27 @@ impl Queue {
         for (index, rank) in away.iter().enumerate() {
             let overtakers = begun.iter().filter(|(_, away_before)| *away_before > index).count();
             if let Some(waiting) = self.waiting.get_mut(rank) {
-                waiting.passed = waiting.passed.saturating_add(u32::try_from(overtakers).unwrap_or(u32::MAX));
+                waiting.passed =
+                    waiting.passed.saturating_add(u32::try_from(overtakers).unwrap_or(u32::MAX));
             }
         }
         begun.into_iter().filter_map(|(rank, _)| self.start(rank)).collect()
     }
 
-    /// The request waits no longer. For how long its robot should stay away, with its place kept; `None` if it does not
-    /// wait. `chance` is from 0 to 1.
+    /// The request waits no longer. For how long its robot should stay away, with its place kept;
+    /// `None` if it does not wait. `chance` is from 0 to 1.
     pub(super) fn send_away(&mut self, asking: Asking, now_ms: u64, chance: f64) -> Option<u64> {
         let rank = self.asking.remove(&asking)?;
         let on_site = self.waiting.get(&rank)?.site.as_ref().and_then(|site| self.sites.get(site));
-        let at_once = [Some(&self.all), on_site].into_iter().flatten().filter_map(|load| load.limits.most()).min();
+        let at_once = [Some(&self.all), on_site]
+            .into_iter()
+            .flatten()
+            .filter_map(|load| load.limits.most())
+            .min();
         let (at_once, lasts_ms) = (at_once.unwrap_or(1).max(1), self.lasts_ms.max(1));
         // Beyond the longest time to stay away it does not matter how many there are.
-        let enough = usize::try_from((MAX_AWAY_MS / lasts_ms + 1).saturating_mul(at_once)).unwrap_or(usize::MAX);
+        let enough = usize::try_from((MAX_AWAY_MS / lasts_ms + 1).saturating_mul(at_once))
+            .unwrap_or(usize::MAX);
         let ahead = self.waiting.range(..rank).take(enough).count() as u64;
         let away_ms = jittered((ahead + 1).div_ceil(at_once).saturating_mul(lasts_ms), chance);
         let waiting = self.waiting.get_mut(&rank)?;
@@ -338,8 +360,8 @@ impl Queue {
     }
 }
 
-/// A time to stay away: at least what is expected, up to half as much again, so that those sent away together come back
-/// one by one.
+/// A time to stay away: at least what is expected, up to half as much again, so that those sent
+/// away together come back one by one.
 pub(super) fn jittered(expected_ms: u64, chance: f64) -> u64 {
     let expected_ms = expected_ms.clamp(MIN_AWAY_MS, MAX_AWAY_MS);
     expected_ms + (expected_ms as f64 / 2.0 * chance.clamp(0.0, 1.0)) as u64
@@ -352,7 +374,10 @@ mod tests {
     use super::*;
 
     fn limits(max: u64) -> TransferLimits {
-        TransferLimits { all: SiteLimits { max: Some(max), bytes_per_s: None }, ..TransferLimits::default() }
+        TransferLimits {
+            all: SiteLimits { max: Some(max), bytes_per_s: None },
+            ..TransferLimits::default()
+        }
     }
 
     fn place(number: u8) -> Place {
@@ -388,7 +413,10 @@ mod tests {
     #[test]
     fn a_bandwidth_is_shared_by_no_more_than_have_something_of_it() {
         let most = |max, bytes_per_s| SiteLimits { max, bytes_per_s: Some(bytes_per_s) }.most();
-        assert_eq!([most(None, 1 << 20), most(Some(3), 1 << 20), most(Some(3), 1000)], [Some(256), Some(3), Some(1)]);
+        assert_eq!(
+            [most(None, 1 << 20), most(Some(3), 1 << 20), most(Some(3), 1000)],
+            [Some(256), Some(3), Some(1)]
+        );
         assert_eq!(SiteLimits::default().most(), None);
         let all = SiteLimits { max: None, bytes_per_s: Some(8 << 10) };
         let mut queue = Queue::new(&TransferLimits { all, ..TransferLimits::default() });
@@ -421,7 +449,8 @@ mod tests {
     #[test]
     fn who_is_sent_away_is_told_a_time_by_its_place_and_keeps_that() {
         let mut queue = Queue::new(&limits(2));
-        let asked: Vec<Asking> = (0..8).map(|number| queue.ask(place(number), &claim(0), 0).expect("room")).collect();
+        let asked: Vec<Asking> =
+            (0..8).map(|number| queue.ask(place(number), &claim(0), 0).expect("room")).collect();
         assert_eq!(queue.begin(0).len(), 2);
         assert_eq!(queue.send_away(asked[0], 0, 0.0), None, "it is under way");
         assert_eq!(queue.send_away(asked[2], 0, 0.0), Some(1_000));
@@ -444,8 +473,10 @@ mod tests {
     #[test]
     fn places_are_bounded() {
         let mut queue = Queue::new(&limits(1));
-        let place =
-            |number: usize| Place { robot: format!("r{number:016x}").parse().expect("valid"), blob: Digest::of(b"x") };
+        let place = |number: usize| Place {
+            robot: format!("r{number:016x}").parse().expect("valid"),
+            blob: Digest::of(b"x"),
+        };
         for number in 0..MAX_PLACES {
             assert!(queue.ask(place(number), &claim(0), 0).is_some());
         }
@@ -454,9 +485,9 @@ mod tests {
     }
 
     proptest! {
-        /// However robots come and go, and however many newcomers ask meanwhile: never more transfers than the limit, and
-        /// one that keeps coming back when it was told gets its turn after at most those before it, each of which may be
-        /// passed a few times.
+        /// However robots come and go, and however many newcomers ask meanwhile: never more
+        /// transfers than the limit, and one that keeps coming back when it was told gets its turn
+        /// after at most those before it, each of which may be passed a few times.
         #[test]
         fn nobody_starves(max in 1u64..5, others in 1u8..20, newcomers in proptest::collection::vec(0u64..3, 300), seed in any::<u64>()) {
             let mut queue = Queue::new(&limits(max));
@@ -502,8 +533,8 @@ mod tests {
             prop_assert!(begun_in_all <= u64::from(others) + u64::from(MAX_PASSED) + max);
         }
 
-        /// However many blobs a robot asks for: what it gets beyond one turn is what nobody without a turn could have had, and
-        /// all that is asked for is had in the end.
+        /// However many blobs a robot asks for: what it gets beyond one turn is what nobody without
+        /// a turn could have had, and all that is asked for is had in the end.
         #[test]
         fn one_robot_does_not_take_the_turns_of_others(max in 1u64..5, acts in proptest::collection::vec((0u8..4, 0u8..6, 0u8..6), 1..200)) {
             let mut queue = Queue::new(&limits(max));

@@ -1,12 +1,13 @@
-//! The private certificate authority: made on the first start, kept for ever, known to robots by its pin. It vouches for this
-//! server alone; the keys of the certificates it makes live in memory and are replaced at every start.
+//! The private certificate authority: made on the first start, kept for ever, known to robots by
+//! its pin. It vouches for this server alone; the keys of the certificates it makes live in memory
+//! and are replaced at every start.
 
 use std::net::IpAddr;
 use std::time::Duration;
 
 use rcgen::{
-    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
-    KeyUsagePurpose, PublicKeyData as _, SanType, date_time_ymd,
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa,
+    Issuer, KeyPair, KeyUsagePurpose, PublicKeyData as _, SanType, date_time_ymd,
 };
 use rustls::crypto::ring;
 use rustls::pki_types::pem::PemObject as _;
@@ -18,8 +19,8 @@ use task_transport::pin_of;
 use super::TlsError;
 use crate::system::data_directory::DataDirectory;
 
-/// The authority's certificate is good from this year on, and so are those it makes for robots: no clock that could be right
-/// stands before it.
+/// The authority's certificate is good from this year on, and so are those it makes for robots: no
+/// clock that could be right stands before it.
 const FIRST_YEAR: i32 = 2020;
 /// It has no successor.
 const LAST_YEAR: i32 = 2120;
@@ -65,7 +66,12 @@ impl Authority {
     }
 
     /// A certificate for the server under these names, with a key of its own.
-    pub(super) fn issue(&self, audience: Audience, names: &[String], now_ms: u64) -> Result<CertifiedKey, TlsError> {
+    pub(super) fn issue(
+        &self,
+        audience: Audience,
+        names: &[String],
+        now_ms: u64,
+    ) -> Result<CertifiedKey, TlsError> {
         let mut params = CertificateParams::default();
         params.subject_alt_names = names.iter().filter_map(|name| subject(name)).collect();
         params.distinguished_name = named("taskd");
@@ -82,17 +88,20 @@ impl Authority {
         let key = PrivatePkcs8KeyDer::from(key.serialize_der());
         // With the authority's own: only so can whoever knows its pin recognize it.
         let chain = vec![certificate, self.certificate.clone()];
-        CertifiedKey::from_der(chain, key.into(), &ring::default_provider()).map_err(TlsError::Unusable)
+        CertifiedKey::from_der(chain, key.into(), &ring::default_provider())
+            .map_err(TlsError::Unusable)
     }
 }
 
-/// Whatever the authority's certificate says follows from its key, so that certificates it makes fit a copy of any age.
+/// Whatever the authority's certificate says follows from its key, so that certificates it makes
+/// fit a copy of any age.
 fn authority_params(pin: &CaPin) -> Result<CertificateParams, rcgen::Error> {
     let mut params = CertificateParams::new(Vec::new())?;
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
     params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
     params.distinguished_name = named(&format!("taskd authority {}", &pin.to_string()[..16]));
-    (params.not_before, params.not_after) = (date_time_ymd(FIRST_YEAR, 1, 1), date_time_ymd(LAST_YEAR, 1, 1));
+    (params.not_before, params.not_after) =
+        (date_time_ymd(FIRST_YEAR, 1, 1), date_time_ymd(LAST_YEAR, 1, 1));
     Ok(params)
 }
 

@@ -1,10 +1,12 @@
-//! What clients prove about themselves. Anybody may show any certificate with an ed25519 key, by whomever it was made; what
-//! counts is that they hold the key, and whose key that is others know.
+//! What clients prove about themselves. Anybody may show any certificate with an ed25519 key, by
+//! whomever it was made; what counts is that they hold the key, and whose key that is others know.
 
 use std::sync::Arc;
 
 use rustls::client::danger::HandshakeSignatureValid;
-use rustls::crypto::{WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature};
+use rustls::crypto::{
+    WebPkiSupportedAlgorithms, ring, verify_tls12_signature, verify_tls13_signature,
+};
 use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{CertificateError, DigitallySignedStruct, DistinguishedName, Error, SignatureScheme};

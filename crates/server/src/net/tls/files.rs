@@ -1,5 +1,5 @@
-//! The operator's own certificate: a chain and its key in two PEM files, which somebody else replaces when they like. It
-//! takes what fits together and nothing else.
+//! The operator's own certificate: a chain and its key in two PEM files, which somebody else
+//! replaces when they like. It takes what fits together and nothing else.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -29,7 +29,8 @@ impl Files {
         Self { certificate, key, seen: None }
     }
 
-    /// What is in the files; `None` if it is what was there the last time. What can't be used is said once.
+    /// What is in the files; `None` if it is what was there the last time. What can't be used is
+    /// said once.
     pub(super) fn read_news(&mut self) -> Result<Option<CertifiedKey>, TlsError> {
         let (certificate, key) = (read(&self.certificate)?, read(&self.key)?);
         let content = [&certificate, &key].map(|bytes| Digest::of(bytes));
@@ -45,11 +46,10 @@ impl Files {
             CertificateDer::pem_slice_iter(certificate).collect();
         let chain = chain.ok().filter(|chain| !chain.is_empty());
         let chain = chain.ok_or_else(|| wrong(&self.certificate, "a chain of certificates"))?;
-        let key = PrivateKeyDer::from_pem_slice(key).map_err(|_| wrong(&self.key, "an unencrypted private key"))?;
-        CertifiedKey::from_der(chain, key, &ring::default_provider()).map_err(|source| TlsError::Unfit {
-            certificate: self.certificate.clone(),
-            key: self.key.clone(),
-            source,
+        let key = PrivateKeyDer::from_pem_slice(key)
+            .map_err(|_| wrong(&self.key, "an unencrypted private key"))?;
+        CertifiedKey::from_der(chain, key, &ring::default_provider()).map_err(|source| {
+            TlsError::Unfit { certificate: self.certificate.clone(), key: self.key.clone(), source }
         })
     }
 }

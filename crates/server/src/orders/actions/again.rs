@@ -38,8 +38,8 @@ impl Remembered for Rollback {
 type Goal = (PackageRef, TaskKind, Vec<RobotId>);
 
 impl Actions {
-    /// Orders once more what `id` has brought, the same way, on the robots where that has ended badly. The same key with the
-    /// same order gives the same deployment.
+    /// Orders once more what `id` has brought, the same way, on the robots where that has ended
+    /// badly. The same key with the same order gives the same deployment.
     pub async fn retry_deployment(
         &self,
         by: &Person,
@@ -57,30 +57,45 @@ impl Actions {
             return Ok(answer);
         }
         let PackageRef { name, version, .. } = &past.package;
-        let package = package.ok_or_else(|| ActionError::PackageNotFound(name.clone(), version.clone()))?;
+        let package =
+            package.ok_or_else(|| ActionError::PackageNotFound(name.clone(), version.clone()))?;
         let selector = match &retry.selector {
             Some(selector) => Some(selector.clone()),
             None => self.store.deployment_selector(id).await?,
         };
         let selector = selector.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?;
-        let robots: Vec<RobotId> =
-            to_retry(&mut write, by, &past, retry).await?.into_iter().map(|robot| robot.id).collect();
+        let robots: Vec<RobotId> = to_retry(&mut write, by, &past, retry)
+            .await?
+            .into_iter()
+            .map(|robot| robot.id)
+            .collect();
         let order = CreateDeployment {
             delivery: past.delivery,
             priority: past.priority,
             batch: past.batch,
             max_failures: past.max_failures,
-            ..CreateDeployment::new(package.package.name.clone(), package.package.manifest.digest, selector)
+            ..CreateDeployment::new(
+                package.package.name.clone(),
+                package.package.manifest.digest,
+                selector,
+            )
         };
         self.check_fits(&order, &package)?;
-        // What was taken over from robots after the database was put back never had a time of its own.
+        // What was taken over from robots after the database was put back never had a time of its
+        // own.
         let lifetime_ms = match past.expires_at_ms.saturating_sub(past.created_at_ms) {
             0 => self.settings.assignment_lifetime_ms,
             lifetime_ms => lifetime_ms,
         };
         let expires_at_ms = now_ms + lifetime_ms;
         let kind = package.manifest.run.kind;
-        let placed = Placed { package: &package.package, kind, order: &order, robots: &robots, expires_at_ms };
+        let placed = Placed {
+            package: &package.package,
+            kind,
+            order: &order,
+            robots: &robots,
+            expires_at_ms,
+        };
         let mut consequences = Consequences::default();
         let new = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
         let deed = Deed::by(by, Act::DeploymentRetry, &new)
@@ -109,8 +124,8 @@ impl Actions {
         Ok(to_retry(&mut write, by, &past, retry).await?.into_iter().map(matched).collect())
     }
 
-    /// Orders the robots that match back to the package of `task` that ran there before the one they should have now; one
-    /// deployment for each package. The same key gives the same answer.
+    /// Orders the robots that match back to the package of `task` that ran there before the one
+    /// they should have now; one deployment for each package. The same key gives the same answer.
     pub async fn roll_back(
         &self,
         by: &Person,
@@ -131,12 +146,15 @@ impl Actions {
         let expires_at_ms = now_ms + self.settings.assignment_lifetime_ms;
         let mut consequences = Consequences::default();
         for (package, kind, robots) in goals {
-            let order = CreateDeployment::new(task.clone(), package.manifest.digest, selector.clone());
-            let placed = Placed { package: &package, kind, order: &order, robots: &robots, expires_at_ms };
+            let order =
+                CreateDeployment::new(task.clone(), package.manifest.digest, selector.clone());
+            let placed =
+                Placed { package: &package, kind, order: &order, robots: &robots, expires_at_ms };
             let id = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
             rollback.deployments.push(id);
         }
-        let deployments: Vec<&str> = rollback.deployments.iter().map(DeploymentId::as_str).collect();
+        let deployments: Vec<&str> =
+            rollback.deployments.iter().map(DeploymentId::as_str).collect();
         let deed = Deed::by(by, Act::TaskRollBack, task)
             .with("robots", selector)
             .with("count", rollback.robots.len())
@@ -149,7 +167,12 @@ impl Actions {
     }
 
     /// What [`Actions::roll_back`] would do.
-    pub async fn rollback(&self, by: &Person, task: &TaskName, selector: &Selector) -> Result<Rollback, ActionError> {
+    pub async fn rollback(
+        &self,
+        by: &Person,
+        task: &TaskName,
+        selector: &Selector,
+    ) -> Result<Rollback, ActionError> {
         // What is written here is never committed.
         let mut write = self.store.begin_keeping_rights().await?;
         Ok(rollback(&mut write, by, task, selector, self.clock.now_ms()).await?.0)
@@ -200,13 +223,17 @@ async fn rollback(
     let robots = meant(write, by, task, selector, now_ms).await?;
     let ids: Vec<RobotId> = robots.iter().map(|robot| robot.id.clone()).collect();
     let earlier = write.earlier_packages(task, &ids).await?;
-    let mut package_of: HashMap<RobotId, (PackageRef, TaskKind)> =
-        earlier.into_iter().map(|earlier| (earlier.robot, (earlier.package, earlier.kind))).collect();
+    let mut package_of: HashMap<RobotId, (PackageRef, TaskKind)> = earlier
+        .into_iter()
+        .map(|earlier| (earlier.robot, (earlier.package, earlier.kind)))
+        .collect();
     let (mut rollback, mut goals) = (Rollback::default(), BTreeMap::<Digest, Goal>::new());
     for robot in robots {
         match package_of.remove(&robot.id) {
             Some((package, kind)) => {
-                let goal = goals.entry(package.manifest.digest).or_insert_with(|| (package, kind, Vec::new()));
+                let goal = goals
+                    .entry(package.manifest.digest)
+                    .or_insert_with(|| (package, kind, Vec::new()));
                 goal.2.push(robot.id.clone());
                 rollback.robots.push(matched(robot));
             }

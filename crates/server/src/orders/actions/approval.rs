@@ -27,14 +27,16 @@ impl Actions {
             return Ok(());
         }
         write.approve_robot(robot).await?;
-        let deed = Deed::by(by, Act::RobotApprove, robot).with("name", &known.name).with("mac", known.mac);
+        let deed =
+            Deed::by(by, Act::RobotApprove, robot).with("name", &known.name).with("mac", known.mac);
         write.audit(&deed, now_ms).await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(known.id));
         Ok(())
     }
 
-    /// Turns a robot away that waits, and forgets it. One that does not wait is not meant: that would be removing it.
+    /// Turns a robot away that waits, and forgets it. One that does not wait is not meant: that
+    /// would be removing it.
     pub async fn reject_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -50,7 +52,10 @@ impl Actions {
 }
 
 /// Turns away whoever has waited for too long, and says who that was.
-pub(super) async fn give_up_pending(write: &mut Write, now_ms: u64) -> Result<Vec<KnownRobot>, StoreError> {
+pub(super) async fn give_up_pending(
+    write: &mut Write,
+    now_ms: u64,
+) -> Result<Vec<KnownRobot>, StoreError> {
     let given_up = write.pending_since(now_ms.saturating_sub(PENDING_LIFETIME_MS)).await?;
     for known in &given_up {
         let deed = Deed::new("server".to_owned(), None, None, Act::RobotReject, &known.id)
@@ -60,7 +65,12 @@ pub(super) async fn give_up_pending(write: &mut Write, now_ms: u64) -> Result<Ve
     Ok(given_up)
 }
 
-async fn turn_away(write: &mut Write, known: &KnownRobot, deed: Deed, now_ms: u64) -> Result<(), StoreError> {
+async fn turn_away(
+    write: &mut Write,
+    known: &KnownRobot,
+    deed: Deed,
+    now_ms: u64,
+) -> Result<(), StoreError> {
     let robots = std::slice::from_ref(&known.id);
     write.revoke_tokens(robots, now_ms).await?;
     write.remove_robots(robots, now_ms).await?;

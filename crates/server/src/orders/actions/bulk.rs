@@ -12,8 +12,9 @@ use crate::orders::changes::{Change, Consequences};
 use crate::store::{Act, Deed, KnownRobot, Write};
 
 impl Actions {
-    /// Sets labels of the robots that match, and takes labels away. Before and after they have to be the person's. Gives the
-    /// robots meant, also those that had it all before; `online` is left false. A dry run only looks whether it could be done.
+    /// Sets labels of the robots that match, and takes labels away. Before and after they have to
+    /// be the person's. Gives the robots meant, also those that had it all before; `online` is left
+    /// false. A dry run only looks whether it could be done.
     pub async fn label_robots(
         &self,
         by: &Person,
@@ -22,7 +23,10 @@ impl Actions {
     ) -> Result<Vec<MatchedRobot>, ActionError> {
         let BulkLabels { selector, set, remove, dry_run } = order;
         if set.is_empty() && remove.is_empty() {
-            return Err(ActionError::Invalid { key: "set", reason: "no label is to be set or removed".to_owned() });
+            return Err(ActionError::Invalid {
+                key: "set",
+                reason: "no label is to be set or removed".to_owned(),
+            });
         }
         if let Some(both) = remove.iter().find(|key| set.contains_key(*key)) {
             let reason = format!("{both} is to be set as well");
@@ -37,7 +41,8 @@ impl Actions {
         let robots = meant(&mut write, by, selector).await?;
         let relabelled = |robot: &KnownRobot| {
             let kept = robot.labels.iter().filter(|(key, _)| !remove.contains(*key));
-            let labels: Labels = kept.chain(set).map(|(key, value)| (key.clone(), value.clone())).collect();
+            let labels: Labels =
+                kept.chain(set).map(|(key, value)| (key.clone(), value.clone())).collect();
             check_labels(&labels)?;
             Ok(KnownRobot { labels, ..robot.clone() })
         };
@@ -46,8 +51,12 @@ impl Actions {
         if *dry_run {
             return Ok(robots.into_iter().map(matched).collect());
         }
-        let changed: Vec<&KnownRobot> =
-            after.iter().zip(&robots).filter(|(after, before)| after != before).map(|(after, _)| after).collect();
+        let changed: Vec<&KnownRobot> = after
+            .iter()
+            .zip(&robots)
+            .filter(|(after, before)| after != before)
+            .map(|(after, _)| after)
+            .collect();
         write.update_labels(&changed).await?;
         let removed: Vec<&str> = remove.iter().map(|key| key.as_str()).collect();
         let deed = Deed::by(by, Act::BulkLabels, selector)
@@ -121,7 +130,11 @@ impl Actions {
 }
 
 /// The robots that a selector means; an error if nobody, or if one of them is not the person's.
-async fn meant(write: &mut Write, by: &Person, selector: &Selector) -> Result<Vec<KnownRobot>, ActionError> {
+async fn meant(
+    write: &mut Write,
+    by: &Person,
+    selector: &Selector,
+) -> Result<Vec<KnownRobot>, ActionError> {
     let robots = all_known(write.matching_robots(selector, &by.scope).await?)?;
     if robots.is_empty() {
         return Err(ActionError::NoRobotsMatch(quoted(selector)));

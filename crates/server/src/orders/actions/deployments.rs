@@ -23,8 +23,8 @@ use crate::store::{Act, Deed, NewDeployment, Revocable, StillRunning, Write};
 const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
 
 impl Actions {
-    /// Orders `package`, which the caller has looked up for `order`, on the robots that match now. The same key with the
-    /// same order gives the same deployment.
+    /// Orders `package`, which the caller has looked up for `order`, on the robots that match now.
+    /// The same key with the same order gives the same deployment.
     pub async fn create_deployment(
         &self,
         by: &Person,
@@ -39,10 +39,14 @@ impl Actions {
             None => self.settings.assignment_lifetime_ms,
         };
         if order.batch == Some(0) {
-            return Err(ActionError::Invalid { key: "batch", reason: "expected at least 1 robot".to_owned() });
+            return Err(ActionError::Invalid {
+                key: "batch",
+                reason: "expected at least 1 robot".to_owned(),
+            });
         }
         if !(MIN_PRIORITY..=MAX_PRIORITY).contains(&order.priority) {
-            let reason = format!("expected {MIN_PRIORITY} to {MAX_PRIORITY}, not {}", order.priority);
+            let reason =
+                format!("expected {MIN_PRIORITY} to {MAX_PRIORITY}, not {}", order.priority);
             return Err(ActionError::Invalid { key: "priority", reason });
         }
         let mut write = self.store.begin().await?;
@@ -57,7 +61,8 @@ impl Actions {
         check_scope(by, &robots, || quoted(&order.selector))?;
         let robots: Vec<RobotId> = robots.into_iter().map(|robot| robot.id).collect();
         let (kind, expires_at_ms) = (package.manifest.run.kind, now_ms + lifetime_ms);
-        let placed = Placed { package: &package.package, kind, order, robots: &robots, expires_at_ms };
+        let placed =
+            Placed { package: &package.package, kind, order, robots: &robots, expires_at_ms };
         let mut consequences = Consequences::default();
         let id = placed.place(&mut write, &self.chooser, now_ms, &mut consequences).await?;
         let task = &package.package.name;
@@ -74,18 +79,28 @@ impl Actions {
     }
 
     /// What is ordered to ride inside an announcement must fit into one.
-    pub(super) fn check_fits(&self, order: &CreateDeployment, package: &PackageView) -> Result<(), ActionError> {
+    pub(super) fn check_fits(
+        &self,
+        order: &CreateDeployment,
+        package: &PackageView,
+    ) -> Result<(), ActionError> {
         let (size, most) = (travelling_bytes(&package.package), self.chooser.inline_bytes());
         if order.delivery != DeliveryChoice::Inline || size <= most {
             return Ok(());
         }
-        let exact =
-            |bytes: u64| if shown_bytes(size) == shown_bytes(most) { format!("{bytes} B") } else { shown_bytes(bytes) };
+        let exact = |bytes: u64| {
+            if shown_bytes(size) == shown_bytes(most) {
+                format!("{bytes} B")
+            } else {
+                shown_bytes(bytes)
+            }
+        };
         let package = format!("{} {}", package.package.name, package.package.version);
         Err(ActionError::TooLargeForInline { package, size: exact(size), most: exact(most) })
     }
 
-    /// The deployment that `key` with this `order` gave before. A repeated order is answered also when its package is gone.
+    /// The deployment that `key` with this `order` gave before. A repeated order is answered also
+    /// when its package is gone.
     pub async fn deployment_ordered_before(
         &self,
         by: &Person,
@@ -96,9 +111,14 @@ impl Actions {
         self.answered_before(&mut write, by, key, &creation(order)).await
     }
 
-    /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a service that runs goes on.
-    /// Doing it twice is harmless; one that is over everywhere is left as it is.
-    pub async fn cancel_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
+    /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a
+    /// service that runs goes on. Doing it twice is harmless; one that is over everywhere is left
+    /// as it is.
+    pub async fn cancel_deployment(
+        &self,
+        by: &Person,
+        id: &DeploymentId,
+    ) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let is_cancelled = is_cancelled(&mut write, id).await?;
@@ -106,14 +126,16 @@ impl Actions {
         if is_cancelled {
             return Ok(());
         }
-        let robots: Vec<RobotId> = write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
+        let robots: Vec<RobotId> =
+            write.revocable(id).await?.into_iter().map(|row| row.robot).collect();
         if robots.is_empty() && !write.may_be_put_back(id).await? {
             return Err(ActionError::NothingToCancel(id.clone()));
         }
         write.adopt_diverged(&robots, now_ms).await?;
         write.mark_cancelled(id, now_ms).await?;
         let taken = write.revocable(id).await?;
-        let mut consequences = take_back(&mut write, &self.chooser, &taken, Phase::Cancelled, now_ms).await?;
+        let mut consequences =
+            take_back(&mut write, &self.chooser, &taken, Phase::Cancelled, now_ms).await?;
         write.skip_as_previous(id).await?;
         consequences.deployments.insert(id.clone());
         write.audit(&Deed::by(by, Act::DeploymentCancel, id), now_ms).await?;
@@ -122,9 +144,13 @@ impl Actions {
         Ok(())
     }
 
-    /// Lets a paused deployment go on; the failures so far are forgiven. Of one that is not paused the error says why
-    /// nothing more begins there.
-    pub async fn resume_deployment(&self, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
+    /// Lets a paused deployment go on; the failures so far are forgiven. Of one that is not paused
+    /// the error says why nothing more begins there.
+    pub async fn resume_deployment(
+        &self,
+        by: &Person,
+        id: &DeploymentId,
+    ) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let is_cancelled = is_cancelled(&mut write, id).await?;
@@ -140,7 +166,8 @@ impl Actions {
         write.resume(id, open.rollout.forgiven.max(tally.failures())).await?;
         write.audit(&Deed::by(by, Act::DeploymentResume, id), now_ms).await?;
         let touched = BTreeSet::from([id.clone()]);
-        let mut consequences = Consequences { deployments: touched.clone(), ..Consequences::default() };
+        let mut consequences =
+            Consequences { deployments: touched.clone(), ..Consequences::default() };
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
         write.commit().await?;
         self.changes.publish(consequences);
@@ -152,13 +179,17 @@ impl Actions {
         let found = self.store.deployment(id, false).await?;
         let mut view = found.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?;
         let assignments = view.assignments.get_or_insert_default();
-        let offline = self.chooser.offline_ms(assignments.iter().map(|one| &one.robot), self.clock.now_ms());
-        assignments.iter_mut().zip(offline).for_each(|(one, offline_ms)| one.online = offline_ms.is_none());
+        let offline =
+            self.chooser.offline_ms(assignments.iter().map(|one| &one.robot), self.clock.now_ms());
+        assignments
+            .iter_mut()
+            .zip(offline)
+            .for_each(|(one, offline_ms)| one.online = offline_ms.is_none());
         Ok(ActionError::NotPaused { id: id.clone(), why: view.awaited().to_string() })
     }
 
-    /// Begins batches that are due because robots have come back or stay away. To be called when a robot has come, and
-    /// every few seconds.
+    /// Begins batches that are due because robots have come back or stay away. To be called when a
+    /// robot has come, and every few seconds.
     pub async fn advance_rollouts(&self) -> Result<(), ActionError> {
         let open = self.store.open_rollouts().await?;
         if open.is_empty() {
@@ -176,8 +207,9 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends what was not done in time, and forgets old idempotency keys, tokens that have ended and robots that nobody approved. To be called about once
-    /// a minute. Gives the users whose tokens those were.
+    /// Ends what was not done in time, and forgets old idempotency keys, tokens that have ended and
+    /// robots that nobody approved. To be called about once a minute. Gives the users whose tokens
+    /// those were.
     pub async fn expire(&self) -> Result<BTreeSet<UserName>, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -185,10 +217,13 @@ impl Actions {
         let users = write.forget_ended_tokens(now_ms).await?;
         let given_up = give_up_pending(&mut write, now_ms).await?;
         let overdue = write.overdue(now_ms).await?;
-        let consequences = take_back(&mut write, &self.chooser, &overdue, Phase::Expired, now_ms).await?;
+        let consequences =
+            take_back(&mut write, &self.chooser, &overdue, Phase::Expired, now_ms).await?;
         write.commit().await?;
         self.changes.publish(consequences);
-        given_up.into_iter().for_each(|robot| self.changes.announce(Change::RobotRemoved(Box::new(robot))));
+        given_up
+            .into_iter()
+            .for_each(|robot| self.changes.announce(Change::RobotRemoved(Box::new(robot))));
         Ok(users)
     }
 }
@@ -244,7 +279,11 @@ async fn is_cancelled(write: &mut Write, id: &DeploymentId) -> Result<bool, Acti
 }
 
 /// Whether all robots of a deployment are the person's.
-async fn check_deployment(write: &mut Write, by: &Person, id: &DeploymentId) -> Result<(), ActionError> {
+async fn check_deployment(
+    write: &mut Write,
+    by: &Person,
+    id: &DeploymentId,
+) -> Result<(), ActionError> {
     if by.scope.is_everything() {
         return Ok(());
     }
@@ -261,8 +300,11 @@ async fn take_back(
     now_ms: u64,
 ) -> Result<Consequences, ActionError> {
     let taken_back = write.take_back(taken, phase, now_ms).await?;
-    let touched: BTreeSet<DeploymentId> =
-        taken.iter().flat_map(|row| row.previous.iter().chain([&row.deployment])).cloned().collect();
+    let touched: BTreeSet<DeploymentId> = taken
+        .iter()
+        .flat_map(|row| row.previous.iter().chain([&row.deployment]))
+        .cloned()
+        .collect();
     let mut consequences = Consequences {
         robots: taken.iter().map(|row| row.robot.clone()).collect(),
         rings: taken_back.into_iter().collect(),

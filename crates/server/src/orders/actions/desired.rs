@@ -70,21 +70,35 @@ impl Actions {
         Ok(self.store.robot_ids().await?)
     }
 
-    /// What `robot` should be running, signed. Refused as `diverged` while the robot is ahead of the database.
+    /// What `robot` should be running, signed. Refused as `diverged` while the robot is ahead of
+    /// the database.
     pub async fn desired(&self, robot: &RobotId) -> Result<Desired, ActionError> {
         let found = self.store.desired_tasks(std::slice::from_ref(robot)).await?.pop();
         self.sign(found.ok_or_else(|| ActionError::RobotNotFound(robot.to_string()))?)
     }
 
     /// The same for many robots; those that were removed or are diverged are left out.
-    pub async fn desired_of(&self, robots: &[RobotId]) -> Result<Vec<(RobotId, Desired)>, ActionError> {
+    pub async fn desired_of(
+        &self,
+        robots: &[RobotId],
+    ) -> Result<Vec<(RobotId, Desired)>, ActionError> {
         let found = self.store.desired_tasks(robots).await?;
-        let signed = found.into_iter().filter_map(|found| Some((found.robot.clone(), self.sign(found).ok()?)));
+        let signed = found
+            .into_iter()
+            .filter_map(|found| Some((found.robot.clone(), self.sign(found).ok()?)));
         Ok(signed.collect())
     }
 
     fn sign(&self, found: DesiredTasks) -> Result<Desired, ActionError> {
-        let DesiredTasks { robot, generation, observed_generation, tasks, along, evidence, settings } = found;
+        let DesiredTasks {
+            robot,
+            generation,
+            observed_generation,
+            tasks,
+            along,
+            evidence,
+            settings,
+        } = found;
         if observed_generation > generation {
             return Err(ActionError::Diverged(robot));
         }
@@ -105,7 +119,10 @@ impl Actions {
         };
         let payload = serde_json::to_vec(&state).expect("a desired state always has a JSON form");
         let envelope = Envelope::seal(DESIRED_STATE_TYPE, &payload, &self.key);
-        self.envelopes.keep(&robot, Kept { issued_at_ms: now_ms, generation, evidence, envelope: envelope.clone() });
+        self.envelopes.keep(
+            &robot,
+            Kept { issued_at_ms: now_ms, generation, evidence, envelope: envelope.clone() },
+        );
         Ok(Desired { generation, envelope, along })
     }
 }

@@ -7,9 +7,13 @@ use crate::domain::delivery::FELL_BEHIND;
 use crate::orders::changes::Consequences;
 
 impl Actions {
-    /// Tells robots that still wait for the parts of a package to pull it, `because`. The new decision is stored, and their
-    /// state signed anew.
-    pub async fn pull_instead(&self, parts: &[(DeploymentId, RobotId)], because: &str) -> Result<(), ActionError> {
+    /// Tells robots that still wait for the parts of a package to pull it, `because`. The new
+    /// decision is stored, and their state signed anew.
+    pub async fn pull_instead(
+        &self,
+        parts: &[(DeploymentId, RobotId)],
+        because: &str,
+    ) -> Result<(), ActionError> {
         if parts.is_empty() {
             return Ok(());
         }

@@ -1,5 +1,5 @@
-//! What people and robots may order. Each order is one write to the store; after its commit the change is announced and
-//! the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
+//! What people and robots may order. Each order is one write to the store; after its commit the
+//! change is announced and the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
 
 mod again;
 mod approval;
@@ -22,7 +22,10 @@ use serde::de::DeserializeOwned;
 use task_proto::api::MatchedRobot;
 use task_proto::envelope::SigningKey;
 use task_proto::selector::Selector;
-use task_proto::{CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TaskName, TokenId, UserName, Version};
+use task_proto::{
+    CaPin, DeploymentId, Digest, MacAddress, RobotId, RobotName, TaskName, TokenId, UserName,
+    Version,
+};
 
 use crate::auth::passwords::Passwords;
 use crate::auth::sign_ins::SignIns;
@@ -72,7 +75,8 @@ pub struct ActionSettings {
     pub enrolment_token_uses: u64,
     /// How many robots may enrol in a minute; by one token half of them.
     pub enrolments_per_minute: u64,
-    /// The certificate authority that robots are told to trust, if they are to trust the server's own.
+    /// The certificate authority that robots are told to trust, if they are to trust the server's
+    /// own.
     pub ca_pin: Option<CaPin>,
     /// Whether every new robot waits to be approved.
     pub enrolment_approval: bool,
@@ -97,8 +101,8 @@ impl Default for ActionSettings {
 }
 
 impl Actions {
-    /// Orders that go to `store` and are announced to `changes`; desired states are signed with `key`, and how
-    /// packages travel is up to `chooser`.
+    /// Orders that go to `store` and are announced to `changes`; desired states are signed with
+    /// `key`, and how packages travel is up to `chooser`.
     pub fn new(
         store: Store,
         clock: Clock,
@@ -112,11 +116,22 @@ impl Actions {
         let per_minute = settings.enrolments_per_minute;
         let (by_token, all) = (Pace::per_minute(per_minute / 2), Pace::per_minute(per_minute));
         let enrolments = Arc::new(Enrolments { by_token, all });
-        Self { store, clock, changes, key, settings, chooser, envelopes, passwords, sign_ins, enrolments }
+        Self {
+            store,
+            clock,
+            changes,
+            key,
+            settings,
+            chooser,
+            envelopes,
+            passwords,
+            sign_ins,
+            enrolments,
+        }
     }
 
-    /// What was answered when `key` came with this `request` before; an error if it came with another, or from someone else.
-    /// Robots that are no longer the person's are left out.
+    /// What was answered when `key` came with this `request` before; an error if it came with
+    /// another, or from someone else. Robots that are no longer the person's are left out.
     async fn answered_before<T: Remembered>(
         &self,
         write: &mut Write,
@@ -130,9 +145,11 @@ impl Actions {
             return Err(ActionError::IdempotencyKeyReused(key.to_string()));
         }
         let answer = serde_json::from_str(&past.answer);
-        let mut answer: T = answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?;
+        let mut answer: T =
+            answer.map_err(|_| StoreError::Unreadable { column: "orders.answer" })?;
         if !by.scope.is_everything() {
-            let own: HashSet<RobotId> = write.robots_ever_in(&by.scope).await?.into_iter().collect();
+            let own: HashSet<RobotId> =
+                write.robots_ever_in(&by.scope).await?.into_iter().collect();
             answer.keep_robots(&own);
         }
         Ok(Some(answer))
@@ -172,26 +189,40 @@ impl Remembered for DeploymentId {
     fn keep_robots(&mut self, _own: &HashSet<RobotId>) {}
 }
 
-/// A request as it is remembered with its answer. That of the first token is remembered as it was before there were users.
+/// A request as it is remembered with its answer. That of the first token is remembered as it was
+/// before there were users.
 fn remembered(by: &Person, request: &str) -> String {
     let text = if by.is_first() { request.to_owned() } else { format!("{} {request}", by.name) };
     Digest::of(text.as_bytes()).to_string()
 }
 
-/// Refuses an order as a whole if one of the robots it means is not the person's: a part of it would be a surprise.
-/// `what` says what means them.
-fn check_scope(by: &Person, robots: &[KnownRobot], what: impl FnOnce() -> String) -> Result<(), ActionError> {
-    let outside = robots.iter().filter(|robot| !by.scope.covers(&robot.id, &robot.name, &robot.labels)).count();
+/// Refuses an order as a whole if one of the robots it means is not the person's: a part of it
+/// would be a surprise. `what` says what means them.
+fn check_scope(
+    by: &Person,
+    robots: &[KnownRobot],
+    what: impl FnOnce() -> String,
+) -> Result<(), ActionError> {
+    let outside = robots
+        .iter()
+        .filter(|robot| !by.scope.covers(&robot.id, &robot.name, &robot.labels))
+        .count();
     if outside == 0 {
         return Ok(());
     }
-    let (meant, what, person, scope) = (robots.len(), what(), by.name.clone(), by.scope.to_string());
+    let (meant, what, person, scope) =
+        (robots.len(), what(), by.name.clone(), by.scope.to_string());
     Err(ActionError::OutOfScope { outside, meant, what, person, scope })
 }
 
-/// The robots that match. A name that no robot of the person's has is a mistake that would go unnoticed.
+/// The robots that match. A name that no robot of the person's has is a mistake that would go
+/// unnoticed.
 fn all_known(matching: Matching) -> Result<Vec<KnownRobot>, ActionError> {
-    if matching.unknown.is_empty() { Ok(matching.robots) } else { Err(ActionError::UnknownRobots(matching.unknown)) }
+    if matching.unknown.is_empty() {
+        Ok(matching.robots)
+    } else {
+        Err(ActionError::UnknownRobots(matching.unknown))
+    }
 }
 
 /// The first names of a list that may be long.
@@ -204,11 +235,19 @@ fn listed(names: &[RobotName]) -> String {
     }
 }
 
-fn out_of_scope(outside: usize, meant: usize, what: &str, person: &UserName, scope: &str) -> String {
+fn out_of_scope(
+    outside: usize,
+    meant: usize,
+    what: &str,
+    person: &UserName,
+    scope: &str,
+) -> String {
     if meant == 1 {
         return format!("{what} is outside of {person}'s scope {scope:?}; nothing was done");
     }
-    format!("{outside} of the {meant} robots of {what} are outside of {person}'s scope {scope:?}; nothing was done")
+    format!(
+        "{outside} of the {meant} robots of {what} are outside of {person}'s scope {scope:?}; nothing was done"
+    )
 }
 
 /// A selector in an error.
@@ -271,7 +310,9 @@ pub enum ActionError {
     #[error("the provider has no name for you that is a user name here; ask an administrator")]
     NoName,
     /// The provider and the rules for it decide.
-    #[error("{0} signs in by the provider: what {0} may is for oidc.rules in the configuration to say")]
+    #[error(
+        "{0} signs in by the provider: what {0} may is for oidc.rules in the configuration to say"
+    )]
     OfProvider(UserName),
     /// It could not be hashed.
     #[error("the password could not be hashed")]
@@ -307,7 +348,9 @@ pub enum ActionError {
         most: String,
     },
     /// Someone is registered by this MAC.
-    #[error("a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot")]
+    #[error(
+        "a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot"
+    )]
     MacKnown {
         /// The MAC.
         mac: MacAddress,
@@ -343,7 +386,8 @@ pub enum ActionError {
     /// The enrolment token is unknown, used up, expired or revoked.
     #[error("the enrolment token is unknown, used up, expired or revoked")]
     TokenRefused,
-    /// The robot was registered again and the token made then waits for its first use: the old agent gets no other.
+    /// The robot was registered again and the token made then waits for its first use: the old
+    /// agent gets no other.
     #[error("robot {0} was registered again and its new token was not used yet")]
     EnrolledAnew(RobotId),
     /// There is no such robot.
@@ -358,7 +402,9 @@ pub enum ActionError {
     )]
     NothingToRetry(DeploymentId),
     /// Nobody had another package of the task before.
-    #[error("none of these robots had another package of {0} before that has run there and is still on the server")]
+    #[error(
+        "none of these robots had another package of {0} before that has run there and is still on the server"
+    )]
     NothingToRollBack(TaskName),
     /// It was deleted.
     #[error("{0} {1} is no longer on the server: push it again")]
@@ -379,8 +425,11 @@ pub enum ActionError {
         /// What it waits for.
         why: String,
     },
-    /// The robot's generation is higher than ours: the database was restored. It is left alone until its next order.
-    #[error("robot {0} reports a later state than the server knows; it is left alone until its next order")]
+    /// The robot's generation is higher than ours: the database was restored. It is left alone
+    /// until its next order.
+    #[error(
+        "robot {0} reports a later state than the server knows; it is left alone until its next order"
+    )]
     Diverged(RobotId),
     /// The database failed.
     #[error("the database failed")]
@@ -437,7 +486,8 @@ pub struct IdempotencyKey(String);
 impl FromStr for IdempotencyKey {
     type Err = ActionError;
     fn from_str(text: &str) -> Result<Self, ActionError> {
-        let valid = (1..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
+        let valid =
+            (1..=128).contains(&text.len()) && text.bytes().all(|byte| byte.is_ascii_graphic());
         if valid { Ok(Self(text.to_owned())) } else { Err(ActionError::InvalidIdempotencyKey) }
     }
 }

@@ -1,10 +1,11 @@
-//! People come, change and go, sign out, and get and lose tokens. Whoever had more rights before such a change is served
-//! with them no longer.
+//! People come, change and go, sign out, and get and lose tokens. Whoever had more rights before
+//! such a change is served with them no longer.
 
 use std::net::IpAddr;
 
 use task_proto::api::{
-    AccessToken, AddUser, ChangePassword, CreateToken, EditUser, TokenList, TokenOrigin, TokenView, UserView,
+    AccessToken, AddUser, ChangePassword, CreateToken, EditUser, TokenList, TokenOrigin, TokenView,
+    UserView,
 };
 use task_proto::person::Permission;
 use task_proto::selector::Selector;
@@ -41,7 +42,14 @@ impl Actions {
         };
         let (scope, now_ms) = (limit(order.scope.as_ref())?, self.clock.now_ms());
         let roles = order.roles.clone();
-        let user = User { name: name.clone(), roles, scope, password, subject: None, created_at_ms: now_ms };
+        let user = User {
+            name: name.clone(),
+            roles,
+            scope,
+            password,
+            subject: None,
+            created_at_ms: now_ms,
+        };
         let mut write = self.store.begin().await?;
         check_new(&mut write, name).await?;
         write.put_user(&user).await?;
@@ -51,7 +59,12 @@ impl Actions {
     }
 
     /// Changes what a user may.
-    pub async fn edit_user(&self, by: &Person, name: &UserName, edit: &EditUser) -> Result<UserView, ActionError> {
+    pub async fn edit_user(
+        &self,
+        by: &Person,
+        name: &UserName,
+        edit: &EditUser,
+    ) -> Result<UserView, ActionError> {
         let mut write = self.store.begin().await?;
         let before = known_user(&mut write, name).await?;
         check_own(&before)?;
@@ -65,7 +78,9 @@ impl Actions {
         if before.is_administrator() && !user.is_administrator() {
             check_not_last(&mut write, Some(name)).await?;
         }
-        write.audit(&Deed::by(by, Act::UserEdit, name).described(&user), self.clock.now_ms()).await?;
+        write
+            .audit(&Deed::by(by, Act::UserEdit, name).described(&user), self.clock.now_ms())
+            .await?;
         write.put_user(&user).await?;
         write.commit().await?;
         self.changes.announce_rights();
@@ -85,10 +100,18 @@ impl Actions {
         Ok(())
     }
 
-    /// Sets a user's password. What was signed in with the old one is signed out; tokens that were made stay.
-    pub async fn set_password(&self, by: &Person, name: &UserName, password: &str) -> Result<(), ActionError> {
+    /// Sets a user's password. What was signed in with the old one is signed out; tokens that were
+    /// made stay.
+    pub async fn set_password(
+        &self,
+        by: &Person,
+        name: &UserName,
+        password: &str,
+    ) -> Result<(), ActionError> {
         // Told before the work of hashing.
-        check_own(&self.store.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))?)?;
+        check_own(
+            &self.store.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))?,
+        )?;
         let hash = self.passwords.hash(name, password).await?;
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -108,13 +131,19 @@ impl Actions {
     }
 
     /// Sets one's own password, if one knows the old one.
-    pub async fn change_password(&self, by: &Person, order: &ChangePassword) -> Result<(), ActionError> {
+    pub async fn change_password(
+        &self,
+        by: &Person,
+        order: &ChangePassword,
+    ) -> Result<(), ActionError> {
         if by.is_first() {
             return Err(ActionError::NotPermitted("the first token has no password".to_owned()));
         }
         let address = by.address.unwrap_or(IpAddr::from([0; 4]));
         self.check_password(&by.name, &order.old, address).await.map_err(|error| match error {
-            ActionError::SignInRefused => ActionError::Invalid { key: "old", reason: "it is wrong".to_owned() },
+            ActionError::SignInRefused => {
+                ActionError::Invalid { key: "old", reason: "it is wrong".to_owned() }
+            }
             error => error,
         })?;
         self.set_password(by, &by.name, &order.new).await
@@ -141,19 +170,30 @@ impl Actions {
     }
 
     /// Makes a token: for oneself, or by an administrator for anybody.
-    pub async fn create_token(&self, by: &Person, order: &CreateToken) -> Result<AccessToken, ActionError> {
-        let invalid = |key, reason: &str| Err(ActionError::Invalid { key, reason: reason.to_owned() });
+    pub async fn create_token(
+        &self,
+        by: &Person,
+        order: &CreateToken,
+    ) -> Result<AccessToken, ActionError> {
+        let invalid =
+            |key, reason: &str| Err(ActionError::Invalid { key, reason: reason.to_owned() });
         let user = match &order.user {
             Some(user) if *user != by.name && !by.may(Permission::Administer) => {
-                return Err(ActionError::NotPermitted(format!("{} may make tokens for {} only", by.name, by.name)));
+                return Err(ActionError::NotPermitted(format!(
+                    "{} may make tokens for {} only",
+                    by.name, by.name
+                )));
             }
             Some(user) => user,
-            None if by.is_first() => return invalid("user", "the first token is nobody's: say whose the new one is"),
+            None if by.is_first() => {
+                return invalid("user", "the first token is nobody's: say whose the new one is");
+            }
             None => &by.name,
         };
         // Or else one that leaked would never end.
         if by.origin == TokenOrigin::Token && !by.may(Permission::Administer) {
-            let reason = "a token can't be made with a token: sign in with the password (taskd login)";
+            let reason =
+                "a token can't be made with a token: sign in with the password (taskd login)";
             return Err(ActionError::NotPermitted(reason.to_owned()));
         }
         if order.title.chars().count() > MOST_TITLE || order.title.contains(char::is_control) {
@@ -167,13 +207,23 @@ impl Actions {
             };
         let mut write = self.store.begin().await?;
         let owner = known_user(&mut write, user).await?;
-        // It would outlast what the provider says of its user, which is only heard when they sign in.
+        // It would outlast what the provider says of its user, which is only heard when they sign
+        // in.
         if owner.subject.is_some() && !by.may(Permission::Administer) {
-            let reason = format!("{user} signs in by the provider: an administrator makes tokens for {user}");
+            let reason = format!(
+                "{user} signs in by the provider: an administrator makes tokens for {user}"
+            );
             return Err(ActionError::NotPermitted(reason));
         }
-        if order.roles.as_ref().is_some_and(|roles| roles.within(&owner.roles).as_ref() != Some(roles)) {
-            return Err(ActionError::Invalid { key: "roles", reason: format!("{user} has only {}", owner.roles) });
+        if order
+            .roles
+            .as_ref()
+            .is_some_and(|roles| roles.within(&owner.roles).as_ref() != Some(roles))
+        {
+            return Err(ActionError::Invalid {
+                key: "roles",
+                reason: format!("{user} has only {}", owner.roles),
+            });
         }
         if write.tokens_of_user(user).await?.len() >= 2 * MOST_TOKENS {
             return invalid("user", "this user has too many tokens: revoke some");
@@ -201,13 +251,16 @@ impl Actions {
         Ok(AccessToken { id, token: token.reveal(), user: user.clone(), expires_at_ms })
     }
 
-    /// Ends a token: one of one's own, or by an administrator anybody's. Doing it twice is harmless. Gives whose it was. A token
-    /// made for something that is less than its user ends itself alone: it may have leaked.
+    /// Ends a token: one of one's own, or by an administrator anybody's. Doing it twice is
+    /// harmless. Gives whose it was. A token made for something that is less than its user ends
+    /// itself alone: it may have leaked.
     pub async fn revoke_token(&self, by: &Person, id: &TokenId) -> Result<UserName, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let token: Option<TokenView> = write.person_token(id).await?;
-        let is_own = |token: &TokenView| token.user == by.name && (by.origin != TokenOrigin::Token || *id == by.token);
+        let is_own = |token: &TokenView| {
+            token.user == by.name && (by.origin != TokenOrigin::Token || *id == by.token)
+        };
         let token = token.filter(|token| is_own(token) || by.may(Permission::Administer));
         let token = token.ok_or_else(|| ActionError::TokenNotFound(id.clone()))?;
         if token.revoked_at_ms.is_some() {
@@ -260,7 +313,10 @@ pub(super) async fn check_new(write: &mut Write, name: &UserName) -> Result<(), 
         return Err(ActionError::UserExists(name.clone()));
     }
     if users.len() >= MOST_USERS {
-        return Err(ActionError::Invalid { key: "name", reason: format!("there are {MOST_USERS} users already") });
+        return Err(ActionError::Invalid {
+            key: "name",
+            reason: format!("there are {MOST_USERS} users already"),
+        });
     }
     Ok(())
 }
@@ -277,13 +333,15 @@ async fn known_user(write: &mut Write, name: &UserName) -> Result<User, ActionEr
     write.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))
 }
 
-/// Refuses to end the last way in: another administrator with a password, or the first token, has to be left. `except` goes,
-/// or else the first token.
+/// Refuses to end the last way in: another administrator with a password, or the first token, has
+/// to be left. `except` goes, or else the first token.
 async fn check_not_last(write: &mut Write, except: Option<&UserName>) -> Result<(), ActionError> {
     if except.is_some() && write.has_first_token().await? {
         return Ok(());
     }
-    let is_other = |user: &User| user.is_administrator() && user.password.is_some() && Some(&user.name) != except;
+    let is_other = |user: &User| {
+        user.is_administrator() && user.password.is_some() && Some(&user.name) != except
+    };
     match write.users().await?.iter().any(is_other) {
         true => Ok(()),
         false => Err(ActionError::LastAdministrator(except.cloned().unwrap_or_else(first_name))),

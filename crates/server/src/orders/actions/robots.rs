@@ -4,7 +4,8 @@ use std::net::IpAddr;
 use std::time::Instant;
 
 use task_proto::api::{
-    CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList, MatchedRobot,
+    CreateEnrollmentToken, EditRobot, EnrollRequest, EnrollmentToken, EnrollmentTokenList,
+    MatchedRobot,
 };
 use task_proto::envelope::Envelope;
 use task_proto::id::Labels;
@@ -40,10 +41,10 @@ pub struct Enrolled {
 }
 
 impl Actions {
-    /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC may register again with
-    /// a token made for it, and by the same token as before while the answer to that may have been lost: nobody has used
-    /// what was in it. It keeps its id, name and labels; its old token ends when the new one is first used. `address` is
-    /// where it asks from.
+    /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC
+    /// may register again with a token made for it, and by the same token as before while the
+    /// answer to that may have been lost: nobody has used what was in it. It keeps its id, name and
+    /// labels; its old token ends when the new one is first used. `address` is where it asks from.
     pub async fn enroll(
         &self,
         token: &Token,
@@ -52,7 +53,11 @@ impl Actions {
     ) -> Result<Enrolled, ActionError> {
         check_labels(&request.labels)?;
         let (now_ms, now) = (self.clock.now_ms(), Instant::now());
-        let in_time = self.enrolments.by_token.take(&token.id(), now).and_then(|()| self.enrolments.all.take("", now));
+        let in_time = self
+            .enrolments
+            .by_token
+            .take(&token.id(), now)
+            .and_then(|()| self.enrolments.all.take("", now));
         in_time.map_err(|wait| ActionError::TooManyEnrolments { seconds: seconds(wait) })?;
         let mut write = self.store.begin().await?;
         let terms = write.enrolment_terms(token, now_ms).await?.ok_or(ActionError::TokenRefused)?;
@@ -89,17 +94,29 @@ impl Actions {
         let robot_token = Token::random(TokenKind::Robot);
         let key = request.client_key.as_ref();
         write.offer_robot_token(&robot_token, &robot.id, Some(token), key, now_ms).await?;
-        let deed = Deed::new("enrolment".to_owned(), token.id().parse().ok(), address, Act::RobotEnroll, &robot.id);
+        let deed = Deed::new(
+            "enrolment".to_owned(),
+            token.id().parse().ok(),
+            address,
+            Act::RobotEnroll,
+            &robot.id,
+        );
         let deed = deed.with("name", &robot.name).with("mac", robot.mac);
-        write.audit(&deed.with_some("awaits_approval", awaits_approval.then_some(true)), now_ms).await?;
+        write
+            .audit(&deed.with_some("awaits_approval", awaits_approval.then_some(true)), now_ms)
+            .await?;
         write.commit().await?;
         self.changes.announce(Change::Robot(robot.id.clone()));
         Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token, awaits_approval })
     }
 
-    /// Makes a token that `robot` may go over to. The one it uses, which is that of `token_number`, ends when that one is first
-    /// used.
-    pub async fn next_robot_token(&self, robot: &RobotId, token_number: u64) -> Result<Token, ActionError> {
+    /// Makes a token that `robot` may go over to. The one it uses, which is that of `token_number`,
+    /// ends when that one is first used.
+    pub async fn next_robot_token(
+        &self,
+        robot: &RobotId,
+        token_number: u64,
+    ) -> Result<Token, ActionError> {
         let mut write = self.store.begin().await?;
         known_robot(&mut write, robot.as_str()).await?;
         write.check_token(robot, token_number).await?;
@@ -121,13 +138,18 @@ impl Actions {
     ) -> Result<EnrollmentToken, ActionError> {
         check_labels(&order.labels)?;
         if order.uses == Some(0) {
-            return Err(ActionError::Invalid { key: "uses", reason: "a token needs at least one use".to_owned() });
+            return Err(ActionError::Invalid {
+                key: "uses",
+                reason: "a token needs at least one use".to_owned(),
+            });
         }
         if order.unlimited && order.uses.is_some() {
-            let reason = "a token for any number of enrolments (unlimited) has no number of uses".to_owned();
+            let reason =
+                "a token for any number of enrolments (unlimited) has no number of uses".to_owned();
             return Err(ActionError::Invalid { key: "uses", reason });
         }
-        let uses_left = (!order.unlimited).then_some(order.uses.unwrap_or(self.settings.enrolment_token_uses));
+        let uses_left =
+            (!order.unlimited).then_some(order.uses.unwrap_or(self.settings.enrolment_token_uses));
         let now_ms = self.clock.now_ms();
         let lifetime_ms = match order.ttl_s {
             Some(ttl_s) => lifetime_ms("ttl_s", ttl_s)?,
@@ -160,7 +182,11 @@ impl Actions {
     }
 
     /// Ends an enrolment token now. Robots that came by it stay.
-    pub async fn revoke_enrollment_token(&self, by: &Person, id: &TokenId) -> Result<(), ActionError> {
+    pub async fn revoke_enrollment_token(
+        &self,
+        by: &Person,
+        id: &TokenId,
+    ) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         if !write.revoke_enrolment_token(id, now_ms).await? {
@@ -170,8 +196,14 @@ impl Actions {
         Ok(write.commit().await?)
     }
 
-    /// Changes a robot's name, labels or settings. Before and after it has to be one of the person's.
-    pub async fn edit_robot(&self, by: &Person, robot: &RobotId, edit: &EditRobot) -> Result<(), ActionError> {
+    /// Changes a robot's name, labels or settings. Before and after it has to be one of the
+    /// person's.
+    pub async fn edit_robot(
+        &self,
+        by: &Person,
+        robot: &RobotId,
+        edit: &EditRobot,
+    ) -> Result<(), ActionError> {
         let mut write = self.store.begin().await?;
         let mut known = known_robot(&mut write, robot.as_str()).await?;
         check_scope(by, std::slice::from_ref(&known), || known.name.to_string())?;
@@ -184,17 +216,24 @@ impl Actions {
             check_name(&mut write, name).await?;
             known.name = name.clone();
         }
-        check_scope(by, std::slice::from_ref(&known), || format!("{} with the new name and labels", known.name))?;
+        check_scope(by, std::slice::from_ref(&known), || {
+            format!("{} with the new name and labels", known.name)
+        })?;
         write.update_robot(&known).await?;
         let now_ms = self.clock.now_ms();
         let is_set = match &edit.settings {
-            Some(settings) => set(&mut write, &known.id, settings.clone().unwrap_or_default(), now_ms).await?,
+            Some(settings) => {
+                set(&mut write, &known.id, settings.clone().unwrap_or_default(), now_ms).await?
+            }
             None => false,
         };
         let renamed = edit.name.as_ref().map(|_| &known.name);
         let labels = edit.labels.as_ref().map(shown_labels);
         let settings = edit.settings.as_ref().map(|settings| shown_settings(settings.as_ref()));
-        let deed = deed.with_some("new_name", renamed).with_some("labels", labels).with_some("settings", settings);
+        let deed = deed
+            .with_some("new_name", renamed)
+            .with_some("labels", labels)
+            .with_some("settings", settings);
         write.audit(&deed, now_ms).await?;
         write.commit().await?;
         if is_set {
@@ -223,8 +262,9 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends all tokens of a robot and those made for it, now; its name, its history and what is ordered of it stay. There is no
-    /// way back by the same tokens, for who has them is in doubt: it has to be registered anew. Doing it twice is harmless.
+    /// Ends all tokens of a robot and those made for it, now; its name, its history and what is
+    /// ordered of it stay. There is no way back by the same tokens, for who has them is in doubt:
+    /// it has to be registered anew. Doing it twice is harmless.
     pub async fn revoke_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -233,7 +273,8 @@ impl Actions {
         if !write.revoke_robot(robot, now_ms).await? {
             return Ok(());
         }
-        let deed = Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
+        let deed =
+            Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
         write.audit(&deed, now_ms).await?;
         // No batch waits for it any more.
         let touched = write.begun_on(robot).await?;
@@ -245,20 +286,29 @@ impl Actions {
         Ok(())
     }
 
-    /// Writes down that a robot is about to be asked to change something, which it then may or may not do, and signs that for
-    /// the robot.
+    /// Writes down that a robot is about to be asked to change something, which it then may or may
+    /// not do, and signs that for the robot.
     pub async fn sign_action(&self, by: &Person, action: &Action) -> Result<Envelope, ActionError> {
         let mut write = self.store.begin_keeping_rights().await?;
         let ask = serde_json::to_string(&action.ask).expect("a question always has a JSON form");
-        write.audit(&Deed::by(by, Act::RobotAsk, &action.robot_id).with("ask", ask), self.clock.now_ms()).await?;
+        write
+            .audit(
+                &Deed::by(by, Act::RobotAsk, &action.robot_id).with("ask", ask),
+                self.clock.now_ms(),
+            )
+            .await?;
         write.commit().await?;
         let payload = serde_json::to_vec(action).expect("an action always has a JSON form");
         Ok(Envelope::seal(ACTION_TYPE, &payload, &self.key))
     }
 
-    /// The robots an order with this selector would mean now, sorted by name; an error if nobody, or if one of them is not
-    /// the person's. `online` is left false.
-    pub async fn matching_robots(&self, by: &Person, selector: &Selector) -> Result<Vec<MatchedRobot>, ActionError> {
+    /// The robots an order with this selector would mean now, sorted by name; an error if nobody,
+    /// or if one of them is not the person's. `online` is left false.
+    pub async fn matching_robots(
+        &self,
+        by: &Person,
+        selector: &Selector,
+    ) -> Result<Vec<MatchedRobot>, ActionError> {
         let robots = all_known(self.store.matching_robots(selector, &by.scope).await?)?;
         if robots.is_empty() {
             return Err(ActionError::NoRobotsMatch(quoted(selector)));
@@ -319,7 +369,11 @@ async fn register(
     Ok(robot)
 }
 
-async fn default_name(write: &mut Write, mac: &MacAddress, id: &RobotId) -> Result<RobotName, StoreError> {
+async fn default_name(
+    write: &mut Write,
+    mac: &MacAddress,
+    id: &RobotId,
+) -> Result<RobotName, StoreError> {
     let name = |text: String| text.parse::<RobotName>().expect("made of letters and digits");
     let by_mac = name(format!("robot-{}", mac.to_string().replace(':', "")));
     let is_free = write.known_robot(by_mac.as_str()).await?.is_none();
@@ -342,12 +396,19 @@ pub(super) fn check_labels(labels: &Labels) -> Result<(), ActionError> {
     if labels.len() <= MAX_LABELS {
         return Ok(());
     }
-    Err(ActionError::Invalid { key: "labels", reason: format!("at most {MAX_LABELS}, not {}", labels.len()) })
+    Err(ActionError::Invalid {
+        key: "labels",
+        reason: format!("at most {MAX_LABELS}, not {}", labels.len()),
+    })
 }
 
 /// The robot with this id or name, or the error that there is none.
-pub(super) async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<KnownRobot, ActionError> {
-    // An id has the form of a name. What has not is no matter for the database, which might not even take the text.
+pub(super) async fn known_robot(
+    write: &mut Write,
+    id_or_name: &str,
+) -> Result<KnownRobot, ActionError> {
+    // An id has the form of a name. What has not is no matter for the database, which might not
+    // even take the text.
     let robot = match id_or_name.parse::<RobotName>() {
         Ok(name) => write.known_robot(name.as_str()).await?,
         Err(_) => None,
@@ -356,8 +417,15 @@ pub(super) async fn known_robot(write: &mut Write, id_or_name: &str) -> Result<K
 }
 
 /// Sets a robot's settings; whether they are others than before.
-async fn set(write: &mut Write, robot: &RobotId, settings: RobotSettings, now_ms: u64) -> Result<bool, ActionError> {
-    settings.check().map_err(|error| ActionError::Invalid { key: "settings", reason: error.to_string() })?;
+async fn set(
+    write: &mut Write,
+    robot: &RobotId,
+    settings: RobotSettings,
+    now_ms: u64,
+) -> Result<bool, ActionError> {
+    settings
+        .check()
+        .map_err(|error| ActionError::Invalid { key: "settings", reason: error.to_string() })?;
     write.adopt_diverged(std::slice::from_ref(robot), now_ms).await?;
     Ok(write.update_settings(robot, &settings).await?)
 }
@@ -370,7 +438,11 @@ fn shown_settings(settings: Option<&RobotSettings>) -> String {
 
 /// An error if so many wait that no other may.
 async fn check_room(write: &mut Write) -> Result<(), ActionError> {
-    if write.count_pending().await? < MOST_PENDING { Ok(()) } else { Err(ActionError::TooManyPending(MOST_PENDING)) }
+    if write.count_pending().await? < MOST_PENDING {
+        Ok(())
+    } else {
+        Err(ActionError::TooManyPending(MOST_PENDING))
+    }
 }
 
 /// What is written down of a robot's removal: it is all that is left of it.

@@ -1,5 +1,5 @@
-//! Signing in: with a password, or by what a provider says. Whoever has signed in has a token of their own that ends by
-//! itself. How often it may fail is counted before anything is looked at.
+//! Signing in: with a password, or by what a provider says. Whoever has signed in has a token of
+//! their own that ends by itself. How often it may fail is counted before anything is looked at.
 
 use std::net::IpAddr;
 
@@ -36,13 +36,19 @@ pub struct SignedIn {
 pub struct ProviderUser {
     /// Who they are there, behind the issuer.
     pub subject: String,
-    /// What they are called if they are new here; `None`: the provider has no name for them that is one here.
+    /// What they are called if they are new here; `None`: the provider has no name for them that is
+    /// one here.
     pub name: Option<UserName>,
 }
 
 impl Actions {
     /// Signs in with a password.
-    pub async fn sign_in(&self, order: &LogIn, origin: TokenOrigin, address: IpAddr) -> Result<SignedIn, ActionError> {
+    pub async fn sign_in(
+        &self,
+        order: &LogIn,
+        origin: TokenOrigin,
+        address: IpAddr,
+    ) -> Result<SignedIn, ActionError> {
         let lifetime_ms = match (origin, order.ttl_s) {
             (TokenOrigin::Page, _) => PAGE_LIFETIME_MS,
             (_, Some(seconds)) => lifetime_ms("ttl_s", seconds)?.min(LOGIN_LIFETIME_MS),
@@ -56,13 +62,15 @@ impl Actions {
             return Err(ActionError::SignInRefused);
         }
         let how = if origin == TokenOrigin::Page { "page" } else { "login" };
-        let signed_in = begin_session(&mut write, &order.user, origin, how, address, lifetime_ms, now_ms).await?;
+        let signed_in =
+            begin_session(&mut write, &order.user, origin, how, address, lifetime_ms, now_ms)
+                .await?;
         write.commit().await?;
         Ok(signed_in)
     }
 
-    /// Signs in somebody of whom a provider says who they are. Their user is the one that the provider's name for them had
-    /// the last time; what that may is what `rule` says now.
+    /// Signs in somebody of whom a provider says who they are. Their user is the one that the
+    /// provider's name for them had the last time; what that may is what `rule` says now.
     pub async fn sign_in_by_provider(
         &self,
         who: &ProviderUser,
@@ -72,12 +80,14 @@ impl Actions {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
         let before = write.user_by_subject(&who.subject).await?;
-        let deed = |act, name: &UserName| Deed::new("server".to_owned(), None, Some(address), act, name);
+        let deed =
+            |act, name: &UserName| Deed::new("server".to_owned(), None, Some(address), act, name);
         let Some(rule) = rule else {
             // What they were signed in to ends, too.
             if let Some(user) = &before {
                 write.remove_user(&user.name).await?;
-                let deed = deed(Act::UserRemove, &user.name).with("why", "no rule gives them a role any more");
+                let deed = deed(Act::UserRemove, &user.name)
+                    .with("why", "no rule gives them a role any more");
                 write.audit(&deed, now_ms).await?;
                 write.commit().await?;
                 self.changes.announce_rights();
@@ -90,16 +100,30 @@ impl Actions {
             None => {
                 let name = who.name.clone().ok_or(ActionError::NoName)?;
                 check_new(&mut write, &name).await?;
-                User { name, roles, scope, password: None, subject: Some(who.subject.clone()), created_at_ms: now_ms }
+                User {
+                    name,
+                    roles,
+                    scope,
+                    password: None,
+                    subject: Some(who.subject.clone()),
+                    created_at_ms: now_ms,
+                }
             }
         };
         if before.as_ref() != Some(&user) {
             write.put_user(&user).await?;
             let act = if before.is_some() { Act::UserEdit } else { Act::UserAdd };
-            write.audit(&deed(act, &user.name).described(&user).with("subject", &who.subject), now_ms).await?;
+            write
+                .audit(
+                    &deed(act, &user.name).described(&user).with("subject", &who.subject),
+                    now_ms,
+                )
+                .await?;
         }
         let (origin, lifetime_ms) = (TokenOrigin::Page, PAGE_LIFETIME_MS);
-        let signed_in = begin_session(&mut write, &user.name, origin, "provider", address, lifetime_ms, now_ms).await?;
+        let signed_in =
+            begin_session(&mut write, &user.name, origin, "provider", address, lifetime_ms, now_ms)
+                .await?;
         write.commit().await?;
         let has_other_rights = before.is_some_and(|before| before != user);
         if has_other_rights {
@@ -108,7 +132,8 @@ impl Actions {
         Ok(SignedIn { has_other_rights, ..signed_in })
     }
 
-    /// Counts an attempt to sign in by the provider as failed until [`Self::provider_sign_in_succeeded`].
+    /// Counts an attempt to sign in by the provider as failed until
+    /// [`Self::provider_sign_in_succeeded`].
     pub async fn begin_provider_sign_in(&self, address: IpAddr) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let Err(blocked) = self.sign_ins.begin_unnamed(address, now_ms) else { return Ok(()) };
@@ -154,12 +179,19 @@ impl Actions {
     }
 
     /// Never succeeds; the first time it is written down.
-    async fn blocked(&self, whose: &str, address: IpAddr, blocked: Blocked, now_ms: u64) -> Result<(), ActionError> {
+    async fn blocked(
+        &self,
+        whose: &str,
+        address: IpAddr,
+        blocked: Blocked,
+        now_ms: u64,
+    ) -> Result<(), ActionError> {
         let Blocked { until_ms, is_news } = blocked;
         if is_news {
             let mut write = self.store.begin_keeping_rights().await?;
             // Nobody knows who it is, so nobody is named as the one who did it.
-            let deed = Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
+            let deed =
+                Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
             write.audit(&deed.with("until_ms", until_ms), now_ms).await?;
             write.commit().await?;
         }
@@ -191,7 +223,8 @@ async fn begin_session(
     let (roles, scope) = (None, None);
     let new = NewToken { token: &token, user, origin, title: &title, roles, scope, expires_at_ms };
     write.create_token(&new, now_ms).await?;
-    let deed = Deed::new(user.to_string(), token.id().parse().ok(), Some(address), Act::SignIn, user);
+    let deed =
+        Deed::new(user.to_string(), token.id().parse().ok(), Some(address), Act::SignIn, user);
     write.audit(&deed.with("how", how).with("expires_at_ms", expires_at_ms), now_ms).await?;
     Ok(SignedIn { user: user.clone(), token, expires_at_ms, has_other_rights: false })
 }

@@ -17,7 +17,8 @@ const MOST_ALONE: usize = 5;
 /// Robots that come or go are told of once nobody has for so many turns, or after so many.
 const QUIET_TURNS: u32 = 3;
 const MOST_TURNS: u32 = 60;
-/// Failed tasks and unsettled deployments remembered; beyond it all are forgotten, and their ends are not told.
+/// Failed tasks and unsettled deployments remembered; beyond it all are forgotten, and their ends
+/// are not told.
 const MOST_REMEMBERED: usize = 10_000;
 /// A deployment that is older when it is first seen is not new.
 const NEW_MS: u64 = 60_000;
@@ -96,19 +97,26 @@ impl Pending {
         self.states.insert(view.id.clone(), view.state);
         let is_new = before.is_none() && now_ms.saturating_sub(view.created_at_ms) < NEW_MS;
         let robots: u64 = view.counts.iter().map(|counted| counted.count).sum();
-        let counts: Vec<_> =
-            view.counts.iter().map(|counted| format!("{} {}", counted.count, counted.phase.as_str())).collect();
+        let counts: Vec<_> = view
+            .counts
+            .iter()
+            .map(|counted| format!("{} {}", counted.count, counted.phase.as_str()))
+            .collect();
         let counts = counts.join(", ");
         let (kind, level, what) = match view.state {
-            DeploymentState::Active if is_new => {
-                (FeedKind::DeploymentBegun, LogLevel::Info, format!("was ordered on {}", counted(robots)))
-            }
+            DeploymentState::Active if is_new => (
+                FeedKind::DeploymentBegun,
+                LogLevel::Info,
+                format!("was ordered on {}", counted(robots)),
+            ),
             DeploymentState::Active if before == Some(DeploymentState::Paused) => {
                 (FeedKind::DeploymentBegun, LogLevel::Info, "goes on".to_owned())
             }
-            DeploymentState::Paused if before != Some(DeploymentState::Paused) => {
-                (FeedKind::DeploymentPaused, LogLevel::Warn, format!("is paused: too many robots failed ({counts})"))
-            }
+            DeploymentState::Paused if before != Some(DeploymentState::Paused) => (
+                FeedKind::DeploymentPaused,
+                LogLevel::Warn,
+                format!("is paused: too many robots failed ({counts})"),
+            ),
             DeploymentState::Settled if before.is_some() || is_new => {
                 (FeedKind::DeploymentSettled, LogLevel::Info, format!("has settled: {counts}"))
             }
@@ -137,7 +145,8 @@ impl Pending {
             if self.failed.len() >= MOST_REMEMBERED {
                 self.failed.clear();
             }
-            let is_news = if is_failure { self.failed.insert(part) } else { self.failed.remove(&part) };
+            let is_news =
+                if is_failure { self.failed.insert(part) } else { self.failed.remove(&part) };
             if is_news {
                 groups.entry((news.deployment.clone(), is_failure)).or_default().push(news);
             }
@@ -157,8 +166,17 @@ impl Pending {
                 continue;
             }
             for news in group {
-                let why = news.failure.as_ref().filter(|_| is_failure).map(|failure| format!(": {failure}"));
-                let text = format!("{package} {} on {}{}", news.phase.as_str(), news.name, why.unwrap_or_default());
+                let why = news
+                    .failure
+                    .as_ref()
+                    .filter(|_| is_failure)
+                    .map(|failure| format!(": {failure}"));
+                let text = format!(
+                    "{package} {} on {}{}",
+                    news.phase.as_str(),
+                    news.name,
+                    why.unwrap_or_default()
+                );
                 if let Some(robot) = read(store.find_robot(news.robot.as_str()).await) {
                     let about = about_robot(robot, kind, level, text);
                     said.push(Said { deployment: Some(news.deployment.clone()), ..about });
@@ -193,7 +211,11 @@ fn about_removed(robots: Vec<KnownRobot>) -> Vec<Said> {
     robots.into_iter().map(about).collect()
 }
 
-async fn about_robots(kind: FeedKind, news: HashMap<RobotId, Vec<String>>, store: &Store) -> Vec<Said> {
+async fn about_robots(
+    kind: FeedKind,
+    news: HashMap<RobotId, Vec<String>>,
+    store: &Store,
+) -> Vec<Said> {
     let (level, what) = match kind {
         FeedKind::RobotEnrolled => (LogLevel::Info, "registered"),
         FeedKind::RobotRevoked => (LogLevel::Warn, "were put out"),
@@ -222,7 +244,10 @@ async fn about_presence(presence: HashMap<RobotId, (bool, bool)>, store: &Store)
         (true, FeedKind::RobotOnline, LogLevel::Info, "came online"),
         (false, FeedKind::RobotOffline, LogLevel::Warn, "went offline"),
     ] {
-        let moved = presence.iter().filter(|(_, heard)| **heard == (is_online, is_online)).map(|(robot, _)| robot);
+        let moved = presence
+            .iter()
+            .filter(|(_, heard)| **heard == (is_online, is_online))
+            .map(|(robot, _)| robot);
         let moved: Vec<&RobotId> = moved.collect();
         if moved.len() > MOST_ALONE {
             said.push(about_many(kind, level, format!("{} robots {what}", moved.len())));

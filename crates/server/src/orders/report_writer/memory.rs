@@ -1,6 +1,7 @@
-//! What the writer remembers of the database from one batch to the next, so that robots that keep reporting are not read
-//! again each time. Every write takes the next turn: as long as this writer had the last one too, nobody else, in this
-//! process or another, has changed anything. Otherwise all is forgotten. It never decides anything.
+//! What the writer remembers of the database from one batch to the next, so that robots that keep
+//! reporting are not read again each time. Every write takes the next turn: as long as this writer
+//! had the last one too, nobody else, in this process or another, has changed anything. Otherwise
+//! all is forgotten. It never decides anything.
 
 use std::collections::{HashMap, HashSet};
 
@@ -22,7 +23,8 @@ pub(super) struct Memory {
     robots: HashMap<RobotId, Remembered>,
     /// Deployments without a robot whose batch has not begun: nothing moves them on.
     begun: HashSet<DeploymentId>,
-    /// The codes of what is wrong with robots. No write of others changes them, so they are not forgotten.
+    /// The codes of what is wrong with robots. No write of others changes them, so they are not
+    /// forgotten.
     conditions: HashMap<RobotId, Vec<FailureCode>>,
 }
 
@@ -35,7 +37,8 @@ pub(super) struct Remembered {
 }
 
 impl Memory {
-    /// Makes sure that all is known of those of `robots` that are registered, as it stands in `write`.
+    /// Makes sure that all is known of those of `robots` that are registered, as it stands in
+    /// `write`.
     pub(super) async fn learn(
         &mut self,
         write: &mut Write,
@@ -47,7 +50,8 @@ impl Memory {
         if self.robots.len() > MAX_ROBOTS {
             self.robots.clear();
         }
-        let unknown: Vec<RobotId> = robots.filter(|robot| !self.robots.contains_key(*robot)).cloned().collect();
+        let unknown: Vec<RobotId> =
+            robots.filter(|robot| !self.robots.contains_key(*robot)).cloned().collect();
         for robot in write.reported_robots(&unknown).await? {
             let remembered = Remembered { robot, open: Vec::new(), fingerprint: None };
             self.robots.insert(remembered.robot.id.clone(), remembered);
@@ -79,15 +83,21 @@ impl Memory {
     }
 
     /// Takes in what a robot says is wrong with it. Gives what it did not say before.
-    pub(super) fn new_conditions<'a>(&mut self, robot: &RobotId, conditions: &'a [Condition]) -> Vec<&'a Condition> {
+    pub(super) fn new_conditions<'a>(
+        &mut self,
+        robot: &RobotId,
+        conditions: &'a [Condition],
+    ) -> Vec<&'a Condition> {
         let before = self.conditions.remove(robot).unwrap_or_default();
         if self.conditions.len() >= MAX_ROBOTS {
             self.conditions.clear();
         }
         let conditions = &conditions[..conditions.len().min(MAX_CONDITIONS)];
-        let codes: Vec<_> = conditions.iter().map(|condition| FailureCode::from(condition.code.clone())).collect();
+        let codes: Vec<_> =
+            conditions.iter().map(|condition| FailureCode::from(condition.code.clone())).collect();
         let is_new = |(_, code): &(&Condition, &FailureCode)| !before.contains(code);
-        let new = conditions.iter().zip(&codes).filter(is_new).map(|(condition, _)| condition).collect();
+        let new =
+            conditions.iter().zip(&codes).filter(is_new).map(|(condition, _)| condition).collect();
         if !codes.is_empty() {
             self.conditions.insert(robot.clone(), codes);
         }

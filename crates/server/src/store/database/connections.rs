@@ -1,6 +1,6 @@
-//! Connections to the database, and how long one may be silent. One whose other end was lost, or that stalls on its way, would
-//! keep whoever waits for it, and with the writer everybody, for as long as the kernel hopes; here it is given up, and whoever
-//! comes next gets another.
+//! Connections to the database, and how long one may be silent. One whose other end was lost, or
+//! that stalls on its way, would keep whoever waits for it, and with the writer everybody, for as
+//! long as the kernel hopes; here it is given up, and whoever comes next gets another.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -10,7 +10,9 @@ use futures_util::future::BoxFuture;
 use futures_util::stream::{self, BoxStream};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use sqlx::any::{Any, AnyQueryResult, AnyRow, AnyStatement, AnyTypeInfo};
-use sqlx::{AnyConnection, AssertSqlSafe, Connection as _, Either, Error, Execute, Executor, SqlStr};
+use sqlx::{
+    AnyConnection, AssertSqlSafe, Connection as _, Either, Error, Execute, Executor, SqlStr,
+};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::timeout;
 
@@ -44,8 +46,8 @@ tokio::task_local! {
     static SHARES_READS: ();
 }
 
-/// Runs what is not urgent: of each set of connections it gets only a part, so that the rest is free for what is. Tasks that it
-/// spawns are urgent again.
+/// Runs what is not urgent: of each set of connections it gets only a part, so that the rest is
+/// free for what is. Tasks that it spawns are urgent again.
 pub async fn with_shared_reads<F: Future>(future: F) -> F::Output {
     SHARES_READS.scope((), future).await
 }
@@ -59,8 +61,8 @@ pub(in crate::store) struct Connections {
     idle: Arc<Mutex<Vec<AnyConnection>>>,
 }
 
-/// A connection while it is lent. What it was in the middle of when it is dropped is not done: a transaction is rolled back
-/// before anybody else gets the connection.
+/// A connection while it is lent. What it was in the middle of when it is dropped is not done: a
+/// transaction is rolled back before anybody else gets the connection.
 pub(in crate::store) struct Lent {
     /// `None` once it was given back.
     held: Option<Held>,
@@ -96,18 +98,29 @@ impl Connections {
     pub(in crate::store) async fn lend(&self) -> Result<Lent, Error> {
         let Terms { greeting, wait, connect, ref state, .. } = *self.terms;
         if !state.is_open() {
-            return Err(Error::Io(io::Error::new(io::ErrorKind::NotConnected, "the database is not open yet")));
+            return Err(Error::Io(io::Error::new(
+                io::ErrorKind::NotConnected,
+                "the database is not open yet",
+            )));
         }
         let shared = match SHARES_READS.try_with(|()| ()) {
-            Ok(()) => Some(timeout(wait, self.shared.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?),
+            Ok(()) => Some(
+                timeout(wait, self.shared.clone().acquire_owned())
+                    .await
+                    .map_err(|_| Error::PoolTimedOut)?,
+            ),
             Err(_) => None,
         };
         let shared = shared.transpose().map_err(|_| Error::PoolClosed)?;
-        let place = timeout(wait, self.places.clone().acquire_owned()).await.map_err(|_| Error::PoolTimedOut)?;
+        let place = timeout(wait, self.places.clone().acquire_owned())
+            .await
+            .map_err(|_| Error::PoolTimedOut)?;
         let place = place.map_err(|_| Error::PoolClosed)?;
         let connection = loop {
             let Some(mut known) = lock(&self.idle).pop() else {
-                break bounded(connect, self.connect()).await.inspect_err(|error| state.note(error))?;
+                break bounded(connect, self.connect())
+                    .await
+                    .inspect_err(|error| state.note(error))?;
             };
             match bounded(greeting, known.ping()).await {
                 Ok(()) => break known,
@@ -115,7 +128,13 @@ impl Connections {
             }
         };
         state.answers();
-        let held = Held { connection, is_sound: true, idle: self.idle.clone(), _place: place, _shared: shared };
+        let held = Held {
+            connection,
+            is_sound: true,
+            idle: self.idle.clone(),
+            _place: place,
+            _shared: shared,
+        };
         Ok(Lent { held: Some(held), terms: self.terms.clone(), in_transaction: false })
     }
 
@@ -143,7 +162,11 @@ impl Lent {
     /// Where the next statement runs.
     pub(in crate::store) fn connection(&mut self) -> Statement<'_> {
         let held = self.held.as_mut().expect("it is given back when it is dropped");
-        Statement { connection: &mut held.connection, is_sound: &mut held.is_sound, terms: &self.terms }
+        Statement {
+            connection: &mut held.connection,
+            is_sound: &mut held.is_sound,
+            terms: &self.terms,
+        }
     }
 
     pub(in crate::store) async fn begin(&mut self) -> Result<(), Error> {
@@ -167,7 +190,11 @@ impl Drop for Lent {
         }
         let answer = self.terms.answer;
         tokio::spawn(async move {
-            if held.is_sound && bounded(answer, sqlx::raw_sql("ROLLBACK").execute(&mut held.connection)).await.is_ok() {
+            if held.is_sound
+                && bounded(answer, sqlx::raw_sql("ROLLBACK").execute(&mut held.connection))
+                    .await
+                    .is_ok()
+            {
                 held.give_back();
             }
         });
@@ -202,7 +229,10 @@ impl Statement<'_> {
 impl<'c> Executor<'c> for Statement<'c> {
     type Database = Any;
 
-    fn fetch_many<'e, 'q: 'e, E>(self, query: E) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
+    fn fetch_many<'e, 'q: 'e, E>(
+        self,
+        query: E,
+    ) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
     where
         'c: 'e,
         E: 'q + Execute<'q, Any>,
@@ -233,7 +263,11 @@ impl<'c> Executor<'c> for Statement<'c> {
         })
     }
 
-    fn prepare_with<'e>(self, sql: SqlStr, parameters: &'e [AnyTypeInfo]) -> BoxFuture<'e, Result<AnyStatement, Error>>
+    fn prepare_with<'e>(
+        self,
+        sql: SqlStr,
+        parameters: &'e [AnyTypeInfo],
+    ) -> BoxFuture<'e, Result<AnyStatement, Error>>
     where
         'c: 'e,
     {
@@ -241,16 +275,22 @@ impl<'c> Executor<'c> for Statement<'c> {
     }
 }
 
-/// Statements that each run on whichever connection is free, which is lent until all their rows are there.
+/// Statements that each run on whichever connection is free, which is lent until all their rows are
+/// there.
 impl<'c> Executor<'c> for &'c Connections {
     type Database = Any;
 
-    fn fetch_many<'e, 'q: 'e, E>(self, query: E) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
+    fn fetch_many<'e, 'q: 'e, E>(
+        self,
+        query: E,
+    ) -> BoxStream<'e, Result<Either<AnyQueryResult, AnyRow>, Error>>
     where
         'c: 'e,
         E: 'q + Execute<'q, Any>,
     {
-        let rows = async move { self.lend().await?.connection().fetch_many(query).try_collect::<Vec<_>>().await };
+        let rows = async move {
+            self.lend().await?.connection().fetch_many(query).try_collect::<Vec<_>>().await
+        };
         stream::once(rows).map_ok(|rows| stream::iter(rows).map(Ok)).try_flatten().boxed()
     }
 
@@ -262,7 +302,11 @@ impl<'c> Executor<'c> for &'c Connections {
         Box::pin(async move { self.lend().await?.connection().fetch_optional(query).await })
     }
 
-    fn prepare_with<'e>(self, sql: SqlStr, parameters: &'e [AnyTypeInfo]) -> BoxFuture<'e, Result<AnyStatement, Error>>
+    fn prepare_with<'e>(
+        self,
+        sql: SqlStr,
+        parameters: &'e [AnyTypeInfo],
+    ) -> BoxFuture<'e, Result<AnyStatement, Error>>
     where
         'c: 'e,
     {
@@ -280,7 +324,8 @@ pub(in crate::store) async fn bounded<T>(
     time: Duration,
     answer: impl Future<Output = Result<T, Error>>,
 ) -> Result<T, Error> {
-    let silent = |_| Error::Io(io::Error::new(io::ErrorKind::TimedOut, "the database does not answer"));
+    let silent =
+        |_| Error::Io(io::Error::new(io::ErrorKind::TimedOut, "the database does not answer"));
     timeout(time, answer).await.map_err(silent)?
 }
 
@@ -298,7 +343,8 @@ mod tests {
 
     use super::*;
 
-    /// Something between us and a real Postgres. What is told to stall passes nothing on any more, and ends nothing either.
+    /// Something between us and a real Postgres. What is told to stall passes nothing on any more,
+    /// and ends nothing either.
     struct Between {
         url: String,
         stalled: watch::Sender<()>,
@@ -306,9 +352,11 @@ mod tests {
 
     impl Between {
         async fn start() -> Self {
-            let server = std::env::var("TASKD_TEST_POSTGRES").expect("run the tests with ./scripts/test");
+            let server =
+                std::env::var("TASKD_TEST_POSTGRES").expect("run the tests with ./scripts/test");
             let (scheme, host) = server.rsplit_once('@').expect("postgres://user@host:port");
-            let (host, listener) = (host.to_owned(), TcpListener::bind("127.0.0.1:0").await.expect("a port"));
+            let (host, listener) =
+                (host.to_owned(), TcpListener::bind("127.0.0.1:0").await.expect("a port"));
             let url = format!("{scheme}@{}/postgres", listener.local_addr().expect("bound"));
             let (stalled, known) = watch::channel(());
             tokio::spawn(async move {
@@ -316,7 +364,8 @@ mod tests {
                     let (mut stalled, host) = (known.clone(), host.clone());
                     stalled.mark_unchanged();
                     tokio::spawn(async move {
-                        let mut far = TcpStream::connect(host).await.expect("the test server answers");
+                        let mut far =
+                            TcpStream::connect(host).await.expect("the test server answers");
                         tokio::select! {
                             _ = copy_bidirectional(&mut near, &mut far) => return,
                             _ = stalled.changed() => {}
@@ -331,13 +380,25 @@ mod tests {
 
         async fn one_connection(&self) -> Connections {
             sqlx::any::install_default_drivers();
-            let (few, session) = (Duration::from_secs(2), "SET idle_in_transaction_session_timeout = '60s'".to_owned());
+            let (few, session) = (
+                Duration::from_secs(2),
+                "SET idle_in_transaction_session_timeout = '60s'".to_owned(),
+            );
             let wait = Duration::from_secs(60);
             let (url, connect, state) = (self.url.clone(), wait, DatabaseState::unknown());
             state.opened();
             let (count, shared, answer, greeting) = (1, 1, few, few);
-            let connections =
-                Connections::new(Terms { url, session, count, shared, answer, greeting, connect, wait, state });
+            let connections = Connections::new(Terms {
+                url,
+                session,
+                count,
+                shared,
+                answer,
+                greeting,
+                connect,
+                wait,
+                state,
+            });
             connections.lend().await.expect("opens");
             connections
         }
@@ -361,7 +422,10 @@ mod tests {
         lent.begin().await.expect("begun");
         between.stall();
         let silent = sqlx::query("SELECT 1").execute(lent.connection()).await.expect_err("silent");
-        assert_eq!(silent.to_string(), "error communicating with database: the database does not answer");
+        assert_eq!(
+            silent.to_string(),
+            "error communicating with database: the database does not answer"
+        );
         drop(lent);
         assert_eq!(answers(&connections).await.expect("another answers"), 1);
 
@@ -381,17 +445,20 @@ mod tests {
     async fn shared_reads_leave_connections_to_urgent_ones() {
         sqlx::any::install_default_drivers();
         let directory = tempfile::tempdir().expect("a directory");
-        let (url, session) = (crate::store::sqlite_url(&directory.path().join("database")), String::new());
+        let (url, session) =
+            (crate::store::sqlite_url(&directory.path().join("database")), String::new());
         let long = Duration::from_secs(60);
         let state = DatabaseState::unknown();
         state.opened();
         let (answer, greeting, connect, wait) = (long, long, long, long);
-        let terms = Terms { url, session, count: 3, shared: 1, answer, greeting, connect, wait, state };
+        let terms =
+            Terms { url, session, count: 3, shared: 1, answer, greeting, connect, wait, state };
         let connections = Connections::new(terms);
         let shared = with_shared_reads(connections.lend()).await.expect("lent");
         let mut next = Box::pin(with_shared_reads(connections.lend()));
         assert!(poll!(next.as_mut()).is_pending());
-        let urgent = [connections.lend().await.expect("lent"), connections.lend().await.expect("lent")];
+        let urgent =
+            [connections.lend().await.expect("lent"), connections.lend().await.expect("lent")];
         drop(shared);
         next.await.expect("lent");
         drop(urgent);
@@ -402,23 +469,33 @@ mod tests {
         let between = Between::start().await;
         let connections = between.one_connection().await;
         let session = async || {
-            let pid = sqlx::query_scalar::<_, i32>("SELECT pg_backend_pid()").fetch_one(&connections).await;
+            let pid = sqlx::query_scalar::<_, i32>("SELECT pg_backend_pid()")
+                .fetch_one(&connections)
+                .await;
             pid.expect("answers")
         };
         let before = session().await;
         let mut lent = connections.lend().await.expect("lent");
         lent.begin().await.expect("begun");
-        sqlx::query("CREATE TEMPORARY TABLE made (id INT)").execute(lent.connection()).await.expect("made");
-        let refused = sqlx::query("SELECT 1 / 0").execute(lent.connection()).await.expect_err("refused");
+        sqlx::query("CREATE TEMPORARY TABLE made (id INT)")
+            .execute(lent.connection())
+            .await
+            .expect("made");
+        let refused =
+            sqlx::query("SELECT 1 / 0").execute(lent.connection()).await.expect_err("refused");
         assert!(is_refusal(&refused), "{refused}");
         drop(lent);
-        let made = sqlx::query("SELECT * FROM made").execute(&connections).await.expect_err("rolled back");
+        let made =
+            sqlx::query("SELECT * FROM made").execute(&connections).await.expect_err("rolled back");
         assert!(is_refusal(&made), "{made}");
         assert_eq!(session().await, before);
 
         let mut lent = connections.lend().await.expect("lent");
         lent.begin().await.expect("begun");
-        sqlx::query("CREATE TEMPORARY TABLE made (id INT)").execute(lent.connection()).await.expect("made");
+        sqlx::query("CREATE TEMPORARY TABLE made (id INT)")
+            .execute(lent.connection())
+            .await
+            .expect("made");
         lent.commit().await.expect("committed");
         sqlx::query("SELECT * FROM made").execute(&connections).await.expect("is there");
         assert_eq!(session().await, before);

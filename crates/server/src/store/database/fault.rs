@@ -1,5 +1,6 @@
-//! Faults of the database itself, told apart by the codes of its errors: a corrupt file, a full disk, a server that is away
-//! or busy. It decides only which fault an error shows, never what is done about it.
+//! Faults of the database itself, told apart by the codes of its errors: a corrupt file, a full
+//! disk, a server that is away or busy. It decides only which fault an error shows, never what is
+//! done about it.
 
 use std::io;
 
@@ -34,7 +35,9 @@ impl Fault {
     /// Likewise of a migration that failed.
     pub(in crate::store) fn of_migration(error: &MigrateError) -> Option<Self> {
         match error {
-            MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => Self::of(error),
+            MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => {
+                Self::of(error)
+            }
             _ => None,
         }
     }
@@ -69,9 +72,11 @@ impl Fault {
             "53100" => Some(Self::Full),
             // Shut down, crashed, starting up, cut off for being idle, a standby.
             "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Away),
-            // Too many connections, too little memory, a lock or a statement that took too long, a deadlock. Connections that
-            // are there go on.
-            "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => Some(Self::Busy),
+            // Too many connections, too little memory, a lock or a statement that took too long, a
+            // deadlock. Connections that are there go on.
+            "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => {
+                Some(Self::Busy)
+            }
             _ if code.starts_with("08") => Some(Self::Away),
             _ => None,
         }

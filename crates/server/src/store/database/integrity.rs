@@ -1,5 +1,6 @@
-//! Checks of a SQLite file: a quick one before it is served, a full one beside the service. Each has a connection of its own
-//! that only reads. Postgres checks its pages itself as it reads them, where they have checksums: this is asked for.
+//! Checks of a SQLite file: a quick one before it is served, a full one beside the service. Each
+//! has a connection of its own that only reads. Postgres checks its pages itself as it reads them,
+//! where they have checksums: this is asked for.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -14,7 +15,8 @@ use crate::store::{Store, StoreError, sqlite_url};
 
 /// How long the check at start may take. What it did not come to is checked beside the service.
 const QUICK_TIME: Duration = Duration::from_secs(10);
-/// How often a check looks whether it has to end: after so many pages or steps of SQLite's virtual machine.
+/// How often a check looks whether it has to end: after so many pages or steps of SQLite's virtual
+/// machine.
 const STEPS_PER_LOOK: i32 = 1000;
 /// A full check works for this long, then leaves disk and processor to the service for as long.
 const TURN: Duration = Duration::from_millis(20);
@@ -36,7 +38,10 @@ pub(in crate::store) enum Checked {
 pub(in crate::store) async fn check_quickly(url: &str) -> Result<Checked, Error> {
     let mut connection = SqliteConnection::connect(url).await?;
     let end = Instant::now() + QUICK_TIME;
-    connection.lock_handle().await?.set_progress_handler(STEPS_PER_LOOK, move || Instant::now() < end);
+    connection
+        .lock_handle()
+        .await?
+        .set_progress_handler(STEPS_PER_LOOK, move || Instant::now() < end);
     let checked = run(&mut connection, "PRAGMA quick_check(1)").await;
     close(connection).await;
     checked
@@ -52,7 +57,8 @@ pub async fn check_at_rest(path: &Path) -> Result<Option<String>, StoreError> {
     }
 }
 
-/// Checks all tables and indices of the file against each other, a table at a time so that no read lasts for long.
+/// Checks all tables and indices of the file against each other, a table at a time so that no read
+/// lasts for long.
 async fn check_fully(url: &str, stop: CancellationToken) -> Result<Checked, Error> {
     let mut connection = SqliteConnection::connect(url).await?;
     let mut turn_began = Instant::now();
@@ -102,8 +108,11 @@ async fn run(connection: &mut SqliteConnection, check: &str) -> Result<Checked, 
     let text: String = row.try_get(0)?;
     Ok(match text.as_str() {
         "ok" => Checked::Sound,
-        // A row of foreign_key_check has the table, the row, the table that it refers to, and by which key.
-        table if row.len() > 1 => Checked::Damaged(format!("a row of {table} refers to one that is not there")),
+        // A row of foreign_key_check has the table, the row, the table that it refers to, and by
+        // which key.
+        table if row.len() > 1 => {
+            Checked::Damaged(format!("a row of {table} refers to one that is not there"))
+        }
         // A line that names the database may come first.
         _ => Checked::Damaged(text.lines().last().unwrap_or(&text).to_owned()),
     })
@@ -127,14 +136,19 @@ async fn close(connection: SqliteConnection) {
 
 /// How Postgres guards its pages.
 pub(in crate::store) async fn postgres_guard(connection: &mut AnyConnection) -> &'static str {
-    match sqlx::query_scalar::<_, String>("SHOW data_checksums").fetch_one(connection).await.as_deref() {
+    match sqlx::query_scalar::<_, String>("SHOW data_checksums")
+        .fetch_one(connection)
+        .await
+        .as_deref()
+    {
         Ok("on") => "Postgres checks its pages as it reads them (data_checksums is on)",
         _ => "nothing checks its pages: data_checksums of this Postgres is not on",
     }
 }
 
 impl Store {
-    /// Checks a SQLite file in full, slowly, unless `stop` comes first; [`crate::store::DatabaseState`] has the outcome.
+    /// Checks a SQLite file in full, slowly, unless `stop` comes first;
+    /// [`crate::store::DatabaseState`] has the outcome.
     pub async fn check(&self, now_ms: u64, stop: CancellationToken) -> Result<(), StoreError> {
         if self.is_postgres || !self.state.is_there() {
             return Ok(());
@@ -172,13 +186,15 @@ mod tests {
         assert_eq!((store.state().fully_checked_at_ms(), store.state().problem()), (Some(8), None));
         assert_eq!(check_at_rest(&path).await.expect("checked"), None);
 
-        let orphan =
-            "INSERT INTO tokens (id, kind, digest, robot_id, created_at_ms) VALUES ('t', 'r', 'd', 'nobody', 1)";
+        let orphan = "INSERT INTO tokens (id, kind, digest, robot_id, created_at_ms) VALUES ('t', 'r', 'd', 'nobody', 1)";
         let mut other = SqliteConnection::connect(&sqlite_url(&path)).await.expect("opens");
         sqlx::raw_sql("PRAGMA foreign_keys = OFF").execute(&mut other).await.expect("set");
         sqlx::raw_sql(orphan).execute(&mut other).await.expect("written");
         store.check(9, CancellationToken::new()).await.expect("checked");
-        assert_eq!(store.state().corruption(), Some("a row of tokens refers to one that is not there"));
+        assert_eq!(
+            store.state().corruption(),
+            Some("a row of tokens refers to one that is not there")
+        );
         assert!(matches!(store.begin().await.err(), Some(StoreError::Corrupt)));
         // A row that can't be found does not mean that nobody needs the blob.
         let collected = store.forget_unneeded(vec![task_proto::Digest::of(b"a blob")]).await;

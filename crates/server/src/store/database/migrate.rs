@@ -1,5 +1,6 @@
-//! The tables, as a list of migrations that only grows: a migration that has shipped is never edited. Each is one SQL text
-//! for both databases, so it keeps to TEXT and BIGINT columns. A noun's tables are in its own file.
+//! The tables, as a list of migrations that only grows: a migration that has shipped is never
+//! edited. Each is one SQL text for both databases, so it keeps to TEXT and BIGINT columns. A
+//! noun's tables are in its own file.
 
 use std::borrow::Cow;
 
@@ -34,7 +35,13 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
 /// Applies what has not been applied yet.
 pub(in crate::store) async fn run(connection: &mut AnyConnection) -> Result<(), MigrateError> {
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
-        Migration::new(version, Cow::Borrowed(name), MigrationType::Simple, sql.into_sql_str(), false)
+        Migration::new(
+            version,
+            Cow::Borrowed(name),
+            MigrationType::Simple,
+            sql.into_sql_str(),
+            false,
+        )
     });
     // `run` itself does not promise a future that other threads may take over.
     Migrator::with_migrations(migrations.collect()).run_direct(None, connection, false).await

@@ -1,5 +1,6 @@
-//! The state of the database as its users found it: whether it answers, whether it is corrupt, when it was last checked in
-//! full. Each change is logged once, here. A database that was found corrupt stays so until the next start, which checks it.
+//! The state of the database as its users found it: whether it answers, whether it is corrupt, when
+//! it was last checked in full. Each change is logged once, here. A database that was found corrupt
+//! stays so until the next start, which checks it.
 
 use std::fmt::Display;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -80,7 +81,8 @@ impl DatabaseState {
         Some(self.0.fully_checked_at_ms.load(Ordering::Relaxed)).filter(|at_ms| *at_ms > 0)
     }
 
-    /// For people: how the database itself guards its pages, where it is not for this server to check them.
+    /// For people: how the database itself guards its pages, where it is not for this server to
+    /// check them.
     pub fn guard(&self) -> Option<&'static str> {
         self.0.guard.get().copied()
     }
@@ -141,7 +143,10 @@ impl DatabaseState {
     pub(in crate::store) fn is_corrupt(&self, finding: impl Display) {
         let finding = finding.to_string();
         if self.0.corruption.set(finding.clone()).is_ok() {
-            tracing::error!(finding, "the database is corrupt: orders and reports are refused; see docs/server.md");
+            tracing::error!(
+                finding,
+                "the database is corrupt: orders and reports are refused; see docs/server.md"
+            );
         }
     }
 }

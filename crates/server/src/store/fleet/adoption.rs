@@ -1,5 +1,6 @@
-//! Diverged robots: the database was put back to an older copy, and a robot reports a generation it does not know. Before
-//! the next order for such a robot is applied, what the robot has is taken over as what it should have.
+//! Diverged robots: the database was put back to an older copy, and a robot reports a generation it
+//! does not know. Before the next order for such a robot is applied, what the robot has is taken
+//! over as what it should have.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -12,13 +13,17 @@ use crate::store::rows::{from_json, id, json, number, stored, word};
 use crate::store::timelines::{grown, grown_by, step};
 use crate::store::{StoreError, Write};
 
-/// The highest run that is taken over. Beyond it a made-up one would leave no room above it, and an order for this robot and
-/// others would fail for all of them.
+/// The highest run that is taken over. Beyond it a made-up one would leave no room above it, and an
+/// order for this robot and others would fail for all of them.
 const MAX_RUN: u64 = 1 << 53;
 
 impl Write {
     /// Adopts those of `robots` that are diverged.
-    pub async fn adopt_diverged(&mut self, robots: &[RobotId], now_ms: u64) -> Result<(), StoreError> {
+    pub async fn adopt_diverged(
+        &mut self,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         let rows = sqlx::query(
             "SELECT id, observed_generation, report FROM robots
              WHERE observed_generation > generation AND removed_at_ms IS NULL AND report IS NOT NULL",
@@ -47,7 +52,8 @@ impl Write {
         observed: Generation,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        // What we believed it should have is out of date, all of it; what is also reported comes back below.
+        // What we believed it should have is out of date, all of it; what is also reported comes
+        // back below.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $2,
                  phase = CASE ended WHEN 1 THEN phase ELSE 'stopped' END,
@@ -59,8 +65,10 @@ impl Write {
         .bind(stored(now_ms))
         .execute(self.connection())
         .await?;
-        // A robot could list a task twice; the database would refuse that, and the whole order with it.
-        let tasks: BTreeMap<&TaskName, &TaskReport> = report.tasks.iter().map(|task| (&task.task, task)).collect();
+        // A robot could list a task twice; the database would refuse that, and the whole order with
+        // it.
+        let tasks: BTreeMap<&TaskName, &TaskReport> =
+            report.tasks.iter().map(|task| (&task.task, task)).collect();
         for task in tasks.into_values() {
             self.adopt_task(robot, task, now_ms).await?;
         }
@@ -72,7 +80,12 @@ impl Write {
         Ok(())
     }
 
-    async fn adopt_task(&mut self, robot: &RobotId, task: &TaskReport, now_ms: u64) -> Result<(), StoreError> {
+    async fn adopt_task(
+        &mut self,
+        robot: &RobotId,
+        task: &TaskReport,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         // Older than what is ordered in this write: it can be rolled back to.
         let number = stored(self.turn().saturating_sub(1));
         // The order itself may be lost as well; then the robot's word is all there is of it.

@@ -1,4 +1,5 @@
-//! Enrolment tokens as an administrator looks after them, robots that wait to be approved, and robots that are put out.
+//! Enrolment tokens as an administrator looks after them, robots that wait to be approved, and
+//! robots that are put out.
 
 use sqlx::Row as _;
 use std::net::IpAddr;
@@ -17,7 +18,10 @@ const MOST_LISTED: i64 = 1_000;
 
 impl Store {
     /// The enrolment tokens that are good for something at `now_ms`, the newest first.
-    pub async fn enrolment_tokens(&self, now_ms: u64) -> Result<Vec<EnrollmentTokenView>, StoreError> {
+    pub async fn enrolment_tokens(
+        &self,
+        now_ms: u64,
+    ) -> Result<Vec<EnrollmentTokenView>, StoreError> {
         let rows = sqlx::query(
             "SELECT t.id, r.name AS robot, t.labels, t.uses_left, t.approval, t.created_at_ms, t.expires_at_ms
              FROM tokens t LEFT JOIN robots r ON r.id = t.robot_id
@@ -57,13 +61,19 @@ impl Store {
         .bind(token.id())
         .fetch_optional(&self.reads)
         .await?;
-        Ok(digest.is_some_and(|digest| digest.as_bytes().ct_eq(token.secret_digest().to_string().as_bytes()).into()))
+        Ok(digest.is_some_and(|digest| {
+            digest.as_bytes().ct_eq(token.secret_digest().to_string().as_bytes()).into()
+        }))
     }
 }
 
 impl Write {
     /// Ends an enrolment token; false if there is none.
-    pub async fn revoke_enrolment_token(&mut self, token: &TokenId, now_ms: u64) -> Result<bool, StoreError> {
+    pub async fn revoke_enrolment_token(
+        &mut self,
+        token: &TokenId,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
         let ended: Option<String> = sqlx::query_scalar(
             "UPDATE tokens SET revoked_at_ms = $2 WHERE id = $1 AND kind = 'enrolment' AND revoked_at_ms IS NULL
              RETURNING id",
@@ -84,7 +94,8 @@ impl Write {
 
     /// Whether the robot waits to be approved.
     pub async fn is_pending(&mut self, robot: &RobotId) -> Result<bool, StoreError> {
-        let sql = "SELECT id FROM robots WHERE id = $1 AND awaits_approval = 1 AND removed_at_ms IS NULL";
+        let sql =
+            "SELECT id FROM robots WHERE id = $1 AND awaits_approval = 1 AND removed_at_ms IS NULL";
         let found: Option<String> =
             sqlx::query_scalar(sql).bind(robot.as_str()).fetch_optional(self.connection()).await?;
         Ok(found.is_some())
@@ -129,7 +140,8 @@ impl Write {
         Ok(())
     }
 
-    /// Ends whatever `robot` could come in by; what is ordered of it stays. False if that was done before.
+    /// Ends whatever `robot` could come in by; what is ordered of it stays. False if that was done
+    /// before.
     pub async fn revoke_robot(&mut self, robot: &RobotId, now_ms: u64) -> Result<bool, StoreError> {
         // Reports that came by its tokens and are not stored yet come too late.
         let last_token = stored(self.turn());
@@ -148,7 +160,8 @@ impl Write {
         Ok(revoked.is_some())
     }
 
-    /// Takes a robot back that was revoked and is registered anew. The tokens from before stay ended.
+    /// Takes a robot back that was revoked and is registered anew. The tokens from before stay
+    /// ended.
     pub async fn readmit(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query("UPDATE robots SET revoked_at_ms = NULL WHERE id = $1")
             .bind(robot.as_str())

@@ -8,7 +8,8 @@ use crate::domain::person::Scope;
 use crate::store::{KnownRobot, Store, StoreError, Write};
 
 /// Those that can be ordered something.
-const ORDERABLE: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
+const ORDERABLE: &str =
+    "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
 
 /// The robots that a selector means.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -21,12 +22,20 @@ pub struct Matching {
 
 impl Store {
     /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
+    pub async fn matching_robots(
+        &self,
+        selector: &Selector,
+        scope: &Scope,
+    ) -> Result<Matching, StoreError> {
         matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector, scope)
     }
 
     /// The names and ids in a selector that no robot of a scope has, sorted.
-    pub async fn unknown_robots(&self, selector: &Selector, scope: &Scope) -> Result<Vec<RobotName>, StoreError> {
+    pub async fn unknown_robots(
+        &self,
+        selector: &Selector,
+        scope: &Scope,
+    ) -> Result<Vec<RobotName>, StoreError> {
         if selector.names().is_empty() {
             return Ok(Vec::new());
         }
@@ -36,16 +45,26 @@ impl Store {
 
 impl Write {
     /// The robots that `selector` means now, sorted by name; none that waits to be approved.
-    pub async fn matching_robots(&mut self, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
+    pub async fn matching_robots(
+        &mut self,
+        selector: &Selector,
+        scope: &Scope,
+    ) -> Result<Matching, StoreError> {
         matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector, scope)
     }
 }
 
-fn matching(rows: Vec<sqlx::any::AnyRow>, selector: &Selector, scope: &Scope) -> Result<Matching, StoreError> {
+fn matching(
+    rows: Vec<sqlx::any::AnyRow>,
+    selector: &Selector,
+    scope: &Scope,
+) -> Result<Matching, StoreError> {
     let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
     let mut names = selector.names();
     if !names.is_empty() {
-        for robot in robots.iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels)) {
+        for robot in
+            robots.iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels))
+        {
             names.remove(robot.name.as_str());
             names.remove(robot.id.as_str());
         }

@@ -1,4 +1,5 @@
-//! Reports: what is known about a batch of robots, read at once, and what they said, written at once.
+//! Reports: what is known about a batch of robots, read at once, and what they said, written at
+//! once.
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
@@ -9,13 +10,17 @@ use task_proto::report::{Phase, Report};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, RobotId, RobotName};
 
 use crate::domain::deployment::Standing;
-use crate::store::rows::{from_json, from_optional_json, from_word, groups, id, json, number, stored, values};
+use crate::store::rows::{
+    from_json, from_optional_json, from_word, groups, id, json, number, stored, values,
+};
 use crate::store::timelines::{grown, step};
 use crate::store::{Store, StoreError, Write};
 
 /// Columns of where an assignment stands in a statement.
-const STANDING: &[&str] = &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];
-/// The highest generation a robot is believed. Beyond it a made-up one would leave no room above it.
+const STANDING: &[&str] =
+    &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];
+/// The highest generation a robot is believed. Beyond it a made-up one would leave no room above
+/// it.
 const MAX_GENERATION: Generation = Generation(1 << 53);
 
 /// A robot that has reported, as it is stored.
@@ -63,7 +68,8 @@ pub struct ReportedBy {
 impl Store {
     /// Which agent each robot's last report is by. One that can't be read is left out.
     pub async fn last_agents(&self) -> Result<Vec<(RobotId, ReportedBy)>, StoreError> {
-        let sql = "SELECT id, report FROM robots WHERE report IS NOT NULL AND removed_at_ms IS NULL";
+        let sql =
+            "SELECT id, report FROM robots WHERE report IS NOT NULL AND removed_at_ms IS NULL";
         let mut rows = sqlx::query(sql).fetch(&self.reads);
         let mut found = Vec::new();
         // A report may be large, and there is one of each robot.
@@ -78,7 +84,10 @@ impl Store {
 
 impl Write {
     /// Those of `robots` that are registered.
-    pub async fn reported_robots(&mut self, robots: &[RobotId]) -> Result<Vec<ReportedRobot>, StoreError> {
+    pub async fn reported_robots(
+        &mut self,
+        robots: &[RobotId],
+    ) -> Result<Vec<ReportedRobot>, StoreError> {
         let mut found = Vec::with_capacity(robots.len());
         for group in groups(robots) {
             let sql = format!(
@@ -98,7 +107,10 @@ impl Write {
                     name: id("robots.name", row.try_get("name")?)?,
                     labels: from_json("robots.labels", row.try_get("labels")?)?,
                     generation: Generation(number(row.try_get("generation")?)),
-                    last_report: (number(row.try_get("report_start")?), number(row.try_get("report_seq")?)),
+                    last_report: (
+                        number(row.try_get("report_start")?),
+                        number(row.try_get("report_seq")?),
+                    ),
                     token_number: number(row.try_get("token_number")?),
                 });
             }
@@ -107,7 +119,10 @@ impl Write {
     }
 
     /// The released assignments of `robots` that have not ended.
-    pub async fn open_assignments(&mut self, robots: &[RobotId]) -> Result<Vec<OpenAssignment>, StoreError> {
+    pub async fn open_assignments(
+        &mut self,
+        robots: &[RobotId],
+    ) -> Result<Vec<OpenAssignment>, StoreError> {
         let mut found = Vec::with_capacity(robots.len());
         for group in groups(robots) {
             let sql = format!(
@@ -130,7 +145,11 @@ impl Write {
     }
 
     /// Stores reports, at most one of each robot.
-    pub async fn store_reports(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
+    pub async fn store_reports(
+        &mut self,
+        reports: &[&Report],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(reports) {
             let sql = format!(
                 "WITH v (id, start, seq, observed, report, link, battery) AS ({})
@@ -155,9 +174,13 @@ impl Write {
         Ok(())
     }
 
-    /// The same for reports that say nothing new: only which each was. The stored ones stay, with the times and the progress
-    /// of when they were written.
-    pub async fn store_repeated(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
+    /// The same for reports that say nothing new: only which each was. The stored ones stay, with
+    /// the times and the progress of when they were written.
+    pub async fn store_repeated(
+        &mut self,
+        reports: &[&Report],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(reports) {
             let sql = format!(
                 "WITH v (id, start, seq, observed) AS ({})
@@ -179,8 +202,13 @@ impl Write {
         Ok(())
     }
 
-    /// Stores where assignments stand now, and that they came there or try again. One that has run or ended does not expire any more.
-    pub async fn store_standings(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
+    /// Stores where assignments stand now, and that they came there or try again. One that has run
+    /// or ended does not expire any more.
+    pub async fn store_standings(
+        &mut self,
+        assignments: &[OpenAssignment],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(assignments) {
             let sql = format!(
                 "WITH v (deployment_id, robot_id, phase, ended, progress, failure, attempts, reached, step) AS ({})
@@ -212,7 +240,11 @@ impl Write {
     }
 
     /// The same for assignments that are still in the phase they were in: what no index is made of.
-    pub async fn store_progress(&mut self, assignments: &[OpenAssignment], now_ms: u64) -> Result<(), StoreError> {
+    pub async fn store_progress(
+        &mut self,
+        assignments: &[OpenAssignment],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(assignments) {
             let sql = format!(
                 "WITH v (deployment_id, robot_id, progress, failure, attempts) AS ({})
@@ -241,7 +273,9 @@ fn open_assignment(row: &sqlx::any::AnyRow) -> Result<OpenAssignment, StoreError
         deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
         robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
         kind: from_word("deployments.kind", row.try_get("kind")?)?,
-        removed: row.try_get::<Option<i64>, _>("removed_generation")?.map(|stored| Generation(number(stored))),
+        removed: row
+            .try_get::<Option<i64>, _>("removed_generation")?
+            .map(|stored| Generation(number(stored))),
         standing: Standing {
             run: number(row.try_get("run")?),
             phase: Phase::from_text(row.try_get("phase")?),

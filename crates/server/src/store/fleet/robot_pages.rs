@@ -19,8 +19,8 @@ pub struct RobotPage {
 }
 
 impl Store {
-    /// The first `limit` robots in a scope that `selector` means, whose names come after `after`. All are looked at, of few is
-    /// everything read.
+    /// The first `limit` robots in a scope that `selector` means, whose names come after `after`.
+    /// All are looked at, of few is everything read.
     pub async fn robots_page(
         &self,
         scope: &Scope,

@@ -70,10 +70,10 @@ pub struct FetchedBy {
     pub labels: Labels,
 }
 
-pub(in crate::store) const KNOWN: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
+pub(in crate::store) const KNOWN: &str =
+    "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL";
 
-const KNOWN_BY_ID_OR_NAME: &str =
-    "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
+const KNOWN_BY_ID_OR_NAME: &str = "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND (id = $1 OR name = $1)";
 
 impl Store {
     /// All robots, sorted by name. `online` and `address` are left empty: only presence knows them.
@@ -90,8 +90,10 @@ impl Store {
         let outdated = self.outdated_deployments().await?;
         for group in groups(robots) {
             let ids = values(1, group.len(), &["TEXT"]);
-            let mut robots = sqlx::query(AssertSqlSafe(format!("{ROBOT_ROWS} AND r.id IN ({ids})")));
-            let mut tasks = sqlx::query(AssertSqlSafe(format!("{TASK_ROWS} AND a.robot_id IN ({ids})")));
+            let mut robots =
+                sqlx::query(AssertSqlSafe(format!("{ROBOT_ROWS} AND r.id IN ({ids})")));
+            let mut tasks =
+                sqlx::query(AssertSqlSafe(format!("{TASK_ROWS} AND a.robot_id IN ({ids})")));
             for robot in group {
                 robots = robots.bind(robot.as_str());
                 tasks = tasks.bind(robot.as_str());
@@ -110,7 +112,8 @@ impl Store {
 
     /// The robot with this id or name.
     pub async fn find_robot(&self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
-        let row = sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(&self.reads).await?;
+        let row =
+            sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(&self.reads).await?;
         row.map(|row| known_robot(&row)).transpose()
     }
 
@@ -120,12 +123,17 @@ impl Store {
     }
 
     /// The robots of a scope, with what transfers to them have shown.
-    pub async fn robots_and_links(&self, scope: &Scope) -> Result<Vec<(KnownRobot, Option<LinkFacts>)>, StoreError> {
+    pub async fn robots_and_links(
+        &self,
+        scope: &Scope,
+    ) -> Result<Vec<(KnownRobot, Option<LinkFacts>)>, StoreError> {
         let sql = "SELECT id, name, mac, labels, link FROM robots WHERE removed_at_ms IS NULL";
         let rows = sqlx::query(sql).fetch_all(&self.reads).await?;
-        let read =
-            |row: &sqlx::any::AnyRow| Ok((known_robot(row)?, from_optional_json("robots.link", row.try_get("link")?)?));
-        let mut robots = rows.iter().map(read).collect::<Result<Vec<(KnownRobot, _)>, StoreError>>()?;
+        let read = |row: &sqlx::any::AnyRow| {
+            Ok((known_robot(row)?, from_optional_json("robots.link", row.try_get("link")?)?))
+        };
+        let mut robots =
+            rows.iter().map(read).collect::<Result<Vec<(KnownRobot, _)>, StoreError>>()?;
         robots.retain(|(robot, _)| scope.covers(&robot.id, &robot.name, &robot.labels));
         Ok(robots)
     }
@@ -145,8 +153,8 @@ impl Store {
         rows.iter().map(|row| id("robots.id", row)).collect()
     }
 
-    /// The robots' credentials at an external broker, sorted by robot; those that were revoked or wait to be approved have
-    /// none there.
+    /// The robots' credentials at an external broker, sorted by robot; those that were revoked or
+    /// wait to be approved have none there.
     pub async fn broker_credentials(&self) -> Result<Vec<BrokerCredential>, StoreError> {
         let approved = format!("{CREDENTIALS} AND awaits_approval = 0 ORDER BY id");
         let rows = sqlx::query(AssertSqlSafe(approved)).bind("");
@@ -154,18 +162,23 @@ impl Store {
     }
 
     /// One robot's; `None` if it is not registered, or was revoked.
-    pub async fn broker_credential(&self, robot: &RobotId) -> Result<Option<BrokerCredential>, StoreError> {
+    pub async fn broker_credential(
+        &self,
+        robot: &RobotId,
+    ) -> Result<Option<BrokerCredential>, StoreError> {
         let row = sqlx::query(CREDENTIALS).bind(robot.as_str());
         row.fetch_optional(&self.reads).await?.as_ref().map(broker_credential).transpose()
     }
 
     /// The robots that should have `task`.
     pub async fn robots_with_task(&self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
-        let rows: Vec<String> = sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(&self.reads).await?;
+        let rows: Vec<String> =
+            sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(&self.reads).await?;
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
-    /// What each of `robots` should have; those that are not registered, were revoked or wait to be approved are left out.
+    /// What each of `robots` should have; those that are not registered, were revoked or wait to be
+    /// approved are left out.
     pub async fn desired_tasks(&self, robots: &[RobotId]) -> Result<Vec<DesiredTasks>, StoreError> {
         let mut found: Vec<DesiredTasks> = Vec::with_capacity(robots.len());
         for group in groups(robots) {
@@ -190,7 +203,9 @@ impl Store {
                     found.push(DesiredTasks {
                         robot,
                         generation: Generation(number(row.try_get("generation")?)),
-                        observed_generation: Generation(number(row.try_get("observed_generation")?)),
+                        observed_generation: Generation(number(
+                            row.try_get("observed_generation")?,
+                        )),
                         tasks: Vec::new(),
                         along: Vec::new(),
                         evidence: Evidence::default(),
@@ -198,7 +213,10 @@ impl Store {
                     });
                 }
                 if let (Some(last), Some(task)) = (found.last_mut(), desired_task(&row)?) {
-                    if matches!(Phase::from_text(row.try_get("phase")?), Phase::Assigned | Phase::Fetching) {
+                    if matches!(
+                        Phase::from_text(row.try_get("phase")?),
+                        Phase::Assigned | Phase::Fetching
+                    ) {
                         last.along.extend(riding(&task));
                     }
                     last.tasks.push(task);
@@ -209,10 +227,14 @@ impl Store {
         Ok(found)
     }
 
-    /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it belongs to no package that
-    /// the robot should have. What was taken over from a robot's report, which has no time limit, only counts if such a package
-    /// is here.
-    pub async fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Result<Option<Arc<FetchedBy>>, StoreError> {
+    /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it
+    /// belongs to no package that the robot should have. What was taken over from a robot's report,
+    /// which has no time limit, only counts if such a package is here.
+    pub async fn fetched_by(
+        &self,
+        robot: &RobotId,
+        digest: &Digest,
+    ) -> Result<Option<Arc<FetchedBy>>, StoreError> {
         if let Some(order) = self.access.fetched_by(robot, digest) {
             return Ok(Some(order));
         }
@@ -230,7 +252,10 @@ impl Store {
         .await?;
         for row in rows {
             let package: PackageRef = from_json("deployments.package", row.try_get("package")?)?;
-            if [package.manifest, package.config, package.content].iter().any(|blob| blob.digest == *digest) {
+            if [package.manifest, package.config, package.content]
+                .iter()
+                .any(|blob| blob.digest == *digest)
+            {
                 let labels = from_json("robots.labels", row.try_get("labels")?)?;
                 let (priority, number) = (priority(&row)?, number(row.try_get("number")?));
                 let order = FetchedBy { priority, number, labels };
@@ -244,35 +269,53 @@ impl Store {
 impl Write {
     /// The robots of a scope, and those that were when they were removed.
     pub async fn robots_ever_in(&mut self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
-        let rows = sqlx::query("SELECT id, name, mac, labels FROM robots").fetch_all(self.connection()).await?;
+        let rows = sqlx::query("SELECT id, name, mac, labels FROM robots")
+            .fetch_all(self.connection())
+            .await?;
         let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
-        let own = robots.into_iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
+        let own =
+            robots.into_iter().filter(|robot| scope.covers(&robot.id, &robot.name, &robot.labels));
         Ok(own.map(|robot| robot.id).collect())
     }
 
     /// The robots that should have `task`.
     pub async fn robots_with_task(&mut self, task: &TaskName) -> Result<Vec<RobotId>, StoreError> {
-        let rows: Vec<String> = sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(self.connection()).await?;
+        let rows: Vec<String> =
+            sqlx::query_scalar(WITH_TASK).bind(task.as_str()).fetch_all(self.connection()).await?;
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
     /// The robot registered by `mac`.
-    pub async fn robot_by_mac(&mut self, mac: &MacAddress) -> Result<Option<KnownRobot>, StoreError> {
-        let row = sqlx::query("SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND mac = $1")
-            .bind(mac.to_string())
+    pub async fn robot_by_mac(
+        &mut self,
+        mac: &MacAddress,
+    ) -> Result<Option<KnownRobot>, StoreError> {
+        let row = sqlx::query(
+            "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND mac = $1",
+        )
+        .bind(mac.to_string())
+        .fetch_optional(self.connection())
+        .await?;
+        row.map(|row| known_robot(&row)).transpose()
+    }
+
+    /// The robot with this id or name.
+    pub async fn known_robot(
+        &mut self,
+        id_or_name: &str,
+    ) -> Result<Option<KnownRobot>, StoreError> {
+        let row = sqlx::query(KNOWN_BY_ID_OR_NAME)
+            .bind(id_or_name)
             .fetch_optional(self.connection())
             .await?;
         row.map(|row| known_robot(&row)).transpose()
     }
 
-    /// The robot with this id or name.
-    pub async fn known_robot(&mut self, id_or_name: &str) -> Result<Option<KnownRobot>, StoreError> {
-        let row = sqlx::query(KNOWN_BY_ID_OR_NAME).bind(id_or_name).fetch_optional(self.connection()).await?;
-        row.map(|row| known_robot(&row)).transpose()
-    }
-
     /// The robots that a deployment is for.
-    pub async fn robots_of_deployment(&mut self, deployment: &DeploymentId) -> Result<Vec<KnownRobot>, StoreError> {
+    pub async fn robots_of_deployment(
+        &mut self,
+        deployment: &DeploymentId,
+    ) -> Result<Vec<KnownRobot>, StoreError> {
         let of_deployment = "id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)";
         let rows = sqlx::query(AssertSqlSafe(format!("{KNOWN} AND {of_deployment}")))
             .bind(deployment.as_str())
@@ -282,7 +325,11 @@ impl Write {
     }
 
     /// Registers a robot.
-    pub async fn insert_robot(&mut self, robot: &KnownRobot, now_ms: u64) -> Result<(), StoreError> {
+    pub async fn insert_robot(
+        &mut self,
+        robot: &KnownRobot,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         sqlx::query("INSERT INTO robots (id, name, mac, labels, enrolled_at_ms) VALUES ($1, $2, $3, $4, $5)")
             .bind(robot.id.as_str())
             .bind(robot.name.as_str())
@@ -305,9 +352,13 @@ impl Write {
         Ok(())
     }
 
-    /// Stores what is set for a robot, if that is something else than what was. It is part of its desired state, whose
-    /// generation is raised then.
-    pub async fn update_settings(&mut self, robot: &RobotId, settings: &RobotSettings) -> Result<bool, StoreError> {
+    /// Stores what is set for a robot, if that is something else than what was. It is part of its
+    /// desired state, whose generation is raised then.
+    pub async fn update_settings(
+        &mut self,
+        robot: &RobotId,
+        settings: &RobotSettings,
+    ) -> Result<bool, StoreError> {
         let settings = Some(settings).filter(|settings| !settings.is_empty()).map(json);
         let changed = sqlx::query(
             "UPDATE robots SET settings = $2, generation = generation + 1
@@ -336,7 +387,8 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and counts from 1.
+    /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and
+    /// counts from 1.
     pub async fn forget_report(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query(
             "UPDATE robots SET report_start = 0, report_seq = 0, observed_generation = 0, report = NULL,
@@ -358,7 +410,11 @@ impl Write {
     }
 
     /// Marks robots as removed: their MACs and names are free, their ids are not.
-    pub async fn remove_robots(&mut self, robots: &[RobotId], now_ms: u64) -> Result<(), StoreError> {
+    pub async fn remove_robots(
+        &mut self,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(robots) {
             let sql = format!(
                 "UPDATE robots SET removed_at_ms = $1, report = NULL WHERE id IN ({})",
@@ -379,13 +435,15 @@ const CREDENTIALS: &str = "SELECT id, broker_credential FROM robots
 
 const WITH_TASK: &str = "SELECT robot_id FROM assignments WHERE task = $1 AND desired = 1";
 
-const ROBOT_ROWS: &str = "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
+const ROBOT_ROWS: &str =
+    "SELECT r.id, r.name, r.mac, r.labels, r.enrolled_at_ms, r.generation, r.observed_generation,
          r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval, r.settings
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
-/// What each robot should have, and what it is still getting rid of. The first condition is that of an index, word for
-/// word: without it all that was ever ordered would be read.
-const TASK_ROWS: &str = "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
+/// What each robot should have, and what it is still getting rid of. The first condition is that of
+/// an index, word for word: without it all that was ever ordered would be read.
+const TASK_ROWS: &str =
+    "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
          a.mechanism, a.rule, a.because, d.version
      FROM assignments a JOIN deployments d ON d.id = a.deployment_id
      WHERE (a.desired = 1 OR a.ended = 0) AND (a.desired = 1 OR a.released = 1)";
@@ -462,7 +520,8 @@ fn robot_view(row: &sqlx::any::AnyRow, mut tasks: Vec<RobotTask>) -> Result<Robo
         conditions.push(Condition { code: "revoked".to_owned(), text });
     }
     if row.try_get::<i64, _>("awaits_approval")? != 0 {
-        let text = "it gets nothing until an administrator approves it (taskd robot approve)".to_owned();
+        let text =
+            "it gets nothing until an administrator approves it (taskd robot approve)".to_owned();
         conditions.push(Condition { code: AWAITS_APPROVAL.to_owned(), text });
     }
     if observed_generation > generation {

@@ -1,6 +1,6 @@
-//! Assignments: each deployment's part for each robot, and which of them is desired. Every change is a few statements over
-//! sets of rows, whatever the number of robots. Whoever changes what is desired of a robot raises its generation in the
-//! same write.
+//! Assignments: each deployment's part for each robot, and which of them is desired. Every change
+//! is a few statements over sets of rows, whatever the number of robots. Whoever changes what is
+//! desired of a robot raises its generation in the same write.
 
 use std::collections::BTreeSet;
 
@@ -35,8 +35,9 @@ pub struct Released {
 }
 
 impl Write {
-    /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released yet; older parts of the
-    /// same task that wait for their batch give way, and their deployments are returned.
+    /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released
+    /// yet; older parts of the same task that wait for their batch give way, and their deployments
+    /// are returned.
     pub async fn assign(
         &mut self,
         deployment: &DeploymentId,
@@ -80,9 +81,14 @@ impl Write {
         deployments(superseded)
     }
 
-    /// Settles a new deployment on the robots that run its package already, as they last said: nothing begins there. What
-    /// they should have stays the earlier deployment, so that they hear of nothing.
-    pub async fn settle_running(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<(), StoreError> {
+    /// Settles a new deployment on the robots that run its package already, as they last said:
+    /// nothing begins there. What they should have stays the earlier deployment, so that they hear
+    /// of nothing.
+    pub async fn settle_running(
+        &mut self,
+        deployment: &DeploymentId,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         // The same package has the same text.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET released = 1, ended = 1, ran = 1, phase = 'running', updated_at_ms = $2, timeline = {}
@@ -104,18 +110,25 @@ impl Write {
     }
 
     /// Moves robots that wait for their batch behind all others, in their order.
-    pub async fn postpone(&mut self, deployment: &DeploymentId, robots: &[&RobotId]) -> Result<(), StoreError> {
-        let last: Option<i64> = sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
-            .bind(deployment.as_str())
-            .fetch_one(self.connection())
-            .await?;
+    pub async fn postpone(
+        &mut self,
+        deployment: &DeploymentId,
+        robots: &[&RobotId],
+    ) -> Result<(), StoreError> {
+        let last: Option<i64> =
+            sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
+                .bind(deployment.as_str())
+                .fetch_one(self.connection())
+                .await?;
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (id) AS ({}) UPDATE assignments SET place = place + $2 FROM v
                  WHERE deployment_id = $1 AND robot_id = v.id AND released = 0 AND ended = 0",
                 values(3, group.len(), &["TEXT"])
             );
-            let mut query = sqlx::query(AssertSqlSafe(sql)).bind(deployment.as_str()).bind(last.unwrap_or(0) + 1);
+            let mut query = sqlx::query(AssertSqlSafe(sql))
+                .bind(deployment.as_str())
+                .bind(last.unwrap_or(0) + 1);
             for robot in group {
                 query = query.bind(robot.as_str());
             }
@@ -124,9 +137,13 @@ impl Write {
         Ok(())
     }
 
-    /// Lets the time of all robots run that wait for their batch, where it does not yet: nothing but them is waited for.
-    /// Says whether there were any.
-    pub async fn await_offline(&mut self, deployment: &DeploymentId, now_ms: u64) -> Result<bool, StoreError> {
+    /// Lets the time of all robots run that wait for their batch, where it does not yet: nothing
+    /// but them is waited for. Says whether there were any.
+    pub async fn await_offline(
+        &mut self,
+        deployment: &DeploymentId,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
         let begun = sqlx::query(
             "UPDATE assignments SET expires_at_ms =
                  CAST($2 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1)
@@ -139,7 +156,8 @@ impl Write {
         Ok(begun.rows_affected() > 0)
     }
 
-    /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their time begins now.
+    /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their
+    /// time begins now.
     pub async fn release(
         &mut self,
         deployment: &DeploymentId,
@@ -156,7 +174,10 @@ impl Write {
         .await?;
         let Some(&(_, last)) = batch.last() else { return Ok(Released::default()) };
         self.changes_access();
-        let robots = batch.iter().map(|(robot, _)| id("assignments.robot_id", robot)).collect::<Result<Vec<_>, _>>()?;
+        let robots = batch
+            .iter()
+            .map(|(robot, _)| id("assignments.robot_id", robot))
+            .collect::<Result<Vec<_>, _>>()?;
         self.adopt_diverged(&robots, now_ms).await?;
         sqlx::query(
             "UPDATE assignments SET previous = (
@@ -200,7 +221,8 @@ impl Write {
         Ok(Released { robots, superseded: deployments(superseded)? })
     }
 
-    /// Carries out an order on `task` where it changes anything on `robots`. Returns the assignments it changed.
+    /// Carries out an order on `task` where it changes anything on `robots`. Returns the
+    /// assignments it changed.
     pub async fn order_on_task(
         &mut self,
         order: TaskOrder,
@@ -237,8 +259,10 @@ impl Write {
                  RETURNING assignments.deployment_id, assignments.robot_id",
                 values(4, group.len(), &["TEXT"])
             );
-            let mut query =
-                sqlx::query_as(AssertSqlSafe(sql)).bind(task.as_str()).bind(stored(expires_at_ms)).bind(stored(now_ms));
+            let mut query = sqlx::query_as(AssertSqlSafe(sql))
+                .bind(task.as_str())
+                .bind(stored(expires_at_ms))
+                .bind(stored(now_ms));
             for robot in group {
                 query = query.bind(robot.as_str());
             }
@@ -249,8 +273,8 @@ impl Write {
         Ok(changed)
     }
 
-    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is stopped or removed must not come back
-    /// with a later batch. Returns their deployments.
+    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is stopped
+    /// or removed must not come back with a later batch. Returns their deployments.
     pub async fn drop_waiting(
         &mut self,
         task: Option<&TaskName>,
@@ -278,7 +302,8 @@ impl Write {
         deployments(dropped)
     }
 
-    /// Ends everything that is ordered of robots which are being removed. Returns the deployments concerned.
+    /// Ends everything that is ordered of robots which are being removed. Returns the deployments
+    /// concerned.
     pub async fn end_all_of_robots(
         &mut self,
         robots: &[RobotId],
@@ -304,7 +329,10 @@ impl Write {
         deployments(ended)
     }
 
-    pub(in crate::store) async fn raise_generations(&mut self, robots: &[RobotId]) -> Result<(), StoreError> {
+    pub(in crate::store) async fn raise_generations(
+        &mut self,
+        robots: &[RobotId],
+    ) -> Result<(), StoreError> {
         for group in groups(robots) {
             let sql = format!(
                 "WITH v (id) AS ({}) UPDATE robots SET generation = generation + 1 FROM v WHERE robots.id = v.id",

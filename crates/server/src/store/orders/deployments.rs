@@ -13,7 +13,8 @@ use task_proto::{DeploymentId, RobotId};
 use crate::domain::deployment;
 use crate::domain::rollout::{Rollout, Standing};
 use crate::store::rows::{
-    from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values, word,
+    from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values,
+    word,
 };
 use crate::store::{Store, StoreError, Write};
 use crate::store::{deliveries, timelines};
@@ -66,7 +67,8 @@ pub struct DeploymentPage {
     pub next: Option<DeploymentId>,
 }
 
-/// What is read of each deployment. The selector may name thousands of robots, which is too much for lists and events.
+/// What is read of each deployment. The selector may name thousands of robots, which is too much
+/// for lists and events.
 const ROWS: &str =
     "SELECT id, number, package, kind, CASE WHEN length(selector) <= 1000 THEN selector END AS selector, delivery,
          priority, batch, max_failures, paused, created_at_ms, expires_at_ms, cancelled_at_ms
@@ -76,8 +78,8 @@ const ROWS: &str =
 const LISTED: &str = "(SELECT id FROM deployments WHERE number BETWEEN $1 AND $2)";
 
 impl Store {
-    /// The newest `limit` deployments, or the newest older than `before`; `None` if there is no such deployment. With `robots`
-    /// of them those that concern one of these, as far as they do.
+    /// The newest `limit` deployments, or the newest older than `before`; `None` if there is no
+    /// such deployment. With `robots` of them those that concern one of these, as far as they do.
     pub async fn deployments(
         &self,
         robots: Option<&[RobotId]>,
@@ -86,7 +88,8 @@ impl Store {
     ) -> Result<Option<DeploymentPage>, StoreError> {
         let number = match before {
             Some(before) => {
-                let query = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1").bind(before.as_str());
+                let query = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1")
+                    .bind(before.as_str());
                 match query.fetch_optional(&self.reads).await? {
                     Some(number) => number,
                     None => return Ok(None),
@@ -115,13 +118,16 @@ impl Store {
     }
 
     /// One deployment without its assignments, and without its selector if that is long.
-    pub async fn deployment_summary(&self, id: &DeploymentId) -> Result<Option<DeploymentView>, StoreError> {
+    pub async fn deployment_summary(
+        &self,
+        id: &DeploymentId,
+    ) -> Result<Option<DeploymentView>, StoreError> {
         let query = sqlx::query(AssertSqlSafe(format!("{ROWS} WHERE id = $1"))).bind(id.as_str());
         Ok(self.deployment_views(&query.fetch_all(&self.reads).await?, None).await?.pop())
     }
 
-    /// One deployment with its assignments, sorted by robot name; their `online` is left false, and most don't ask for their
-    /// timelines.
+    /// One deployment with its assignments, sorted by robot name; their `online` is left false, and
+    /// most don't ask for their timelines.
     pub async fn deployment(
         &self,
         id: &DeploymentId,
@@ -145,13 +151,18 @@ impl Store {
     }
 
     /// The selector that a deployment was ordered with.
-    pub async fn deployment_selector(&self, deployment: &DeploymentId) -> Result<Option<Selector>, StoreError> {
-        let query = sqlx::query_scalar("SELECT selector FROM deployments WHERE id = $1").bind(deployment.as_str());
+    pub async fn deployment_selector(
+        &self,
+        deployment: &DeploymentId,
+    ) -> Result<Option<Selector>, StoreError> {
+        let query = sqlx::query_scalar("SELECT selector FROM deployments WHERE id = $1")
+            .bind(deployment.as_str());
         let selector: Option<String> = query.fetch_optional(&self.reads).await?;
         selector.map(|selector| id("deployments.selector", &selector)).transpose()
     }
 
-    /// Batched deployments that may go on by themselves: they have robots waiting and are not paused.
+    /// Batched deployments that may go on by themselves: they have robots waiting and are not
+    /// paused.
     pub async fn open_rollouts(&self) -> Result<BTreeSet<DeploymentId>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
             "SELECT id FROM deployments WHERE batch IS NOT NULL AND paused = 0 AND cancelled_at_ms IS NULL AND id IN (
@@ -163,7 +174,9 @@ impl Store {
     }
 
     /// The deployments whose package lost its version to another: mostly none.
-    pub(in crate::store) async fn outdated_deployments(&self) -> Result<HashSet<String>, StoreError> {
+    pub(in crate::store) async fn outdated_deployments(
+        &self,
+    ) -> Result<HashSet<String>, StoreError> {
         // The same package has the same text.
         let rows: Vec<String> = sqlx::query_scalar(
             "SELECT d.id FROM packages p JOIN deployments d ON d.task = p.name AND d.package = p.package
@@ -186,13 +199,16 @@ impl Store {
         rows.iter().map(|row| from_json("deployments.package", row)).collect()
     }
 
-    /// The views of these rows, which follow each other, as far as they concern `robots`, or in whole.
+    /// The views of these rows, which follow each other, as far as they concern `robots`, or in
+    /// whole.
     async fn deployment_views(
         &self,
         rows: &[sqlx::any::AnyRow],
         robots: Option<&[RobotId]>,
     ) -> Result<Vec<DeploymentView>, StoreError> {
-        let (Some(newest), Some(oldest)) = (rows.first(), rows.last()) else { return Ok(Vec::new()) };
+        let (Some(newest), Some(oldest)) = (rows.first(), rows.last()) else {
+            return Ok(Vec::new());
+        };
         let numbers = (oldest.try_get("number")?, newest.try_get("number")?);
         let mut counts = self.counted(numbers, robots).await?;
         let superseded: Vec<(String, String)> = sqlx::query_as(AssertSqlSafe(format!(
@@ -205,25 +221,31 @@ impl Store {
         .await?;
         let mut supersedes: HashMap<String, Vec<DeploymentId>> = HashMap::new();
         for (newer, older) in superseded {
-            supersedes.entry(newer).or_default().push(crate::store::rows::id("assignments.deployment_id", &older)?);
+            supersedes
+                .entry(newer)
+                .or_default()
+                .push(crate::store::rows::id("assignments.deployment_id", &older)?);
         }
         let outdated = self.outdated_deployments().await?;
         let view = |row: &sqlx::any::AnyRow| {
             let id: String = row.try_get("id")?;
             let (counts, supersedes) = (counts.remove(&id), supersedes.remove(&id));
-            let view = deployment_view(row, counts.unwrap_or_default(), supersedes.unwrap_or_default())?;
+            let view =
+                deployment_view(row, counts.unwrap_or_default(), supersedes.unwrap_or_default())?;
             Ok::<_, StoreError>(DeploymentView { outdated: outdated.contains(&id), ..view })
         };
         rows.iter().map(view).collect()
     }
 
-    /// How many assignments of each deployment with one of these numbers stand in which phase: of all robots or of some.
+    /// How many assignments of each deployment with one of these numbers stand in which phase: of
+    /// all robots or of some.
     async fn counted(
         &self,
         numbers: (i64, i64),
         robots: Option<&[RobotId]>,
     ) -> Result<HashMap<String, Vec<PhaseCount>>, StoreError> {
-        let groups: Vec<&[RobotId]> = robots.map_or_else(|| vec![[].as_slice()], |robots| groups(robots).collect());
+        let groups: Vec<&[RobotId]> =
+            robots.map_or_else(|| vec![[].as_slice()], |robots| groups(robots).collect());
         let mut counts: HashMap<String, Vec<PhaseCount>> = HashMap::new();
         for group in groups {
             let among = match group.len() {
@@ -234,8 +256,9 @@ impl Store {
                 "SELECT deployment_id, phase, COUNT(*) FROM assignments WHERE deployment_id IN {LISTED} {among}
                  GROUP BY deployment_id, phase"
             );
-            let mut query =
-                sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql)).bind(numbers.0).bind(numbers.1);
+            let mut query = sqlx::query_as::<_, (String, String, i64)>(AssertSqlSafe(sql))
+                .bind(numbers.0)
+                .bind(numbers.1);
             for robot in group {
                 query = query.bind(robot.as_str());
             }
@@ -254,7 +277,11 @@ impl Store {
 
 impl Write {
     /// Stores an order.
-    pub async fn insert_deployment(&mut self, new: &NewDeployment<'_>, now_ms: u64) -> Result<(), StoreError> {
+    pub async fn insert_deployment(
+        &mut self,
+        new: &NewDeployment<'_>,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         let number = stored(self.turn());
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, batch, max_failures,
@@ -281,10 +308,11 @@ impl Write {
 
     /// Whether the operator took a deployment back; `None` if there is none.
     pub async fn is_cancelled(&mut self, id: &DeploymentId) -> Result<Option<bool>, StoreError> {
-        let row: Option<(Option<i64>,)> = sqlx::query_as("SELECT cancelled_at_ms FROM deployments WHERE id = $1")
-            .bind(id.as_str())
-            .fetch_optional(self.connection())
-            .await?;
+        let row: Option<(Option<i64>,)> =
+            sqlx::query_as("SELECT cancelled_at_ms FROM deployments WHERE id = $1")
+                .bind(id.as_str())
+                .fetch_optional(self.connection())
+                .await?;
         Ok(row.map(|(cancelled_at_ms,)| cancelled_at_ms.is_some()))
     }
 
@@ -306,18 +334,25 @@ impl Write {
             forgiven: number(row.try_get("forgiven")?),
             paused: row.try_get::<i64, _>("paused")? == 1,
         };
-        let counted: Vec<(String, i64)> =
-            sqlx::query_as("SELECT phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY phase")
-                .bind(id.as_str())
-                .fetch_all(self.connection())
-                .await?;
-        let failures = counted.iter().filter(|(phase, _)| deployment::is_failure(Phase::from_text(phase), kind));
+        let counted: Vec<(String, i64)> = sqlx::query_as(
+            "SELECT phase, COUNT(*) FROM assignments WHERE deployment_id = $1 GROUP BY phase",
+        )
+        .bind(id.as_str())
+        .fetch_all(self.connection())
+        .await?;
+        let failures = counted
+            .iter()
+            .filter(|(phase, _)| deployment::is_failure(Phase::from_text(phase), kind));
         let failed = failures.map(|(_, count)| number(*count)).sum();
         Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind).await? }))
     }
 
     /// The robots of a deployment that have not settled, in the order of their turns.
-    async fn open_robots(&mut self, deployment: &DeploymentId, kind: TaskKind) -> Result<Vec<OpenRobot>, StoreError> {
+    async fn open_robots(
+        &mut self,
+        deployment: &DeploymentId,
+        kind: TaskKind,
+    ) -> Result<Vec<OpenRobot>, StoreError> {
         let rows: Vec<(String, i64, String, i64, i64)> = sqlx::query_as(
             "SELECT a.robot_id, a.released, a.phase, a.ran,
                  CAST(CASE WHEN r.revoked_at_ms IS NULL THEN 0 ELSE 1 END AS BIGINT)
@@ -331,13 +366,15 @@ impl Write {
         .await?;
         let mut robots = Vec::with_capacity(rows.len());
         for (robot, released, phase, ran, is_revoked) in rows {
-            let (robot, phase) = (self::id("assignments.robot_id", &robot)?, Phase::from_text(&phase));
+            let (robot, phase) =
+                (self::id("assignments.robot_id", &robot)?, Phase::from_text(&phase));
             let standing = match phase {
                 _ if released == 0 => Standing::Waiting,
                 Phase::Assigned | Phase::Deferred => Standing::Released,
                 _ => Standing::Begun,
             };
-            // A service that ran has shown what its batch was to show, whatever is ordered of it since.
+            // A service that ran has shown what its batch was to show, whatever is ordered of it
+            // since.
             let has_run = ran == 1 && kind == TaskKind::Service;
             robots.push(OpenRobot { robot, standing, has_run, is_revoked: is_revoked == 1 });
         }
@@ -345,7 +382,10 @@ impl Write {
     }
 
     /// The deployments that have begun on `robot` and have not ended there.
-    pub async fn begun_on(&mut self, robot: &RobotId) -> Result<BTreeSet<DeploymentId>, StoreError> {
+    pub async fn begun_on(
+        &mut self,
+        robot: &RobotId,
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
             "SELECT deployment_id FROM assignments WHERE robot_id = $1 AND released = 1 AND ended = 0",
         )
@@ -362,15 +402,34 @@ impl Write {
 
     /// Lets a deployment begin batches again and forgives it `failures`.
     pub async fn resume(&mut self, id: &DeploymentId, failures: u64) -> Result<(), StoreError> {
-        self.update_deployment("UPDATE deployments SET paused = 0, forgiven = $2 WHERE id = $1", id, failures).await
+        self.update_deployment(
+            "UPDATE deployments SET paused = 0, forgiven = $2 WHERE id = $1",
+            id,
+            failures,
+        )
+        .await
     }
 
     /// Marks a deployment as taken back by the operator.
-    pub async fn mark_cancelled(&mut self, id: &DeploymentId, now_ms: u64) -> Result<(), StoreError> {
-        self.update_deployment("UPDATE deployments SET cancelled_at_ms = $2 WHERE id = $1", id, now_ms).await
+    pub async fn mark_cancelled(
+        &mut self,
+        id: &DeploymentId,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        self.update_deployment(
+            "UPDATE deployments SET cancelled_at_ms = $2 WHERE id = $1",
+            id,
+            now_ms,
+        )
+        .await
     }
 
-    async fn update_deployment(&mut self, sql: &'static str, id: &DeploymentId, value: u64) -> Result<(), StoreError> {
+    async fn update_deployment(
+        &mut self,
+        sql: &'static str,
+        id: &DeploymentId,
+        value: u64,
+    ) -> Result<(), StoreError> {
         sqlx::query(sql).bind(id.as_str()).bind(stored(value)).execute(self.connection()).await?;
         Ok(())
     }
@@ -389,7 +448,10 @@ fn deployment_view(
         id: id("deployments.id", row.try_get("id")?)?,
         package: from_json("deployments.package", row.try_get("package")?)?,
         kind,
-        selector: row.try_get::<Option<&str>, _>("selector")?.map(|it| id("deployments.selector", it)).transpose()?,
+        selector: row
+            .try_get::<Option<&str>, _>("selector")?
+            .map(|it| id("deployments.selector", it))
+            .transpose()?,
         delivery: from_word("deployments.delivery", row.try_get("delivery")?)?,
         priority: priority(row)?,
         state: deployment::state(kind, cancelled, paused, &counts),
@@ -416,7 +478,9 @@ fn assignment_view(row: &sqlx::any::AnyRow) -> Result<AssignmentView, StoreError
         progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,
         failure: from_optional_json("assignments.failure", row.try_get("failure")?)?,
         attempts: u32::try_from(row.try_get::<i64, _>("attempts")?).unwrap_or(u32::MAX),
-        superseded_by: superseded_by.map(|newer| id("assignments.superseded_by", &newer)).transpose()?,
+        superseded_by: superseded_by
+            .map(|newer| id("assignments.superseded_by", &newer))
+            .transpose()?,
         updated_at_ms: number(row.try_get("updated_at_ms")?),
         timeline: row.try_get::<Option<&str>, _>("timeline")?.map(timelines::read),
     })

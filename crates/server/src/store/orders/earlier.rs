@@ -1,4 +1,5 @@
-//! What was ordered before, as far as it matters for the next order: what ended badly, and what ran before what is there now.
+//! What was ordered before, as far as it matters for the next order: what ended badly, and what ran
+//! before what is there now.
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::desired::PackageRef;
@@ -31,9 +32,12 @@ pub struct EarlierPackage {
 }
 
 impl Write {
-    /// The robots for which `deployment` has ended badly and that nothing else was ordered of since, to stop or remove it
-    /// neither, sorted by name.
-    pub async fn unsuccessful(&mut self, deployment: &DeploymentId) -> Result<Vec<Unsuccessful>, StoreError> {
+    /// The robots for which `deployment` has ended badly and that nothing else was ordered of
+    /// since, to stop or remove it neither, sorted by name.
+    pub async fn unsuccessful(
+        &mut self,
+        deployment: &DeploymentId,
+    ) -> Result<Vec<Unsuccessful>, StoreError> {
         let rows = sqlx::query(
             "SELECT r.id, r.name, r.mac, r.labels, a.failure
              FROM assignments a JOIN deployments d ON d.id = a.deployment_id JOIN robots r ON r.id = a.robot_id
@@ -56,8 +60,8 @@ impl Write {
         Ok(found)
     }
 
-    /// Of each of `robots` the newest package of `task` that ran there before the one it should have now, is another, and still
-    /// is here. Those that have none are left out.
+    /// Of each of `robots` the newest package of `task` that ran there before the one it should
+    /// have now, is another, and still is here. Those that have none are left out.
     pub async fn earlier_packages(
         &mut self,
         task: &TaskName,
@@ -84,9 +88,14 @@ impl Write {
                 query = query.bind(robot.as_str());
             }
             for row in query.fetch_all(self.connection()).await? {
-                let package: PackageRef = from_json("deployments.package", row.try_get("package")?)?;
+                let package: PackageRef =
+                    from_json("deployments.package", row.try_get("package")?)?;
                 let kind = from_word("deployments.kind", row.try_get("kind")?)?;
-                found.push(EarlierPackage { robot: id("robots.id", row.try_get("robot")?)?, package, kind });
+                found.push(EarlierPackage {
+                    robot: id("robots.id", row.try_get("robot")?)?,
+                    package,
+                    kind,
+                });
             }
         }
         Ok(found)

@@ -1,4 +1,5 @@
-//! Direct-push: which robots still wait for a package inside MQTT messages, and which are to pull it instead.
+//! Direct-push: which robots still wait for a package inside MQTT messages, and which are to pull
+//! it instead.
 
 use sqlx::AssertSqlSafe;
 use task_proto::desired::{Delivery, PackageRef};
@@ -7,7 +8,8 @@ use task_proto::{DeploymentId, Digest, RobotId};
 use crate::store::rows::{from_json, groups, id, parts_of, stored, values};
 use crate::store::{Store, StoreError, Write};
 
-/// Assignments whose robot is to hear the package, and has not got all of it. Diverged robots are left alone.
+/// Assignments whose robot is to hear the package, and has not got all of it. Diverged robots are
+/// left alone.
 const AWAITING: &str = "assignments.mechanism = 'direct-push' AND assignments.desired = 1
     AND assignments.released = 1 AND assignments.ended = 0 AND assignments.phase IN ('assigned', 'fetching')
     AND EXISTS (SELECT 1 FROM robots r WHERE r.id = assignments.robot_id AND r.removed_at_ms IS NULL
@@ -30,7 +32,10 @@ impl Store {
     }
 
     /// The robots that wait for parts of `content`, and by which deployments.
-    pub async fn awaiting_parts(&self, content: &Digest) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
+    pub async fn awaiting_parts(
+        &self,
+        content: &Digest,
+    ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
         let mut awaiting = Vec::new();
         for (deployment, package) in self.direct_pushes().await? {
             if package.content.digest != *content {
@@ -51,8 +56,8 @@ impl Store {
 }
 
 impl Write {
-    /// Decides anew for those of `parts` that still wait for parts: they pull, by `rule`, `because`. Returns the robots whose
-    /// desired state is new.
+    /// Decides anew for those of `parts` that still wait for parts: they pull, by `rule`,
+    /// `because`. Returns the robots whose desired state is new.
     pub async fn pull_instead(
         &mut self,
         parts: &[(DeploymentId, RobotId)],

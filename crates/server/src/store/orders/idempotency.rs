@@ -15,22 +15,30 @@ pub struct PastOrder {
 impl Write {
     /// The order that came with `key`.
     pub async fn past_order(&mut self, key: &str) -> Result<Option<PastOrder>, StoreError> {
-        let row: Option<(String, String)> = sqlx::query_as("SELECT request, answer FROM orders WHERE key = $1")
-            .bind(key)
-            .fetch_optional(self.connection())
-            .await?;
+        let row: Option<(String, String)> =
+            sqlx::query_as("SELECT request, answer FROM orders WHERE key = $1")
+                .bind(key)
+                .fetch_optional(self.connection())
+                .await?;
         Ok(row.map(|(request, answer)| PastOrder { request, answer }))
     }
 
     /// Remembers the order that came with `key`.
-    pub async fn remember_order(&mut self, key: &str, order: &PastOrder, now_ms: u64) -> Result<(), StoreError> {
-        sqlx::query("INSERT INTO orders (key, request, answer, created_at_ms) VALUES ($1, $2, $3, $4)")
-            .bind(key)
-            .bind(order.request.as_str())
-            .bind(order.answer.as_str())
-            .bind(stored(now_ms))
-            .execute(self.connection())
-            .await?;
+    pub async fn remember_order(
+        &mut self,
+        key: &str,
+        order: &PastOrder,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO orders (key, request, answer, created_at_ms) VALUES ($1, $2, $3, $4)",
+        )
+        .bind(key)
+        .bind(order.request.as_str())
+        .bind(order.answer.as_str())
+        .bind(stored(now_ms))
+        .execute(self.connection())
+        .await?;
         Ok(())
     }
 

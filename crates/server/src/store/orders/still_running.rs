@@ -38,18 +38,31 @@ impl Write {
         self.changes_access();
         // One of a robot's deployments is desired at a time, so this comes first.
         let give_way = "SET desired = 0, superseded_by = $2, updated_at_ms = $1";
-        self.set_pairs(give_way, deployment.as_str(), now_ms, found.iter().map(|one| (&one.failed, &one.robot)))
-            .await?;
+        self.set_pairs(
+            give_way,
+            deployment.as_str(),
+            now_ms,
+            found.iter().map(|one| (&one.failed, &one.robot)),
+        )
+        .await?;
         let timeline = grown_by(Phase::Running, "$1");
         let come_back = format!(
             "SET desired = 1, superseded_by = NULL, removed_generation = NULL, wanted = 'running', phase = $2, ended = 0,
                  progress = NULL, failure = NULL, expires_at_ms = NULL, updated_at_ms = $1, timeline = {timeline}"
         );
-        let settle =
-            format!("SET released = 1, ended = 1, ran = 1, phase = $2, updated_at_ms = $1, timeline = {timeline}");
+        let settle = format!(
+            "SET released = 1, ended = 1, ran = 1, phase = $2, updated_at_ms = $1, timeline = {timeline}"
+        );
         let running = Phase::Running.as_str();
-        self.set_pairs(&come_back, running, now_ms, found.iter().map(|one| (&one.earlier, &one.robot))).await?;
-        self.set_pairs(&settle, running, now_ms, found.iter().map(|one| (deployment, &one.robot))).await?;
+        self.set_pairs(
+            &come_back,
+            running,
+            now_ms,
+            found.iter().map(|one| (&one.earlier, &one.robot)),
+        )
+        .await?;
+        self.set_pairs(&settle, running, now_ms, found.iter().map(|one| (deployment, &one.robot)))
+            .await?;
         let robots: Vec<RobotId> = found.iter().map(|one| one.robot.clone()).collect();
         self.raise_generations(&robots).await?;
         Ok(found)
@@ -90,7 +103,10 @@ impl Write {
             let runs = report.tasks.iter().any(|said| {
                 let brought = said.active.as_ref().map(|active| &active.deployment);
                 let is_over = said.wanted == Wanted::Running && said.phase.is_final();
-                said.task == *task && said.deployment == one.failed && is_over && brought == Some(&one.earlier)
+                said.task == *task
+                    && said.deployment == one.failed
+                    && is_over
+                    && brought == Some(&one.earlier)
             });
             if runs {
                 found.push(one);

@@ -1,5 +1,6 @@
-//! Assignments that end before they were done: somebody cancels them, or their time is up. What they had replaced is desired
-//! again. Where a task has run, and only its start or restart did not come to it, nothing is replaced: it is left as it is.
+//! Assignments that end before they were done: somebody cancels them, or their time is up. What
+//! they had replaced is desired again. Where a task has run, and only its start or restart did not
+//! come to it, nothing is replaced: it is left as it is.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +9,9 @@ use task_proto::desired::Wanted;
 use task_proto::report::{Failure, Phase, Report};
 use task_proto::{DeploymentId, RobotId};
 
-use crate::store::rows::{from_optional_json, from_word, groups, id, json, number, parts_of, stored, values, word};
+use crate::store::rows::{
+    from_optional_json, from_word, groups, id, json, number, parts_of, stored, values, word,
+};
 use crate::store::timelines::grown_by;
 use crate::store::{StoreError, Write};
 
@@ -43,14 +46,18 @@ const PAIR: &[&str] = &["TEXT", "TEXT"];
 /// Columns of [`Left`] in a statement.
 const LEFT: &[&str] = &["TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "TEXT"];
 /// What [`revocable`] reads. A robot's report is only read where the task has run there.
-const COLUMNS: &str = "a.deployment_id, a.robot_id, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
+const COLUMNS: &str =
+    "a.deployment_id, a.robot_id, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
      CASE WHEN a.ran = 1 THEN r.report END AS report,
      CAST(CASE WHEN r.observed_generation > r.generation THEN 1 ELSE 0 END AS BIGINT) AS diverged";
 
 impl Write {
-    /// What a cancel takes back: all that has not settled, and what ended badly but is still what its robot should have.
-    /// A service that runs has settled: there is nothing left to interrupt.
-    pub async fn revocable(&mut self, deployment: &DeploymentId) -> Result<Vec<Revocable>, StoreError> {
+    /// What a cancel takes back: all that has not settled, and what ended badly but is still what
+    /// its robot should have. A service that runs has settled: there is nothing left to interrupt.
+    pub async fn revocable(
+        &mut self,
+        deployment: &DeploymentId,
+    ) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT {COLUMNS} FROM assignments a
              JOIN deployments d ON d.id = a.deployment_id JOIN robots r ON r.id = a.robot_id
@@ -61,7 +68,8 @@ impl Write {
         .bind(deployment.as_str())
         .fetch_all(self.connection())
         .await?;
-        // What is on its way to run or runs is interrupted; what was only told to run once more is not undone.
+        // What is on its way to run or runs is interrupted; what was only told to run once more is
+        // not undone.
         rows.iter().map(|row| revocable(row, |phase| phase == Phase::Assigned)).collect()
     }
 
@@ -90,15 +98,16 @@ impl Write {
         rows.iter().map(|row| revocable(row, |_| true)).collect()
     }
 
-    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what they had replaced.
-    /// Returns the robots whose desired state is new.
+    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what
+    /// they had replaced. Returns the robots whose desired state is new.
     pub async fn take_back(
         &mut self,
         taken: &[Revocable],
         phase: Phase,
         now_ms: u64,
     ) -> Result<Vec<RobotId>, StoreError> {
-        let (left, taken): (Vec<&Revocable>, Vec<&Revocable>) = taken.iter().partition(|row| row.left.is_some());
+        let (left, taken): (Vec<&Revocable>, Vec<&Revocable>) =
+            taken.iter().partition(|row| row.left.is_some());
         self.leave(&left, phase, now_ms).await?;
         let end = format!(
             "SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $1,
@@ -106,10 +115,17 @@ impl Write {
                  timeline = CASE ended WHEN 1 THEN timeline ELSE {} END",
             grown_by(phase, "$1")
         );
-        self.set_pairs(&end, phase.as_str(), now_ms, taken.iter().map(|row| (&row.deployment, &row.robot))).await?;
+        self.set_pairs(
+            &end,
+            phase.as_str(),
+            now_ms,
+            taken.iter().map(|row| (&row.deployment, &row.robot)),
+        )
+        .await?;
         // What was stopped since stays so, whatever version of it comes back.
         for (wanted, stop) in [(Wanted::Running, ""), (Wanted::Stopped, "wanted = 'stopped', ")] {
-            // Where the replaced one stands is what the robot's next report says; $2 is what it is until then.
+            // Where the replaced one stands is what the robot's next report says; $2 is what it is
+            // until then.
             let revive = format!(
                 "SET {stop}desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
                      ended = CASE phase WHEN 'superseded' THEN 0 ELSE ended END,
@@ -118,8 +134,10 @@ impl Write {
                 grown_by(Phase::Assigned, "$1")
             );
             let replaced = taken.iter().filter(|row| row.desired && row.wanted == wanted);
-            let previous: Vec<_> = replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot))).collect();
-            self.set_pairs(&revive, Phase::Assigned.as_str(), now_ms, previous.iter().copied()).await?;
+            let previous: Vec<_> =
+                replaced.filter_map(|row| Some((row.previous.as_ref()?, &row.robot))).collect();
+            self.set_pairs(&revive, Phase::Assigned.as_str(), now_ms, previous.iter().copied())
+                .await?;
             self.pass_over_deleted(&previous).await?;
         }
         let is_told = |row: &&Revocable| row.left.as_ref().map_or(row.desired, |left| left.is_told);
@@ -130,9 +148,14 @@ impl Write {
         Ok(robots)
     }
 
-    /// Ends what was ordered of tasks that stay on their robots. A run that a robot never spoke of may have begun there, so its
-    /// number is not given out again.
-    async fn leave(&mut self, rows: &[&Revocable], phase: Phase, now_ms: u64) -> Result<(), StoreError> {
+    /// Ends what was ordered of tasks that stay on their robots. A run that a robot never spoke of
+    /// may have begun there, so its number is not given out again.
+    async fn leave(
+        &mut self,
+        rows: &[&Revocable],
+        phase: Phase,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         let rows: Vec<_> = rows.iter().filter_map(|row| Some((*row, row.left.as_ref()?))).collect();
         for group in groups(&rows) {
             let sql = format!(
@@ -161,8 +184,8 @@ impl Write {
         Ok(())
     }
 
-    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts back what it had
-    /// replaced itself.
+    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts
+    /// back what it had replaced itself.
     pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
         let changed: Vec<(String, String)> = sqlx::query_as(
             "UPDATE assignments SET previous = (
@@ -175,13 +198,18 @@ impl Write {
         .fetch_all(self.connection())
         .await?;
         let changed = parts_of(changed)?;
-        let changed: Vec<_> = changed.iter().map(|(deployment, robot)| (deployment, robot)).collect();
+        let changed: Vec<_> =
+            changed.iter().map(|(deployment, robot)| (deployment, robot)).collect();
         self.pass_over_deleted(&changed).await
     }
 
-    /// Has these put back nothing that was deleted, but what that had replaced itself. A deleted package's bytes are kept while
-    /// it is desired, or what a cancel of that puts back; these become that only now, so theirs may be gone.
-    async fn pass_over_deleted(&mut self, pairs: &[(&DeploymentId, &RobotId)]) -> Result<(), StoreError> {
+    /// Has these put back nothing that was deleted, but what that had replaced itself. A deleted
+    /// package's bytes are kept while it is desired, or what a cancel of that puts back; these
+    /// become that only now, so theirs may be gone.
+    async fn pass_over_deleted(
+        &mut self,
+        pairs: &[(&DeploymentId, &RobotId)],
+    ) -> Result<(), StoreError> {
         for group in groups(pairs) {
             // The same package has the same text.
             let sql = format!(
@@ -234,13 +262,20 @@ impl Write {
     }
 }
 
-/// Reads [`COLUMNS`]. A task that has run where it is, in a phase that `stays` tells, is left there.
-fn revocable(row: &sqlx::any::AnyRow, stays: impl Fn(Phase) -> bool) -> Result<Revocable, StoreError> {
+/// Reads [`COLUMNS`]. A task that has run where it is, in a phase that `stays` tells, is left
+/// there.
+fn revocable(
+    row: &sqlx::any::AnyRow,
+    stays: impl Fn(Phase) -> bool,
+) -> Result<Revocable, StoreError> {
     let deployment: DeploymentId = id("assignments.deployment_id", row.try_get("deployment_id")?)?;
     let previous: Option<String> = row.try_get("previous")?;
     let is = |column| row.try_get::<i64, _>(column).map(|value| value == 1);
-    let (desired, wanted, run) =
-        (is("desired")?, from_word("assignments.wanted", row.try_get("wanted")?)?, number(row.try_get("run")?));
+    let (desired, wanted, run) = (
+        is("desired")?,
+        from_word("assignments.wanted", row.try_get("wanted")?)?,
+        number(row.try_get("run")?),
+    );
     let unchanged = Left { run, wanted, phase: None, failure: None, is_told: false };
     let left = if is("diverged")? {
         Some(unchanged)
@@ -260,14 +295,18 @@ fn revocable(row: &sqlx::any::AnyRow, stays: impl Fn(Phase) -> bool) -> Result<R
     })
 }
 
-/// A robot that never heard of the last order on its task keeps what it said that it has. One that has heard of it, and has not
-/// come to it in time, does not come to it later.
+/// A robot that never heard of the last order on its task keeps what it said that it has. One that
+/// has heard of it, and has not come to it in time, does not come to it later.
 fn as_reported(report: Option<Report>, deployment: &DeploymentId, ordered: Left) -> Left {
     let tasks = report.into_iter().flat_map(|report| report.tasks);
     match tasks.into_iter().find(|task| task.deployment == *deployment) {
-        Some(task) if task.run < ordered.run => {
-            Left { run: task.run, wanted: task.wanted, phase: Some(task.phase), failure: task.failure, is_told: true }
-        }
+        Some(task) if task.run < ordered.run => Left {
+            run: task.run,
+            wanted: task.wanted,
+            phase: Some(task.phase),
+            failure: task.failure,
+            is_told: true,
+        },
         _ => Left { wanted: Wanted::Stopped, is_told: true, ..ordered },
     }
 }

@@ -1,7 +1,8 @@
-//! Who was let in a moment ago, so that a robot's thousand requests ask the database once, and what publishers have signed,
-//! which robots are told each time they ask what they should have. An answer is remembered until
-//! the next write that could change it has ended, at most for some seconds, and never beyond a token's own end: what is
-//! revoked here is revoked at once. Refusals are not remembered. It never decides who may do what.
+//! Who was let in a moment ago, so that a robot's thousand requests ask the database once, and what
+//! publishers have signed, which robots are told each time they ask what they should have. An
+//! answer is remembered until the next write that could change it has ended, at most for some
+//! seconds, and never beyond a token's own end: what is revoked here is revoked at once. Refusals
+//! are not remembered. It never decides who may do what.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,8 +37,8 @@ struct Answers {
     signatures: HashMap<Digest, Vec<BlobRef>>,
 }
 
-/// A token by its kind, its id and the digest of its secret. Whoever could make use of how long a look-up takes would have
-/// to choose secrets by their SHA-256.
+/// A token by its kind, its id and the digest of its secret. Whoever could make use of how long a
+/// look-up takes would have to choose secrets by their SHA-256.
 type Shown = (TokenKind, String, Digest);
 
 #[derive(Debug)]
@@ -52,7 +53,8 @@ pub(in crate::store) struct Asked {
     epoch: u64,
 }
 
-/// A write that is under way. When it ends, however it ends, all answers are forgotten, if that is due.
+/// A write that is under way. When it ends, however it ends, all answers are forgotten, if that is
+/// due.
 #[derive(Debug)]
 pub(in crate::store) struct Ending {
     access: Access,
@@ -92,7 +94,11 @@ impl Access {
     }
 
     /// By which order the robot may fetch the blob, if that is known.
-    pub(in crate::store) fn fetched_by(&self, robot: &RobotId, digest: &Digest) -> Option<Arc<FetchedBy>> {
+    pub(in crate::store) fn fetched_by(
+        &self,
+        robot: &RobotId,
+        digest: &Digest,
+    ) -> Option<Arc<FetchedBy>> {
         self.answers().fetches.get(&(robot.clone(), *digest)).cloned()
     }
 
@@ -134,7 +140,12 @@ impl Access {
     }
 
     /// Remembers the signatures of a package.
-    pub(in crate::store) fn remember_signatures(&self, asked: Asked, manifest: Digest, signatures: Vec<BlobRef>) {
+    pub(in crate::store) fn remember_signatures(
+        &self,
+        asked: Asked,
+        manifest: Digest,
+        signatures: Vec<BlobRef>,
+    ) {
         let mut answers = self.answers();
         if answers.epoch == asked.epoch {
             if answers.signatures.len() >= MAX_PACKAGES {
@@ -150,7 +161,8 @@ impl Access {
     }
 
     fn answers(&self) -> MutexGuard<'_, Answers> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         let mut answers = self.answers.lock().unwrap_or_else(PoisonError::into_inner);
         if answers.since.is_none_or(|since| since.elapsed() > MAX_AGE) {
             answers.forget();
@@ -191,7 +203,8 @@ mod tests {
     #[test]
     fn an_answer_counts_until_a_write_ends_or_the_token_does() {
         let access = Access::default();
-        let (token, robot, blob) = (Token::random(TokenKind::Robot), RobotId::random(), Digest::of(b"x"));
+        let (token, robot, blob) =
+            (Token::random(TokenKind::Robot), RobotId::random(), Digest::of(b"x"));
         let holder = TokenHolder::Robot { robot: robot.clone(), token_number: 3, key: None };
         let remember = |asked| {
             access.remember_holder(asked, &token, &holder, Some(100));
@@ -202,7 +215,10 @@ mod tests {
         };
         let known = || {
             let found = access.fetched_by(&robot, &blob).is_some();
-            assert_eq!((access.lists().is_some(), access.signatures(&blob).is_some()), (found, found));
+            assert_eq!(
+                (access.lists().is_some(), access.signatures(&blob).is_some()),
+                (found, found)
+            );
             (access.holder(&token, 99), found)
         };
         assert_eq!(known(), (None, false));

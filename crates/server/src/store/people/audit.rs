@@ -1,5 +1,6 @@
-//! The audit's entries: each is added by the write that it tells of, and none is ever changed or removed. So that it does not
-//! grow without bound, what a person does to themselves alone is done so often a day and no more.
+//! The audit's entries: each is added by the write that it tells of, and none is ever changed or
+//! removed. So that it does not grow without bound, what a person does to themselves alone is done
+//! so often a day and no more.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -136,9 +137,10 @@ impl Act {
 }
 
 impl Act {
-    /// Whether everybody may do it again and again, whatever their role, and to nobody but themselves. Of what they began by
-    /// it, signing out and revoking a token end each once. All else takes somebody who is trusted with more than the length
-    /// of the audit, and an order must not wait.
+    /// Whether everybody may do it again and again, whatever their role, and to nobody but
+    /// themselves. Of what they began by it, signing out and revoking a token end each once. All
+    /// else takes somebody who is trusted with more than the length of the audit, and an order must
+    /// not wait.
     fn is_everybodys(self) -> bool {
         matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
     }
@@ -170,8 +172,22 @@ impl Deed {
     }
 
     /// Someone who is no user, or not yet known to be one.
-    pub fn new(who: String, token: Option<TokenId>, address: Option<IpAddr>, act: Act, target: impl ToString) -> Self {
-        Self { who, token, address, by: None, act, target: shortened(&target.to_string()), detail: BTreeMap::new() }
+    pub fn new(
+        who: String,
+        token: Option<TokenId>,
+        address: Option<IpAddr>,
+        act: Act,
+        target: impl ToString,
+    ) -> Self {
+        Self {
+            who,
+            token,
+            address,
+            by: None,
+            act,
+            target: shortened(&target.to_string()),
+            detail: BTreeMap::new(),
+        }
     }
 
     /// With this as well.
@@ -196,7 +212,8 @@ impl Deed {
     }
 }
 
-/// As much of a text as an entry keeps. Neither a terminal nor Postgres takes every control character.
+/// As much of a text as an entry keeps. Neither a terminal nor Postgres takes every control
+/// character.
 fn shortened(text: &str) -> String {
     let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
     let mut kept: String = characters.by_ref().take(MOST_CHARACTERS).collect();
@@ -207,15 +224,21 @@ fn shortened(text: &str) -> String {
 }
 
 impl Write {
-    /// Writes down what this write does. It is there if and only if the write is; and the write is not, if whoever does it may
-    /// no longer: a request's body can come long after its head. So this comes before one's own rights are changed.
+    /// Writes down what this write does. It is there if and only if the write is; and the write is
+    /// not, if whoever does it may no longer: a request's body can come long after its head. So
+    /// this comes before one's own rights are changed.
     pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
         if let Some(by) = &deed.by {
             self.check_rights(by, now_ms).await?;
         }
-        if deed.act.is_everybodys() && !deed.by.as_ref().is_some_and(|by| by.may(Permission::Administer)) {
+        if deed.act.is_everybodys()
+            && !deed.by.as_ref().is_some_and(|by| by.may(Permission::Administer))
+        {
             let taken = self.everybodys.take(&deed.who, Instant::now());
-            taken.map_err(|wait| StoreError::TooManyActs { who: deed.who.clone(), seconds: seconds(wait) })?;
+            taken.map_err(|wait| StoreError::TooManyActs {
+                who: deed.who.clone(),
+                seconds: seconds(wait),
+            })?;
         }
         let last = sqlx::query("SELECT number, digest FROM audit ORDER BY number DESC LIMIT 1")
             .fetch_optional(self.connection())
@@ -251,7 +274,11 @@ impl Write {
     }
 
     /// Writes it down, if there is something to, and makes it so.
-    pub(in crate::store) async fn commit_with(mut self, deed: Option<&Deed>, now_ms: u64) -> Result<(), StoreError> {
+    pub(in crate::store) async fn commit_with(
+        mut self,
+        deed: Option<&Deed>,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         if let Some(deed) = deed {
             self.audit(deed, now_ms).await?;
         }
@@ -262,7 +289,8 @@ impl Write {
 impl Store {
     /// Entries of the audit: those after a number, the oldest first, or else the newest first.
     pub async fn audit(&self, query: &AuditQuery) -> Result<AuditPage, StoreError> {
-        let last: Option<i64> = sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.reads).await?;
+        let last: Option<i64> =
+            sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.reads).await?;
         let order = if query.after.is_some() { "ASC" } else { "DESC" };
         let limit = query.limit.unwrap_or(MOST_RECORDS).min(MOST_RECORDS);
         let rows = sqlx::query(AssertSqlSafe(format!(
@@ -289,7 +317,8 @@ impl Store {
             }
             let entry = serde_json::value::RawValue::from_string(entry)
                 .map_err(|_| StoreError::Unreadable { column: "audit.entry" })?;
-            records.push(AuditRecord { digest: id("audit.digest", row.try_get("digest")?)?, entry });
+            records
+                .push(AuditRecord { digest: id("audit.digest", row.try_get("digest")?)?, entry });
         }
         Ok(AuditPage { records, last: last.map_or(0, number) })
     }
@@ -301,7 +330,8 @@ mod tests {
 
     #[test]
     fn no_statement_changes_or_removes_an_entry() {
-        let mut directories = vec![std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/store")];
+        let mut directories =
+            vec![std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/store")];
         let mut looked_at = 0;
         while let Some(directory) = directories.pop() {
             for file in std::fs::read_dir(directory).expect("a directory") {
@@ -311,7 +341,8 @@ mod tests {
                     continue;
                 }
                 let text = std::fs::read_to_string(path).expect("text");
-                let statements = text.split_whitespace().collect::<Vec<_>>().join(" ").to_lowercase();
+                let statements =
+                    text.split_whitespace().collect::<Vec<_>>().join(" ").to_lowercase();
                 for verb in ["update", "delete from", "drop table", "alter table", "truncate"] {
                     assert!(!statements.contains(&format!("{verb} audit ")), "{verb}");
                 }

@@ -1,6 +1,7 @@
-//! The first use of a robot's token, which ends its other ones. When a fleet comes for the first time, thousands happen at
-//! once: whoever finds nobody writing writes for all who wait, so that they share one commit, and what others remember of
-//! the database is out of date once and not thousands of times.
+//! The first use of a robot's token, which ends its other ones. When a fleet comes for the first
+//! time, thousands happen at once: whoever finds nobody writing writes for all who wait, so that
+//! they share one commit, and what others remember of the database is out of date once and not
+//! thousands of times.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -31,7 +32,8 @@ struct Waiting {
 
 impl FirstUses {
     fn waiting(&self) -> MutexGuard<'_, Vec<Waiting>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
+        // half-done.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -45,9 +47,13 @@ impl FirstUses {
 }
 
 impl Store {
-    /// Marks a robot's token as the one it uses; false if it is used or ended already. Goes on to its end even if the caller
-    /// does not wait for it.
-    pub(in crate::store) async fn use_first(&self, token: &Token, now_ms: u64) -> Result<bool, StoreError> {
+    /// Marks a robot's token as the one it uses; false if it is used or ended already. Goes on to
+    /// its end even if the caller does not wait for it.
+    pub(in crate::store) async fn use_first(
+        &self,
+        token: &Token,
+        now_ms: u64,
+    ) -> Result<bool, StoreError> {
         let (told, mut hears) = oneshot::channel();
         self.first_uses.waiting().push(Waiting { token_id: token.id(), now_ms, told });
         let lost = |_| Err(StoreError::Statement(sqlx::Error::WorkerCrashed));
@@ -107,7 +113,8 @@ impl Write {
         .await?;
         let Some(row) = row else { return Ok(false) };
         let robot: RobotId = id("tokens.robot_id", row.try_get("robot_id")?)?;
-        let (made_by, number): (Option<String>, i64) = (row.try_get("made_by")?, row.try_get("number")?);
+        let (made_by, number): (Option<String>, i64) =
+            (row.try_get("made_by")?, row.try_get("number")?);
         sqlx::query(
             "UPDATE tokens SET revoked_at_ms = $3
              WHERE robot_id = $1 AND kind = 'robot' AND id <> $2 AND revoked_at_ms IS NULL",

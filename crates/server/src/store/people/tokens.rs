@@ -1,5 +1,6 @@
-//! Tokens: stored as digests of their secrets, with what each may do. A robot has at most two that are valid: the one it
-//! uses, and one that was made for it and ends the other when it is first used.
+//! Tokens: stored as digests of their secrets, with what each may do. A robot has at most two that
+//! are valid: the one it uses, and one that was made for it and ends the other when it is first
+//! used.
 
 use std::collections::BTreeSet;
 
@@ -15,7 +16,9 @@ use task_proto::{RobotId, TokenId, UserName};
 
 use crate::domain::person::{Person, Scope};
 use crate::net::tls::ClientProof;
-use crate::store::rows::{from_optional_json, from_word, groups, id, json, number, optional, stored, values};
+use crate::store::rows::{
+    from_optional_json, from_word, groups, id, json, number, optional, stored, values,
+};
 use crate::store::{Store, StoreError, Write};
 
 /// Whom a valid token stands for.
@@ -68,7 +71,8 @@ pub struct EnrolmentTerms {
     pub robot: Option<RobotId>,
     /// Labels that whoever uses it gets.
     pub labels: Labels,
-    /// Enrolments left; `None`: any number. With none left it is only good for an enrolment whose answer was lost.
+    /// Enrolments left; `None`: any number. With none left it is only good for an enrolment whose
+    /// answer was lost.
     pub uses_left: Option<u64>,
     /// When it ends.
     pub expires_at_ms: u64,
@@ -101,8 +105,8 @@ struct UserPart {
     origin: TokenOrigin,
 }
 
-/// An enrolment token without a use left is still good while a token that it made was never used: the answer with that
-/// one may have been lost.
+/// An enrolment token without a use left is still good while a token that it made was never used:
+/// the answer with that one may have been lost.
 const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
          t.client_key, t.user_name, t.roles, t.scope, t.origin, t.approval, u.roles AS user_roles, u.scope AS user_scope,
          r.awaits_approval
@@ -112,15 +116,26 @@ const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t
             WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
 
 impl Store {
-    /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or revoked. Changes nothing.
-    pub async fn token_holder(&self, token: &Token, now_ms: u64) -> Result<Option<TokenHolder>, StoreError> {
+    /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or
+    /// revoked. Changes nothing.
+    pub async fn token_holder(
+        &self,
+        token: &Token,
+        now_ms: u64,
+    ) -> Result<Option<TokenHolder>, StoreError> {
         let row = self.valid_token(token, now_ms).await?;
         Ok(row.and_then(|row| row.holder(token)))
     }
 
-    /// The same for whoever shows the token to come in. A robot's first use of a token ends its other ones.
-    /// Who has registered a key has to have proven that it holds it, if it was asked to: else the token is as if unknown.
-    pub async fn admit(&self, token: &Token, proof: &ClientProof, now_ms: u64) -> Result<Option<Admitted>, StoreError> {
+    /// The same for whoever shows the token to come in. A robot's first use of a token ends its
+    /// other ones. Who has registered a key has to have proven that it holds it, if it was asked
+    /// to: else the token is as if unknown.
+    pub async fn admit(
+        &self,
+        token: &Token,
+        proof: &ClientProof,
+        now_ms: u64,
+    ) -> Result<Option<Admitted>, StoreError> {
         if let Some(holder) = self.access.holder(token, now_ms) {
             let is_proven = holder.is_proven_by(proof);
             return Ok(is_proven.then_some(Admitted { holder, is_first_use: false }));
@@ -133,7 +148,8 @@ impl Store {
         let Some(holder) = holder else { return Ok(None) };
         if is_unused && !self.use_first(token, now_ms).await? {
             // Somebody was faster: either with this token or with a later one.
-            let holder = self.token_holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
+            let holder =
+                self.token_holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
             return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
         }
         // How often an enrolment token may be used is counted by those who use it.
@@ -143,7 +159,11 @@ impl Store {
         Ok(Some(Admitted { holder, is_first_use: is_unused }))
     }
 
-    async fn valid_token(&self, token: &Token, now_ms: u64) -> Result<Option<TokenRow>, StoreError> {
+    async fn valid_token(
+        &self,
+        token: &Token,
+        now_ms: u64,
+    ) -> Result<Option<TokenRow>, StoreError> {
         let row = sqlx::query(VALID_TOKEN)
             .bind(token.id())
             .bind(kind_text(token.kind()))
@@ -154,7 +174,11 @@ impl Store {
     }
 
     /// Stores the first token, which does not expire.
-    pub async fn create_operator_token(&self, token: &Token, now_ms: u64) -> Result<(), StoreError> {
+    pub async fn create_operator_token(
+        &self,
+        token: &Token,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
         write.insert_token(token, None, None, now_ms).await?;
         write.commit().await
@@ -163,7 +187,11 @@ impl Store {
 
 impl Write {
     /// What the enrolment token `token` is good for now; `None` if it is good for nothing.
-    pub async fn enrolment_terms(&mut self, token: &Token, now_ms: u64) -> Result<Option<EnrolmentTerms>, StoreError> {
+    pub async fn enrolment_terms(
+        &mut self,
+        token: &Token,
+        now_ms: u64,
+    ) -> Result<Option<EnrolmentTerms>, StoreError> {
         if token.kind() != TokenKind::Enrolment {
             return Ok(None);
         }
@@ -183,8 +211,13 @@ impl Write {
         }))
     }
 
-    /// An error unless `by` may now what they might when they were let in. What this write changes itself does not count.
-    pub(in crate::store) async fn check_rights(&mut self, by: &Person, now_ms: u64) -> Result<(), StoreError> {
+    /// An error unless `by` may now what they might when they were let in. What this write changes
+    /// itself does not count.
+    pub(in crate::store) async fn check_rights(
+        &mut self,
+        by: &Person,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         if self.vouched_for.as_ref() == Some(by) {
             return Ok(());
         }
@@ -204,10 +237,12 @@ impl Write {
 
     /// Counts one enrolment by `token`.
     pub async fn use_enrolment_token(&mut self, token: &Token) -> Result<(), StoreError> {
-        sqlx::query("UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL")
-            .bind(token.id())
-            .execute(self.connection())
-            .await?;
+        sqlx::query(
+            "UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL",
+        )
+        .bind(token.id())
+        .execute(self.connection())
+        .await?;
         Ok(())
     }
 
@@ -230,8 +265,9 @@ impl Write {
         Ok(())
     }
 
-    /// Makes `token` the one that `robot` may go over to, in the place of another that it never used. `made_by` is the
-    /// enrolment token it came by; `None`: the robot itself asked for it. Who has to show a key with it has `key`.
+    /// Makes `token` the one that `robot` may go over to, in the place of another that it never
+    /// used. `made_by` is the enrolment token it came by; `None`: the robot itself asked for it.
+    /// Who has to show a key with it has `key`.
     pub async fn offer_robot_token(
         &mut self,
         token: &Token,
@@ -240,10 +276,12 @@ impl Write {
         key: Option<&PublicKey>,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        sqlx::query("DELETE FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL")
-            .bind(robot.as_str())
-            .execute(self.connection())
-            .await?;
+        sqlx::query(
+            "DELETE FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL",
+        )
+        .bind(robot.as_str())
+        .execute(self.connection())
+        .await?;
         self.insert_token(token, Some(robot), made_by, now_ms).await?;
         sqlx::query("UPDATE tokens SET client_key = $2 WHERE id = $1")
             .bind(token.id())
@@ -254,7 +292,11 @@ impl Write {
     }
 
     /// Refuses what `robot` asked by a token that has ended since.
-    pub async fn check_token(&mut self, robot: &RobotId, token_number: u64) -> Result<(), StoreError> {
+    pub async fn check_token(
+        &mut self,
+        robot: &RobotId,
+        token_number: u64,
+    ) -> Result<(), StoreError> {
         let found: Option<String> = sqlx::query_scalar(
             "SELECT id FROM tokens
              WHERE robot_id = $1 AND number = $2 AND kind = 'robot' AND used_at_ms IS NOT NULL AND revoked_at_ms IS NULL",
@@ -278,8 +320,13 @@ impl Write {
         row.map(|row| client_key(&row)).transpose().map(Option::flatten)
     }
 
-    /// Whether `robot` was given a token by an enrolment, by `made_by` or by any, that nobody has used yet.
-    pub async fn awaits_first_use(&mut self, robot: &RobotId, made_by: Option<&Token>) -> Result<bool, StoreError> {
+    /// Whether `robot` was given a token by an enrolment, by `made_by` or by any, that nobody has
+    /// used yet.
+    pub async fn awaits_first_use(
+        &mut self,
+        robot: &RobotId,
+        made_by: Option<&Token>,
+    ) -> Result<bool, StoreError> {
         let found: Option<String> = sqlx::query_scalar(
             "SELECT id FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL
                  AND revoked_at_ms IS NULL AND made_by IS NOT NULL AND (made_by = $2 OR $2 = '')",
@@ -292,7 +339,11 @@ impl Write {
     }
 
     /// Ends all tokens made for `robots`.
-    pub async fn revoke_tokens(&mut self, robots: &[RobotId], now_ms: u64) -> Result<(), StoreError> {
+    pub async fn revoke_tokens(
+        &mut self,
+        robots: &[RobotId],
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         for group in groups(robots) {
             let sql = format!(
                 "UPDATE tokens SET revoked_at_ms = $1 WHERE revoked_at_ms IS NULL AND robot_id IN ({})",
@@ -307,10 +358,14 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets tokens that are good for nothing any more, and says whose they were if they were users'. The first token stays
-    /// when it was revoked: it is in the data directory, and must not come back to life at the next start. Those of a
-    /// revoked robot stay as well, so that it can be told.
-    pub async fn forget_ended_tokens(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
+    /// Forgets tokens that are good for nothing any more, and says whose they were if they were
+    /// users'. The first token stays when it was revoked: it is in the data directory, and must not
+    /// come back to life at the next start. Those of a revoked robot stay as well, so that it can
+    /// be told.
+    pub async fn forget_ended_tokens(
+        &mut self,
+        now_ms: u64,
+    ) -> Result<BTreeSet<UserName>, StoreError> {
         let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens
              WHERE (kind <> 'operator' OR user_name IS NOT NULL) AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
@@ -359,16 +414,21 @@ impl TokenRow {
             TokenKind::Robot if self.is_pending => {
                 self.robot.map(|robot| TokenHolder::Pending { robot, key: self.key })
             }
-            TokenKind::Robot => {
-                self.robot.map(|robot| TokenHolder::Robot { robot, token_number: self.number, key: self.key })
-            }
+            TokenKind::Robot => self.robot.map(|robot| TokenHolder::Robot {
+                robot,
+                token_number: self.number,
+                key: self.key,
+            }),
         }
     }
 
-    /// What the token allows is what both it and its user are allowed now; `None` if that is nothing.
+    /// What the token allows is what both it and its user are allowed now; `None` if that is
+    /// nothing.
     fn person(self, token: &TokenId) -> Option<Person> {
         let token = token.clone();
-        let Some(UserPart { name, user, roles, scope, origin }) = self.user else { return Some(Person::first(token)) };
+        let Some(UserPart { name, user, roles, scope, origin }) = self.user else {
+            return Some(Person::first(token));
+        };
         let (user_roles, user_scope) = user?;
         let roles = match roles {
             Some(roles) => roles.within(&user_roles)?,
@@ -393,7 +453,9 @@ fn token_row(row: sqlx::any::AnyRow) -> Result<TokenRow, StoreError> {
         expires_at_ms: row.try_get::<Option<i64>, _>("expires_at_ms")?.map(number),
         is_used: row.try_get::<Option<i64>, _>("used_at_ms")?.is_some(),
         approval: row.try_get::<i64, _>("approval")? != 0,
-        is_pending: row.try_get::<Option<i64>, _>("awaits_approval")?.is_some_and(|awaits| awaits != 0),
+        is_pending: row
+            .try_get::<Option<i64>, _>("awaits_approval")?
+            .is_some_and(|awaits| awaits != 0),
         number: number(row.try_get("number")?),
         key: client_key(&row)?,
         user: user_part(&row)?,

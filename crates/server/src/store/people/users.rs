@@ -1,4 +1,5 @@
-//! People and their access tokens. A token without a user is the first one, which lies in the data directory.
+//! People and their access tokens. A token without a user is the first one, which lies in the data
+//! directory.
 
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
@@ -67,7 +68,8 @@ pub struct NewToken<'a> {
 
 const USERS: &str = "SELECT name, roles, scope, password, subject, created_at_ms FROM users";
 
-const TOKENS: &str = "SELECT id, user_name, origin, title, roles, scope, created_at_ms, expires_at_ms, revoked_at_ms
+const TOKENS: &str =
+    "SELECT id, user_name, origin, title, roles, scope, created_at_ms, expires_at_ms, revoked_at_ms
      FROM tokens WHERE kind = 'operator'";
 
 impl Store {
@@ -81,12 +83,18 @@ impl Store {
 
     /// One user.
     pub async fn user(&self, name: &UserName) -> Result<Option<User>, StoreError> {
-        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1"))).bind(name.as_str());
+        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
+            .bind(name.as_str());
         row.fetch_optional(&self.reads).await?.as_ref().map(user).transpose()
     }
 
-    /// Everybody's tokens or one user's, the newest first; of those that have ended only the first token.
-    pub async fn person_tokens(&self, of: Option<&UserName>, now_ms: u64) -> Result<Vec<TokenView>, StoreError> {
+    /// Everybody's tokens or one user's, the newest first; of those that have ended only the first
+    /// token.
+    pub async fn person_tokens(
+        &self,
+        of: Option<&UserName>,
+        now_ms: u64,
+    ) -> Result<Vec<TokenView>, StoreError> {
         let listed = "AND (user_name = $1 OR $1 = '')
              AND (user_name IS NULL OR revoked_at_ms IS NULL AND (expires_at_ms IS NULL OR expires_at_ms > $2))
              ORDER BY number DESC LIMIT $3";
@@ -103,13 +111,15 @@ impl Store {
 impl Write {
     /// One user.
     pub async fn user(&mut self, name: &UserName) -> Result<Option<User>, StoreError> {
-        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1"))).bind(name.as_str());
+        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
+            .bind(name.as_str());
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
     /// The user who signs in by the provider as `subject`.
     pub async fn user_by_subject(&mut self, subject: &str) -> Result<Option<User>, StoreError> {
-        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE subject = $1"))).bind(subject);
+        let row =
+            sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE subject = $1"))).bind(subject);
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
@@ -144,14 +154,19 @@ impl Write {
 
     /// Removes a user with all their tokens.
     pub async fn remove_user(&mut self, name: &UserName) -> Result<(), StoreError> {
-        for sql in ["DELETE FROM tokens WHERE user_name = $1", "DELETE FROM users WHERE name = $1"] {
+        for sql in ["DELETE FROM tokens WHERE user_name = $1", "DELETE FROM users WHERE name = $1"]
+        {
             sqlx::query(sql).bind(name.as_str()).execute(self.connection()).await?;
         }
         Ok(())
     }
 
     /// Stores a user's token.
-    pub async fn create_token(&mut self, new: &NewToken<'_>, now_ms: u64) -> Result<(), StoreError> {
+    pub async fn create_token(
+        &mut self,
+        new: &NewToken<'_>,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         self.insert_token(new.token, None, None, now_ms).await?;
         sqlx::query(
             "UPDATE tokens SET user_name = $2, origin = $3, title = $4, roles = $5, scope = $6, expires_at_ms = $7
@@ -171,19 +186,28 @@ impl Write {
 
     /// One person's token, whether it is good or not.
     pub async fn person_token(&mut self, token: &TokenId) -> Result<Option<TokenView>, StoreError> {
-        let row = sqlx::query(sqlx::AssertSqlSafe(format!("{TOKENS} AND id = $1"))).bind(token.as_str());
+        let row =
+            sqlx::query(sqlx::AssertSqlSafe(format!("{TOKENS} AND id = $1"))).bind(token.as_str());
         row.fetch_optional(self.connection()).await?.as_ref().map(token_view).transpose()
     }
 
     /// The tokens of one user, the newest first.
     pub async fn tokens_of_user(&mut self, name: &UserName) -> Result<Vec<TokenView>, StoreError> {
-        let sql = format!("{TOKENS} AND user_name = $1 AND revoked_at_ms IS NULL ORDER BY number DESC");
-        let rows = sqlx::query(sqlx::AssertSqlSafe(sql)).bind(name.as_str()).fetch_all(self.connection()).await?;
+        let sql =
+            format!("{TOKENS} AND user_name = $1 AND revoked_at_ms IS NULL ORDER BY number DESC");
+        let rows = sqlx::query(sqlx::AssertSqlSafe(sql))
+            .bind(name.as_str())
+            .fetch_all(self.connection())
+            .await?;
         rows.iter().map(token_view).collect()
     }
 
     /// Ends a person's token.
-    pub async fn revoke_person_token(&mut self, token: &TokenId, now_ms: u64) -> Result<(), StoreError> {
+    pub async fn revoke_person_token(
+        &mut self,
+        token: &TokenId,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
         sqlx::query(
             "UPDATE tokens SET revoked_at_ms = $2 WHERE id = $1 AND kind = 'operator' AND revoked_at_ms IS NULL",
         )
@@ -212,7 +236,8 @@ fn token_view(row: &AnyRow) -> Result<TokenView, StoreError> {
     Ok(TokenView {
         id: id("tokens.id", row.try_get("id")?)?,
         user: optional("tokens.user_name", row.try_get("user_name")?)?.unwrap_or_else(first_name),
-        origin: origin.map_or(Ok(TokenOrigin::First), |origin| from_word("tokens.origin", &origin))?,
+        origin: origin
+            .map_or(Ok(TokenOrigin::First), |origin| from_word("tokens.origin", &origin))?,
         title: row.try_get::<Option<String>, _>("title")?.unwrap_or_default(),
         roles: optional("tokens.roles", row.try_get("roles")?)?,
         scope: optional("tokens.scope", row.try_get("scope")?)?,

@@ -1,5 +1,6 @@
-//! Which blobs somebody needs: a manifest that has them as parts or is one itself, or a package that a robot should have or may
-//! get back. What nobody needs is forgotten here; its bytes are others' to delete.
+//! Which blobs somebody needs: a manifest that has them as parts or is one itself, or a package
+//! that a robot should have or may get back. What nobody needs is forgotten here; its bytes are
+//! others' to delete.
 
 use std::collections::HashSet;
 
@@ -13,19 +14,24 @@ use crate::store::{Store, StoreError};
 impl Store {
     /// Every blob that somebody needs now. More may be needed as soon as this is known.
     pub async fn needed_blobs(&self) -> Result<HashSet<Digest>, StoreError> {
-        let texts: Vec<String> =
-            sqlx::query_scalar("SELECT digest FROM manifests UNION SELECT digest FROM manifest_parts")
-                .fetch_all(&self.reads)
-                .await?;
+        let texts: Vec<String> = sqlx::query_scalar(
+            "SELECT digest FROM manifests UNION SELECT digest FROM manifest_parts",
+        )
+        .fetch_all(&self.reads)
+        .await?;
         let needed = texts.iter().map(|text| id("manifests.digest", text));
         let mut needed = needed.collect::<Result<HashSet<Digest>, _>>()?;
         needed.extend(self.blobs_in_use().await?);
         Ok(needed)
     }
 
-    /// Those of `candidates` that nobody needs. Repositories that hold one without need forget it; where there is none, nothing
-    /// is written. The caller holds back everybody who could come to rely on one.
-    pub async fn forget_unneeded(&self, candidates: Vec<Digest>) -> Result<Vec<Digest>, StoreError> {
+    /// Those of `candidates` that nobody needs. Repositories that hold one without need forget it;
+    /// where there is none, nothing is written. The caller holds back everybody who could come to
+    /// rely on one.
+    pub async fn forget_unneeded(
+        &self,
+        candidates: Vec<Digest>,
+    ) -> Result<Vec<Digest>, StoreError> {
         if candidates.is_empty() {
             return Ok(candidates);
         }
@@ -44,13 +50,15 @@ impl Store {
                 needed.insert(id("manifests.digest", text)?);
             }
         }
-        let unneeded: Vec<Digest> = candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
+        let unneeded: Vec<Digest> =
+            candidates.into_iter().filter(|digest| !needed.contains(digest)).collect();
         if unneeded.is_empty() {
             return Ok(unneeded);
         }
         let mut write = self.begin().await?;
         for digest in &unneeded {
-            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
+            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1")
+                .bind(digest.to_string());
             query.execute(write.connection()).await?;
             write.uncount_blob(digest).await?;
         }

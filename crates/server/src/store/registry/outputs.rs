@@ -1,4 +1,5 @@
-//! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under the robot's repository.
+//! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under
+//! the robot's repository.
 
 use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
@@ -29,8 +30,8 @@ pub struct NewOutput {
 }
 
 impl Store {
-    /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most 1,000, and fewer if they
-    /// are large.
+    /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most
+    /// 1,000, and fewer if they are large.
     pub async fn outputs(
         &self,
         robot: Option<&RobotId>,
@@ -53,7 +54,11 @@ impl Store {
             let robot_name = rows::id("robots.name", row.try_get("name")?)?;
             if !scope.is_everything() {
                 let labels = rows::from_json("robots.labels", row.try_get("labels")?)?;
-                if !scope.covers(&rows::id("outputs.robot_id", row.try_get("robot_id")?)?, &robot_name, &labels) {
+                if !scope.covers(
+                    &rows::id("outputs.robot_id", row.try_get("robot_id")?)?,
+                    &robot_name,
+                    &labels,
+                ) {
                     continue;
                 }
             }
@@ -74,8 +79,8 @@ impl Store {
 }
 
 impl Write {
-    /// Notes an output, which takes the place of an earlier one of the same run. Gives the manifests of the robot's
-    /// repositories that are too many now, or have too many bytes.
+    /// Notes an output, which takes the place of an earlier one of the same run. Gives the
+    /// manifests of the robot's repositories that are too many now, or have too many bytes.
     pub(in crate::store) async fn insert_output(
         &mut self,
         repository: &RepositoryName,
@@ -110,7 +115,8 @@ impl Write {
         .bind(manifest.to_string())
         .fetch_all(self.connection())
         .await?;
-        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) = (Vec::new(), 1, 1, bytes_taken(output));
+        let (mut surplus, mut kept, mut kept_here, mut kept_bytes) =
+            (Vec::new(), 1, 1, bytes_taken(output));
         for row in &others {
             let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
             let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;

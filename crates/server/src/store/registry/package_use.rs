@@ -1,5 +1,5 @@
-//! Which packages there are of a name, who should have them, and that nothing of a package is deleted that someone should
-//! have: whichever way the deletion comes, it is decided here.
+//! Which packages there are of a name, who should have them, and that nothing of a package is
+//! deleted that someone should have: whichever way the deletion comes, it is decided here.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -54,7 +54,8 @@ impl Store {
         ranked(&rows)
     }
 
-    /// The package that a version or a digest means: a version is what its tag points to, or the newest that says so.
+    /// The package that a version or a digest means: a version is what its tag points to, or the
+    /// newest that says so.
     pub async fn find_package(
         &self,
         name: &TaskName,
@@ -64,12 +65,15 @@ impl Store {
             Reference::Digest(digest) => return self.package(name, digest).await,
             Reference::Tag(tag) => tag,
         };
-        let tagged = self.manifest(&RepositoryName::of_package(name), reference).await?.map(|found| found.digest);
+        let tagged = self
+            .manifest(&RepositoryName::of_package(name), reference)
+            .await?
+            .map(|found| found.digest);
         let mut versions = self.package_versions(name).await?;
-        let at = versions
-            .iter()
-            .position(|view| Some(view.package.manifest.digest) == tagged)
-            .or_else(|| versions.iter().position(|view| view.package.version.as_str() == tag.as_str()));
+        let at =
+            versions.iter().position(|view| Some(view.package.manifest.digest) == tagged).or_else(
+                || versions.iter().position(|view| view.package.version.as_str() == tag.as_str()),
+            );
         Ok(at.map(|at| versions.swap_remove(at)))
     }
 
@@ -79,11 +83,12 @@ impl Store {
         name: &TaskName,
         robots: Option<&HashSet<RobotId>>,
     ) -> Result<Vec<PackageUse>, StoreError> {
-        let rows: Vec<(String, String)> =
-            sqlx::query_as("SELECT deployment_id, robot_id FROM assignments WHERE task = $1 AND desired = 1")
-                .bind(name.as_str())
-                .fetch_all(&self.reads)
-                .await?;
+        let rows: Vec<(String, String)> = sqlx::query_as(
+            "SELECT deployment_id, robot_id FROM assignments WHERE task = $1 AND desired = 1",
+        )
+        .bind(name.as_str())
+        .fetch_all(&self.reads)
+        .await?;
         let mut by_deployment: HashMap<String, u64> = HashMap::new();
         for (deployment, robot) in rows {
             let robot: RobotId = id("assignments.robot_id", &robot)?;
@@ -100,14 +105,15 @@ impl Store {
         let mut uses: BTreeMap<Digest, u64> = BTreeMap::new();
         for (deployment, package) in rows {
             let package: PackageRef = from_json("deployments.package", &package)?;
-            *uses.entry(package.manifest.digest).or_default() += by_deployment.remove(&deployment).unwrap_or(0);
+            *uses.entry(package.manifest.digest).or_default() +=
+                by_deployment.remove(&deployment).unwrap_or(0);
         }
         let uses = uses.into_iter().filter(|(_, robots)| *robots > 0);
         Ok(uses.map(|(manifest, robots)| PackageUse { manifest, robots }).collect())
     }
 
-    /// Removes a manifest with all its tags, unless robots should have a package that it is, is a part of, or signs. A
-    /// signature is also removed by a person whose robots all of those are.
+    /// Removes a manifest with all its tags, unless robots should have a package that it is, is a
+    /// part of, or signs. A signature is also removed by a person whose robots all of those are.
     pub async fn delete_manifest(
         &self,
         repository: &RepositoryName,
@@ -174,7 +180,8 @@ impl Write {
         deed: &Deed,
     ) -> Result<Option<PackageUsers>, StoreError> {
         let Ok(name) = repository.as_str().parse::<TaskName>() else { return Ok(None) };
-        let packages = "SELECT manifest FROM packages WHERE name = $1 AND (manifest = $2 OR manifest IN
+        let packages =
+            "SELECT manifest FROM packages WHERE name = $1 AND (manifest = $2 OR manifest IN
                  (SELECT manifest FROM manifest_parts WHERE repository = $1 AND digest = $2))";
         for package in self.digests(packages, repository, digest).await? {
             let users = self.package_users(&name, &package).await?;
@@ -192,8 +199,8 @@ impl Write {
         Ok(None)
     }
 
-    /// Who keeps a tag from being deleted, or pointed to another manifest than `to`: robots that should have the package it
-    /// points to, and are outside of the person's scope.
+    /// Who keeps a tag from being deleted, or pointed to another manifest than `to`: robots that
+    /// should have the package it points to, and are outside of the person's scope.
     pub(in crate::store) async fn refusal_to_move(
         &mut self,
         repository: &RepositoryName,
@@ -201,13 +208,18 @@ impl Write {
         to: Option<&Digest>,
         deed: Option<&Deed>,
     ) -> Result<Option<PackageUsers>, StoreError> {
-        let (Some(deed), Ok(name)) = (deed, repository.as_str().parse::<TaskName>()) else { return Ok(None) };
-        let tagged: Option<String> = sqlx::query_scalar("SELECT manifest FROM tags WHERE repository = $1 AND tag = $2")
-            .bind(repository.as_str())
-            .bind(tag.as_str())
-            .fetch_optional(self.connection())
-            .await?;
-        let Some(tagged) = tagged.map(|digest| id::<Digest>("tags.manifest", &digest)).transpose()? else {
+        let (Some(deed), Ok(name)) = (deed, repository.as_str().parse::<TaskName>()) else {
+            return Ok(None);
+        };
+        let tagged: Option<String> =
+            sqlx::query_scalar("SELECT manifest FROM tags WHERE repository = $1 AND tag = $2")
+                .bind(repository.as_str())
+                .bind(tag.as_str())
+                .fetch_optional(self.connection())
+                .await?;
+        let Some(tagged) =
+            tagged.map(|digest| id::<Digest>("tags.manifest", &digest)).transpose()?
+        else {
             return Ok(None);
         };
         if to == Some(&tagged) {
@@ -228,7 +240,11 @@ impl Write {
         found.iter().map(|found| id("packages.manifest", found)).collect()
     }
 
-    async fn package_users(&mut self, name: &TaskName, manifest: &Digest) -> Result<PackageUsers, StoreError> {
+    async fn package_users(
+        &mut self,
+        name: &TaskName,
+        manifest: &Digest,
+    ) -> Result<PackageUsers, StoreError> {
         let rows: Vec<(String, String)> = sqlx::query_as(
             "SELECT id, package FROM deployments WHERE id IN (
                  SELECT deployment_id FROM assignments WHERE (desired = 1 OR ended = 0) AND task = $1)
@@ -245,7 +261,10 @@ impl Write {
             }
             let assigned = "SELECT robot_id FROM assignments WHERE deployment_id = $1 AND (desired = 1 OR ended = 0)";
             let sql = format!("{KNOWN} AND id IN ({assigned})");
-            let rows = sqlx::query(AssertSqlSafe(sql)).bind(&deployment).fetch_all(self.connection()).await?;
+            let rows = sqlx::query(AssertSqlSafe(sql))
+                .bind(&deployment)
+                .fetch_all(self.connection())
+                .await?;
             let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
             let ids = robots.iter().map(|robot| robot.id.clone()).collect();
             users.deployments.push((id("deployments.id", &deployment)?, ids));

@@ -1,5 +1,5 @@
-//! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the blob store. It never
-//! touches those bytes, and never decides what is a valid manifest.
+//! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the
+//! blob store. It never touches those bytes, and never decides what is a valid manifest.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -74,8 +74,8 @@ pub enum PutManifest {
 }
 
 impl Store {
-    /// Stores a manifest and points its tags to it, if all its parts are in the repository. With a `deed` that is written
-    /// down, as below.
+    /// Stores a manifest and points its tags to it, if all its parts are in the repository. With a
+    /// `deed` that is written down, as below.
     pub async fn put_manifest(
         &self,
         repository: &RepositoryName,
@@ -111,7 +111,9 @@ impl Store {
         }
         write.insert_manifest(repository, new, now_ms).await?;
         for tag in &new.tags {
-            if let Some(users) = write.refusal_to_move(repository, tag, Some(&new.manifest.digest), deed).await? {
+            if let Some(users) =
+                write.refusal_to_move(repository, tag, Some(&new.manifest.digest), deed).await?
+            {
                 return Ok(PutManifest::TagInUse(tag.clone(), users));
             }
             write.point_tag(repository, tag, &new.manifest.digest).await?;
@@ -120,7 +122,9 @@ impl Store {
             write.insert_package(package, task_manifest, now_ms).await?;
         }
         if let Some(output) = &new.output {
-            for (repository, surplus) in write.insert_output(repository, &new.manifest.digest, output, now_ms).await? {
+            for (repository, surplus) in
+                write.insert_output(repository, &new.manifest.digest, output, now_ms).await?
+            {
                 write.delete_manifest(&repository, &surplus).await?;
             }
         }
@@ -175,14 +179,19 @@ impl Store {
             .bind(repository.as_str())
             .fetch_all(&self.reads)
             .await?;
-        let mut tags = names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
+        let mut tags =
+            names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
         // Sorted here: a database sorts by its locale.
         tags.sort();
         Ok(Some(tags))
     }
 
     /// Makes a blob part of a repository.
-    pub async fn link_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+    pub async fn link_blob(
+        &self,
+        repository: &RepositoryName,
+        blob: &BlobRef,
+    ) -> Result<(), StoreError> {
         let mut write = self.begin().await?;
         let is_known = write.count_blob(repository, blob).await?;
         let linked =
@@ -198,16 +207,19 @@ impl Store {
     }
 
     /// Whether a blob is in `repository`, or in any if that is `None`.
-    pub async fn has_blob(&self, repository: Option<&RepositoryName>, digest: &Digest) -> Result<bool, StoreError> {
+    pub async fn has_blob(
+        &self,
+        repository: Option<&RepositoryName>,
+        digest: &Digest,
+    ) -> Result<bool, StoreError> {
         let query = match repository {
-            Some(repository) => {
-                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 AND repository = $2")
-                    .bind(digest.to_string())
-                    .bind(repository.as_str())
-            }
-            None => {
-                sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 LIMIT 1").bind(digest.to_string())
-            }
+            Some(repository) => sqlx::query(
+                "SELECT digest FROM repository_blobs WHERE digest = $1 AND repository = $2",
+            )
+            .bind(digest.to_string())
+            .bind(repository.as_str()),
+            None => sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 LIMIT 1")
+                .bind(digest.to_string()),
         };
         Ok(query.fetch_optional(&self.reads).await?.is_some())
     }
@@ -222,7 +234,11 @@ impl Store {
     }
 
     /// One package.
-    pub async fn package(&self, name: &TaskName, manifest: &Digest) -> Result<Option<PackageView>, StoreError> {
+    pub async fn package(
+        &self,
+        name: &TaskName,
+        manifest: &Digest,
+    ) -> Result<Option<PackageView>, StoreError> {
         let row =
             sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages WHERE name = $1 AND manifest = $2")
                 .bind(name.as_str())
@@ -251,24 +267,27 @@ impl Write {
         repository: &RepositoryName,
         digest: &Digest,
     ) -> Result<bool, StoreError> {
-        let query = sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2");
+        let query =
+            sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2");
         let query = query.bind(repository.as_str()).bind(digest.to_string());
         Ok(query.execute(self.connection()).await?.rows_affected() > 0)
     }
 
-    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not there.
+    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not
+    /// there.
     pub(in crate::store) async fn delete_manifest(
         &mut self,
         repository: &RepositoryName,
         digest: &Digest,
     ) -> Result<Option<Vec<Digest>>, StoreError> {
         self.drop_of_robot(repository, digest).await?;
-        let parts: Vec<String> =
-            sqlx::query_scalar("DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest")
-                .bind(repository.as_str())
-                .bind(digest.to_string())
-                .fetch_all(self.connection())
-                .await?;
+        let parts: Vec<String> = sqlx::query_scalar(
+            "DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest",
+        )
+        .bind(repository.as_str())
+        .bind(digest.to_string())
+        .fetch_all(self.connection())
+        .await?;
         self.delete_document(repository, digest).await?;
         let mut deleted = 0;
         for sql in [
@@ -283,10 +302,18 @@ impl Write {
         if deleted == 0 {
             return Ok(None);
         }
-        parts.iter().map(|part| rows::id("manifest_parts.digest", part)).collect::<Result<_, _>>().map(Some)
+        parts
+            .iter()
+            .map(|part| rows::id("manifest_parts.digest", part))
+            .collect::<Result<_, _>>()
+            .map(Some)
     }
 
-    async fn repository_holds(&mut self, repository: &RepositoryName, part: &Digest) -> Result<bool, StoreError> {
+    async fn repository_holds(
+        &mut self,
+        repository: &RepositoryName,
+        part: &Digest,
+    ) -> Result<bool, StoreError> {
         let found = sqlx::query(
             "SELECT digest FROM repository_blobs WHERE repository = $1 AND digest = $2
              UNION ALL SELECT digest FROM manifests WHERE repository = $1 AND digest = $2",
@@ -333,7 +360,12 @@ impl Write {
         Ok(())
     }
 
-    async fn point_tag(&mut self, repository: &RepositoryName, tag: &Tag, manifest: &Digest) -> Result<(), StoreError> {
+    async fn point_tag(
+        &mut self,
+        repository: &RepositoryName,
+        tag: &Tag,
+        manifest: &Digest,
+    ) -> Result<(), StoreError> {
         sqlx::query(
             "INSERT INTO tags (repository, tag, manifest) VALUES ($1, $2, $3)
              ON CONFLICT (repository, tag) DO UPDATE SET manifest = excluded.manifest",
@@ -347,7 +379,10 @@ impl Write {
     }
 
     /// Another package that the version of this one means.
-    async fn other_of_version(&mut self, package: &PackageRef) -> Result<Option<Digest>, StoreError> {
+    async fn other_of_version(
+        &mut self,
+        package: &PackageRef,
+    ) -> Result<Option<Digest>, StoreError> {
         let other: Option<String> = sqlx::query_scalar(
             "SELECT t.manifest FROM tags t JOIN packages p ON p.name = t.repository AND p.manifest = t.manifest
              WHERE t.repository = $1 AND t.tag = $2 AND t.manifest <> $3",
@@ -360,9 +395,16 @@ impl Write {
         other.map(|digest| rows::id("tags.manifest", &digest)).transpose()
     }
 
-    /// Marks the package `outdated` as one whose version means `package` from now on, and that one as none.
-    async fn replace_package(&mut self, package: &PackageRef, outdated: &Digest) -> Result<(), StoreError> {
-        for (manifest, replaced_by) in [(outdated, Some(&package.manifest.digest)), (&package.manifest.digest, None)] {
+    /// Marks the package `outdated` as one whose version means `package` from now on, and that one
+    /// as none.
+    async fn replace_package(
+        &mut self,
+        package: &PackageRef,
+        outdated: &Digest,
+    ) -> Result<(), StoreError> {
+        for (manifest, replaced_by) in
+            [(outdated, Some(&package.manifest.digest)), (&package.manifest.digest, None)]
+        {
             sqlx::query("UPDATE packages SET replaced_by = $3 WHERE name = $1 AND manifest = $2")
                 .bind(package.name.as_str())
                 .bind(manifest.to_string())
@@ -395,15 +437,20 @@ impl Write {
     }
 }
 
-/// Packages, and whether a tag points to each: what is stored for one order alone, as by `taskd run`, has none.
+/// Packages, and whether a tag points to each: what is stored for one order alone, as by
+/// `taskd run`, has none.
 pub(in crate::store) const PACKAGE_ROWS: &str = "SELECT p.package, p.task_manifest, p.pushed_at_ms,
     (SELECT COUNT(*) FROM tags t WHERE t.repository = p.name AND t.manifest = p.manifest) AS tags FROM packages p";
 
-/// Those with a tag before the others, each the newest first: so that a name or a version means what was pushed under it.
+/// Those with a tag before the others, each the newest first: so that a name or a version means
+/// what was pushed under it.
 pub(in crate::store) fn ranked(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
-    let views = rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));
+    let views =
+        rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));
     let mut views = views.collect::<Result<Vec<_>, StoreError>>()?;
-    views.sort_by_key(|(is_bare, view)| (*is_bare, Reverse(view.pushed_at_ms), view.package.manifest.digest));
+    views.sort_by_key(|(is_bare, view)| {
+        (*is_bare, Reverse(view.pushed_at_ms), view.package.manifest.digest)
+    });
     Ok(views.into_iter().map(|(_, view)| view).collect())
 }
 

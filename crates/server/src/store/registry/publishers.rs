@@ -1,5 +1,5 @@
-//! What publishers have signed: envelopes about packages, and their lists. The registry holds the bytes; here is which
-//! robots are told of which. Nothing is verified here.
+//! What publishers have signed: envelopes about packages, and their lists. The registry holds the
+//! bytes; here is which robots are told of which. Nothing is verified here.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -34,16 +34,25 @@ pub enum SignedDocument {
 
 impl Store {
     /// The list of publishers with this version, or the newest.
-    pub async fn publisher_list(&self, version: Option<u64>) -> Result<Option<BlobRef>, StoreError> {
-        let sql =
-            "SELECT envelope, size FROM publisher_lists WHERE version = $1 OR $1 < 0 ORDER BY version DESC LIMIT 1";
-        let row = sqlx::query(sql).bind(version.map_or(-1, rows::stored)).fetch_optional(&self.reads).await?;
+    pub async fn publisher_list(
+        &self,
+        version: Option<u64>,
+    ) -> Result<Option<BlobRef>, StoreError> {
+        let sql = "SELECT envelope, size FROM publisher_lists WHERE version = $1 OR $1 < 0 ORDER BY version DESC LIMIT 1";
+        let row = sqlx::query(sql)
+            .bind(version.map_or(-1, rows::stored))
+            .fetch_optional(&self.reads)
+            .await?;
         row.as_ref().map(|row| envelope("publisher_lists.envelope", row)).transpose()
     }
 
-    /// Whether the blob is something signed that `robot` may have to look at: a list of publishers, or a signature of a
-    /// package it should have.
-    pub async fn is_evidence_for(&self, robot: &RobotId, blob: &Digest) -> Result<bool, StoreError> {
+    /// Whether the blob is something signed that `robot` may have to look at: a list of publishers,
+    /// or a signature of a package it should have.
+    pub async fn is_evidence_for(
+        &self,
+        robot: &RobotId,
+        blob: &Digest,
+    ) -> Result<bool, StoreError> {
         let packages: Vec<String> = sqlx::query_scalar(
             "SELECT package FROM signatures WHERE envelope = $1
              UNION ALL SELECT CAST('' AS TEXT) FROM publisher_lists WHERE envelope = $1",
@@ -58,12 +67,17 @@ impl Store {
             return Ok(false);
         }
         let wanted = self.desired_tasks(std::slice::from_ref(robot)).await?;
-        let mut manifests = wanted.iter().flat_map(|wanted| &wanted.tasks).map(|task| task.package.manifest.digest);
+        let mut manifests =
+            wanted.iter().flat_map(|wanted| &wanted.tasks).map(|task| task.package.manifest.digest);
         Ok(manifests.any(|manifest| packages.contains(&manifest.to_string())))
     }
 
     /// The robots that should have this version of the package.
-    pub async fn robots_with_package(&self, name: &TaskName, manifest: &Digest) -> Result<Vec<RobotId>, StoreError> {
+    pub async fn robots_with_package(
+        &self,
+        name: &TaskName,
+        manifest: &Digest,
+    ) -> Result<Vec<RobotId>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
             "SELECT DISTINCT a.robot_id FROM assignments a JOIN deployments d ON d.id = a.deployment_id
              WHERE a.desired = 1 AND d.task = $1 AND d.package LIKE $2",
@@ -75,18 +89,27 @@ impl Store {
         rows.iter().map(|row| rows::id("assignments.robot_id", row)).collect()
     }
 
-    /// Adds to what robots should have who has signed it, and lets that ride along where anything does.
-    pub(in crate::store) async fn add_evidence(&self, found: &mut [DesiredTasks]) -> Result<(), StoreError> {
+    /// Adds to what robots should have who has signed it, and lets that ride along where anything
+    /// does.
+    pub(in crate::store) async fn add_evidence(
+        &self,
+        found: &mut [DesiredTasks],
+    ) -> Result<(), StoreError> {
         let lists = self.lists_to_follow().await?;
-        let manifests: BTreeSet<Digest> =
-            found.iter().flat_map(|found| &found.tasks).map(|task| task.package.manifest.digest).collect();
+        let manifests: BTreeSet<Digest> = found
+            .iter()
+            .flat_map(|found| &found.tasks)
+            .map(|task| task.package.manifest.digest)
+            .collect();
         let signatures = self.signatures(&manifests).await?;
         for wanted in found {
             let mut evidence = Evidence { lists: lists.clone(), signatures: Vec::new() };
             for task in &wanted.tasks {
                 let manifest = task.package.manifest.digest;
                 let envelopes = signatures.get(&manifest).into_iter().flatten();
-                evidence.signatures.extend(envelopes.map(|envelope| SignatureRef { manifest, envelope: *envelope }));
+                evidence.signatures.extend(
+                    envelopes.map(|envelope| SignatureRef { manifest, envelope: *envelope }),
+                );
             }
             if !wanted.along.is_empty() {
                 // First: without them all else is of no use.
@@ -118,7 +141,10 @@ impl Store {
     }
 
     /// The first envelopes about each of these packages.
-    async fn signatures(&self, manifests: &BTreeSet<Digest>) -> Result<HashMap<Digest, Vec<BlobRef>>, StoreError> {
+    async fn signatures(
+        &self,
+        manifests: &BTreeSet<Digest>,
+    ) -> Result<HashMap<Digest, Vec<BlobRef>>, StoreError> {
         let asked = self.access.ask();
         let mut signatures: HashMap<Digest, Vec<BlobRef>> = HashMap::new();
         let mut unknown = Vec::new();
@@ -146,7 +172,11 @@ impl Store {
             }
         }
         for manifest in unknown {
-            self.access.remember_signatures(asked, manifest, signatures.get(&manifest).cloned().unwrap_or_default());
+            self.access.remember_signatures(
+                asked,
+                manifest,
+                signatures.get(&manifest).cloned().unwrap_or_default(),
+            );
         }
         Ok(signatures)
     }
@@ -215,7 +245,8 @@ impl Write {
             .execute(self.connection())
             .await?;
         if repository.as_str() == task_proto::publisher::LIST_REPOSITORY {
-            let delete = sqlx::query("DELETE FROM publisher_lists WHERE manifest = $1").bind(manifest.to_string());
+            let delete = sqlx::query("DELETE FROM publisher_lists WHERE manifest = $1")
+                .bind(manifest.to_string());
             delete.execute(self.connection()).await?;
         }
         Ok(())

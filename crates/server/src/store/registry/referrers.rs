@@ -1,4 +1,5 @@
-//! Which manifests refer to one, a page at a time: anything may have any number of them, and each says of itself what it likes.
+//! Which manifests refer to one, a page at a time: anything may have any number of them, and each
+//! says of itself what it likes.
 
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
@@ -23,7 +24,8 @@ pub struct ReferrersPage {
 }
 
 impl Store {
-    /// The manifests whose subject is `subject`, of one type or of all: those after a digest, or the first.
+    /// The manifests whose subject is `subject`, of one type or of all: those after a digest, or
+    /// the first.
     pub async fn referrers(
         &self,
         repository: &RepositoryName,
@@ -61,11 +63,15 @@ impl Store {
         .fetch_all(&self.reads)
         .await?;
         let next = if has_more { Some(rows::id("manifests.digest", last)?) } else { None };
-        Ok(ReferrersPage { manifests: found.iter().map(descriptor).collect::<Result<_, _>>()?, next })
+        Ok(ReferrersPage {
+            manifests: found.iter().map(descriptor).collect::<Result<_, _>>()?,
+            next,
+        })
     }
 }
 
-/// The last entry of a page that begins with the first of these, and whether there are more; `None` if there is nothing.
+/// The last entry of a page that begins with the first of these, and whether there are more; `None`
+/// if there is nothing.
 fn page_end(sizes: &[(String, i64)]) -> Option<(&str, bool)> {
     let mut bytes = 0;
     let fitting = sizes.iter().take_while(|(_, size)| {

@@ -1,5 +1,5 @@
-//! How many bytes each robot keeps on the server's disk: of blobs and manifests in its repositories, from when they are there
-//! until they are collected. It knows no limit.
+//! How many bytes each robot keeps on the server's disk: of blobs and manifests in its
+//! repositories, from when they are there until they are collected. It knows no limit.
 
 use std::collections::BTreeMap;
 
@@ -12,15 +12,21 @@ use crate::store::{Store, StoreError, Write, rows};
 /// What the smallest file counts: there is more to keeping it than its bytes.
 const LEAST_BYTES: u64 = 64 * 1024;
 
-/// What one takes on the disk with its manifest and config, small files counted as [`LEAST_BYTES`] each, in bytes.
+/// What one takes on the disk with its manifest and config, small files counted as [`LEAST_BYTES`]
+/// each, in bytes.
 pub fn bytes_taken(output: &OutputSet) -> u64 {
-    let blobs: BTreeMap<Digest, u64> = output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
+    let blobs: BTreeMap<Digest, u64> =
+        output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
     blobs.values().fold(2 * LEAST_BYTES, |sum, size| sum.saturating_add((*size).max(LEAST_BYTES)))
 }
 
 impl Store {
     /// Counts a manifest or a blob among what its robot takes, if the repository is a robot's.
-    pub async fn count_blob(&self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+    pub async fn count_blob(
+        &self,
+        repository: &RepositoryName,
+        blob: &BlobRef,
+    ) -> Result<(), StoreError> {
         if owner(repository).is_none() {
             return Ok(());
         }
@@ -29,17 +35,19 @@ impl Store {
         write.commit().await
     }
 
-    /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`] each.
+    /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`]
+    /// each.
     pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
-        let bytes: Option<i64> = sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
-            .bind(robot.as_str())
-            .fetch_optional(&self.reads)
-            .await?;
+        let bytes: Option<i64> =
+            sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
+                .bind(robot.as_str())
+                .fetch_optional(&self.reads)
+                .await?;
         Ok(rows::number(bytes.unwrap_or(0)))
     }
 
-    /// Blobs of manifests that robots had and have no more, and that nobody is known to be about to list. Others' manifests
-    /// may need them.
+    /// Blobs of manifests that robots had and have no more, and that nobody is known to be about to
+    /// list. Others' manifests may need them.
     pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
         let texts: Vec<String> = sqlx::query_scalar(
             "SELECT DISTINCT d.digest FROM robot_blobs d WHERE d.dropped = 1
@@ -73,18 +81,20 @@ impl Write {
         Ok(())
     }
 
-    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected: whether it was already.
+    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected: whether
+    /// it was already.
     pub(in crate::store) async fn count_blob(
         &mut self,
         repository: &RepositoryName,
         blob: &BlobRef,
     ) -> Result<bool, StoreError> {
         let Some((robot, _)) = owner(repository) else { return Ok(false) };
-        let known = sqlx::query("UPDATE robot_blobs SET dropped = 0 WHERE robot_id = $1 AND digest = $2")
-            .bind(robot.as_str())
-            .bind(blob.digest.to_string())
-            .execute(self.connection())
-            .await?;
+        let known =
+            sqlx::query("UPDATE robot_blobs SET dropped = 0 WHERE robot_id = $1 AND digest = $2")
+                .bind(robot.as_str())
+                .bind(blob.digest.to_string())
+                .execute(self.connection())
+                .await?;
         if known.rows_affected() > 0 {
             return Ok(true);
         }
@@ -107,17 +117,22 @@ impl Write {
     ) -> Result<(), StoreError> {
         let Some((robot, _)) = owner(repository) else { return Ok(()) };
         let bytes = rows::stored(LEAST_BYTES);
-        sqlx::query("UPDATE robot_blobs SET bytes = bytes + $1 WHERE robot_id = $2 AND digest = $3")
-            .bind(bytes)
-            .bind(robot.as_str())
-            .bind(blob.digest.to_string())
-            .execute(self.connection())
-            .await?;
+        sqlx::query(
+            "UPDATE robot_blobs SET bytes = bytes + $1 WHERE robot_id = $2 AND digest = $3",
+        )
+        .bind(bytes)
+        .bind(robot.as_str())
+        .bind(blob.digest.to_string())
+        .execute(self.connection())
+        .await?;
         self.add_to_robot(robot.as_str(), bytes).await
     }
 
     /// Counts a blob no more, for it is collected.
-    pub(in crate::store) async fn uncount_blob(&mut self, digest: &Digest) -> Result<(), StoreError> {
+    pub(in crate::store) async fn uncount_blob(
+        &mut self,
+        digest: &Digest,
+    ) -> Result<(), StoreError> {
         let counted: Vec<(String, i64)> =
             sqlx::query_as("DELETE FROM robot_blobs WHERE digest = $1 RETURNING robot_id, bytes")
                 .bind(digest.to_string())

@@ -12,7 +12,9 @@ use task_proto::{DeploymentId, Digest, Generation};
 use crate::process::program::ExitStatus;
 use crate::reconcile::driver::*;
 use crate::setup::installation::Installation;
-use crate::task::ledger::{ActiveRun, Collection, GateQuestion, GateStep, LedgerError, ProcessRecord};
+use crate::task::ledger::{
+    ActiveRun, Collection, GateQuestion, GateStep, LedgerError, ProcessRecord,
+};
 use crate::task::observed::Exit;
 
 #[derive(Default)]
@@ -101,7 +103,8 @@ impl Fake {
 
 impl Effects for Fake {
     fn now(&self) -> Now {
-        let wall_ms = self.state(|state| state.wall_ms).unwrap_or_else(crate::system::clock::wall_ms);
+        let wall_ms =
+            self.state(|state| state.wall_ms).unwrap_or_else(crate::system::clock::wall_ms);
         Now { boot_ms: crate::system::clock::boot_ms(), wall_ms }
     }
 
@@ -149,7 +152,10 @@ impl Effects for Fake {
                 }
                 manifest
             };
-            let manifest = || TaskManifest { exec_depends: state.exec_depends.clone(), ..of_jobs(manifest(package)) };
+            let manifest = || TaskManifest {
+                exec_depends: state.exec_depends.clone(),
+                ..of_jobs(manifest(package))
+            };
             let manifest = state.manifests.contains(&package.manifest.digest).then(manifest);
             let is_trusted = !state.untrusted.contains(&package.manifest.digest);
             let vouched = if is_trusted { Vouched::Yes } else { Vouched::No };
@@ -175,7 +181,8 @@ impl Effects for Fake {
 
     async fn process_ended(&self, _task: &TaskName, process: &ProcessRecord) {
         let mut exited = self.exited.subscribe();
-        let ended = |_: &()| self.state(|state| state.exits.iter().any(|(dir, _)| *dir == process.dir));
+        let ended =
+            |_: &()| self.state(|state| state.exits.iter().any(|(dir, _)| *dir == process.dir));
         exited.wait_for(ended).await.expect("the fake lives");
     }
 
@@ -199,7 +206,11 @@ impl Effects for Fake {
         self.state(|state| state.trust.clone())
     }
 
-    async fn check_signers(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn check_signers(
+        &self,
+        package: &PackageRef,
+        _cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         self.state(|state| state.checked.push(package.manifest.digest));
         let failure = Failure::new(FailureCode::UNTRUSTED_PACKAGE, "nobody has signed it");
         Err(StepFailure { failure, retry_after_ms: None })
@@ -209,7 +220,11 @@ impl Effects for Fake {
         self.state(|state| state.kept_parts.push(wanted.to_vec()));
     }
 
-    async fn pull_manifest(&self, package: &PackageRef, _cancel: &CancellationToken) -> Result<Done, StepFailure> {
+    async fn pull_manifest(
+        &self,
+        package: &PackageRef,
+        _cancel: &CancellationToken,
+    ) -> Result<Done, StepFailure> {
         self.state(|state| state.manifests.insert(package.manifest.digest));
         Ok(Done::Well)
     }
@@ -264,7 +279,11 @@ impl Effects for Fake {
         Err(StepFailure { failure, retry_after_ms: Some(0) })
     }
 
-    async fn build(&self, _package: &PackageRef, _cancel: &CancellationToken) -> Result<(), StepFailure> {
+    async fn build(
+        &self,
+        _package: &PackageRef,
+        _cancel: &CancellationToken,
+    ) -> Result<(), StepFailure> {
         Ok(())
     }
 
@@ -282,7 +301,8 @@ impl Effects for Fake {
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
         self.state(|state| {
             let dir = run.process.as_ref().expect("a process to start").dir.clone();
-            let written = state.ledgers.last().and_then(|ledger| ledger.tasks.get(task)?.active.clone());
+            let written =
+                state.ledgers.last().and_then(|ledger| ledger.tasks.get(task)?.active.clone());
             assert_eq!(written.as_ref(), Some(run), "the ledger is written before the start");
             assert!(state.alive.is_empty(), "two processes of a task");
             state.alive.insert(dir);

@@ -17,11 +17,17 @@ async fn a_process_of_which_nothing_can_be_told_is_looked_at_seldom_and_holds_up
     let looked = tokio::time::timeout(PATIENCE, looked.wait_for(|looks| *looks > 0)).await;
     looked.expect("it is looked at").expect("the fake lives");
     bench.order(2, vec![talker.clone(), other.clone()]).await;
-    let runs = |task: &task_proto::report::TaskReport| task.task == other.task && task.phase == Phase::Running;
+    let runs = |task: &task_proto::report::TaskReport| {
+        task.task == other.task && task.phase == Phase::Running
+    };
     bench.report(|report| report.tasks.iter().any(runs)).await;
     let looks = *bench.fake.looks.borrow();
     let periods = began.elapsed().as_millis() as u64 / plan::LOOK_AGAIN_MS;
     assert!(looks <= periods + 1, "{looks} looks");
     bench.fake.state(|state| (state.hangs, state.alive) = (false, Default::default()));
-    bench.report(|report| report.tasks.iter().any(|task| task.task == talker.task && task.restarts == 1)).await;
+    bench
+        .report(|report| {
+            report.tasks.iter().any(|task| task.task == talker.task && task.restarts == 1)
+        })
+        .await;
 }

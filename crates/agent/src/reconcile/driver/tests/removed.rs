@@ -10,7 +10,11 @@ async fn a_removed_robot_goes_on_and_begins_nothing_new() {
     bench.say(Heard::TokenRefused("this robot was revoked".to_owned())).await;
     let report = bench.report(|report| has(report, "removed")).await;
     assert_eq!(report.tasks[0].phase, Phase::Running);
-    assert!(report.conditions[0].text.contains("(this robot was revoked)"), "{:?}", report.conditions);
+    assert!(
+        report.conditions[0].text.contains("(this robot was revoked)"),
+        "{:?}",
+        report.conditions
+    );
     let ledger = bench.end().await;
     assert!(ledger.removed, "it is remembered over a restart");
 }
@@ -23,7 +27,8 @@ async fn a_removed_robot_begins_nothing_after_a_restart_until_it_is_known_again(
     bench.phase(Phase::Deferred).await;
     bench.say(Heard::TokenRefused(String::new())).await;
     bench.report(|report| has(report, "removed")).await;
-    let (fake, key, robot) = (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let (fake, key, robot) =
+        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;
 
     fake.state(|state| state.held = false);
@@ -38,8 +43,14 @@ async fn a_removed_robot_begins_nothing_after_a_restart_until_it_is_known_again(
 async fn nobody_but_the_server_makes_a_removed_robot_known_again() {
     let bench = Bench::new().await;
     let tasks = vec![order("1.0")];
-    let Heard::Desired { envelope, inline, .. } = bench.sealed(1, tasks.clone(), &bench.key) else { panic!("sealed") };
-    let again = |was_asked_for| Heard::Desired { envelope: envelope.clone(), inline: inline.clone(), was_asked_for };
+    let Heard::Desired { envelope, inline, .. } = bench.sealed(1, tasks.clone(), &bench.key) else {
+        panic!("sealed")
+    };
+    let again = |was_asked_for| Heard::Desired {
+        envelope: envelope.clone(),
+        inline: inline.clone(),
+        was_asked_for,
+    };
     bench.say(again(false)).await;
     bench.phase(Phase::Running).await;
     // Whatever is on the broker: what others have signed, and what the server has said before.

@@ -1,9 +1,11 @@
-//! The simulated world: one robot with one task, on which things happen in any order. Acts for the agent exactly as the
-//! plan decides, and checks on the way that no job is started twice.
+//! The simulated world: one robot with one task, on which things happen in any order. Acts for the
+//! agent exactly as the plan decides, and checks on the way that no job is started twice.
 
 use proptest::prelude::*;
 use task_proto::desired::{BlobRef, Delivery};
-use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskKind, TaskManifest};
+use task_proto::manifest::{
+    Build, ContentFacts, Outputs, Ready, Requires, Run, TaskKind, TaskManifest,
+};
 use task_proto::report::{Failure, FailureCode};
 use task_proto::{DeploymentId, Digest};
 
@@ -39,8 +41,8 @@ pub(super) struct World {
     pub(super) bad: Option<u8>,
     pub(super) gated: bool,
     pub(super) outputs: Outputs,
-    /// Whether the robot asks who has signed a version, those whose signatures are on its disk, and whether these are
-    /// enough.
+    /// Whether the robot asks who has signed a version, those whose signatures are on its disk, and
+    /// whether these are enough.
     pub(super) asks: bool,
     vouched: Vec<PackageRef>,
     signed: bool,
@@ -108,7 +110,9 @@ pub(super) fn health(sight: Sight, since_ms: u64) -> Health {
             what: "`/mapper` is gone".to_owned(),
             seen: String::new(),
         }),
-        Sight::Refused => Health::Refused(Failure::new(FailureCode::NODE_NAME_TAKEN, "it was there before")),
+        Sight::Refused => {
+            Health::Refused(Failure::new(FailureCode::NODE_NAME_TAKEN, "it was there before"))
+        }
     }
 }
 
@@ -240,7 +244,8 @@ impl World {
     /// The driver's loop: plans both lanes until they rest.
     pub(super) fn plan(&mut self) {
         let desired = self.desired.clone();
-        // An interrupted step has no further effect; the driver waits for that before it begins another.
+        // An interrupted step has no further effect; the driver waits for that before it begins
+        // another.
         self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref(), self.record.as_ref()));
         if self.record.is_none() {
             self.record = desired.map(|order| TaskRecord::new(order, self.now_ms));
@@ -272,10 +277,16 @@ impl World {
 
     fn begin(&mut self, step: Step) {
         let record = self.record.as_ref().expect("a step is of a record");
-        let same = |run: &ActiveRun, other: &ActiveRun| run.deployment == other.deployment && run.run == other.run;
+        let same = |run: &ActiveRun, other: &ActiveRun| {
+            run.deployment == other.deployment && run.run == other.run
+        };
         let new = match &step {
-            Step::PullManifest(package) | Step::PullContent { package, .. } | Step::Build(package) => Some(package),
-            Step::Start(run) if record.active.as_ref().is_none_or(|active| !same(active, run)) => Some(&run.package),
+            Step::PullManifest(package)
+            | Step::PullContent { package, .. }
+            | Step::Build(package) => Some(package),
+            Step::Start(run) if record.active.as_ref().is_none_or(|active| !same(active, run)) => {
+                Some(&run.package)
+            }
             _ => None,
         };
         let vouched = new.map_or(Vouched::Yes, |package| self.vouched_for(package));
@@ -283,9 +294,9 @@ impl World {
         self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
         // What a start will do is fixed by the record written before it.
         let step = match step {
-            Step::Start(_) => {
-                Step::Start(Box::new(self.record.clone().and_then(|record| record.active).expect("begun")))
-            }
+            Step::Start(_) => Step::Start(Box::new(
+                self.record.clone().and_then(|record| record.active).expect("begun"),
+            )),
             other => other,
         };
         self.steps.push((step, false));
@@ -293,10 +304,16 @@ impl World {
 
     fn with_situation<T>(&self, ask: impl Fn(&Situation<'_>) -> T) -> T {
         let record = self.record.as_ref().expect("there is a record");
-        let level =
-            self.disk.iter().find(|(on_disk, _)| *on_disk == record.order.package).map_or(0, |(_, level)| *level);
+        let level = self
+            .disk
+            .iter()
+            .find(|(on_disk, _)| *on_disk == record.order.package)
+            .map_or(0, |(_, level)| *level);
         let prepared = Prepared {
-            manifest: (level > 0).then(|| TaskManifest { outputs: self.outputs.clone(), ..manifest(&self.manifest) }),
+            manifest: (level > 0).then(|| TaskManifest {
+                outputs: self.outputs.clone(),
+                ..manifest(&self.manifest)
+            }),
             content: level > 1,
             built: level > 2,
             versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
@@ -306,9 +323,11 @@ impl World {
             None => ProcessState::None,
             Some(process) if self.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
             Some(process) => match self.ended.iter().find(|(dir, _)| *dir == process.dir) {
-                Some((_, status)) => {
-                    ProcessState::Ended(Exit { status: *status, out_of_memory_bytes: None, last_lines: String::new() })
-                }
+                Some((_, status)) => ProcessState::Ended(Exit {
+                    status: *status,
+                    out_of_memory_bytes: None,
+                    last_lines: String::new(),
+                }),
                 None => ProcessState::NeverStarted,
             },
         };
@@ -325,7 +344,10 @@ impl World {
             acting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Run),
             collecting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Collect),
             deleting: self.steps.iter().any(|(step, _)| step.deletes()),
-            robot: &RobotFacts { installations: self.ros_seen.then(|| vec![ros()]), ..RobotFacts::default() },
+            robot: &RobotFacts {
+                installations: self.ros_seen.then(|| vec![ros()]),
+                ..RobotFacts::default()
+            },
             may_begin: self.may_begin,
             held: self.held,
             gated: self.gated,
@@ -336,14 +358,21 @@ impl World {
     }
 
     fn told_to_wait(&mut self, ms: u64) {
-        let is_pull = |step: &Step| matches!(step, Step::PullManifest(_) | Step::PullContent { .. });
-        let Some(at) = self.steps.iter().position(|(step, done)| !done && is_pull(step)) else { return };
+        let is_pull =
+            |step: &Step| matches!(step, Step::PullManifest(_) | Step::PullContent { .. });
+        let Some(at) = self.steps.iter().position(|(step, done)| !done && is_pull(step)) else {
+            return;
+        };
         let (step, _) = self.steps.remove(at);
         let before = self.record.clone().expect("a step is of a record").preparation;
         let told = Done::ToldToWait { at_least_ms: ms };
         let record = self.with_situation(|s| finished(s, &step, Ok(told)));
         let after = &record.preparation;
-        assert_eq!((after.phase, after.attempts), (before.phase, before.attempts), "it counts as a try");
+        assert_eq!(
+            (after.phase, after.attempts),
+            (before.phase, before.attempts),
+            "it counts as a try"
+        );
         assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms.saturating_add(ms));
         self.record = Some(record);
     }
@@ -352,7 +381,9 @@ impl World {
         let start = |(step, done): &(Step, bool)| {
             if let (Step::Start(run), false) = (step, done) { Some(run.clone()) } else { None }
         };
-        let Some((at, run)) = self.steps.iter().enumerate().find_map(|(at, step)| Some((at, start(step)?))) else {
+        let Some((at, run)) =
+            self.steps.iter().enumerate().find_map(|(at, step)| Some((at, start(step)?)))
+        else {
             return;
         };
         let (step, _) = self.steps.remove(at);
@@ -385,10 +416,15 @@ impl World {
             Step::LookForRos(_) => self.ros_seen = true,
             Step::Ask(_) => {}
             Step::Collect(files) => {
-                assert!(self.disk.iter().any(|(package, _)| *package == files.package), "its files are gone");
+                assert!(
+                    self.disk.iter().any(|(package, _)| *package == files.package),
+                    "its files are gone"
+                );
                 let active = self.record.as_ref().and_then(|record| record.active.as_ref());
                 let same = active.is_some_and(|run| {
-                    run.deployment == files.deployment && run.run == files.run && run.process.is_some()
+                    run.deployment == files.deployment
+                        && run.run == files.run
+                        && run.process.is_some()
                 });
                 assert!(!same, "it still writes");
             }
@@ -397,16 +433,25 @@ impl World {
             Step::Start(run) => {
                 assert!(self.alive.is_empty(), "a second process of the task");
                 let dir = run.process.as_ref().expect("begun").dir.clone();
-                assert!(self.ended.iter().all(|(other, _)| *other != dir), "a run directory is used twice");
+                assert!(
+                    self.ended.iter().all(|(other, _)| *other != dir),
+                    "a run directory is used twice"
+                );
                 self.alive.push(dir);
                 if self.manifest.kind == TaskKind::Job {
                     let job = (run.deployment.clone(), run.run);
-                    assert!(self.manifest.idempotent || !self.job_starts.contains(&job), "a job is started twice");
+                    assert!(
+                        self.manifest.idempotent || !self.job_starts.contains(&job),
+                        "a job is started twice"
+                    );
                     self.job_starts.push(job);
                 }
             }
             Step::Stop(run) => {
-                assert_eq!(self.record.as_ref().and_then(|record| record.active.as_ref()), Some(&**run));
+                assert_eq!(
+                    self.record.as_ref().and_then(|record| record.active.as_ref()),
+                    Some(&**run)
+                );
                 let process = run.process.as_ref().expect("what lives");
                 self.alive.retain(|dir| *dir != process.dir);
                 self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
@@ -415,14 +460,18 @@ impl World {
                 let active = self.record.as_ref().and_then(|record| record.active.as_ref());
                 let fallback = self.record.as_ref().and_then(|record| record.fallback.as_ref());
                 for run in [active, fallback].into_iter().flatten() {
-                    assert!(kept.contains(&run.package.manifest.digest), "prunes what runs or may come back");
+                    assert!(
+                        kept.contains(&run.package.manifest.digest),
+                        "prunes what runs or may come back"
+                    );
                 }
                 self.disk.retain(|(package, _)| kept.contains(&package.manifest.digest));
             }
             Step::Remove => {
                 assert!(self.alive.is_empty(), "removes a task that runs");
                 self.disk.clear();
-                // With the task its history and directories go: the same order afterwards is a new one.
+                // With the task its history and directories go: the same order afterwards is a new
+                // one.
                 self.job_starts.clear();
                 self.ended.clear();
             }
@@ -440,13 +489,15 @@ impl World {
     }
 
     fn learn(&mut self) {
-        let (done, under_way) = std::mem::take(&mut self.steps).into_iter().partition(|(_, done)| *done);
+        let (done, under_way) =
+            std::mem::take(&mut self.steps).into_iter().partition(|(_, done)| *done);
         self.steps = under_way;
         for (step, _) in done {
             if step == Step::Remove {
                 self.record = None;
             } else {
-                self.record = Some(self.with_situation(|s| finished(s, &step, Ok(Done::Started(7)))));
+                self.record =
+                    Some(self.with_situation(|s| finished(s, &step, Ok(Done::Started(7)))));
             }
         }
     }

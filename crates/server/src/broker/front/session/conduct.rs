@@ -9,15 +9,19 @@ use crate::limits::conduct::{Offence, Verdict};
 
 /// Subscriptions to what is not for it that a robot may try in one session.
 const MAX_REFUSED_FILTERS: u32 = 16;
-/// How much more of an unfinished packet has to come for the client to count as heard: who trickles is silent.
+/// How much more of an unfinished packet has to come for the client to count as heard: who trickles
+/// is silent.
 const HEARD_BYTES: usize = 1024;
 
 impl End {
-    /// What a robot did that ended like this, if none of ours would do that. (A flood has been noticed before.)
+    /// What a robot did that ended like this, if none of ours would do that. (A flood has been
+    /// noticed before.)
     pub(super) fn offence(self) -> Option<Offence> {
         match self {
             Self::Malformed(DecodeError::TooLarge(bytes)) => Some(Offence::TooLarge(bytes)),
-            Self::Malformed(DecodeError::Retained) => Some(Offence::Violation("sends messages to be retained")),
+            Self::Malformed(DecodeError::Retained) => {
+                Some(Offence::Violation("sends messages to be retained"))
+            }
             Self::Malformed(_) => Some(Offence::Violation("sends what is no MQTT")),
             Self::Violation(what) => Some(Offence::Violation(what)),
             _ => None,
@@ -26,8 +30,8 @@ impl End {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
-    /// Counts a packet of the robot's. If it is more than may come now, it is the last one for a while; if that goes on, the
-    /// last one of the session.
+    /// Counts a packet of the robot's. If it is more than may come now, it is the last one for a
+    /// while; if that goes on, the last one of the session.
     pub(super) fn weigh(&mut self, received: &Received, bytes: usize) -> Result<(), End> {
         let Some(watched) = self.watched else { return Ok(()) };
         let messages = u64::from(!received.is_answer());

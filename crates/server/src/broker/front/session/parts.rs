@@ -1,4 +1,5 @@
-//! A session's part in fan-outs: the packages it hears, and which of their parts its robot has not acknowledged yet.
+//! A session's part in fan-outs: the packages it hears, and which of their parts its robot has not
+//! acknowledged yet.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -16,7 +17,8 @@ use crate::broker::front::access::Hearing;
 use crate::broker::front::codec::encode_publish_head;
 use crate::broker::front::parts::{Due, Member};
 
-/// What may be left to write of a part that the robot may no longer have; more would keep the connection busy in vain.
+/// What may be left to write of a part that the robot may no longer have; more would keep the
+/// connection busy in vain.
 const MAX_VAIN_BYTES: usize = 256 * 1024;
 
 /// The packages a session hears.
@@ -71,8 +73,9 @@ impl Parts {
 
     /// The first thing that is due, of all packages by turns.
     fn first_due(&self, may_send: bool) -> Option<(Digest, Due)> {
-        let by_turns =
-            |is_last: bool| self.members.iter().filter(move |(digest, _)| (Some(**digest) == self.last) == is_last);
+        let by_turns = |is_last: bool| {
+            self.members.iter().filter(move |(digest, _)| (Some(**digest) == self.last) == is_last)
+        };
         by_turns(false).chain(by_turns(true)).find_map(|(digest, member)| match member.due() {
             Due::Nothing => None,
             Due::Part(..) if !may_send => None,
@@ -81,8 +84,8 @@ impl Parts {
     }
 }
 
-/// Waits until there is something to do: a part, if one may be sent, or a package that has ended. Cancel-safe, since nothing
-/// is taken yet.
+/// Waits until there is something to do: a part, if one may be sent, or a package that has ended.
+/// Cancel-safe, since nothing is taken yet.
 pub(super) async fn due(parts: &Parts, may_send: bool) -> (Digest, Due) {
     loop {
         if let Some(due) = parts.first_due(may_send) {
@@ -119,7 +122,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         let packet_id = self.outgoing.begin(qos);
         match qos {
             QoS::AtMostOnce => self.parts.writing = Some((digest, number)),
-            QoS::AtLeastOnce | QoS::ExactlyOnce => drop(self.parts.in_flight.insert(packet_id, (digest, number))),
+            QoS::AtLeastOnce | QoS::ExactlyOnce => {
+                self.parts.in_flight.insert(packet_id, (digest, number));
+            }
         }
         self.parts.last = Some(digest);
         self.count(Count::PacketsOut);

@@ -21,7 +21,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         for (filter, qos) in filters.into_iter().take(max_filters) {
             let has_room = self.hearing.len() < max_filters || self.hearing.contains_key(&filter);
             let fits = has_room && filter.len() <= MAX_FILTER_BYTES;
-            let hearing = may_subscribe(&self.visitor, &self.context.prefix, &filter).filter(|_| fits);
+            let hearing =
+                may_subscribe(&self.visitor, &self.context.prefix, &filter).filter(|_| fits);
             let is_heard = match hearing {
                 Some(Hearing::Package(digest)) => self.join(digest),
                 Some(_) => true,
@@ -66,7 +67,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         self.send(Packet::UnsubAck(UnsubAck { pkid, reasons: Vec::new() }, None));
     }
 
-    /// Sends what came out of the router if a subscription matches, once, as the best of them has it.
+    /// Sends what came out of the router if a subscription matches, once, as the best of them has
+    /// it.
     pub(super) fn pass_on(&mut self, heard: Heard) {
         let matching = self.hearing.iter().filter(|(filter, _)| matches(filter, &heard.topic));
         let best = matching.map(|(_, (_, qos))| *qos).max_by_key(|qos| *qos as u8);

@@ -1,5 +1,5 @@
-//! The QoS 2 messages that a client has sent and not released. MQTT 3.1.1 lets it have as many as there are packet ids, so
-//! they are bits: 8 KiB for all of them, and nothing for who has none.
+//! The QoS 2 messages that a client has sent and not released. MQTT 3.1.1 lets it have as many as
+//! there are packet ids, so they are bits: 8 KiB for all of them, and nothing for who has none.
 
 /// Their packet ids.
 #[derive(Debug, Default)]

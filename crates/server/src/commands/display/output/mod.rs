@@ -1,5 +1,5 @@
-//! What people and programs read: results on stdout as table or JSON, everything else on stderr. A reader that goes away
-//! (a closed pipe) is no error: what it no longer wants is dropped.
+//! What people and programs read: results on stdout as table or JSON, everything else on stderr. A
+//! reader that goes away (a closed pipe) is no error: what it no longer wants is dropped.
 
 pub(in crate::commands) mod table;
 
@@ -32,7 +32,8 @@ pub(crate) struct Output {
 impl Output {
     pub(crate) fn new(format: Format) -> Self {
         let is_terminal = io::stdout().is_terminal();
-        let colours = is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+        let colours =
+            is_terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
         let wide = format == Format::Wide;
         let width = (is_terminal && !wide).then(terminal_width).flatten();
         Self { format, look: Look { wide, width, colours } }
@@ -64,7 +65,10 @@ impl Output {
     }
 
     /// Prints names, one a line.
-    pub(crate) fn lines(&self, lines: impl Iterator<Item = impl AsRef<str>>) -> Result<(), CommandError> {
+    pub(crate) fn lines(
+        &self,
+        lines: impl Iterator<Item = impl AsRef<str>>,
+    ) -> Result<(), CommandError> {
         print(&lines.map(|line| printable(line.as_ref())).collect::<Vec<_>>().join("\n")).map(drop)
     }
 
@@ -93,8 +97,8 @@ impl Output {
         print(&text)
     }
 
-    /// Prints the one thing `value`: as JSON, as the name it goes by, or as the text that `describe` makes of it, whose
-    /// parts hold nothing that a terminal would obey.
+    /// Prints the one thing `value`: as JSON, as the name it goes by, or as the text that
+    /// `describe` makes of it, whose parts hold nothing that a terminal would obey.
     pub(crate) fn described<T: Serialize>(
         &self,
         value: &T,
@@ -133,12 +137,14 @@ pub(crate) fn json_line<T: Serialize>(value: &T) -> Result<String, CommandError>
     serde_json::to_string(value).map(escaped).map_err(unprintable)
 }
 
-/// JSON as a terminal may see it: the control characters that JSON itself allows, which lie in texts only, are escaped.
+/// JSON as a terminal may see it: the control characters that JSON itself allows, which lie in
+/// texts only, are escaped.
 fn escaped(json: String) -> String {
     if !json.contains(is_c1) {
         return json;
     }
-    let escape = |c: char| if is_c1(c) { format!("\\u{:04x}", u32::from(c)) } else { c.to_string() };
+    let escape =
+        |c: char| if is_c1(c) { format!("\\u{:04x}", u32::from(c)) } else { c.to_string() };
     json.chars().map(escape).collect()
 }
 
@@ -159,12 +165,14 @@ pub(crate) fn stream_text(text: &str) -> Result<bool, CommandError> {
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
         Ok(()) => Ok(true),
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
-        Err(error) => Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error }),
+        Err(error) => {
+            Err(CommandError::Io { what: "can't write to stdout".to_owned(), source: error })
+        }
     }
 }
 
-/// `text` on one line and without control characters, nor those that turn a line's direction: a robot or a package may
-/// have put them there.
+/// `text` on one line and without control characters, nor those that turn a line's direction: a
+/// robot or a package may have put them there.
 pub(crate) fn printable(text: &str) -> String {
     let turns = |c: char| matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     text.chars().map(|c| if c.is_control() || turns(c) { ' ' } else { c }).collect()
@@ -175,7 +183,8 @@ fn shown(text: &str) -> String {
     text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
 }
 
-/// Says `text` on stderr: a server's or a robot's words may be in it. Nobody may be listening, which is no reason to fail.
+/// Says `text` on stderr: a server's or a robot's words may be in it. Nobody may be listening,
+/// which is no reason to fail.
 pub(crate) fn say(text: &str) {
     let _ = writeln!(io::stderr().lock(), "{}", shown(text));
 }
@@ -230,6 +239,10 @@ mod tests {
         let text = "\u{1b}]0;x\u{7}\u{9b}2J\u{7f} é";
         let line = json_line(&text).unwrap();
         assert_eq!(line, r#""\u001b]0;x\u0007\u009b2J\u007f é""#);
-        assert_eq!(serde_json::from_str::<String>(&line).unwrap(), text, "programs read what was meant");
+        assert_eq!(
+            serde_json::from_str::<String>(&line).unwrap(),
+            text,
+            "programs read what was meant"
+        );
     }
 }

@@ -1,5 +1,6 @@
-//! A table without lines, its columns two spaces apart: as wide as what is in it, or as the terminal that shows it. Text
-//! only; what a state means is said by its word, and colour only repeats it.
+//! A table without lines, its columns two spaces apart: as wide as what is in it, or as the
+//! terminal that shows it. Text only; what a state means is said by its word, and colour only
+//! repeats it.
 
 use unicode_width::{UnicodeWidthChar as _, UnicodeWidthStr as _};
 
@@ -57,10 +58,12 @@ pub(crate) struct Look {
 
 /// The table as lines.
 pub(crate) fn table(columns: &Columns, rows: &[Vec<String>], look: Look) -> String {
-    let count = if look.wide { columns.narrow.len() + columns.wide.len() } else { columns.narrow.len() };
+    let count =
+        if look.wide { columns.narrow.len() + columns.wide.len() } else { columns.narrow.len() };
     let titles: Vec<&str> = columns.titles().take(count).collect();
     let cells = |row: &Vec<String>| row.iter().take(count).map(|cell| printable(cell)).collect();
-    let mut lines: Vec<Vec<String>> = vec![titles.iter().map(|title| title.to_uppercase()).collect()];
+    let mut lines: Vec<Vec<String>> =
+        vec![titles.iter().map(|title| title.to_uppercase()).collect()];
     lines.extend(rows.iter().map(cells));
     let widths = fitted(&titles, widths(&lines, count), look.width);
     let mut text = String::new();
@@ -68,8 +71,9 @@ pub(crate) fn table(columns: &Columns, rows: &[Vec<String>], look: Look) -> Stri
         for (at, cell) in line.iter().enumerate() {
             let cell = cut(cell, widths[at]);
             let padding = if at + 1 == line.len() { 0 } else { widths[at] - cell.width() + GAP };
-            let colour =
-                (look.colours && number > 0 && COLOURED.contains(&titles[at])).then(|| colour(&cell)).flatten();
+            let colour = (look.colours && number > 0 && COLOURED.contains(&titles[at]))
+                .then(|| colour(&cell))
+                .flatten();
             match colour {
                 Some(colour) => text.push_str(&format!("\x1b[{colour}m{cell}\x1b[0m")),
                 None => text.push_str(&cell),
@@ -85,7 +89,9 @@ pub(crate) fn table(columns: &Columns, rows: &[Vec<String>], look: Look) -> Stri
 
 fn widths(lines: &[Vec<String>], count: usize) -> Vec<usize> {
     (0..count)
-        .map(|at| lines.iter().filter_map(|line| line.get(at)).map(|cell| cell.width()).max().unwrap_or(0))
+        .map(|at| {
+            lines.iter().filter_map(|line| line.get(at)).map(|cell| cell.width()).max().unwrap_or(0)
+        })
         .collect()
 }
 
@@ -95,8 +101,12 @@ fn fitted(titles: &[&str], mut widths: Vec<usize>, limit: Option<usize>) -> Vec<
     let room = limit.saturating_sub(GAP * widths.len().saturating_sub(1));
     let mut over = widths.iter().sum::<usize>().saturating_sub(room);
     while over > 0 {
-        let can_be_cut = |at: &usize| !WHOLE.contains(&titles[*at]) && widths[*at] > MIN_CUT.max(titles[*at].len());
-        let Some(widest) = (0..widths.len()).filter(can_be_cut).max_by_key(|at| widths[*at]) else { break };
+        let can_be_cut = |at: &usize| {
+            !WHOLE.contains(&titles[*at]) && widths[*at] > MIN_CUT.max(titles[*at].len())
+        };
+        let Some(widest) = (0..widths.len()).filter(can_be_cut).max_by_key(|at| widths[*at]) else {
+            break;
+        };
         widths[widest] -= 1;
         over -= 1;
     }
@@ -132,7 +142,8 @@ fn colour(cell: &str) -> Option<&'static str> {
 mod tests {
     use super::*;
 
-    const COLUMNS: Columns = Columns { name: "name", narrow: &["id", "name", "problem"], wide: &["arch"] };
+    const COLUMNS: Columns =
+        Columns { name: "name", narrow: &["id", "name", "problem"], wide: &["arch"] };
 
     fn rows() -> Vec<Vec<String>> {
         let row = |cells: [&str; 4]| cells.map(str::to_owned).to_vec();
@@ -162,7 +173,10 @@ mod tests {
         for width in [24, 30, 45] {
             let text = fit(width);
             assert!(text.lines().all(|line| line.width() <= width), "{text}");
-            assert!(text.contains("…") && text.contains("a [31mb c") && text.contains("größe"), "{text}");
+            assert!(
+                text.contains("…") && text.contains("a [31mb c") && text.contains("größe"),
+                "{text}"
+            );
         }
         assert!(!fit(80).contains('…'));
         // Narrower than what must not be cut.

@@ -1,5 +1,6 @@
-//! What `taskd doctor` looks at on the machine that the server is on, or is to be on: its directory, the disk, how many
-//! files may be open, its settings and its ports. It opens no secret, and the database only where no server runs, to check it.
+//! What `taskd doctor` looks at on the machine that the server is on, or is to be on: its
+//! directory, the disk, how many files may be open, its settings and its ports. It opens no secret,
+//! and the database only where no server runs, to check it.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
@@ -83,9 +84,14 @@ async fn database(checkup: &mut Checkup, data: &Path, config: &Config) {
         return;
     }
     match check_at_rest(&path).await {
-        Ok(None) => checkup.good("integrity", format!("a quick check of {} found nothing wrong", path.display())),
+        Ok(None) => checkup
+            .good("integrity", format!("a quick check of {} found nothing wrong", path.display())),
         Ok(Some(finding)) => {
-            checkup.bad("integrity", format!("{} is corrupt: {finding}", path.display()), INTEGRITY_MEND);
+            checkup.bad(
+                "integrity",
+                format!("{} is corrupt: {finding}", path.display()),
+                INTEGRITY_MEND,
+            );
         }
         Err(error) => checkup.bad(
             "integrity",
@@ -99,14 +105,17 @@ fn disk(checkup: &mut Checkup, data: &Path) {
     let room = match statvfs(data) {
         Ok(room) => room,
         Err(error) => {
-            return checkup.bad("space", format!("{}: {}", data.display(), error.desc()), "look at the file system");
+            return checkup.bad(
+                "space",
+                format!("{}: {}", data.display(), error.desc()),
+                "look at the file system",
+            );
         }
     };
     let size = room.fragment_size();
     let (free, total) = (room.blocks_available() * size, room.blocks() * size);
     let found = format!("{} of {} free", bytes(free), bytes(total));
-    let mend =
-        "delete versions of packages that no robot needs (taskd package rm), or give the directory a larger disk";
+    let mend = "delete versions of packages that no robot needs (taskd package rm), or give the directory a larger disk";
     match (free < LOW_BYTES, free < total / 100 * LOW_PERCENT) {
         (true, _) => checkup.bad("space", found, mend),
         (false, true) => checkup.notice("space", found, mend),
@@ -116,7 +125,8 @@ fn disk(checkup: &mut Checkup, data: &Path) {
 
 fn files(checkup: &mut Checkup, config: &Config) {
     let Ok((_, most)) = getrlimit(Resource::RLIMIT_NOFILE) else { return };
-    let (allowed, wanted) = (usize::try_from(most).unwrap_or(usize::MAX), open_files::wanted(config));
+    let (allowed, wanted) =
+        (usize::try_from(most).unwrap_or(usize::MAX), open_files::wanted(config));
     match open_files::check(config, allowed) {
         Err(too_few) => checkup.bad("files", too_few.to_string(), "a server started from here would not start"),
         Ok(()) if allowed >= wanted => {

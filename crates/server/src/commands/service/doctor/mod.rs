@@ -1,5 +1,5 @@
-//! `taskd doctor`: looks for what commonly goes wrong between here and the server, and on this machine if the server is on
-//! it, and says how to mend it. It changes nothing.
+//! `taskd doctor`: looks for what commonly goes wrong between here and the server, and on this
+//! machine if the server is on it, and says how to mend it. It changes nothing.
 
 mod local;
 
@@ -10,7 +10,9 @@ use std::time::Duration;
 use http::StatusCode;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use task_proto::api::{BrokerCheck, BrokerChecks, DatabaseStatus, Me, RobotList, ServerInfo, ServerStatus, TokenList};
+use task_proto::api::{
+    BrokerCheck, BrokerChecks, DatabaseStatus, Me, RobotList, ServerInfo, ServerStatus, TokenList,
+};
 use task_proto::checkup::{Checkup, Verdict};
 use task_proto::person::Permission;
 use task_proto::time::span;
@@ -23,8 +25,7 @@ use crate::commands::{CommandError, Connection, Outcome};
 use crate::system::clock::Clock;
 
 /// What mends a corrupt database.
-const INTEGRITY_MEND: &str =
-    "stop the server and put back a copy of its data directory, or save what can be read: docs/server.md says how";
+const INTEGRITY_MEND: &str = "stop the server and put back a copy of its data directory, or save what can be read: docs/server.md says how";
 /// How long each answer may take.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// A clock that is wrong by more confuses whoever reads times.
@@ -41,13 +42,19 @@ pub(in crate::commands) async fn run(connection: &Connection) -> Result<Outcome,
     let is_up = match Client::anonymous(connection) {
         Ok(client) => server(&mut checkup, &client, connection).await,
         // The directory, which is looked at below, is to say why.
-        Err(CommandError::Client(ClientError::NotServing { .. } | ClientError::DataDirectory { .. })) => false,
+        Err(CommandError::Client(
+            ClientError::NotServing { .. } | ClientError::DataDirectory { .. },
+        )) => false,
         Err(error) => return Err(error),
     };
     match data_directory(connection) {
         Some(data) if data.exists() => local::check(&mut checkup, &data, is_up).await,
         Some(data) if connection.data.is_some() => {
-            checkup.bad("data", format!("{} does not exist", data.display()), "look at --data and TASKD_DATA");
+            checkup.bad(
+                "data",
+                format!("{} does not exist", data.display()),
+                "look at --data and TASKD_DATA",
+            );
         }
         _ => {}
     }
@@ -64,9 +71,13 @@ fn print(output: &Output, checkup: &Checkup) -> Result<(), CommandError> {
     };
     match output.format() {
         Format::Json => output.json(checkup),
-        Format::Name => {
-            output.lines(checkup.checks.iter().filter(|check| check.verdict != Verdict::Good).map(|check| &check.check))
-        }
+        Format::Name => output.lines(
+            checkup
+                .checks
+                .iter()
+                .filter(|check| check.verdict != Verdict::Good)
+                .map(|check| &check.check),
+        ),
         Format::Table | Format::Wide => output.text(&checkup.text(paint)),
     }
 }
@@ -115,8 +126,15 @@ async fn reach(checkup: &mut Checkup, client: &Client) -> bool {
             true
         }
         Ok(response) => {
-            let found = format!("what answers at {base} is not taskd (status {})", response.status().as_u16());
-            checkup.bad("http", found, "look at --server, and at the proxy in between if there is one");
+            let found = format!(
+                "what answers at {base} is not taskd (status {})",
+                response.status().as_u16()
+            );
+            checkup.bad(
+                "http",
+                found,
+                "look at --server, and at the proxy in between if there is one",
+            );
             false
         }
         Err(error) => {
@@ -126,7 +144,10 @@ async fn reach(checkup: &mut Checkup, client: &Client) -> bool {
                 found.push_str(&format!(": {cause}"));
                 source = cause.source();
             }
-            let mend = match (base.starts_with("https"), found.contains("certificate") || found.contains("pinned")) {
+            let mend = match (
+                base.starts_with("https"),
+                found.contains("certificate") || found.contains("pinned"),
+            ) {
                 (true, true) => {
                     "give the pin that taskd serve printed, as --pin; or put the authority's certificate among the system's"
                 }
@@ -144,20 +165,32 @@ async fn reach(checkup: &mut Checkup, client: &Client) -> bool {
 async fn readiness(checkup: &mut Checkup, client: &Client) {
     let answer = client.request(reqwest::Method::GET, "/readyz").timeout(2 * PATIENCE).send().await;
     let body: Option<Value> = match answer {
-        Ok(response) => response.bytes().await.ok().and_then(|bytes| serde_json::from_slice(&bytes).ok()),
+        Ok(response) => {
+            response.bytes().await.ok().and_then(|bytes| serde_json::from_slice(&bytes).ok())
+        }
         Err(_) => None,
     };
     let Some(body) = body else {
-        checkup.bad("ready", "/readyz does not answer as taskd does", "look at the server's log (journalctl -u taskd)");
+        checkup.bad(
+            "ready",
+            "/readyz does not answer as taskd does",
+            "look at the server's log (journalctl -u taskd)",
+        );
         return;
     };
     let mends = [
-        ("database", "look at the database's own log and disk; for SQLite at the data directory's file system"),
+        (
+            "database",
+            "look at the database's own log and disk; for SQLite at the data directory's file system",
+        ),
         (
             "broker",
             "the server mends its own broker by itself; an external one must run, and know the server (taskd broker acl)",
         ),
-        ("disk", "make room, or remount the file system writable; then the server goes on by itself"),
+        (
+            "disk",
+            "make room, or remount the file system writable; then the server goes on by itself",
+        ),
     ];
     for (part, mend) in mends {
         match body.get(part).and_then(Value::as_str) {
@@ -190,9 +223,13 @@ async fn certificate(checkup: &mut Checkup, client: &Client) {
             checkup.notice("tls", format!("the certificate ends {}", time(end_ms)), mend);
         }
         Some(end_ms) => {
-            let by =
-                if matches!(client.trust(), Trust::Pinned(_)) { "the pinned authority" } else { "the system's roots" };
-            checkup.good("tls", format!("vouched for by {by}, the certificate ends {}", time(end_ms)));
+            let by = if matches!(client.trust(), Trust::Pinned(_)) {
+                "the pinned authority"
+            } else {
+                "the system's roots"
+            };
+            checkup
+                .good("tls", format!("vouched for by {by}, the certificate ends {}", time(end_ms)));
         }
         None => checkup.good("tls", "vouched for; when the certificate ends can't be seen"),
     }
@@ -212,14 +249,20 @@ async fn known_to(checkup: &mut Checkup, connection: &Connection) {
         Ok(Ok(info)) => info,
         Ok(Err(error)) => {
             let mend = match &error {
-                ClientError::Refused { .. } => "sign in with taskd login NAME, or ask an administrator for a token",
+                ClientError::Refused { .. } => {
+                    "sign in with taskd login NAME, or ask an administrator for a token"
+                }
                 _ => "look at the server's log",
             };
             checkup.bad("token", error.to_string(), mend);
             return;
         }
         Err(_) => {
-            checkup.bad("token", "the server does not answer within 5 s", "look at the server's log and load");
+            checkup.bad(
+                "token",
+                "the server does not answer within 5 s",
+                "look at the server's log and load",
+            );
             return;
         }
     };
@@ -255,14 +298,18 @@ fn clocks(checkup: &mut Checkup, info: &ServerInfo, asked_ms: u64, answered_ms: 
 async fn token(checkup: &mut Checkup, client: &Client) {
     let me: Me = match asked(client, "/me").await {
         Ok(me) => me,
-        Err(problem) => return checkup.bad("token", problem, "sign in again with taskd login NAME"),
+        Err(problem) => {
+            return checkup.bad("token", problem, "sign in again with taskd login NAME");
+        }
     };
     let may: Vec<&str> = me.permissions.iter().map(|permission| permission.as_str()).collect();
     let scope: Vec<String> = me.scope.iter().map(ToString::to_string).collect();
-    let whom = if scope.is_empty() { String::new() } else { format!(", on {}", scope.join(" and ")) };
+    let whom =
+        if scope.is_empty() { String::new() } else { format!(", on {}", scope.join(" and ")) };
     let found = format!("{} may {}{whom}", me.name, may.join(", "));
     let list: TokenList = asked(client, "/tokens").await.unwrap_or_default();
-    let end_ms = list.tokens.iter().find(|token| token.id == me.token).and_then(|token| token.expires_at_ms);
+    let end_ms =
+        list.tokens.iter().find(|token| token.id == me.token).and_then(|token| token.expires_at_ms);
     let now_ms = Clock::system().now_ms();
     match end_ms {
         Some(end_ms) if end_ms < now_ms + SOON_MS => {
@@ -285,15 +332,19 @@ async fn token(checkup: &mut Checkup, client: &Client) {
 
 /// Whether the pages of the database are sound, and since when that is known.
 async fn integrity(checkup: &mut Checkup, client: &Client) {
-    let DatabaseStatus { problem, fully_checked_at_ms, guard, .. } = match asked(client, "/server/status").await {
-        Ok(ServerStatus { database, .. }) => database,
-        Err(problem) => return checkup.notice("integrity", problem, "look at the server's log"),
-    };
+    let DatabaseStatus { problem, fully_checked_at_ms, guard, .. } =
+        match asked(client, "/server/status").await {
+            Ok(ServerStatus { database, .. }) => database,
+            Err(problem) => {
+                return checkup.notice("integrity", problem, "look at the server's log");
+            }
+        };
     match (problem, fully_checked_at_ms, guard) {
         (Some(problem), ..) => checkup.bad("integrity", problem, INTEGRITY_MEND),
-        (None, Some(at_ms), _) => {
-            checkup.good("integrity", format!("the last full check, {}, found nothing wrong", time(at_ms)))
-        }
+        (None, Some(at_ms), _) => checkup.good(
+            "integrity",
+            format!("the last full check, {}, found nothing wrong", time(at_ms)),
+        ),
         (None, None, Some(guard)) => checkup.good("integrity", guard),
         (None, None, None) => checkup.notice(
             "integrity",
@@ -303,7 +354,8 @@ async fn integrity(checkup: &mut Checkup, client: &Client) {
     }
 }
 
-/// The broker's own port, as robots reach it, seen from here. Of an external one the server knows how it does.
+/// The broker's own port, as robots reach it, seen from here. Of an external one the server knows
+/// how it does.
 async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     let ServerStatus { broker, .. } = match asked(client, "/server/status").await {
         Ok(status) => status,
@@ -312,21 +364,31 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     if broker.kind == "external" {
         match broker.healthy {
             true => checkup.good("mqtt", format!("the external broker at {} serves", info.mqtt)),
-            false => checkup.bad("mqtt", broker.detail, "the broker must run, and know the server (taskd broker acl)"),
+            false => checkup.bad(
+                "mqtt",
+                broker.detail,
+                "the broker must run, and know the server (taskd broker acl)",
+            ),
         }
         return external_brokers(checkup, client).await;
     }
-    let Some((bound, port)) = info.mqtt.rsplit_once(':').and_then(|(host, port)| Some((host, port.parse().ok()?)))
+    let Some((bound, port)) =
+        info.mqtt.rsplit_once(':').and_then(|(host, port)| Some((host, port.parse().ok()?)))
     else {
-        return checkup.notice("mqtt", format!("{} is no address", info.mqtt), "look at --mqtt of the server");
+        return checkup.notice(
+            "mqtt",
+            format!("{} is no address", info.mqtt),
+            "look at --mqtt of the server",
+        );
     };
     // A server that listens everywhere is where it is asked.
     let is_everywhere = matches!(bound, "0.0.0.0" | "[::]");
     let host = if is_everywhere { client.place().0 } else { bound.to_owned() };
-    let tls = info.ca_pin.map(|pin| Arc::new(Trust::Pinned(pin).client_config(Clock::for_certificates())));
+    let tls = info
+        .ca_pin
+        .map(|pin| Arc::new(Trust::Pinned(pin).client_config(Clock::for_certificates())));
     let route = Route { host: host.clone(), port, tls, websocket: None };
-    let mend =
-        "robots fall back to MQTT over the HTTP port; for its own port look at --mqtt of the server and at firewalls";
+    let mend = "robots fall back to MQTT over the HTTP port; for its own port look at --mqtt of the server and at firewalls";
     match timeout(PATIENCE, greet_mqtt(&route)).await {
         Ok(Ok(Probed::Mqtt)) => checkup.good("mqtt", format!("{host}:{port} answers")),
         Ok(Ok(Probed::SomethingElse)) => {
@@ -336,8 +398,10 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
         Err(_) => checkup.notice("mqtt", format!("{host}:{port} does not answer within 5 s"), mend),
     }
     let (host, port) = client.place();
-    let tls =
-        client.base().starts_with("https").then(|| Arc::new(client.trust().client_config(Clock::for_certificates())));
+    let tls = client
+        .base()
+        .starts_with("https")
+        .then(|| Arc::new(client.trust().client_config(Clock::for_certificates())));
     let route = Route { host, port, tls, websocket: Some(client.path("/mqtt")) };
     let mend = "a proxy in between must let WebSockets pass (see docs/tls.md)";
     match timeout(PATIENCE, greet_mqtt(&route)).await {
@@ -346,20 +410,32 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
             checkup.notice("websocket", "what answers over the HTTP port speaks no MQTT", mend)
         }
         Ok(Err(error)) => checkup.notice("websocket", error.to_string(), mend),
-        Err(_) => checkup.notice("websocket", "MQTT over the HTTP port does not answer within 5 s", mend),
+        Err(_) => {
+            checkup.notice("websocket", "MQTT over the HTTP port does not answer within 5 s", mend)
+        }
     }
 }
 
-/// Whether one account at an external broker can end the session of another. The server tests that: it has the accounts.
+/// Whether one account at an external broker can end the session of another. The server tests that:
+/// it has the accounts.
 async fn external_brokers(checkup: &mut Checkup, client: &Client) {
     let answer = timeout(3 * PATIENCE, client.get::<BrokerChecks>("/broker/check", &[])).await;
     let checks = match answer {
         Ok(Ok(checks)) => checks,
         // That takes an administrator, and a server that knows the test.
-        Ok(Err(ClientError::Refused { status: StatusCode::FORBIDDEN | StatusCode::NOT_FOUND, .. })) => return,
-        Ok(Err(error)) => return checkup.notice("client-ids", error.to_string(), "look at the server's log"),
+        Ok(Err(ClientError::Refused {
+            status: StatusCode::FORBIDDEN | StatusCode::NOT_FOUND,
+            ..
+        })) => return,
+        Ok(Err(error)) => {
+            return checkup.notice("client-ids", error.to_string(), "look at the server's log");
+        }
         Err(_) => {
-            return checkup.notice("client-ids", "the server's test of the broker takes long", "look at the broker");
+            return checkup.notice(
+                "client-ids",
+                "the server's test of the broker takes long",
+                "look at the broker",
+            );
         }
     };
     for BrokerCheck { address, displaces, problem } in checks.brokers {
@@ -399,7 +475,12 @@ async fn versions(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     };
     let online = list.robots.iter().filter(|robot| robot.online).count();
     let mut others: BTreeMap<&str, u64> = BTreeMap::new();
-    for version in list.robots.iter().filter_map(|robot| robot.host.as_ref()).map(|host| host.agent_version.as_str()) {
+    for version in list
+        .robots
+        .iter()
+        .filter_map(|robot| robot.host.as_ref())
+        .map(|host| host.agent_version.as_str())
+    {
         if version != info.version {
             *others.entry(version).or_default() += 1;
         }
@@ -408,8 +489,11 @@ async fn versions(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     match others.is_empty() {
         true => checkup.good("robots", found),
         false => {
-            let others: Vec<String> =
-                others.iter().take(5).map(|(version, count)| format!("{count} with agent {version}")).collect();
+            let others: Vec<String> = others
+                .iter()
+                .take(5)
+                .map(|(version, count)| format!("{count} with agent {version}"))
+                .collect();
             let mend = format!("bring their agents to the server's version, {}", info.version);
             checkup.notice("robots", format!("{found}; {}", others.join(", ")), mend);
         }

@@ -6,8 +6,8 @@ use axum::body::Body;
 use axum::response::Response;
 use bytes::Bytes;
 use http::header::{
-    ACCEPT_RANGES, AUTHORIZATION, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG, IF_NONE_MATCH,
-    IF_RANGE, RANGE,
+    ACCEPT_RANGES, AUTHORIZATION, CACHE_CONTROL, CONTENT_LENGTH, CONTENT_RANGE, CONTENT_TYPE, ETAG,
+    IF_NONE_MATCH, IF_RANGE, RANGE,
 };
 use http::request::Parts;
 use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
@@ -26,14 +26,20 @@ use crate::store::{Act, Deed, Deletion};
 pub(super) const REVALIDATED: &str = "private, no-cache";
 
 /// `GET /v2/<name>/blobs/<digest>` by a person, and `HEAD` by one who only reads.
-pub(super) async fn get(registry: &Registry, repository: &RepositoryName, digest: Digest, request: &Parts) -> Answer {
+pub(super) async fn get(
+    registry: &Registry,
+    repository: &RepositoryName,
+    digest: Digest,
+    request: &Parts,
+) -> Answer {
     if !registry.store.has_blob(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
     }
     read(registry, digest, request).await
 }
 
-/// `HEAD` of the same by who may push there: asked before a push, so from now on the answer must hold for a while.
+/// `HEAD` of the same by who may push there: asked before a push, so from now on the answer must
+/// hold for a while.
 pub(super) async fn head_before_push(
     registry: &Registry,
     repository: &RepositoryName,
@@ -48,9 +54,14 @@ pub(super) async fn head_before_push(
     read(registry, digest, request).await
 }
 
-/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether it still has them. It may
-/// have to wait for its turn to get bytes, not to ask for their size.
-pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: Digest, request: &Parts) -> Answer {
+/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether
+/// it still has them. It may have to wait for its turn to get bytes, not to ask for their size.
+pub(super) async fn get_for_robot(
+    registry: &Registry,
+    robot: &RobotId,
+    digest: Digest,
+    request: &Parts,
+) -> Answer {
     let Some(order) = registry.store.fetched_by(robot, &digest).await? else {
         // These are small, and all else waits for them.
         if registry.store.is_evidence_for(robot, &digest).await? {
@@ -68,10 +79,17 @@ pub(super) async fn get_for_robot(registry: &Registry, robot: &RobotId, digest: 
     Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
 }
 
-/// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs them.
-pub(super) async fn delete(registry: &Registry, by: &Person, repository: &RepositoryName, digest: Digest) -> Answer {
+/// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs
+/// them.
+pub(super) async fn delete(
+    registry: &Registry,
+    by: &Person,
+    repository: &RepositoryName,
+    digest: Digest,
+) -> Answer {
     let deed = Deed::by(by, Act::BlobDelete, repository).with("digest", digest);
-    let deletion = registry.store.unlink_blob(repository, &digest, &deed, registry.clock.now_ms()).await?;
+    let deletion =
+        registry.store.unlink_blob(repository, &digest, &deed, registry.clock.now_ms()).await?;
     deleted(by, deletion, &format!("{repository}@{digest}"), OciError::blob_unknown)
 }
 
@@ -81,15 +99,24 @@ async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
     serve(&blob, request, content_type, caching(request))
 }
 
-/// How long what never changes may be kept. Whoever came by a cookie shares the browser with whoever signs in next, so it asks
-/// each time, and is told that nothing has changed.
+/// How long what never changes may be kept. Whoever came by a cookie shares the browser with
+/// whoever signs in next, so it asks each time, and is told that nothing has changed.
 pub(super) fn caching(request: &Parts) -> HeaderValue {
     let is_by_cookie = !request.headers.contains_key(AUTHORIZATION);
-    HeaderValue::from_static(if is_by_cookie { REVALIDATED } else { "private, max-age=31536000, immutable" })
+    HeaderValue::from_static(if is_by_cookie {
+        REVALIDATED
+    } else {
+        "private, max-age=31536000, immutable"
+    })
 }
 
 /// Answers with the part of a blob that the request's headers ask for.
-pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cache: HeaderValue) -> Answer {
+pub(super) fn serve(
+    blob: &Blob,
+    request: &Parts,
+    content_type: HeaderValue,
+    cache: HeaderValue,
+) -> Answer {
     let quoted = blob.quoted_digest();
     let digest = header_value(quoted.slice(1..quoted.len() - 1))?;
     let etag = header_value(quoted.clone())?;
@@ -112,11 +139,16 @@ pub(super) fn serve(blob: &Blob, request: &Parts, content_type: HeaderValue, cac
         };
         let length = range.end - range.start;
         let is_head = request.method == Method::HEAD;
-        let reader =
-            if request.extensions.get::<Unencrypted>().is_some() { BytesFor::Socket } else { BytesFor::Process };
-        let content_range = (status == StatusCode::PARTIAL_CONTENT)
-            .then(|| format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size()));
-        let mut response = with_room(if is_head { Body::empty() } else { Body::new(blob.body(range, reader)) });
+        let reader = if request.extensions.get::<Unencrypted>().is_some() {
+            BytesFor::Socket
+        } else {
+            BytesFor::Process
+        };
+        let content_range = (status == StatusCode::PARTIAL_CONTENT).then(|| {
+            format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size())
+        });
+        let mut response =
+            with_room(if is_head { Body::empty() } else { Body::new(blob.body(range, reader)) });
         *response.status_mut() = status;
         if let Some(content_range) = content_range {
             response.headers_mut().insert(CONTENT_RANGE, header_value(content_range)?);
@@ -151,8 +183,12 @@ fn unsatisfiable(blob: &Blob) -> Answer {
 
 /// Whether `If-None-Match` names the content.
 fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
-    let tags = headers.get_all(IF_NONE_MATCH).iter().flat_map(|value| value.as_bytes().split(|&b| b == b','));
-    tags.map(<[u8]>::trim_ascii).any(|tag| tag == b"*" || tag.strip_prefix(b"W/").unwrap_or(tag) == etag.as_bytes())
+    let tags = headers
+        .get_all(IF_NONE_MATCH)
+        .iter()
+        .flat_map(|value| value.as_bytes().split(|&b| b == b','));
+    tags.map(<[u8]>::trim_ascii)
+        .any(|tag| tag == b"*" || tag.strip_prefix(b"W/").unwrap_or(tag) == etag.as_bytes())
 }
 
 /// What a request's `Range` comes to.
@@ -163,14 +199,15 @@ enum Wanted {
     Nothing,
 }
 
-/// RFC 9110, section 14. Several ranges, another unit and what can't be read are answered with everything, as it allows; one
-/// that ends before it begins has no bytes, as registries say.
+/// RFC 9110, section 14. Several ranges, another unit and what can't be read are answered with
+/// everything, as it allows; one that ends before it begins has no bytes, as registries say.
 fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
     if headers.get(IF_RANGE).is_some_and(|tag| tag != etag) {
         return Wanted::All;
     }
     let text = headers.get(RANGE).and_then(|value| value.to_str().ok());
-    let Some((first, last)) = text.and_then(|text| text.strip_prefix("bytes=")).and_then(|set| set.split_once('-'))
+    let Some((first, last)) =
+        text.and_then(|text| text.strip_prefix("bytes=")).and_then(|set| set.split_once('-'))
     else {
         return Wanted::All;
     };
@@ -189,7 +226,12 @@ pub(super) fn decimal(text: &str) -> Option<u64> {
 }
 
 /// The answer to a deletion of what is `named` so.
-pub(super) fn deleted(by: &Person, deletion: Deletion, named: &str, unknown: fn() -> OciError) -> Answer {
+pub(super) fn deleted(
+    by: &Person,
+    deletion: Deletion,
+    named: &str,
+    unknown: fn() -> OciError,
+) -> Answer {
     match deletion {
         Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
         Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
@@ -207,7 +249,12 @@ pub(super) async fn check_blob(
     let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
     let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
     if blob.size() != part.size {
-        let message = format!("the blob {} has {} bytes, its descriptor says {}", part.digest, blob.size(), part.size);
+        let message = format!(
+            "the blob {} has {} bytes, its descriptor says {}",
+            part.digest,
+            blob.size(),
+            part.size
+        );
         return Err(OciError::manifest_invalid(message));
     }
     Ok(blob)
@@ -243,7 +290,8 @@ mod tests {
         for (range, expected) in cases {
             assert_eq!(wanted(&headers(&[(RANGE, range)]), &etag, 10), expected, "{range}");
         }
-        let part = |if_range| wanted(&headers(&[(RANGE, "bytes=1-"), (IF_RANGE, if_range)]), &etag, 10);
+        let part =
+            |if_range| wanted(&headers(&[(RANGE, "bytes=1-"), (IF_RANGE, if_range)]), &etag, 10);
         assert_eq!(part("\"x\""), Wanted::Part(1..10));
         assert_eq!(part("\"y\""), Wanted::All);
     }
@@ -251,7 +299,9 @@ mod tests {
     #[test]
     fn an_etag_in_a_list_is_found() {
         let etag = HeaderValue::from_static("\"x\"");
-        for (value, expected) in [("\"y\", \"x\"", true), ("W/\"x\"", true), ("*", true), ("\"y\"", false)] {
+        for (value, expected) in
+            [("\"y\", \"x\"", true), ("W/\"x\"", true), ("*", true), ("\"y\"", false)]
+        {
             assert_eq!(has_it(&headers(&[(IF_NONE_MATCH, value)]), &etag), expected, "{value}");
         }
     }

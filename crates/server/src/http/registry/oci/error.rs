@@ -1,5 +1,5 @@
-//! The distribution specification's error bodies: `{"errors":[{"code","message","detail"}]}`, with its codes. What went
-//! wrong inside the server is logged, never told.
+//! The distribution specification's error bodies: `{"errors":[{"code","message","detail"}]}`, with
+//! its codes. What went wrong inside the server is logged, never told.
 
 use crate::http::openapi::{self, Draft};
 use axum::Json;
@@ -32,7 +32,13 @@ pub struct OciError {
 
 impl OciError {
     fn new(status: StatusCode, code: &'static str, message: impl Into<String>) -> Self {
-        Self { status, code, messages: vec![(message.into(), Value::Null)], allow: None, retry_after_s: None }
+        Self {
+            status,
+            code,
+            messages: vec![(message.into(), Value::Null)],
+            allow: None,
+            retry_after_s: None,
+        }
     }
 
     /// 401: nobody known is asking.
@@ -53,12 +59,20 @@ impl OciError {
 
     /// 404: not an endpoint of the specification.
     pub fn no_endpoint() -> Self {
-        Self::new(StatusCode::NOT_FOUND, "UNSUPPORTED", "this is not an endpoint of the distribution API")
+        Self::new(
+            StatusCode::NOT_FOUND,
+            "UNSUPPORTED",
+            "this is not an endpoint of the distribution API",
+        )
     }
 
     /// 405: the endpoint has other methods.
     pub fn method(allow: &'static str) -> Self {
-        let error = Self::new(StatusCode::METHOD_NOT_ALLOWED, "UNSUPPORTED", "the endpoint does not have this method");
+        let error = Self::new(
+            StatusCode::METHOD_NOT_ALLOWED,
+            "UNSUPPORTED",
+            "the endpoint does not have this method",
+        );
         Self { allow: Some(allow), ..error }
     }
 
@@ -99,7 +113,11 @@ impl OciError {
 
     /// 404: no such upload.
     pub fn upload_unknown() -> Self {
-        Self::new(StatusCode::NOT_FOUND, "BLOB_UPLOAD_UNKNOWN", BlobError::UploadUnknown.to_string())
+        Self::new(
+            StatusCode::NOT_FOUND,
+            "BLOB_UPLOAD_UNKNOWN",
+            BlobError::UploadUnknown.to_string(),
+        )
     }
 
     /// 400: not the announced number of bytes.
@@ -130,7 +148,8 @@ impl OciError {
     /// 400: a manifest whose parts are not in the repository.
     pub fn parts_unknown(parts: &[Digest]) -> Self {
         let message = "the manifest needs a blob that is not in the repository";
-        let messages = parts.iter().map(|part| (message.to_owned(), json!({ "digest": part }))).collect();
+        let messages =
+            parts.iter().map(|part| (message.to_owned(), json!({ "digest": part }))).collect();
         Self {
             status: StatusCode::BAD_REQUEST,
             code: "MANIFEST_BLOB_UNKNOWN",
@@ -147,14 +166,20 @@ impl OciError {
 
     pub(super) fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error, "a registry request failed");
-        Self::new(StatusCode::INTERNAL_SERVER_ERROR, "UNKNOWN", "the server failed; its log says why")
+        Self::new(
+            StatusCode::INTERNAL_SERVER_ERROR,
+            "UNKNOWN",
+            "the server failed; its log says why",
+        )
     }
 }
 
 impl From<StoreError> for OciError {
     fn from(error: StoreError) -> Self {
         match error {
-            StoreError::RightsEnded => Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", error.to_string()),
+            StoreError::RightsEnded => {
+                Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", error.to_string())
+            }
             _ => error.fault().map_or_else(|| Self::internal(&error), Self::from),
         }
     }
@@ -174,7 +199,8 @@ impl From<Fault> for OciError {
 
 impl From<NotYet> for OciError {
     fn from(not_yet: NotYet) -> Self {
-        let error = Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", not_yet.to_string());
+        let error =
+            Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", not_yet.to_string());
         Self { retry_after_s: Some(not_yet.retry_after_s), ..error }
     }
 }
@@ -184,8 +210,12 @@ impl From<BlobError> for OciError {
         let message = error.to_string();
         match error {
             BlobError::UploadUnknown => Self::upload_unknown(),
-            BlobError::UploadBusy => Self::new(StatusCode::CONFLICT, "BLOB_UPLOAD_INVALID", message),
-            BlobError::TooManyUploads { .. } => Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", message),
+            BlobError::UploadBusy => {
+                Self::new(StatusCode::CONFLICT, "BLOB_UPLOAD_INVALID", message)
+            }
+            BlobError::TooManyUploads { .. } => {
+                Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", message)
+            }
             BlobError::OutOfOrder { .. } => {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "BLOB_UPLOAD_INVALID", message)
             }
@@ -195,7 +225,9 @@ impl From<BlobError> for OciError {
                 Self { retry_after_s: Some(COLLECTION_S), ..error }
             }
             BlobError::WrongDigest { .. } => Self::digest_invalid(message),
-            BlobError::Interrupted(_) => Self::new(StatusCode::REQUEST_TIMEOUT, "BLOB_UPLOAD_INVALID", message),
+            BlobError::Interrupted(_) => {
+                Self::new(StatusCode::REQUEST_TIMEOUT, "BLOB_UPLOAD_INVALID", message)
+            }
             BlobError::DiskFull | BlobError::DiskReserved { .. } => {
                 Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message)
             }
@@ -218,7 +250,8 @@ impl From<OciError> for ApiError {
             StatusCode::INTERNAL_SERVER_ERROR => "internal",
             _ => "invalid_request",
         };
-        let message = error.messages.into_iter().next().map_or_else(String::new, |(message, _)| message);
+        let message =
+            error.messages.into_iter().next().map_or_else(String::new, |(message, _)| message);
         Self::new(error.status, code, message)
     }
 }

@@ -29,7 +29,11 @@ struct ReferrersQuery {
 }
 
 /// `GET /v2/<name>/tags/list`.
-pub(super) async fn tags(registry: &Registry, repository: &RepositoryName, request: &Parts) -> Answer {
+pub(super) async fn tags(
+    registry: &Registry,
+    repository: &RepositoryName,
+    request: &Parts,
+) -> Answer {
     let query: TagsQuery = query(&request.uri)?;
     let mut tags = registry.store.tags(repository).await?.ok_or_else(OciError::name_unknown)?;
     if let Some(last) = &query.last {
@@ -76,8 +80,10 @@ pub(super) async fn referrers(
         let asked = request.uri.query().unwrap_or_default();
         let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("last="));
         let kept: String = kept.map(|pair| format!("{pair}&")).collect();
-        let link = format!("</v2/{repository}/referrers/{subject}?{kept}last={last}>; rel=\"next\"");
-        let link = HeaderValue::try_from(link).map_err(|_| OciError::query_invalid("a query no header can hold"))?;
+        let link =
+            format!("</v2/{repository}/referrers/{subject}?{kept}last={last}>; rel=\"next\"");
+        let link = HeaderValue::try_from(link)
+            .map_err(|_| OciError::query_invalid("a query no header can hold"))?;
         headers.insert(LINK, link);
     }
     Ok(response)
@@ -86,7 +92,9 @@ pub(super) async fn referrers(
 /// Any digest, of an algorithm known here or not: a subject need not be here.
 pub(super) fn is_digest(text: &str) -> bool {
     text.split_once(':').is_some_and(|(algorithm, encoded)| {
-        let is_word = |b: u8| b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'+' | b'.' | b'_' | b'-');
+        let is_word = |b: u8| {
+            b.is_ascii_lowercase() || b.is_ascii_digit() || matches!(b, b'+' | b'.' | b'_' | b'-')
+        };
         let is_encoded = |b: u8| b.is_ascii_alphanumeric() || matches!(b, b'=' | b'_' | b'-');
         !algorithm.is_empty()
             && algorithm.bytes().all(is_word)

@@ -1,5 +1,5 @@
-//! Reading, pushing and deleting manifests. One that calls itself a task package must be one: that is checked here, so
-//! that whatever can be ordered can be run.
+//! Reading, pushing and deleting manifests. One that calls itself a task package must be one: that
+//! is checked here, so that whatever can be ordered can be run.
 
 use std::time::Duration;
 
@@ -24,7 +24,10 @@ use crate::blobs::Blob;
 use crate::domain::person::Person;
 use crate::http::registry::packages::in_use;
 use crate::orders::changes::Change;
-use crate::store::{Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest, bytes_taken};
+use crate::store::{
+    Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest,
+    bytes_taken,
+};
 
 /// The largest manifest; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
@@ -43,10 +46,16 @@ pub(super) async fn get(
     request: &Parts,
 ) -> Answer {
     let Ok(reference) = reference else { return Err(OciError::manifest_unknown()) };
-    let stored = registry.store.manifest(repository, &reference).await?.ok_or_else(OciError::manifest_unknown)?;
+    let stored = registry
+        .store
+        .manifest(repository, &reference)
+        .await?
+        .ok_or_else(OciError::manifest_unknown)?;
     let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
     let content_type = match is_json(&stored.media_type) {
-        true => HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?,
+        true => {
+            HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?
+        }
         // Once any type was taken, also one that makes it a page.
         false => HeaderValue::from_static("application/octet-stream"),
     };
@@ -85,7 +94,12 @@ impl<'a> Push<'a> {
 }
 
 /// `PUT`: stores the exact bytes, if all they refer to is in the repository.
-pub(super) async fn put(registry: &Registry, as_said: Push<'_>, parts: &Parts, body: Body) -> Answer {
+pub(super) async fn put(
+    registry: &Registry,
+    as_said: Push<'_>,
+    parts: &Parts,
+    body: Body,
+) -> Answer {
     let bytes = read_body(body).await?;
     let tags = tags_to_set(parts, &as_said.reference)?;
     let repository = as_said.repository;
@@ -111,7 +125,8 @@ pub(super) async fn push(
     }
 
     let manifest = BlobRef { digest, size: bytes.len() as u64 };
-    // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when the manifest is stored.
+    // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when
+    // the manifest is stored.
     let package = match &parsed.package {
         Some(image) => check_package(registry, repository, manifest, image).await?,
         None => None,
@@ -121,7 +136,10 @@ pub(super) async fn push(
     let output = match &parsed.output {
         Some(image) => {
             let max_bytes = registry.blobs.settings().max_robot_bytes;
-            Some(NewOutput { set: check_output(registry, repository, image, max_bytes).await?, max_bytes })
+            Some(NewOutput {
+                set: check_output(registry, repository, image, max_bytes).await?,
+                max_bytes,
+            })
         }
         None => None,
     };
@@ -130,7 +148,9 @@ pub(super) async fn push(
         return Err(OciError::denied("a robot may only push outputs"));
     }
     if only.is_some()
-        && output.as_ref().is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
+        && output
+            .as_ref()
+            .is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
     {
         return Err(OciError::denied("a robot may only tag an output with its own run"));
     }
@@ -158,9 +178,12 @@ pub(super) async fn push(
     match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
         PutManifest::VersionTaken(other) => Err(version_taken(&new, &other)),
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
-        PutManifest::Outdated => Err(OciError::manifest_invalid("there is a list of publishers as new as this one")),
+        PutManifest::Outdated => {
+            Err(OciError::manifest_invalid("there is a list of publishers as new as this one"))
+        }
         PutManifest::TagInUse(tag, users) => {
-            let message = by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
+            let message =
+                by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
             Err(OciError::conflict(message))
         }
         PutManifest::Stored => {
@@ -190,7 +213,9 @@ fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
     let Reference::Digest(expected) = reference else { return Ok(Digest::of(bytes)) };
     let digest = expected.algorithm().digest(bytes);
     if digest != *expected {
-        return Err(OciError::digest_invalid(format!("the manifest hashes to {digest}, not to {expected}")));
+        return Err(OciError::digest_invalid(format!(
+            "the manifest hashes to {digest}, not to {expected}"
+        )));
     }
     Ok(digest)
 }
@@ -219,12 +244,14 @@ pub(super) async fn delete(
         Reference::Digest(digest) => {
             let _hold = registry.blobs.hold_collection().await;
             let deed = Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest);
-            let deletion = registry.store.delete_manifest(repository, &digest, &deed, now_ms).await?;
+            let deletion =
+                registry.store.delete_manifest(repository, &digest, &deed, now_ms).await?;
             if let Deletion::Deleted(parts) = &deletion {
                 if let Ok(name) = repository.as_str().parse() {
                     registry.changes.announce(Change::Package(name));
                 }
-                // An order that looked the package up a moment ago still finds its bytes: they stay for a while.
+                // An order that looked the package up a moment ago still finds its bytes: they stay
+                // for a while.
                 for &blob in parts.iter().chain([&digest]) {
                     registry.blobs.touch(blob, now_ms).await?;
                 }
@@ -236,13 +263,18 @@ pub(super) async fn delete(
 }
 
 async fn read_body(body: Body) -> Result<Bytes, OciError> {
-    let too_large = || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
+    let too_large =
+        || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
     match tokio::time::timeout(PATIENCE, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
         Ok(Ok(bytes)) => Ok(bytes),
         Ok(Err(error)) => {
-            let is_limit =
-                std::error::Error::source(&error).is_some_and(|source| source.is::<http_body_util::LengthLimitError>());
-            Err(if is_limit { too_large() } else { OciError::manifest_invalid("the manifest broke off") })
+            let is_limit = std::error::Error::source(&error)
+                .is_some_and(|source| source.is::<http_body_util::LengthLimitError>());
+            Err(if is_limit {
+                too_large()
+            } else {
+                OciError::manifest_invalid("the manifest broke off")
+            })
         }
         Err(_) => Err(OciError::manifest_invalid("the manifest took too long to arrive")),
     }
@@ -266,21 +298,30 @@ async fn check_output(
     max_bytes: u64,
 ) -> Result<OutputSet, OciError> {
     let config = image.config.blob();
-    let output: OutputSet = serde_json::from_slice(&read_config(registry, repository, config).await?)
-        .map_err(|error| OciError::manifest_invalid(format!("the config does not describe an output: {error}")))?;
+    let output: OutputSet = serde_json::from_slice(
+        &read_config(registry, repository, config).await?,
+    )
+    .map_err(|error| {
+        OciError::manifest_invalid(format!("the config does not describe an output: {error}"))
+    })?;
     if output.repository().as_ref() != Some(repository) {
-        let message = format!("the output of {} on {} belongs into its own repository", output.task, output.robot_id);
+        let message = format!(
+            "the output of {} on {} belongs into its own repository",
+            output.task, output.robot_id
+        );
         return Err(OciError::manifest_invalid(message));
     }
     if output.files.len() > MAX_FILES || output.manifest(config) != *image {
-        let message =
-            format!("the manifest is not that of the output in its config, or it has more than {MAX_FILES} files");
+        let message = format!(
+            "the manifest is not that of the output in its config, or it has more than {MAX_FILES} files"
+        );
         return Err(OciError::manifest_invalid(message));
     }
     let bytes = bytes_taken(&output);
     if bytes > max_bytes {
-        let message =
-            format!("the output takes {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)");
+        let message = format!(
+            "the output takes {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)"
+        );
         return Err(OciError::too_large(message));
     }
     for file in &output.files {
@@ -289,16 +330,23 @@ async fn check_output(
     Ok(output)
 }
 
-async fn read_config(registry: &Registry, repository: &RepositoryName, config: BlobRef) -> Result<Bytes, OciError> {
+async fn read_config(
+    registry: &Registry,
+    repository: &RepositoryName,
+    config: BlobRef,
+) -> Result<Bytes, OciError> {
     let blob = check_blob(registry, repository, config).await?;
     if config.size > MAX_CONFIG_BYTES {
-        return Err(OciError::manifest_invalid(format!("the config has more than {MAX_CONFIG_BYTES} bytes")));
+        return Err(OciError::manifest_invalid(format!(
+            "the config has more than {MAX_CONFIG_BYTES} bytes"
+        )));
     }
     Ok(blob.read().await?)
 }
 
-/// Reads the task manifest out of a package's config blob and holds it and the archive to their rules. A package can be
-/// ordered from the repository of its own name; one in another repository is a copy, checked likewise: `None`.
+/// Reads the task manifest out of a package's config blob and holds it and the archive to their
+/// rules. A package can be ordered from the repository of its own name; one in another repository
+/// is a copy, checked likewise: `None`.
 async fn check_package(
     registry: &Registry,
     repository: &RepositoryName,
@@ -306,39 +354,64 @@ async fn check_package(
     image: &ImageManifest,
 ) -> Result<Option<(PackageRef, TaskManifest)>, OciError> {
     let Some((config, content)) = image.package_blobs() else {
-        let message =
-            format!("a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types");
+        let message = format!(
+            "a manifest of artifactType {PACKAGE_TYPE} needs its config and one layer of its own types"
+        );
         return Err(OciError::manifest_invalid(message));
     };
     let archive = check_blob(registry, repository, content).await?;
-    let task: TaskManifest = serde_json::from_slice(&read_config(registry, repository, config).await?)
-        .map_err(|error| OciError::manifest_invalid(format!("the config is not a task manifest: {error}")))?;
+    let task: TaskManifest = serde_json::from_slice(
+        &read_config(registry, repository, config).await?,
+    )
+    .map_err(|error| {
+        OciError::manifest_invalid(format!("the config is not a task manifest: {error}"))
+    })?;
     let problems: Vec<String> = task.problems().iter().map(ToString::to_string).collect();
     if !problems.is_empty() {
         return Err(OciError::manifest_invalid(problems.join("; ")));
     }
     if is_reserved(repository) {
-        let message = format!("the package {} can't be stored in {repository}, which is for other things", task.name);
+        let message = format!(
+            "the package {} can't be stored in {repository}, which is for other things",
+            task.name
+        );
         return Err(OciError::manifest_invalid(message));
     }
     // What is stored was checked when it was pushed first.
     if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
         check_archive(registry, &archive, content.size, task.content).await?;
     }
-    let package = PackageRef { name: task.name.clone(), version: task.version.clone(), manifest, config, content };
+    let package = PackageRef {
+        name: task.name.clone(),
+        version: task.version.clone(),
+        manifest,
+        config,
+        content,
+    };
     Ok((RepositoryName::of_package(&task.name) == *repository).then_some((package, task)))
 }
 
 /// Reads the package's archive by the rules that a robot unpacks it by.
-async fn check_archive(registry: &Registry, blob: &Blob, size: u64, facts: ContentFacts) -> Result<(), OciError> {
-    let check = registry.readers.read(blob, move |bytes| task_archive::check(bytes, size, &facts, &Limits::default()));
+async fn check_archive(
+    registry: &Registry,
+    blob: &Blob,
+    size: u64,
+    facts: ContentFacts,
+) -> Result<(), OciError> {
+    let check = registry
+        .readers
+        .read(blob, move |bytes| task_archive::check(bytes, size, &facts, &Limits::default()));
     let checked = tokio::time::timeout(READING, check).await;
-    match checked.map_err(|_| OciError::manifest_invalid("the package's archive took too long to read"))? {
+    match checked
+        .map_err(|_| OciError::manifest_invalid("the package's archive took too long to read"))?
+    {
         Ok(()) => Ok(()),
-        Err(UnpackError::Refused(refusal)) => {
-            Err(OciError::manifest_invalid(format!("robots would refuse the package's archive: {refusal}")))
+        Err(UnpackError::Refused(refusal)) => Err(OciError::manifest_invalid(format!(
+            "robots would refuse the package's archive: {refusal}"
+        ))),
+        Err(error @ (UnpackError::Source(_) | UnpackError::Disk { .. })) => {
+            Err(OciError::internal(&error))
         }
-        Err(error @ (UnpackError::Source(_) | UnpackError::Disk { .. })) => Err(OciError::internal(&error)),
     }
 }
 
@@ -357,7 +430,8 @@ fn created(
     }
     if request.uri.query().is_some() {
         for tag in tags {
-            let tag = HeaderValue::try_from(tag.as_str()).map_err(|_| OciError::manifest_unknown())?;
+            let tag =
+                HeaderValue::try_from(tag.as_str()).map_err(|_| OciError::manifest_unknown())?;
             response.headers_mut().append("oci-tag", tag);
         }
     }

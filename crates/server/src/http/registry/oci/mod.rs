@@ -1,5 +1,7 @@
-//! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. People pull and push as their roles allow, a
-//! robot reads the blobs of the packages it should have and pushes outputs into its own repositories. What a repository holds is the store's, the bytes are the blob store's.
+//! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. People pull and push
+//! as their roles allow, a robot reads the blobs of the packages it should have and pushes outputs
+//! into its own repositories. What a repository holds is the store's, the bytes are the blob
+//! store's.
 
 mod blobs;
 mod error;
@@ -103,10 +105,11 @@ pub async fn version(request: Request) -> Answer {
 
 /// The OCI distribution API, pull and push.
 ///
-/// Manifests, blobs, uploads, tags and referrers of packages, of lists of publishers and of what tasks brought back, as the
-/// specification of that API says. People pull and push as their roles allow; a robot reads the blobs of the packages it
-/// should have and pushes its own outputs.
-// The caller is taken from the request's extensions, where the guard put it; without one, nobody is let in.
+/// Manifests, blobs, uploads, tags and referrers of packages, of lists of publishers and of what
+/// tasks brought back, as the specification of that API says. People pull and push as their roles
+/// allow; a robot reads the blobs of the packages it should have and pushes its own outputs.
+// The caller is taken from the request's extensions, where the guard put it; without one, nobody is
+// let in.
 #[utoipa::path(get, path = "/v2/{path}", tag = "registry",
     params(("path" = String, Path, description = "A repository and what of it, which has slashes.")),
     responses((status = 200, description = "As the OCI distribution specification says.", body = String,
@@ -123,9 +126,11 @@ pub async fn dispatch(
     }
     let Path(path) = path.map_err(|_| OciError::path_invalid())?;
     let (name, endpoint) = endpoint(&path).ok_or_else(OciError::no_endpoint)?;
-    let repository: RepositoryName = name.parse().map_err(|error| OciError::name_invalid(&error))?;
+    let repository: RepositoryName =
+        name.parse().map_err(|error| OciError::name_invalid(&error))?;
     let method = parts.method.clone();
-    let (robot, person) = (caller.as_ref().and_then(Caller::robot), caller.as_ref().and_then(Caller::person));
+    let (robot, person) =
+        (caller.as_ref().and_then(Caller::robot), caller.as_ref().and_then(Caller::person));
     if let Some(person) = person {
         check_person(&registry, person, &repository, &method, &endpoint).await?;
     }
@@ -136,7 +141,9 @@ pub async fn dispatch(
             (&Method::GET | &Method::HEAD, Endpoint::Blob(digest)) => {
                 blobs::get_for_robot(&registry, robot, digest_of_blob(digest)?, &parts).await
             }
-            _ => Err(OciError::denied("a robot may only read its packages' blobs and push its own outputs")),
+            _ => Err(OciError::denied(
+                "a robot may only read its packages' blobs and push its own outputs",
+            )),
         };
     }
     match endpoint {
@@ -146,13 +153,18 @@ pub async fn dispatch(
                 Method::HEAD if may_begin(person, &repository) => {
                     blobs::head_before_push(&registry, &repository, digest, &parts).await
                 }
-                Method::GET | Method::HEAD => blobs::get(&registry, &repository, digest, &parts).await,
-                Method::DELETE => blobs::delete(&registry, deleter(person)?, &repository, digest).await,
+                Method::GET | Method::HEAD => {
+                    blobs::get(&registry, &repository, digest, &parts).await
+                }
+                Method::DELETE => {
+                    blobs::delete(&registry, deleter(person)?, &repository, digest).await
+                }
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
         }
         Endpoint::Uploads if method == Method::POST => {
-            // A blob can be mounted from any repository, also from one that is none of the caller's business.
+            // A blob can be mounted from any repository, also from one that is none of the caller's
+            // business.
             let may_mount = person.is_some_and(|person| person.scope.is_everything());
             uploads::begin(&registry, &repository, &parts, body, may_mount).await
         }
@@ -171,20 +183,30 @@ pub async fn dispatch(
         Endpoint::Manifest(text) => {
             let reference = parse_reference(text);
             match method {
-                Method::GET | Method::HEAD => manifests::get(&registry, &repository, reference, &parts).await,
+                Method::GET | Method::HEAD => {
+                    manifests::get(&registry, &repository, reference, &parts).await
+                }
                 Method::PUT => {
                     let only = robot.map(|_| OUTPUT_TYPE);
                     let push = manifests::Push::of(&parts, &repository, reference?, person, only)?;
                     manifests::put(&registry, push, &parts, body).await
                 }
-                Method::DELETE if is_of_another_algorithm(text) => Err(OciError::manifest_unknown()),
-                Method::DELETE => manifests::delete(&registry, deleter(person)?, &repository, reference?).await,
+                Method::DELETE if is_of_another_algorithm(text) => {
+                    Err(OciError::manifest_unknown())
+                }
+                Method::DELETE => {
+                    manifests::delete(&registry, deleter(person)?, &repository, reference?).await
+                }
                 _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
             }
         }
-        Endpoint::Tags | Endpoint::Referrers(_) if method != Method::GET => Err(OciError::method("GET")),
+        Endpoint::Tags | Endpoint::Referrers(_) if method != Method::GET => {
+            Err(OciError::method("GET"))
+        }
         Endpoint::Tags => lists::tags(&registry, &repository, &parts).await,
-        Endpoint::Referrers(subject) => lists::referrers(&registry, &repository, subject, &parts).await,
+        Endpoint::Referrers(subject) => {
+            lists::referrers(&registry, &repository, subject, &parts).await
+        }
     }
 }
 
@@ -199,7 +221,9 @@ async fn check_person(
     let permission = needed(repository, method, endpoint);
     if !person.may(permission) {
         let (name, roles) = (&person.name, &person.roles);
-        return Err(OciError::denied(format!("{name} has no permission to {permission} here (roles: {roles})")));
+        return Err(OciError::denied(format!(
+            "{name} has no permission to {permission} here (roles: {roles})"
+        )));
     }
     if person.scope.is_everything() {
         return Ok(());
@@ -213,12 +237,15 @@ async fn check_person(
     Err(OciError::denied(format!("{repository} is outside of {name}'s scope {scope:?}")))
 }
 
-/// What a person needs for this. Outputs are the robots': one may be ended like the task it came from, and only who may do
-/// everything pushes in a robot's name. The list of publishers concerns all robots.
+/// What a person needs for this. Outputs are the robots': one may be ended like the task it came
+/// from, and only who may do everything pushes in a robot's name. The list of publishers concerns
+/// all robots.
 fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
     let is_output = is_of_outputs(repository);
     match (method, endpoint) {
-        (&Method::GET | &Method::HEAD, endpoint) if !matches!(endpoint, Endpoint::Uploads | Endpoint::Upload(_)) => {
+        (&Method::GET | &Method::HEAD, endpoint)
+            if !matches!(endpoint, Endpoint::Uploads | Endpoint::Upload(_)) =>
+        {
             Permission::Read
         }
         (&Method::DELETE, Endpoint::Manifest(_)) if is_output => Permission::Operate,
@@ -241,13 +268,20 @@ fn is_of_outputs(repository: &RepositoryName) -> bool {
     repository.as_str().starts_with("outputs/")
 }
 
-/// Whether who was let in to this repository may push there: a robot comes this far only to its own outputs.
+/// Whether who was let in to this repository may push there: a robot comes this far only to its own
+/// outputs.
 fn may_begin(person: Option<&Person>, repository: &RepositoryName) -> bool {
     person.is_none_or(|person| person.may(needed(repository, &Method::POST, &Endpoint::Uploads)))
 }
 
-/// Whether this is part of pushing one of the robot's own outputs. It deletes nothing and reads nothing back.
-fn may_push(robot: &RobotId, repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> bool {
+/// Whether this is part of pushing one of the robot's own outputs. It deletes nothing and reads
+/// nothing back.
+fn may_push(
+    robot: &RobotId,
+    repository: &RepositoryName,
+    method: &Method,
+    endpoint: &Endpoint<'_>,
+) -> bool {
     let is_own = output::owner(repository).is_some_and(|(owner, _)| owner == *robot);
     is_own
         && match endpoint {
@@ -259,9 +293,11 @@ fn may_push(robot: &RobotId, repository: &RepositoryName, method: &Method, endpo
 }
 
 fn parse_digest(text: &str) -> Result<Digest, OciError> {
-    text.parse().map_err(|error: task_proto::digest::InvalidDigest| match is_of_another_algorithm(text) {
-        true => OciError::digest_invalid(ALGORITHMS),
-        false => OciError::digest_invalid(error.to_string()),
+    text.parse().map_err(|error: task_proto::digest::InvalidDigest| {
+        match is_of_another_algorithm(text) {
+            true => OciError::digest_invalid(ALGORITHMS),
+            false => OciError::digest_invalid(error.to_string()),
+        }
     })
 }
 
@@ -273,7 +309,8 @@ fn digest_of_blob(text: &str) -> Result<Digest, OciError> {
 /// Whether this is a digest, but not one of those that things have here.
 fn is_of_another_algorithm(text: &str) -> bool {
     let is_known = |algorithm: &str| Algorithm::ALL.iter().any(|known| known.as_str() == algorithm);
-    lists::is_digest(text) && text.split_once(':').is_some_and(|(algorithm, _)| !is_known(algorithm))
+    lists::is_digest(text)
+        && text.split_once(':').is_some_and(|(algorithm, _)| !is_known(algorithm))
 }
 
 fn parse_reference(text: &str) -> Result<Reference, OciError> {
@@ -295,7 +332,8 @@ fn empty<const N: usize>(status: StatusCode, headers: [(&'static str, String); N
     let mut response = status.into_response();
     for (name, value) in headers {
         // All values are made of digests, ids, numbers and names, which a header can hold.
-        let value = HeaderValue::try_from(value).map_err(|_| OciError::query_invalid("a name no header can hold"))?;
+        let value = HeaderValue::try_from(value)
+            .map_err(|_| OciError::query_invalid("a name no header can hold"))?;
         response.headers_mut().insert(name, value);
     }
     Ok(response)

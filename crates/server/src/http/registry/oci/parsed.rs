@@ -1,5 +1,5 @@
-//! What the registry has to understand of a manifest: its parts, what it refers to, and whether it is a task package.
-//! Whatever else it says is kept and not looked at.
+//! What the registry has to understand of a manifest: its parts, what it refers to, and whether it
+//! is a task package. Whatever else it says is kept and not looked at.
 
 use std::collections::BTreeMap;
 
@@ -16,7 +16,8 @@ const DOCKER_MANIFEST_TYPE: &str = "application/vnd.docker.distribution.manifest
 const DOCKER_LIST_TYPE: &str = "application/vnd.docker.distribution.manifest.list.v2+json";
 /// The most blobs and manifests one manifest is made of: each is looked up.
 const MAX_PARTS: usize = 4096;
-/// The most bytes of annotations, names included, of a manifest that refers to another: lists of referrers repeat them.
+/// The most bytes of annotations, names included, of a manifest that refers to another: lists of
+/// referrers repeat them.
 const MAX_ANNOTATION_BYTES: usize = 64 * 1024;
 
 /// A manifest of any kind, as far as it is understood.
@@ -73,7 +74,9 @@ impl Part {
 impl Parsed {
     /// Reads a manifest that came with `content_type`.
     pub fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
-        let invalid = |error: serde_json::Error| OciError::manifest_invalid(format!("not a manifest: {error}"));
+        let invalid = |error: serde_json::Error| {
+            OciError::manifest_invalid(format!("not a manifest: {error}"))
+        };
         let document: Document = serde_json::from_slice(bytes).map_err(invalid)?;
         let media_type = media_type(content_type, document.media_type.as_deref())?;
         document.check_kind(&media_type)?;
@@ -118,15 +121,22 @@ impl Parsed {
 
     /// These go into headers and columns, which not every character can.
     fn check_texts(&self) -> Result<(), OciError> {
-        let texts = [("artifactType", self.artifact_type.as_ref()), ("subject", self.subject.as_ref())];
-        match texts.iter().find(|(_, text)| text.is_some_and(|text| text.contains(char::is_control))) {
-            Some((key, _)) => Err(OciError::manifest_invalid(format!("{key}: it has a control character"))),
+        let texts =
+            [("artifactType", self.artifact_type.as_ref()), ("subject", self.subject.as_ref())];
+        match texts
+            .iter()
+            .find(|(_, text)| text.is_some_and(|text| text.contains(char::is_control)))
+        {
+            Some((key, _)) => {
+                Err(OciError::manifest_invalid(format!("{key}: it has a control character")))
+            }
             None => Ok(()),
         }
     }
 
     fn check_annotations(&self) -> Result<(), OciError> {
-        let bytes: usize = self.annotations.iter().map(|(key, value)| key.len() + value.len()).sum();
+        let bytes: usize =
+            self.annotations.iter().map(|(key, value)| key.len() + value.len()).sum();
         if self.subject.is_none() || bytes <= MAX_ANNOTATION_BYTES {
             return Ok(());
         }
@@ -146,7 +156,9 @@ impl Document {
             INDEX_TYPE | DOCKER_LIST_TYPE if self.manifests.is_none() => "manifests",
             _ => return Ok(()),
         };
-        Err(OciError::manifest_invalid(format!("a manifest of type {media_type} needs {missing:?}")))
+        Err(OciError::manifest_invalid(format!(
+            "a manifest of type {media_type} needs {missing:?}"
+        )))
     }
 
     fn parts(&self) -> Result<Vec<Digest>, OciError> {
@@ -161,7 +173,9 @@ impl Document {
                 ))
             })?;
             if parts.len() == MAX_PARTS {
-                return Err(OciError::manifest_invalid(format!("the manifest has more than {MAX_PARTS} parts")));
+                return Err(OciError::manifest_invalid(format!(
+                    "the manifest has more than {MAX_PARTS} parts"
+                )));
             }
             parts.push(digest);
         }
@@ -173,7 +187,10 @@ impl Document {
 
 /// The manifest's type: what the header and the document say, which must be the same.
 fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, OciError> {
-    let header = header.and_then(|text| text.split(';').next()).map(str::trim).filter(|text| !text.is_empty());
+    let header = header
+        .and_then(|text| text.split(';').next())
+        .map(str::trim)
+        .filter(|text| !text.is_empty());
     let media_type = match (header, document.filter(|text| !text.is_empty())) {
         (Some(header), Some(document)) if header != document => {
             return Err(OciError::manifest_invalid(format!(
@@ -184,19 +201,21 @@ fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, Oc
         (None, None) => MANIFEST_TYPE,
     };
     if !is_json(media_type) {
-        let message =
-            format!("{media_type:?} is no manifest's type; those are application/json and application/…+json");
+        let message = format!(
+            "{media_type:?} is no manifest's type; those are application/json and application/…+json"
+        );
         return Err(OciError::manifest_invalid(message));
     }
     Ok(media_type.to_owned())
 }
 
-/// Whether this is a media type of JSON, which no browser shows as a page: with the characters of RFC 6838, section 4.2.
+/// Whether this is a media type of JSON, which no browser shows as a page: with the characters of
+/// RFC 6838, section 4.2.
 pub(super) fn is_json(media_type: &str) -> bool {
     let is_character = |b: u8| b.is_ascii_alphanumeric() || b"!#$&-^_.+".contains(&b);
-    media_type
-        .strip_prefix("application/")
-        .is_some_and(|subtype| (subtype == "json" || subtype.ends_with("+json")) && subtype.bytes().all(is_character))
+    media_type.strip_prefix("application/").is_some_and(|subtype| {
+        (subtype == "json" || subtype.ends_with("+json")) && subtype.bytes().all(is_character)
+    })
 }
 
 #[cfg(test)]
@@ -205,10 +224,15 @@ mod tests {
 
     #[test]
     fn a_manifests_type_is_one_of_json() {
-        for text in ["application/json", MANIFEST_TYPE, DOCKER_LIST_TYPE, "application/x-foreign+json"] {
+        for text in
+            ["application/json", MANIFEST_TYPE, DOCKER_LIST_TYPE, "application/x-foreign+json"]
+        {
             assert!(is_json(text), "{text}");
             assert_eq!(media_type(Some(text), None).expect("taken"), text);
-            assert_eq!(media_type(Some(&format!("{text}; charset=utf-8")), Some(text)).expect("taken"), text);
+            assert_eq!(
+                media_type(Some(&format!("{text}; charset=utf-8")), Some(text)).expect("taken"),
+                text
+            );
         }
         for text in [
             "text/html",
@@ -221,7 +245,10 @@ mod tests {
             "application/ä+json",
         ] {
             assert!(!is_json(text), "{text}");
-            assert!(media_type(Some(text), None).is_err() && media_type(None, Some(text)).is_err(), "{text}");
+            assert!(
+                media_type(Some(text), None).is_err() && media_type(None, Some(text)).is_err(),
+                "{text}"
+            );
         }
     }
 }

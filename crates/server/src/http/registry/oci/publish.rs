@@ -29,24 +29,37 @@ pub async fn publish(
 ) -> Result<PackageView, OciError> {
     let package = &packed.package;
     let repository = RepositoryName::of_package(&package.name);
-    let tag: Tag = package.version.as_str().parse().map_err(|error| OciError::tag_invalid(&error))?;
+    let tag: Tag =
+        package.version.as_str().parse().map_err(|error| OciError::tag_invalid(&error))?;
     let unreadable = |error: io::Error| OciError::internal(&error);
     let content = tokio::fs::File::open(packed.content.path()).await.map_err(unreadable)?;
-    store(registry, &repository, package.content, ReaderStream::with_capacity(content, CHUNK_BYTES)).await?;
+    store(
+        registry,
+        &repository,
+        package.content,
+        ReaderStream::with_capacity(content, CHUNK_BYTES),
+    )
+    .await?;
     let config = ReaderStream::new(&packed.config_bytes[..]);
     store(registry, &repository, package.config, config).await?;
     let mut headers = HeaderMap::new();
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(MANIFEST_TYPE));
     let manifest = packed.manifest_bytes.clone().into();
     let reference = Reference::Tag(tag.clone());
-    let as_tag = Push { repository: &repository, reference, by: Some(by), only: None, takes_version };
+    let as_tag =
+        Push { repository: &repository, reference, by: Some(by), only: None, takes_version };
     push(registry, as_tag, vec![tag], &headers, manifest).await?;
     let view = registry.store.package(&package.name, &package.manifest.digest).await?;
     view.ok_or_else(OciError::manifest_unknown)
 }
 
 /// Makes these bytes a blob of the repository, unless it has it.
-async fn store<S>(registry: &Registry, repository: &RepositoryName, blob: BlobRef, bytes: S) -> Result<(), OciError>
+async fn store<S>(
+    registry: &Registry,
+    repository: &RepositoryName,
+    blob: BlobRef,
+    bytes: S,
+) -> Result<(), OciError>
 where
     S: futures_util::Stream<Item = io::Result<bytes::Bytes>> + Send,
 {

@@ -1,10 +1,13 @@
-//! What publishers have signed, as it is pushed: an envelope about a package, or a list of publishers. Whether a signature
-//! counts is for robots to say; what could never count, or says something else than its manifest, is turned away here.
+//! What publishers have signed, as it is pushed: an envelope about a package, or a list of
+//! publishers. Whether a signature counts is for robots to say; what could never count, or says
+//! something else than its manifest, is turned away here.
 
 use task_proto::desired::BlobRef;
 use task_proto::envelope::Envelope;
 use task_proto::oci::ImageManifest;
-use task_proto::publisher::{LIST_REPOSITORY, MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, PackageStatement, PublisherList};
+use task_proto::publisher::{
+    LIST_REPOSITORY, MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, PackageStatement, PublisherList,
+};
 use task_proto::{RepositoryName, Tag};
 
 use super::blobs::check_blob;
@@ -29,7 +32,11 @@ pub(super) async fn check(
 }
 
 /// Tells the robots whom a document concerns. Should that fail they hear of it when they ask.
-pub(super) async fn tell(registry: &Registry, repository: &RepositoryName, document: Option<&SignedDocument>) {
+pub(super) async fn tell(
+    registry: &Registry,
+    repository: &RepositoryName,
+    document: Option<&SignedDocument>,
+) {
     match document {
         Some(SignedDocument::List { .. }) => registry.changes.ring_everyone(),
         Some(SignedDocument::Signature { package, .. }) => {
@@ -46,20 +53,26 @@ pub(super) async fn tell(registry: &Registry, repository: &RepositoryName, docum
     }
 }
 
-/// The signature of a package in the package's own repository. Beside a copy in another repository it is a copy itself, and
-/// counts for nobody: `None`.
+/// The signature of a package in the package's own repository. Beside a copy in another repository
+/// it is a copy itself, and counts for nobody: `None`.
 async fn check_signature(
     registry: &Registry,
     repository: &RepositoryName,
     image: &ImageManifest,
 ) -> Result<Option<SignedDocument>, OciError> {
-    let subject =
-        image.subject.as_ref().ok_or_else(|| OciError::manifest_invalid("subject: a signature is about one"))?;
+    let subject = image
+        .subject
+        .as_ref()
+        .ok_or_else(|| OciError::manifest_invalid("subject: a signature is about one"))?;
     let stored = registry.store.manifest(repository, &Reference::Digest(subject.digest)).await?;
-    stored.ok_or_else(|| OciError::manifest_invalid("subject: there is no such package; push it first"))?;
+    stored.ok_or_else(|| {
+        OciError::manifest_invalid("subject: there is no such package; push it first")
+    })?;
     let (blob, envelope) = envelope(registry, repository, image, MAX_SIGNATURE_BYTES).await?;
     let statement = PackageStatement::unverified(&envelope);
-    let signed = statement.map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?.package;
+    let signed = statement
+        .map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?
+        .package;
     let own = match repository.as_str().parse() {
         Ok(name) => registry.store.package(&name, &subject.digest).await?,
         Err(_) => None,
@@ -109,7 +122,8 @@ async fn check_list(
 async fn newest_list(registry: &Registry, newest: BlobRef) -> Result<PublisherList, OciError> {
     let blob = registry.blobs.get(newest.digest).await?.ok_or_else(OciError::blob_unknown)?;
     let envelope = parse(&blob.read().await?)?;
-    PublisherList::unverified(&envelope).map_err(|error| OciError::manifest_invalid(error.to_string()))
+    PublisherList::unverified(&envelope)
+        .map_err(|error| OciError::manifest_invalid(error.to_string()))
 }
 
 /// The one layer of a signed document.
@@ -120,9 +134,11 @@ async fn envelope(
     most: u64,
 ) -> Result<(BlobRef, Envelope), OciError> {
     let envelope = image.lone_envelope();
-    let envelope = envelope.ok_or_else(|| OciError::manifest_invalid("layers: one DSSE envelope is expected"))?;
+    let envelope = envelope
+        .ok_or_else(|| OciError::manifest_invalid("layers: one DSSE envelope is expected"))?;
     if envelope.size > most {
-        let message = format!("layers: the envelope has {} bytes, {most} are possible", envelope.size);
+        let message =
+            format!("layers: the envelope has {} bytes, {most} are possible", envelope.size);
         return Err(OciError::manifest_invalid(message));
     }
     let blob = check_blob(registry, repository, envelope).await?;
@@ -130,5 +146,6 @@ async fn envelope(
 }
 
 fn parse(bytes: &[u8]) -> Result<Envelope, OciError> {
-    serde_json::from_slice(bytes).map_err(|error| OciError::manifest_invalid(format!("not a DSSE envelope: {error}")))
+    serde_json::from_slice(bytes)
+        .map_err(|error| OciError::manifest_invalid(format!("not a DSSE envelope: {error}")))
 }

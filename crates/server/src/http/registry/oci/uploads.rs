@@ -1,4 +1,5 @@
-//! Pushing blobs: in one request, in a POST and a PUT, in chunks, or by mounting what another repository has.
+//! Pushing blobs: in one request, in a POST and a PUT, in chunks, or by mounting what another
+//! repository has.
 
 use axum::body::Body;
 use axum::response::Response;
@@ -29,8 +30,9 @@ struct FinishQuery {
     digest: Option<String>,
 }
 
-/// `POST /v2/<name>/blobs/uploads/`: begins an upload, or does all of it if `digest` or `mount` is given.
-/// A mount that may not be, because it would show what another repository holds, begins an upload instead.
+/// `POST /v2/<name>/blobs/uploads/`: begins an upload, or does all of it if `digest` or `mount` is
+/// given. A mount that may not be, because it would show what another repository holds, begins an
+/// upload instead.
 pub(super) async fn begin(
     registry: &Registry,
     repository: &RepositoryName,
@@ -39,7 +41,8 @@ pub(super) async fn begin(
     may_mount: bool,
 ) -> Answer {
     let query: BeginQuery = query(&parts.uri)?;
-    let is_known = |asked: &String| Algorithm::ALL.iter().any(|algorithm| algorithm.as_str() == asked);
+    let is_known =
+        |asked: &String| Algorithm::ALL.iter().any(|algorithm| algorithm.as_str() == asked);
     if query.digest_algorithm.as_ref().is_some_and(|asked| !is_known(asked)) {
         return Err(OciError::digest_invalid(ALGORITHMS));
     }
@@ -53,9 +56,13 @@ pub(super) async fn begin(
         let kept = kept_bytes(registry, repository).await?;
         check_length(registry, repository, &parts.headers, kept)?;
         let upload = begun(registry, repository).await?;
-        let appended = registry.blobs.append(repository, &upload.id, Some(0), body.into_data_stream(), kept).await;
+        let appended = registry
+            .blobs
+            .append(repository, &upload.id, Some(0), body.into_data_stream(), kept)
+            .await;
         if let Err(error) = appended {
-            // Best effort, for the collector would find it; what the caller has to know is the error.
+            // Best effort, for the collector would find it; what the caller has to know is the
+            // error.
             let _ = upload.cancel().await;
             return Err(error.into());
         }
@@ -64,7 +71,10 @@ pub(super) async fn begin(
     begun(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
 }
 
-pub(super) async fn begun<'a>(registry: &'a Registry, repository: &'a RepositoryName) -> Result<Upload<'a>, OciError> {
+pub(super) async fn begun<'a>(
+    registry: &'a Registry,
+    repository: &'a RepositoryName,
+) -> Result<Upload<'a>, OciError> {
     let id = registry.blobs.begin_upload(repository).await?;
     Ok(Upload { registry, repository, id })
 }
@@ -92,7 +102,8 @@ impl Upload<'_> {
     /// `PUT`: perhaps a last chunk, then the digest that everything must have.
     pub(super) async fn finish(&self, parts: &Parts, body: Body) -> Answer {
         let FinishQuery { digest } = query(&parts.uri)?;
-        let digest = digest.ok_or_else(|| OciError::digest_invalid("the digest parameter is missing"))?;
+        let digest =
+            digest.ok_or_else(|| OciError::digest_invalid("the digest parameter is missing"))?;
         let digest = parse_digest(&digest)?;
         self.take_chunk(parts, body).await?;
         self.complete(digest).await
@@ -110,7 +121,8 @@ impl Upload<'_> {
         check_length(self.registry, self.repository, &parts.headers, kept)?;
         let start = range.as_ref().map(|range| range.start);
         let body = body.into_data_stream();
-        let offset = self.registry.blobs.append(self.repository, &self.id, start, body, kept).await?;
+        let offset =
+            self.registry.blobs.append(self.repository, &self.id, start, body, kept).await?;
         match range {
             Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
                 "the Content-Range ends before byte {}, the body before byte {offset}",
@@ -120,13 +132,17 @@ impl Upload<'_> {
         }
     }
 
-    /// Makes the upload a blob of the repository, in one go as the collector sees it, also if whoever asked has hung up.
+    /// Makes the upload a blob of the repository, in one go as the collector sees it, also if
+    /// whoever asked has hung up.
     pub(super) async fn complete(&self, digest: Digest) -> Answer {
-        let (registry, repository, id) = (self.registry.clone(), self.repository.clone(), self.id.clone());
+        let (registry, repository, id) =
+            (self.registry.clone(), self.repository.clone(), self.id.clone());
         let completed = tokio::spawn(async move {
             let _hold = registry.blobs.hold_collection().await;
             // Others of the robot's may have been finished meanwhile.
-            if let Err(full) = registry.blobs.check_room(&repository, 0, kept_bytes(&registry, &repository).await?) {
+            if let Err(full) =
+                registry.blobs.check_room(&repository, 0, kept_bytes(&registry, &repository).await?)
+            {
                 registry.blobs.cancel_upload(&repository, &id).await?;
                 return Err(full.into());
             }
@@ -143,7 +159,8 @@ impl Upload<'_> {
         let (repository, id) = (self.repository, self.id.as_str());
         let headers: [(&str, String); 3] = [
             ("location", format!("/v2/{repository}/blobs/uploads/{id}")),
-            // An upload without a byte can't be told from one with a single byte: the specification has no word for it.
+            // An upload without a byte can't be told from one with a single byte: the specification
+            // has no word for it.
             ("range", format!("0-{}", offset.saturating_sub(1))),
             ("docker-upload-uuid", id.to_owned()),
         ];
@@ -151,14 +168,18 @@ impl Upload<'_> {
     }
 }
 
-/// Makes a blob of `from` (of any repository, if absent) one of this repository; false if it is not there.
+/// Makes a blob of `from` (of any repository, if absent) one of this repository; false if it is not
+/// there.
 async fn mount(
     registry: &Registry,
     repository: &RepositoryName,
     digest: Digest,
     from: Option<&str>,
 ) -> Result<bool, OciError> {
-    let from = from.map(str::parse::<RepositoryName>).transpose().map_err(|error| OciError::name_invalid(&error))?;
+    let from = from
+        .map(str::parse::<RepositoryName>)
+        .transpose()
+        .map_err(|error| OciError::name_invalid(&error))?;
     let _hold = registry.blobs.hold_collection().await;
     if !registry.store.has_blob(from.as_ref(), &digest).await?
         || !registry.blobs.touch(digest, registry.clock.now_ms()).await?
@@ -171,7 +192,10 @@ async fn mount(
 }
 
 /// How many bytes are kept of the robot whose repository this is, if it is one's.
-pub(super) async fn kept_bytes(registry: &Registry, repository: &RepositoryName) -> Result<u64, OciError> {
+pub(super) async fn kept_bytes(
+    registry: &Registry,
+    repository: &RepositoryName,
+) -> Result<u64, OciError> {
     let Some((robot, _)) = owner(repository) else { return Ok(0) };
     Ok(registry.store.bytes_of_robot(&robot).await?)
 }
@@ -193,11 +217,13 @@ fn announced_length(headers: &HeaderMap) -> Option<u64> {
 /// `Content-Range` as the specification has it: `first-last`, both inclusive.
 fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError> {
     let Some(value) = parts.headers.get(CONTENT_RANGE) else { return Ok(None) };
-    let range = value.to_str().ok().and_then(|text| text.split_once('-')).and_then(|(first, last)| {
-        let (first, last) = (decimal(first)?, decimal(last)?);
-        (first <= last && last < u64::MAX).then_some(first..last + 1)
-    });
-    let range = range.ok_or_else(|| OciError::upload_invalid("the Content-Range is not of the form 0-1023"))?;
+    let range =
+        value.to_str().ok().and_then(|text| text.split_once('-')).and_then(|(first, last)| {
+            let (first, last) = (decimal(first)?, decimal(last)?);
+            (first <= last && last < u64::MAX).then_some(first..last + 1)
+        });
+    let range = range
+        .ok_or_else(|| OciError::upload_invalid("the Content-Range is not of the form 0-1023"))?;
     match announced_length(&parts.headers) {
         Some(length) if length != range.end - range.start => {
             Err(OciError::size_invalid("the Content-Length does not fit the Content-Range"))
@@ -208,5 +234,8 @@ fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError
 
 fn created(repository: &RepositoryName, digest: &Digest) -> Result<Response, OciError> {
     let location = format!("/v2/{repository}/blobs/{digest}");
-    empty(StatusCode::CREATED, [("location", location), ("docker-content-digest", digest.to_string())])
+    empty(
+        StatusCode::CREATED,
+        [("location", location), ("docker-content-digest", digest.to_string())],
+    )
 }

@@ -1,4 +1,4 @@
-//! Runs `task_hostile::mqtt_packets` without end.
+//! Fuzz target: calls `task_hostile::mqtt_packets` on generated inputs.
 #![no_main]
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| task_hostile::mqtt_packets(bytes));

@@ -1,4 +1,4 @@
-//! Runs `task_hostile::rtps` without end.
+//! Fuzz target: calls `task_hostile::rtps` on generated inputs.
 #![no_main]
 
 #[global_allocator]

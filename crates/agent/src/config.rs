@@ -1,8 +1,8 @@
 //! The robot's settings: `agent.toml`, the `TASK_AGENT_*` variables above it, and the trusted
 //! publishers. They are read once, at start, and hold no secret.
 //!
-//! The environment wins over the file, the file over the defaults. Unknown keys are refused by
-//! name.
+//! The environment overrides the file, and the file overrides the defaults. Unknown keys are
+//! refused by name.
 
 pub mod settings;
 pub mod trust;
@@ -34,45 +34,46 @@ use crate::system::durable;
 pub const FILE_NAME: &str = "agent.toml";
 /// The longest time the gate may be given to answer, in seconds.
 pub const MAX_GATE_TIMEOUT_S: u64 = 300;
-/// The user ids of tasks and builds. Neither Debian nor systemd gives these to anybody, and they
-/// are below those that are handed out for containers.
+/// Default user ids of tasks and builds. Neither Debian nor systemd assigns ids from this range,
+/// and the range is below the ids that are assigned for containers.
 const DEFAULT_TASK_UIDS: &str = "70000-79999";
-/// Below it are the system's own accounts.
+/// Lowest user id for tasks; the ids below are the system's own accounts.
 const MIN_TASK_UID: u32 = 1000;
-/// What every variable starts with.
+/// Prefix of every variable.
 const VARIABLE_PREFIX: &str = "TASK_AGENT_";
-/// The variable by which ROS 2 itself knows its domain; `ros_domain_id` wins.
+/// The variable by which ROS 2 itself knows its domain; `ros_domain_id` overrides it.
 const ROS_DOMAIN_ID: &str = "ROS_DOMAIN_ID";
-/// Variables that are no settings: the data directory, the log filter, the enrolment token.
+/// Variables that are no settings: the data directory, the log filter, the enrollment token.
 const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_AGENT_ENROLL_TOKEN"];
 
-/// The property file. What is absent has its default.
+/// The property file. An absent key has its default.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
     /// The server's URL.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub server: Option<String>,
-    /// Whether MQTT is used; `false`: the robot only polls.
+    /// Whether MQTT is used. With `false` the robot only polls.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mqtt: Option<bool>,
-    /// How MQTT gets to the server.
+    /// How the MQTT connection reaches the server.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mqtt_transport: Option<MqttTransport>,
-    /// The name the robot gives itself; the server's wins.
+    /// The name that the robot gives itself; the server's name overrides it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub name: Option<RobotName>,
-    /// Setup files that are sourced before a task is built or run. Absent: what is in `/opt/ros`.
+    /// Setup files that are sourced before a task is built or run. Absent: the setup files in
+    /// `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<PathBuf>>,
-    /// The robot's own ROS workspace, whose setup file in `install` or `devel` is sourced after
+    /// The robot's own ROS workspace. The setup file in its `install` or `devel` is sourced after
     /// them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<PathBuf>,
-    /// Whether the server may name setup files also where `trusted_publishers` are named.
+    /// Whether the server may name setup files even if `trusted_publishers` is set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub server_underlays: Option<bool>,
-    /// `ROS_DOMAIN_ID` of every task. Absent: the agent's own, if it has one.
+    /// `ROS_DOMAIN_ID` of every task. Absent: the agent's own domain id, if it has one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros_domain_id: Option<u32>,
     /// Seconds between two polls while MQTT works.
@@ -84,34 +85,35 @@ pub struct Settings {
     /// Seconds after which the robot asks for a new token.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub token_lifetime_s: Option<u64>,
-    /// Seconds after which the robot says again how its machine does; 0: it does not say.
+    /// Interval between the robot's vitals reports, in seconds; 0: the robot sends none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vitals_interval_s: Option<u64>,
-    /// Whose groups the tasks of an agent that is root have, by name or number; absent:
-    /// `taskd-task`. `root` must be said, and then tasks run as root.
+    /// The account that gives the tasks their groups if the agent is root, by name or number;
+    /// absent: `taskd-task`. `root` must be set explicitly, and then tasks run as root.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_user: Option<String>,
-    /// Whether builds and tasks are denied system calls that only an administrator needs; absent:
-    /// where they run under an account of their own.
+    /// Whether builds and tasks are denied the system calls that only an administrator needs;
+    /// absent: where they run under an account of their own.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub seccomp: Option<Seccomp>,
     /// The user ids that tasks and builds run under, `FIRST-LAST`; `none`: all of them under
     /// `task_user`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_uids: Option<String>,
-    /// The labels the robot gives itself; the server's win.
+    /// The labels that the robot gives itself; the server's labels override them.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub labels: Option<Labels>,
-    /// What tasks may use.
+    /// Resource limits of tasks.
     #[serde(default, deserialize_with = "known_limits", skip_serializing_if = "Option::is_none")]
     pub limits: Option<RobotLimits>,
-    /// Who is asked before a task is started, stopped or switched.
+    /// The gate: the program that approves each start, stop or switch of a task.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate: Option<GateSettings>,
-    /// Which log lines go to the server by themselves.
+    /// Selection of the log lines that the robot sends to the server without a request.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub logs: Option<LogSettings>,
-    /// Whose packages are run; absent: whatever the server orders.
+    /// Publishers of the packages that are run; absent: every package that the server orders is
+    /// run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub trusted_publishers: Option<PublisherSettings>,
 }
@@ -120,17 +122,18 @@ pub struct Settings {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublisherSettings {
-    /// Whose signatures a package needs, until a list of publishers says otherwise.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub keys: Option<Vec<PublicKey>>,
-    /// Of how many of them.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub threshold: Option<u32>,
-    /// Whose signatures the first list of publishers needs; absent: the same keys, and as many of
+    /// The publisher keys: a package needs their signatures, until a list of publishers replaces
     /// them.
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub keys: Option<Vec<PublicKey>>,
+    /// Number of those keys that must have signed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub threshold: Option<u32>,
+    /// The keeper keys: the first list of publishers needs their signatures; absent: the publisher
+    /// keys, with the same threshold.
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub keeper_keys: Option<Vec<PublicKey>>,
-    /// Of how many of them.
+    /// Number of those keys that must have signed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub keeper_threshold: Option<u32>,
     /// Whether nothing is run before the robot has a list.
@@ -145,34 +148,34 @@ pub struct GateSettings {
     /// The program, by its absolute path, and its arguments.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub command: Option<Vec<String>>,
-    /// Seconds it may take to answer.
+    /// Maximum answer time of the gate, in seconds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub timeout_s: Option<u64>,
-    /// What it means when it hangs, crashes or can't be run.
+    /// The decision that applies when the gate hangs, crashes or can't be run.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub default: Option<GateDefault>,
 }
 
-/// How MQTT gets to the server.
+/// How the MQTT connection reaches the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum MqttTransport {
-    /// Over its own port; where that can't be reached, as a WebSocket over the HTTP port.
+    /// Over the MQTT port; where that can't be reached, as a WebSocket over the HTTP port.
     #[default]
     Auto,
-    /// Only over its own port.
+    /// Only over the MQTT port.
     Tcp,
     /// Only as a WebSocket over the HTTP port.
     Websocket,
 }
 
-/// What holds when the gate gives no answer.
+/// The decision that applies when the gate gives no answer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GateDefault {
-    /// As if it had said yes.
+    /// Treat no answer as a yes.
     Allow,
-    /// As if it had said not now.
+    /// Treat no answer as "not now".
     #[default]
     Deny,
 }
@@ -181,16 +184,17 @@ pub enum GateDefault {
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogSettings {
-    /// The least serious lines that go to the server while nobody follows; all are kept here.
+    /// The least serious level of the lines that go to the server while no client follows the log.
+    /// The robot itself keeps the lines of all levels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_level: Option<LogLevel>,
-    /// How many of them a second, for each task.
+    /// Maximum number of forwarded lines a second, for each task.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_lines_per_s: Option<u32>,
 }
 
-/// The `[limits]` table. A robot passes over what a newer server may limit; in its own file an
-/// unknown key is a slip.
+/// The `[limits]` table. A robot ignores limits that only a newer server knows; in the robot's own
+/// file an unknown key is a mistake and is refused.
 fn known_limits<'de, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<Option<RobotLimits>, D::Error> {
@@ -205,71 +209,72 @@ fn known_limits<'de, D: Deserializer<'de>>(
     table.try_into().map(Some).map_err(D::Error::custom)
 }
 
-/// A setting that counts something; as many as there can be, where there are fewer.
+/// A setting that counts something, as `usize`; capped at `usize::MAX`.
 pub(crate) fn count(number: u64) -> usize {
     usize::try_from(number).unwrap_or(usize::MAX)
 }
 
-/// The gate's settings that hold.
+/// The effective settings of the gate.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GateConfig {
     /// The program and its arguments.
     pub command: Vec<String>,
-    /// How long it may take to answer.
+    /// Maximum answer time of the gate.
     pub timeout: Duration,
-    /// What it means when there is no answer.
+    /// The decision that applies when there is no answer.
     pub default: GateDefault,
 }
 
-/// The settings that hold, defaults filled in.
+/// The effective settings, defaults filled in.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
     /// The server's URL, if one is given.
     pub server: Option<reqwest::Url>,
     /// Whether MQTT is used.
     pub mqtt: bool,
-    /// How it gets to the server.
+    /// How the MQTT connection reaches the server.
     pub mqtt_transport: MqttTransport,
-    /// The name the robot gives itself.
+    /// The name that the robot gives itself.
     pub name: Option<RobotName>,
-    /// The labels it gives itself, if it gives any.
+    /// The labels that the robot gives itself, if any.
     pub labels: Option<Labels>,
-    /// Setup files to source; empty: what is found.
+    /// Setup files to source; empty: the setup files that are found.
     pub underlays: Vec<PathBuf>,
     /// The robot's own ROS workspace on top of them.
     pub workspace: Option<PathBuf>,
     /// Whether the server may name setup files although publishers are trusted.
     pub server_underlays: bool,
-    /// `ROS_DOMAIN_ID` of every task, if the settings or the agent's environment say.
+    /// `ROS_DOMAIN_ID` of every task, if the settings or the agent's environment set one.
     pub ros_domain_id: Option<u32>,
-    /// Between two polls while MQTT works.
+    /// Interval between two polls while MQTT works.
     pub poll_interval: Duration,
-    /// Between two polls without MQTT.
+    /// Interval between two polls without MQTT.
     pub poll_interval_without_mqtt: Duration,
     /// The age at which the robot asks for a new token.
     pub token_lifetime: Duration,
-    /// Between two times that the robot says how its machine does; zero: never.
+    /// Interval between two vitals reports; zero: the robot sends none.
     pub vitals_interval: Duration,
-    /// Whose groups tasks have, if the settings say.
+    /// The account that gives tasks their groups, if the settings name one.
     pub task_user: Option<String>,
-    /// Whether they are denied system calls, if the settings say.
+    /// Whether tasks are denied system calls, if the settings contain the key.
     pub seccomp: Option<Seccomp>,
-    /// The user ids of tasks and builds; `None`: that of `task_user` for all.
+    /// The user ids of tasks and builds; `None`: all use the id of `task_user`.
     pub task_uids: Option<RangeInclusive<u32>>,
-    /// What tasks may use.
+    /// Resource limits of tasks.
     pub limits: RobotLimits,
-    /// Which log lines go to the server by themselves.
+    /// Selection of the log lines that the robot sends to the server without a request.
     pub forward: ForwardSettings,
-    /// The level among that, if it was not the default.
+    /// The log level of that selection, if the settings contain one.
     pub own_forward_level: Option<LogLevel>,
-    /// Processes and threads of a task whose package says nothing of them, and of a build.
+    /// Maximum processes and threads of a build, and of a task without a limit in its package.
     pub task_pids: u64,
-    /// Versions that are prepared at the same time.
+    /// Maximum number of versions that are prepared at the same time.
     pub parallel_tasks: usize,
-    /// Who is asked before a task is started, stopped or switched; nobody unless a program is
-    /// named.
+    /// The gate, which approves each start, stop or switch of a task; `None`: no approval is
+    /// needed.
     pub gate: Option<GateConfig>,
-    /// Whose packages are run; `None`: whatever the server orders.
+    /// Publishers of the packages that are run; `None`: every package that the server orders is
+    /// run.
     pub trust: Option<TrustSettings>,
 }
 
@@ -279,9 +284,9 @@ pub enum ConfigError {
     /// The file can't be read or written.
     #[error("cannot use {path}")]
     Io {
-        /// Which.
+        /// The file's path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The file or the variables do not parse; the parser's text names the key.
@@ -289,7 +294,7 @@ pub enum ConfigError {
     Invalid {
         /// File or variable.
         origin: String,
-        /// What is wrong.
+        /// Description of the error.
         reason: String,
     },
 }
@@ -323,13 +328,13 @@ impl Config {
     ) -> Result<Self, ConfigError> {
         let path = data_dir.join(FILE_NAME);
         let mut table = read_table(&path)?;
-        // The file first, alone, so that an error names where it is.
+        // The file is checked first, alone, so that an error names its path.
         let _: Settings = deserialize(table.clone(), &path.display().to_string())?;
         let mut ros_domain_id = None;
         let mut given = BTreeSet::new();
         for (name, value) in variables {
-            // Others may hold any bytes. In a setting's value a wrong character becomes one that
-            // its type refuses.
+            // Other variables may hold any bytes. In a setting's value a wrong character becomes
+            // one that the setting's type refuses.
             let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
             if name == ROS_DOMAIN_ID && !value.is_empty() {
                 ros_domain_id = Some(parse_ros_domain_id(&value)?);
@@ -440,7 +445,7 @@ fn parse_ros_domain_id(value: &str) -> Result<u32, ConfigError> {
     })
 }
 
-/// User ids as people write a range of them.
+/// Parses a range of user ids, `FIRST-LAST`, or `none`.
 fn task_uids(text: &str) -> Result<Option<RangeInclusive<u32>>, ConfigError> {
     if text.trim() == "none" {
         return Ok(None);
@@ -450,7 +455,7 @@ fn task_uids(text: &str) -> Result<Option<RangeInclusive<u32>>, ConfigError> {
     let range = ends.and_then(|(first, last)| Some(first.ok()?..=last.ok()?));
     let is_usable = |range: &RangeInclusive<u32>| {
         let (first, last) = (*range.start(), *range.end());
-        // 65534 is nobody, and the highest two of 16 and of 32 bits are none.
+        // 65534 is the user `nobody`, and the highest ids of 16 and of 32 bits are invalid.
         let reserved = [65_534, 65_535, u32::MAX - 1, u32::MAX];
         first >= MIN_TASK_UID && last > first && reserved.iter().all(|id| !range.contains(id))
     };
@@ -496,7 +501,7 @@ fn trust(settings: PublisherSettings) -> Result<TrustSettings, ConfigError> {
     Ok(TrustSettings { publishers, keepers, requires_list: settings.require_list.unwrap_or(false) })
 }
 
-/// A server's URL as people write it.
+/// Parses a server's URL as users write one.
 pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     let fault = |reason: String| ConfigError::Invalid { origin: "server".to_owned(), reason };
     let is_servers =
@@ -505,7 +510,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     url.ok_or_else(|| fault(format!("{text:?} is no URL of a server like https://server:8080")))
 }
 
-/// Puts one variable's value where its key is: `TASK_AGENT_LIMITS_LOG_BYTES` is `limits.log_bytes`.
+/// Stores one variable's value under its key: `TASK_AGENT_LIMITS_LOG_BYTES` is `limits.log_bytes`.
 fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigError> {
     let key = name[VARIABLE_PREFIX.len()..].to_ascii_lowercase();
     let value = match key.as_str() {
@@ -553,7 +558,8 @@ fn override_by(table: &mut Table, name: &str, text: &str) -> Result<(), ConfigEr
     Ok(())
 }
 
-/// A number or a truth value where it is one, else text, which the key's type then refuses by name.
+/// A number or a truth value where the text is one, else the text, which the key's type then
+/// refuses by name.
 fn scalar(text: &str) -> Value {
     let number = text.parse().map(Value::Integer).ok();
     number

@@ -1,8 +1,9 @@
 //! Log files of tasks: written within a limit, read back on demand, forwarded to the server. They
 //! never grow beyond their limit.
 //!
-//! A line is stored as it came, behind the time and a letter for its stream (see [`record`]). The
-//! level and the node are found when the line is read, where control characters end as well.
+//! A line is stored as it came, after the time and a letter for its stream (see [`record`]). The
+//! level and the node are determined when the line is read. Control characters are also removed at
+//! that point.
 
 pub mod archive;
 pub mod capture;
@@ -31,21 +32,22 @@ use archive::Wanted;
 use line::LogFile;
 use record::Record;
 
-/// The longest that lines are published for one question; who still follows asks again.
+/// Maximum time that lines are published for one request; a client that still follows sends the
+/// request again.
 const MAX_LEASE: Duration = Duration::from_secs(120);
 
-/// Where a task's output goes and how much of it is kept.
+/// Location and size limits of a task's log.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LogSpec {
     /// The current file; older ones are beside it with `.1`, `.2`, … added.
     pub path: PathBuf,
     /// The size at which a file is rotated.
     pub max_bytes: u64,
-    /// How many files are kept, the current one included.
+    /// Number of files that are kept, the current one included.
     pub files: u32,
 }
 
-/// What is asked of a robot's logs.
+/// Requests to a robot's logs.
 #[derive(Debug, Clone)]
 pub struct Logs {
     data: DataDir,
@@ -59,16 +61,16 @@ impl LogSpec {
     }
 }
 
-/// Somebody follows.
+/// A client's request to follow the logs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Following {
-    /// Only these lines and more serious ones.
+    /// Only lines of this level and more serious ones.
     pub level: LogLevel,
-    /// Until then.
+    /// End of the request.
     pub until: Instant,
 }
 
-/// The task has left nothing here, or was never here.
+/// No logs of this task exist on the robot: they were removed, or the task never ran here.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("there is no task {0} on this robot")]
 pub struct NoSuchTask(pub TaskName);
@@ -79,7 +81,7 @@ impl Logs {
         Self { data, following: watch::Sender::new(None) }
     }
 
-    /// The newest lines that are wanted and fit into an answer, the oldest first.
+    /// The newest matching lines that fit into an answer, the oldest first.
     pub async fn kept(&self, wanted: Wanted) -> Result<Vec<LogLine>, NoSuchTask> {
         if let Some(task) =
             wanted.task.as_ref().filter(|task| !self.data.task(task).root().exists())
@@ -91,19 +93,19 @@ impl Logs {
         Ok(tokio::task::spawn_blocking(read).await.unwrap_or_default())
     }
 
-    /// Has lines of `level` and above published for `lease`.
+    /// Publishes lines of `level` and above for `lease`.
     pub fn follow(&self, level: LogLevel, lease: Duration) {
         self.following
             .send_replace(Some(Following { level, until: Instant::now() + lease.min(MAX_LEASE) }));
     }
 
-    /// Whether somebody follows.
+    /// The current request to follow, if any.
     pub fn following(&self) -> watch::Receiver<Option<Following>> {
         self.following.subscribe()
     }
 }
 
-/// Every log there may be.
+/// All logs that may exist.
 fn files(data: &DataDir) -> Vec<LogFile> {
     let none_of_ours = LogFile { path: data.ros_log(), task: None, unmarked: LogSource::Rosout };
     let mut files = vec![none_of_ours];
@@ -132,7 +134,7 @@ pub fn last_lines(path: &Path, max_bytes: u64) -> String {
         file.seek(SeekFrom::Start(begin))?;
         let mut bytes = Vec::new();
         file.take(max_bytes).read_to_end(&mut bytes)?;
-        // What was cut in the middle of a line is not worth showing.
+        // A partial first line is not worth showing.
         let cut = if begin == 0 {
             0
         } else {

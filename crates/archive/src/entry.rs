@@ -1,6 +1,6 @@
 //! One tar entry: headers, long names and PAX records, parsed into a path and a kind that the tree
-//! can trust. It accepts what GNU tar, Python and the packer write, and nothing on which two
-//! readers could disagree.
+//! can trust. The parser accepts the output of GNU tar, Python and the packer, and nothing on which
+//! two readers could disagree.
 
 use std::io::Read;
 
@@ -9,13 +9,14 @@ use task_proto::manifest::MAX_CONTENT_PATH_BYTES;
 use super::stream::{BLOCK_BYTES, Blocks};
 use super::{Refusal, UnpackError};
 
-/// The longest name of one file: what Linux file systems take.
+/// The longest name of one file: the limit of Linux file systems.
 const MAX_COMPONENT_BYTES: usize = 255;
 /// The largest block of PAX records.
 const MAX_PAX_BYTES: u64 = 16 * 1024;
 /// Set-user-id, set-group-id and sticky.
 const SPECIAL_MODE_BITS: u32 = 0o7000;
-/// PAX records that say nothing about what is created: times and owners, which are the robot's own.
+/// PAX records without influence on the created files: times and owners, which the robot sets
+/// itself.
 const IGNORED_PAX_KEYS: [&[u8]; 8] =
     [b"atime", b"comment", b"ctime", b"gid", b"gname", b"mtime", b"uid", b"uname"];
 
@@ -23,13 +24,13 @@ const IGNORED_PAX_KEYS: [&[u8]; 8] =
 /// itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
-    /// Where it belongs.
+    /// The path in the tree.
     pub path: String,
-    /// What it is.
+    /// The kind of file to create.
     pub kind: Kind,
 }
 
-/// What an entry is.
+/// Kinds of entries.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
     /// A directory.
@@ -38,7 +39,7 @@ pub enum Kind {
     File {
         /// Its bytes.
         size: u64,
-        /// Whether anyone may execute it.
+        /// Whether the file is executable.
         executable: bool,
     },
     /// A symbolic link.
@@ -53,7 +54,7 @@ pub enum Kind {
     },
 }
 
-/// What extension headers say about the entry that follows them.
+/// Values from extension headers for the entry that follows them.
 #[derive(Default)]
 struct Extended {
     path: Option<Vec<u8>>,
@@ -119,8 +120,8 @@ impl Extended {
                 b"path" => self.path(value, archive)?,
                 b"linkpath" => self.link(value, archive)?,
                 key if IGNORED_PAX_KEYS.contains(&key) => {}
-                // Sizes and sparse maps that contradict the header are how archives look different
-                // to each reader.
+                // Sizes and sparse maps that contradict the header make readers disagree about an
+                // archive.
                 key => {
                     return Err(archive
                         .damaged(format!("PAX record {} is not accepted", super::shown(key))));
@@ -191,7 +192,8 @@ fn parse(
     Ok(Entry { path, kind })
 }
 
-/// `path` without `.` and empty components; the reason if it is one that must not be created.
+/// `path` without `.` and empty components; an error with the reason if the path must not be
+/// created.
 fn normal_path(path: &[u8], depth_limit: usize) -> Result<String, String> {
     let text = text(path)?;
     if text.starts_with('/') {
@@ -268,7 +270,7 @@ fn pax_records<R: Read>(archive: &mut Blocks<R>, size: u64) -> Result<Vec<Record
     Ok(records)
 }
 
-/// Takes one `LENGTH KEY=VALUE\n` from the front, where LENGTH counts all of it.
+/// Takes one `LENGTH KEY=VALUE\n` from the front, where LENGTH counts the whole record.
 fn split_record(bytes: &[u8]) -> Option<(Record, &[u8])> {
     let digits = bytes.iter().position(|&byte| byte == b' ')?;
     if digits > 5 || !bytes[..digits].iter().all(u8::is_ascii_digit) {

@@ -1,12 +1,12 @@
 //! From a package's archive to its entries, and to a tree in a directory, in one pass and in
-//! bounded memory. It refuses, and says why, whatever a packer would not write: the bytes may come
-//! from anyone until their digest is known.
+//! bounded memory. The reader refuses all input that a packer would not write, with a reason: the
+//! bytes are untrusted until their digest is known.
 //!
 //! Invariants: nothing is created outside the given directory, no symbolic link is ever followed,
-//! and no byte is written beyond what the task manifest announced, or the limits allow. [`check`]
-//! reads an archive by the same rules and writes nothing, so that a server that takes a package and
-//! a robot that unpacks it come to the same verdict. It never hashes the compressed bytes and never
-//! renames.
+//! and no byte is written beyond the size that the task manifest announced, or the limits allow.
+//! [`check`] reads an archive by the same rules and writes nothing: a server that accepts a package
+//! and a robot that unpacks the package come to the same verdict. Neither hashes the compressed
+//! bytes, and neither renames files.
 
 mod entry;
 mod names;
@@ -30,17 +30,17 @@ use self::tree::Tree;
 
 const COPY_BUFFER_BYTES: usize = 128 * 1024;
 
-/// How large a package may get. The default is what a packer holds to.
+/// Size limits of a package. The default is the packer's own limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
     /// Uncompressed bytes.
     pub bytes: u64,
-    /// Files, directories and links, those that paths imply included.
+    /// Files, directories and links, including directories implied by paths.
     pub entries: u64,
     /// Components of a path.
     pub depth: usize,
-    /// Uncompressed bytes for one compressed byte. Small packages may compress as well as they
-    /// like: a bomb needs room.
+    /// Maximum ratio of uncompressed to compressed bytes. Small packages are exempt: a bomb needs
+    /// room.
     pub ratio: u64,
 }
 
@@ -55,50 +55,50 @@ impl Default for Limits {
     }
 }
 
-/// Why there is no tree.
+/// Why unpacking failed.
 #[derive(Debug, thiserror::Error)]
 pub enum UnpackError {
-    /// The archive holds something a package must not.
+    /// The archive violates the rules for packages.
     #[error(transparent)]
     Refused(#[from] Refusal),
     /// The compressed bytes stopped coming.
     #[error("the package's bytes stopped coming")]
     Source(#[source] io::Error),
-    /// The disk did not take it.
+    /// A write to the disk failed.
     #[error("cannot write {}", path.display())]
     Disk {
-        /// What was being written.
+        /// The path being written.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
 
-/// What was found in an archive. Names are shown escaped and cut, so that a hostile one stays
+/// Why an archive is refused. Names are shown escaped and cut, so that a hostile name stays
 /// harmless in a log.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// A number of the archive is above a limit.
     #[error("{what}: {found}, where at most {limit} are allowed")]
     Limit {
-        /// What was counted.
+        /// The quantity that was counted.
         what: &'static str,
-        /// How many there are.
+        /// Number found.
         found: u64,
-        /// How many there may be.
+        /// Maximum number.
         limit: u64,
     },
-    /// The archive is not the one its manifest describes.
+    /// The archive differs from the description in its manifest.
     #[error("{what}: {found}, where the task manifest says {announced}")]
     NotAsAnnounced {
-        /// What was counted.
+        /// The quantity that was counted.
         what: &'static str,
-        /// How many there are.
+        /// Number found.
         found: u64,
-        /// How many were announced.
+        /// Number announced.
         announced: u64,
     },
-    /// The uncompressed archive is not the one its manifest describes.
+    /// The uncompressed archive differs from the description in its manifest.
     #[error(
         "the uncompressed archive hashes to {found}, where the task manifest says {announced} (content.tar_digest)"
     )]
@@ -108,23 +108,23 @@ pub enum Refusal {
         /// The announced one.
         announced: Box<Digest>,
     },
-    /// The manifest describes the uncompressed archive by a digest that nobody compares.
+    /// The manifest describes the uncompressed archive by a digest algorithm that is not supported.
     #[error("content.tar_digest: {0} is no SHA-256 digest")]
     DigestAlgorithm(Box<Digest>),
-    /// An entry is something a package must not hold.
+    /// An entry is not allowed in a package.
     #[error("entry {name}: {reason}")]
     Entry {
         /// Its path.
         name: String,
-        /// What is wrong with it.
+        /// Why the entry is refused.
         reason: String,
     },
-    /// The bytes are not a tar archive, or one that readers would disagree about.
+    /// The bytes are not a tar archive, or readers would disagree about them.
     #[error("damaged archive at byte {at}: {reason}")]
     Damaged {
-        /// Where, in the uncompressed archive.
+        /// Offset in the uncompressed archive.
         at: u64,
-        /// What is wrong.
+        /// Why the archive is refused.
         reason: String,
     },
 }
@@ -136,18 +136,18 @@ impl Refusal {
     }
 }
 
-/// How an archive travels.
+/// Compression of an archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Compression {
-    /// As it is.
+    /// Uncompressed.
     None,
-    /// In zstd frames: one or more, and skippable ones between them.
+    /// zstd frames: one or more, with skippable frames between them.
     Zstd,
 }
 
 /// Unpacks `content`, which has `content_size` compressed bytes, into the new directory `staging`,
-/// whose parent is there. What it created is left in either case. Reads `content` to its end only
-/// if all is well.
+/// whose parent exists. On success and on failure, created files stay there. Reads `content` to its
+/// end only on success.
 pub fn unpack(
     content: impl Read,
     content_size: u64,
@@ -158,7 +158,7 @@ pub fn unpack(
     unpack_all(Entries::announced(content, content_size, facts, limits)?, limits, staging)
 }
 
-/// The same for an archive of which nothing is known: all that it may be is what the limits allow.
+/// Unpacks an archive without a manifest: only the limits bound its size.
 pub fn unpack_unannounced(
     content: impl Read,
     compression: Compression,
@@ -201,8 +201,8 @@ pub fn check(
     Ok(())
 }
 
-/// An archive's entries, one after the other. What is between them is checked as they are read;
-/// whether a name comes twice, or a link leads out, is not.
+/// The entries of an archive, in order. Bytes between entries are checked as they are read;
+/// duplicate names and links that lead out of the archive are not checked.
 pub struct Entries<R: Read> {
     blocks: Blocks<R>,
     depth: usize,
@@ -214,7 +214,8 @@ pub struct Entries<R: Read> {
 }
 
 impl<R: Read> Entries<R> {
-    /// Of `content`, which has `content_size` compressed bytes and is what its task manifest says.
+    /// Entries of `content`, which has `content_size` compressed bytes and is described by its task
+    /// manifest.
     pub fn announced(
         content: R,
         content_size: u64,
@@ -227,7 +228,7 @@ impl<R: Read> Entries<R> {
         Ok(Self::new(blocks.with_digest(facts.tar_digest), limits, Bound::Exactly(facts.entries)))
     }
 
-    /// Of an archive of which nothing is known.
+    /// Limits for an archive without a manifest.
     pub fn unannounced(
         content: R,
         compression: Compression,
@@ -248,8 +249,8 @@ impl<R: Read> Entries<R> {
         }
     }
 
-    /// The next entry; what was left of the last one's content is passed over. `None` once the
-    /// archive has been read to its end and is whole.
+    /// The next entry; unread content of the previous entry is skipped. `None` once the archive has
+    /// been read to its end and is complete.
     #[expect(
         clippy::should_implement_trait,
         reason = "it can fail, and lends nothing that an iterator could give"
@@ -269,7 +270,7 @@ impl<R: Read> Entries<R> {
         Ok(Some(entry))
     }
 
-    /// Hands on the last entry's content in pieces, if it is a file.
+    /// Passes the last entry's content on in pieces, if the entry is a file.
     pub fn content(
         &mut self,
         take: impl FnMut(&[u8]) -> Result<(), UnpackError>,
@@ -279,7 +280,7 @@ impl<R: Read> Entries<R> {
     }
 }
 
-/// Holds what the manifest announces against the limits, before anything is written.
+/// Checks the sizes that the manifest announces against the limits, before anything is written.
 fn admit(content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(), Refusal> {
     let unpacked_limit = content_size.saturating_mul(limits.ratio).max(CONTENT_RATIO_FREE_BYTES);
     for (what, found, limit) in [

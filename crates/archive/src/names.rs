@@ -1,11 +1,12 @@
-//! The names in an archive: which entry may have which name, and where links lead. It is the one
-//! rule for those who unpack an archive and those who only read it, and touches no file.
+//! The names in an archive: which entry may have which name, and where links lead. Unpacking and
+//! reading share these rules. This module touches no file.
 
 use std::collections::BTreeMap;
 
 use super::{Entry, Kind, Limits, Refusal};
 
-/// How many components one symbolic link may lead through, those of other links included.
+/// Maximum number of path components that one symbolic link may resolve through, including those of
+/// other links.
 const MAX_LINK_STEPS: usize = 255;
 /// All paths and link targets together. They are held in memory.
 const MAX_NAMES_BYTES: usize = 16 << 20;
@@ -18,7 +19,7 @@ pub(super) struct Names {
 }
 
 enum Node {
-    /// `announced` by an entry of its own, or only implied by a path below it.
+    /// `announced` by its own entry, or only implied by a path below the directory.
     Directory {
         announced: bool,
     },
@@ -33,8 +34,8 @@ impl Names {
         Self { nodes: BTreeMap::new(), nodes_limit: limits.entries, bytes: 0 }
     }
 
-    /// Takes an entry's name; gives the directories that there have to be for it and were not
-    /// there, from the top.
+    /// Adds an entry's name; returns the directories that the entry needs and that were missing,
+    /// from the top.
     pub(super) fn add(&mut self, entry: &Entry) -> Result<Vec<String>, Refusal> {
         let Entry { path, kind } = entry;
         match kind {
@@ -54,7 +55,7 @@ impl Names {
         }
     }
 
-    /// The symbolic links with their targets, once it is known that none of them leads out of the
+    /// The symbolic links with their targets, after a check that none of them leads out of the
     /// archive.
     pub(super) fn symlinks(&self) -> Result<Vec<(&str, &str)>, Refusal> {
         let mut links = Vec::new();
@@ -80,7 +81,7 @@ impl Names {
         Ok(made)
     }
 
-    /// Takes `path` for `node`, with the directories above it; refuses what is there already.
+    /// Takes `path` for `node`, with the directories above; an error if the path is already taken.
     fn claim(&mut self, path: &str, node: Node) -> Result<Vec<String>, Refusal> {
         let mut implied = Vec::new();
         for (end, _) in path.match_indices('/') {
@@ -118,8 +119,8 @@ impl Names {
         Ok(())
     }
 
-    /// Follows a link through the tree as the kernel would, other links included. What is not there
-    /// counts as a directory: a build may make it.
+    /// Follows a link through the tree as the kernel would, other links included. A missing path
+    /// counts as a directory: a build may create one.
     fn check_symlink(&self, path: &str, target: &str) -> Result<(), Refusal> {
         let mut at: Vec<&str> = split(path).0.split('/').filter(|part| !part.is_empty()).collect();
         let mut ahead: Vec<&str> = target.rsplit('/').collect();

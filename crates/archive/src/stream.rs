@@ -1,4 +1,4 @@
-//! The uncompressed archive as a stream of blocks that ends where it has to.
+//! The uncompressed archive as a stream of blocks with a fixed end.
 
 use std::io::{self, BufRead as _, BufReader, Read};
 
@@ -10,14 +10,14 @@ use zstd::stream::read::Decoder;
 use super::{COPY_BUFFER_BYTES, Compression, Refusal, UnpackError};
 
 pub(super) const BLOCK_BYTES: usize = 512;
-/// The decoder holds a frame's whole window in memory. 2^24 is what zstd's levels up to 19 need,
+/// The decoder holds a frame's whole window in memory. zstd's levels up to 19 need at most 2^24,
 /// and a little more.
 const WINDOW_LOG_MAX: u32 = 24;
 
-/// How many there may be of something.
+/// Bound of a counted quantity.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Bound {
-    /// So many were announced.
+    /// Exactly the announced number.
     Exactly(u64),
     /// More are too many.
     AtMost(u64),
@@ -30,7 +30,7 @@ impl Bound {
         }
     }
 
-    /// Whether there may be `found` so far.
+    /// Checks a running count of `found`.
     pub(super) fn check(self, what: &'static str, found: u64) -> Result<(), Refusal> {
         match self {
             Self::Exactly(announced) if found > announced => {
@@ -41,7 +41,7 @@ impl Bound {
         }
     }
 
-    /// Whether there may be `found` of them in all.
+    /// Checks a final count of `found`.
     pub(super) fn check_end(self, what: &'static str, found: u64) -> Result<(), Refusal> {
         match self {
             Self::Exactly(announced) if found != announced => {
@@ -57,10 +57,9 @@ pub(super) struct Blocks<R: Read> {
     bytes: Bytes<R>,
     position: u64,
     size: Bound,
-    /// Uncompressed bytes for one compressed byte.
+    /// Maximum ratio of uncompressed to compressed bytes.
     ratio: u64,
-    /// What the uncompressed bytes hash to so far, and are to hash to in all, if that was
-    /// announced.
+    /// Running digest of the uncompressed bytes, and the announced digest, if any.
     digest: Option<(Sha256, Digest)>,
 }
 
@@ -101,7 +100,7 @@ impl<R: Read> Bytes<R> {
         }
     }
 
-    /// Whether something comes after the last byte that was read.
+    /// Whether bytes follow the last byte read.
     fn goes_on(&mut self) -> io::Result<bool> {
         match self {
             Self::Plain(reader) => reader.fill_buf().map(|rest| !rest.is_empty()),
@@ -121,8 +120,8 @@ impl<R: Read> Blocks<R> {
         let bytes = match compression {
             Compression::None => Bytes::Plain(BufReader::with_capacity(COPY_BUFFER_BYTES, source)),
             // RFC 8878 allows several frames, and skippable ones. The window's limit holds for each
-            // of them, since only one window is held at a time; all other limits are about the
-            // bytes of all frames together.
+            // frame, since only one window is held at a time; all other limits cover the bytes of
+            // all frames together.
             Compression::Zstd => Decoder::new(source)
                 .and_then(|mut decoder| decoder.window_log_max(WINDOW_LOG_MAX).map(|()| decoder))
                 .map(Bytes::Zstd)
@@ -131,13 +130,13 @@ impl<R: Read> Blocks<R> {
         Ok(Self { bytes, position: 0, size, ratio, digest: None })
     }
 
-    /// The same with the digest that the uncompressed bytes must have in the end.
+    /// Sets the expected digest of the uncompressed bytes.
     pub(super) fn with_digest(mut self, digest: Digest) -> Self {
         self.digest = Some((Sha256::new(), digest));
         self
     }
 
-    /// Whether an entry may be so large; if not, why.
+    /// Checks an entry's size against the limits.
     pub(super) fn check_entry(&self, size: u64) -> Result<(), UnpackError> {
         let left = self.size.most() - self.position;
         match self.size {
@@ -193,7 +192,7 @@ impl<R: Read> Blocks<R> {
         Ok(block)
     }
 
-    /// Hands on the next `size` bytes in pieces and skips what fills their last block.
+    /// Passes on the next `size` bytes in pieces and skips the padding of their last block.
     pub(super) fn copy(
         &mut self,
         size: u64,
@@ -222,8 +221,8 @@ impl<R: Read> Blocks<R> {
         Ok(bytes)
     }
 
-    /// After the end marker there is nothing but zeros, in the announced number, and nothing behind
-    /// them; and the whole has the announced digest.
+    /// Checks the end: only zeros after the end marker, in the announced number, no bytes after
+    /// them, and the announced digest.
     pub(super) fn finish(&mut self, buffer: &mut [u8]) -> Result<(), UnpackError> {
         loop {
             match self.read(buffer)? {

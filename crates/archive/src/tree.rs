@@ -1,6 +1,6 @@
-//! The tree that grows in a directory. Every path is reached from the root's descriptor, one
-//! component at a time and without following links; symbolic links come last, when nothing is
-//! written through them any more.
+//! Creates the tree in a directory. Every path is opened from the root's descriptor, one component
+//! at a time and without following links; symbolic links are created last, when no more files are
+//! written.
 
 use std::fs::{File, Permissions};
 use std::io;
@@ -24,12 +24,13 @@ pub(super) struct Tree {
     root: PathBuf,
     root_fd: OwnedFd,
     names: Names,
-    /// The directory used last: entries come sorted, so it is mostly the next one's as well.
+    /// The directory used last: entries are sorted, so the next entry is mostly in the same
+    /// directory.
     open: Option<(String, OwnedFd)>,
 }
 
 impl Tree {
-    /// Makes the directory `root`, which must not be there yet; its parent must.
+    /// Creates the directory `root`, which must not exist; its parent must.
     pub(super) fn create(root: &Path, limits: &Limits) -> Result<Self, UnpackError> {
         let disk = |source| UnpackError::Disk { path: root.to_owned(), source };
         std::fs::create_dir(root).map_err(disk)?;
@@ -39,8 +40,8 @@ impl Tree {
         Ok(Self { root: root.to_owned(), root_fd, names: Names::new(limits), open: None })
     }
 
-    /// Makes what the entry is: directories, a second name of a file, or the file to write to. A
-    /// symbolic link is only noted.
+    /// Creates the entry's object: directories, a second name of a file, or the file to write to. A
+    /// symbolic link is only recorded.
     pub(super) fn add(&mut self, entry: &Entry) -> Result<Option<File>, UnpackError> {
         for directory in self.names.add(entry)? {
             self.make_directory(&directory)?;
@@ -80,7 +81,7 @@ impl Tree {
         made.map_err(|errno| self.disk(path, errno))
     }
 
-    /// Makes the symbolic links, once it is known that none of them leads out of the tree.
+    /// Creates the symbolic links, after a check that none of them leads out of the tree.
     pub(super) fn finish(mut self) -> Result<(), UnpackError> {
         let links = self.names.symlinks()?;
         let links: Vec<_> =

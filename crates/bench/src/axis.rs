@@ -1,4 +1,4 @@
-//! An axis of a plot: from values to places, where its ticks are, and how a number is written.
+//! An axis of a plot: maps values to positions, places ticks, and formats numbers.
 
 use crate::run::Unit;
 
@@ -16,7 +16,8 @@ pub struct Axis {
 }
 
 impl Axis {
-    /// An axis that holds all `values`; a logarithmic one leaves out those that are not above zero.
+    /// An axis that covers all `values`; a logarithmic axis leaves out values that are not above
+    /// zero.
     pub fn over(values: impl IntoIterator<Item = f64>, is_log: bool) -> Self {
         let fits = |value: &f64| value.is_finite() && (!is_log || *value > 0.0);
         let (mut least, mut most) = (f64::INFINITY, f64::NEG_INFINITY);
@@ -36,19 +37,19 @@ impl Axis {
         Self { least, most, is_log }
     }
 
-    /// The same, from zero on if it is linear.
+    /// The axis, starting at zero if it is linear.
     pub fn from_zero(self) -> Self {
         Self { least: if self.is_log { self.least } else { self.least.min(0.0) }, ..self }
     }
 
-    /// Where a value lies: 0 at the least, 1 at the most.
+    /// Position of a value: 0 for the least, 1 for the most.
     pub fn place(&self, value: f64) -> f64 {
         let (least, most, value) =
             (self.scaled(self.least), self.scaled(self.most), self.scaled(value));
         ((value - least) / (most - least)).clamp(0.0, 1.0)
     }
 
-    /// The values that are written at it.
+    /// The values of the axis labels.
     pub fn ticks(&self) -> Vec<f64> {
         let ticks: Vec<f64> = if self.is_log { self.log_ticks() } else { self.linear_ticks() };
         ticks.into_iter().filter(|tick| *tick >= self.least && *tick <= self.most).collect()
@@ -81,7 +82,7 @@ impl Axis {
     }
 }
 
-/// A value with its unit, short enough to stand at a tick.
+/// A value with its unit, short enough for a tick label.
 pub fn written(value: f64, unit: Unit) -> String {
     match unit {
         Unit::Milliseconds if value >= 1000.0 => format!("{} s", rounded(value / 1000.0)),
@@ -97,7 +98,7 @@ fn in_thousands(value: f64, names: &[&str]) -> String {
     let mut value = value;
     let mut names = names.iter();
     let mut name = names.next().copied().unwrap_or_default();
-    // What would be written as 1000 is one of the next.
+    // A value that would be printed as 1000 belongs to the next unit.
     while value.abs() >= 999.5 {
         let Some(next) = names.next() else { break };
         (value, name) = (value / 1000.0, next);
@@ -105,7 +106,7 @@ fn in_thousands(value: f64, names: &[&str]) -> String {
     format!("{} {name}", rounded(value))
 }
 
-/// Three digits that mean something, no zeros behind the point.
+/// Three significant digits, without trailing zeros behind the point.
 fn rounded(value: f64) -> String {
     let digits = if value == 0.0 { 0.0 } else { value.abs().log10().floor() };
     let places = (2.0 - digits).clamp(0.0, 9.0) as usize;

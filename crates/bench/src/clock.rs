@@ -1,5 +1,5 @@
-//! The only place that reads the wall clock, by which a run says when it was made, and the clock
-//! that is compared between processes. Within one process `Instant` measures.
+//! The only reader of the wall clock, which dates a run, and of the clock that is compared between
+//! processes. Within one process `Instant` measures.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 

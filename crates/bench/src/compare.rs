@@ -1,4 +1,4 @@
-//! `taskbench compare`: what has changed between two results of the same scenario, quantity by
+//! `taskbench compare`: the differences between two results of the same scenario, quantity by
 //! quantity. Points belong together when their series and settings are the same.
 
 use std::path::PathBuf;
@@ -20,7 +20,7 @@ pub struct CompareFlags {
     least: f64,
 }
 
-/// Gives the comparison as a table.
+/// Formats the comparison as a table.
 pub fn compare(flags: &CompareFlags) -> anyhow::Result<String> {
     let read = |path: &PathBuf| Run::read(path).with_context(|| path.display().to_string());
     let (old, new) = (read(&flags.old)?, read(&flags.new)?);
@@ -67,7 +67,7 @@ fn rows(old: &Point, new: &Point, least: f64) -> String {
     for (name, after) in &new.quantities {
         let Some(before) = old.quantities.get(name) else { continue };
         for (figure, label) in [(Figure::Median, "median"), (Figure::P99, "p99")] {
-            // Of one value both figures are the same.
+            // With a single value both figures are equal.
             if figure == Figure::P99 && after.count == 1 && before.count == 1 {
                 continue;
             }

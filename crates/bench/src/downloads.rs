@@ -1,6 +1,6 @@
-//! Many connections that fetch one path over and over, as cheaply as the kernel allows: the bytes
-//! are counted and thrown away unread, or decrypted where they are encrypted, so that what is
-//! measured is the server's work. It knows neither digests nor tokens.
+//! Many connections that fetch one path over and over, at the lowest cost that the kernel allows:
+//! bytes are counted and discarded unread, or decrypted if they are encrypted, so that the
+//! measurement shows the server's work. The module knows neither digests nor tokens.
 
 use std::io;
 use std::net::SocketAddr;
@@ -18,29 +18,29 @@ use tokio::sync::Barrier;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::client::TlsStream;
 
-/// What is decrypted at once.
+/// Bytes decrypted at a time.
 const DECRYPTED_BYTES: usize = 64 * 1024;
-/// The most bytes thrown away by one call.
+/// Maximum bytes discarded by one call.
 const DISCARD_BYTES: usize = 1024 * 1024;
-/// A longer head is not one of the servers that are measured.
+/// The servers under measurement send no longer heads.
 const MAX_HEAD_BYTES: usize = 16 * 1024;
-/// How long a server may take to accept and answer.
+/// Time limit for a server to accept and answer.
 const PATIENCE: Duration = Duration::from_secs(120);
 /// Connections opened at a time.
 const CONNECTS_AT_ONCE: usize = 64;
 
-/// What is fetched.
+/// A request: server, path, token and the expected size.
 #[derive(Clone)]
 pub struct Target {
-    /// Where.
+    /// The server's address.
     pub address: SocketAddr,
-    /// How TLS is spoken there, if it is.
+    /// TLS configuration; `None`: plain text.
     pub tls: Option<Arc<ClientConfig>>,
     /// The path with its leading slash.
     pub path: String,
     /// The bearer token, if one is needed.
     pub token: Option<String>,
-    /// The body's size: another one is a failure.
+    /// The expected size of the body: any other is a failure.
     pub size: u64,
 }
 
@@ -54,19 +54,19 @@ impl Target {
     }
 }
 
-/// How long each connection goes on.
+/// The end of each connection's loop.
 #[derive(Debug, Clone, Copy)]
 pub enum Until {
     /// This many fetches.
     Fetches(u64),
-    /// This long.
+    /// After this time.
     Elapsed(Duration),
 }
 
-/// What the connections got, from when all were open to when the last was done.
+/// Results of all connections, from the moment when all were open to the end of the last one.
 #[derive(Debug, Clone, Copy)]
 pub struct Got {
-    /// Whole answers.
+    /// Number of complete answers.
     pub fetches: u64,
     /// Bytes in their bodies.
     pub bytes: u64,
@@ -76,7 +76,7 @@ pub struct Got {
 
 /// Opens one connection for each of `targets` and fetches until all are done. `started` is called
 /// once all are open, right before the first request. One failed fetch fails the run: a server that
-/// refuses some has an easy life.
+/// refuses requests does less work.
 pub async fn download(
     targets: &[Target],
     until: Until,
@@ -172,7 +172,7 @@ async fn fetch(stream: &mut Stream, request: &[u8], size: u64) -> anyhow::Result
     tokio::time::timeout(PATIENCE, whole).await.context("the server does not answer")?
 }
 
-/// Gives how many bytes of the body are still to come.
+/// Sends the request; returns how many bytes of the body remain.
 async fn ask<S: AsyncRead + AsyncWrite + Unpin>(
     stream: &mut S,
     request: &[u8],
@@ -184,7 +184,7 @@ async fn ask<S: AsyncRead + AsyncWrite + Unpin>(
     size.checked_sub(after_head).context("more came than the answer's length")
 }
 
-/// Reads an answer's head; gives how many bytes of the body came with it.
+/// Reads the head of an answer; returns how many bytes of the body came with the head.
 async fn read_head<S: AsyncRead + Unpin>(stream: &mut S, size: u64) -> anyhow::Result<u64> {
     let mut bytes = Vec::with_capacity(1024);
     loop {
@@ -213,9 +213,9 @@ fn check_head(head: &[u8], size: u64) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Throws `left` bytes away where they are: with MSG_TRUNC a TCP socket copies nothing.
+/// Discards `left` bytes in the kernel: with MSG_TRUNC a TCP socket copies nothing.
 async fn discard(stream: &TcpStream, mut left: u64) -> io::Result<()> {
-    // Never written to, so it takes no memory.
+    // Never written to, so the buffer takes no memory.
     let mut unused = vec![0_u8; DISCARD_BYTES];
     while left > 0 {
         let most = usize::try_from(left).unwrap_or(DISCARD_BYTES).min(DISCARD_BYTES);
@@ -275,7 +275,7 @@ mod tests {
         }
     }
 
-    /// A server that answers everything with the body, and what fetches that from it.
+    /// A server that answers every request with the body, and a target that fetches the body.
     async fn target(certificate: Option<&Certificate>, body: &'static [u8]) -> Target {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let address = listener.local_addr().expect("bound");

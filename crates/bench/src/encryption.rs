@@ -1,5 +1,5 @@
-//! TLS of a run: how its clients connect, and a certificate for the program that taskd is measured
-//! beside.
+//! TLS of a run: the configuration of its clients, and a certificate for the program that taskd is
+//! compared with.
 
 use anyhow::Context as _;
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
@@ -11,17 +11,18 @@ use task_transport::{Trust, pin_of};
 
 /// Servers that a client knows again.
 const SESSIONS: usize = 2;
-/// What a result says of itself.
+/// The note in a result with encryption.
 pub const ALL_IS_ENCRYPTED: &str =
     "Every connection is TLS 1.3, each client checks the server's certificate.";
 
-/// How a client connects to a server whose authority has this pin; without one, the system's roots
-/// have to vouch for it.
+/// TLS configuration for a server whose authority has this pin; without a pin, the system's root
+/// certificates apply.
 pub fn client_config(pin: Option<CaPin>) -> ClientConfig {
     Trust::by(pin).client_config(clock::for_certificates())
 }
 
-/// The same for another client: what the server said to the one is nothing to the other.
+/// A configuration for another client, without shared session state: tickets from the server to one
+/// client are unknown to the other.
 pub fn another(tls: &ClientConfig) -> ClientConfig {
     let mut own = tls.clone();
     own.resumption = Resumption::in_memory_sessions(SESSIONS);
@@ -39,7 +40,7 @@ pub struct Certificate {
 }
 
 impl Certificate {
-    /// A new one.
+    /// A fresh authority, and a server certificate signed by that authority.
     pub fn new() -> anyhow::Result<Self> {
         let mut params = CertificateParams::new(Vec::new())?;
         params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));

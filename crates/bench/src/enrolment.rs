@@ -1,5 +1,5 @@
-//! Robots of a server under measurement: enrolled through its API like any other, with nobody
-//! behind them.
+//! Robots of a server under measurement: enrolled through its API like any other, but without a
+//! process.
 
 use anyhow::Context as _;
 use futures_util::{StreamExt as _, TryStreamExt as _};
@@ -9,12 +9,12 @@ use task_proto::id::Labels;
 
 use crate::server::Server;
 
-/// Enrolments under way at a time.
+/// Enrollments under way at a time.
 const AT_ONCE: usize = 16;
-/// How long the enrolment token is good for.
+/// Lifetime of the enrollment token.
 const TOKEN_TTL_S: u64 = 3600;
 
-/// Enrols `count` robots, named by their numbers.
+/// Enrolls `count` robots, named by their numbers.
 pub async fn enrol(server: &Server, count: usize) -> anyhow::Result<Vec<EnrollResponse>> {
     let uses = Some(count as u64);
     let order = CreateEnrollmentToken { ttl_s: Some(TOKEN_TTL_S), uses, ..Default::default() };

@@ -1,5 +1,5 @@
-//! A run's view of its simulated robots: it registers them, starts the processes they live in, and
-//! hears from these who has verified what, when.
+//! A run's view of its simulated robots: registers them, starts their processes, and receives each
+//! robot's arrivals with their times.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -23,52 +23,52 @@ use crate::process::{Process, Program, Usage};
 use crate::robots::words::{Crew, Member, Order, Word};
 use crate::taskd::Taskd;
 
-/// Enrolments under way at a time.
+/// Enrollments under way at a time.
 const REQUESTS_AT_ONCE: usize = 16;
-/// Robots in one process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant
+/// Robots per process: each takes about [`FILES_PER_ROBOT`] open files, of which systems grant
 /// 20,000 and more.
 pub const ROBOTS_PER_PROCESS: usize = 2500;
-/// Open files a robot has at most: MQTT, which takes three where it is encrypted, HTTP connections,
-/// what it writes.
+/// The most open files per robot: MQTT, which takes three with encryption, HTTP connections, files
+/// being written.
 pub const FILES_PER_ROBOT: usize = 7;
 /// Words from the robots' processes that were not read yet.
 const QUEUED_WORDS: usize = 1024;
-/// Where robots have their data: memory, because every real robot has a disk of its own and here
-/// they would share one.
+/// Directory of the robots' data, in memory: every real robot has its own disk, and here all would
+/// share one.
 const MEMORY: &str = "/dev/shm";
-/// What their processes say beside their words.
+/// Other output of the robots' processes.
 const LOG: &str = "robots.log";
-/// How long putting all robots together may take.
+/// Time limit for setting up all robots.
 const ASSEMBLY_LIMIT: Duration = Duration::from_secs(300);
 
-/// Simulated robots that run. Dropping it kills them.
+/// Running simulated robots. Dropping the fleet kills them.
 pub struct Fleet {
     processes: Vec<(Process, ChildStdin)>,
     /// `None`: a process has ended.
     words: mpsc::Receiver<Option<Word>>,
     dir: TempDir,
-    /// How many there are.
+    /// Number of robots.
     pub robots: usize,
-    /// What registering each took.
+    /// Duration of each robot's registration.
     pub enrolments: Vec<Duration>,
 }
 
-/// What became of an order, robot by robot.
+/// The result of an order, robot by robot.
 #[derive(Debug, Default)]
 pub struct Arrivals {
-    /// Who arrived, and after how many milliseconds.
+    /// Robots that arrived, and after how many milliseconds.
     pub arrived: Vec<(usize, f64)>,
     /// Why the others did not.
     pub failures: Vec<String>,
 }
 
 impl Arrivals {
-    /// The delays.
+    /// The delays in milliseconds.
     pub fn delays_ms(&self) -> impl Iterator<Item = f64> {
         self.arrived.iter().map(|(_, ms)| *ms)
     }
 
-    /// The last one's delay.
+    /// The delay of the last robot.
     pub fn last_ms(&self) -> Option<f64> {
         self.delays_ms().max_by(f64::total_cmp)
     }
@@ -117,7 +117,7 @@ impl Fleet {
         Ok(fleet)
     }
 
-    /// Starts a further process with these robots, which puts them together.
+    /// Starts a further process with these robots.
     async fn add(
         &mut self,
         crew: &Crew,
@@ -134,8 +134,8 @@ impl Fleet {
         self.tell(self.processes.len() - 1, &serde_json::to_vec(crew)?).await
     }
 
-    /// Lets all robots begin at once; gives each one's time until it keeps to the server's state
-    /// and the server knows.
+    /// Starts all robots at once; returns for each one the time until the robot follows the
+    /// server's state and the server knows.
     pub async fn start(&mut self, limit: Duration) -> anyhow::Result<Arrivals> {
         let begun_ns = monotonic_ns();
         let start = serde_json::to_vec(&Order::Start)?;
@@ -149,8 +149,8 @@ impl Fleet {
         self.hear(self.robots, begun_ns, limit, "is not connected and reconciled", news).await
     }
 
-    /// Waits until the first `robots` robots have verified `deployment`, which was ordered at
-    /// `ordered_ns`, or have failed.
+    /// Waits until the first `robots` robots have verified `deployment`, ordered at `ordered_ns`,
+    /// or have failed.
     pub async fn verified(
         &mut self,
         deployment: &DeploymentId,
@@ -203,7 +203,7 @@ impl Fleet {
         Ok(arrivals)
     }
 
-    /// What the payload that robot `number` has unpacked hashes to.
+    /// Digest of the payload that robot `number` has unpacked.
     pub fn payload(
         &self,
         number: usize,
@@ -217,7 +217,7 @@ impl Fleet {
         Ok(Digest::of(&bytes))
     }
 
-    /// What all robots together have used until now.
+    /// Resource usage of all robots together until now.
     pub fn usage(&self) -> Usage {
         let each = self.processes.iter().map(|(process, _)| process.usage());
         each.fold(Usage::default(), Usage::plus)
@@ -253,7 +253,7 @@ impl Fleet {
     }
 }
 
-/// A directory in memory, or a usual temporary one where the system has none.
+/// A directory in memory, or a normal temporary one if the system has none in memory.
 pub fn memory_directory(prefix: &str) -> anyhow::Result<TempDir> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(prefix);
@@ -270,7 +270,7 @@ async fn read_words(output: ChildStdout, said: mpsc::Sender<Option<Word>>) {
             return;
         }
     }
-    // If nobody listens any more, nobody needs to know.
+    // Without a receiver the message is not needed.
     let _ = said.send(None).await;
 }
 
@@ -316,7 +316,7 @@ pub fn name(number: usize) -> String {
     format!("r{number:05}")
 }
 
-/// The selector that means the first `robots` of a fleet of `all`.
+/// The selector of the first `robots` of a fleet of `all`.
 pub fn first(robots: usize, all: usize) -> String {
     if robots == all { "*".to_owned() } else { (0..robots).map(name).collect::<Vec<_>>().join(",") }
 }

@@ -1,5 +1,5 @@
-//! Measures taskd: scenarios that start real servers and simulated robots, and what they leave
-//! behind. Scenarios stand on top and never call one another; see ARCHITECTURE.md.
+//! Measures taskd: scenarios that start real servers and simulated robots, and their results.
+//! Scenarios stand on top and never call one another; see ARCHITECTURE.md.
 
 pub mod axis;
 pub mod clock;

@@ -1,7 +1,7 @@
-//! A link between the server and the robots as bad as is wanted: a network namespace for the
-//! robots, a pair of virtual interfaces, the rate limited on both ends, a delay where the kernel
-//! has one. All robots share it, as they share an access point. It is removed when it goes; what a
-//! killed run has left is removed by the next.
+//! An emulated slow link between the server and the robots: a network namespace for the robots, a
+//! pair of virtual interfaces, a rate limit on both ends, and a delay if the kernel supports one.
+//! All robots share the link, as they share an access point. Dropping the link removes it;
+//! leftovers of a killed run are removed by the next run.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::Path;
@@ -11,13 +11,13 @@ use anyhow::{Context as _, bail};
 
 use crate::process::{ProcessError, Program, run_now};
 
-/// What names of namespaces begin with; the pid of the run follows.
+/// Prefix of the namespaces' names; the pid of the run follows.
 const PREFIX: &str = "taskbench-";
-/// Where the system lists namespaces.
+/// The system's directory of namespaces.
 const NAMESPACES: &str = "/run/netns";
-/// The least that may pass in one go, so that a large segment does.
+/// Minimum burst, so that a large segment passes.
 const MIN_BURST_BYTES: u64 = 64 * 1024;
-/// How long a packet may wait for its turn before it is dropped.
+/// How long a packet may queue before it is dropped.
 const MAX_WAIT: &str = "200ms";
 
 /// A rate, and perhaps a delay: `20mbit,30ms`.
@@ -53,7 +53,7 @@ impl FromStr for LinkQuality {
     }
 }
 
-/// The link. Dropping it removes it.
+/// The emulated link. Dropping the handle removes the link.
 #[derive(Debug)]
 pub struct Link {
     namespace: String,
@@ -62,12 +62,12 @@ pub struct Link {
 }
 
 impl Link {
-    /// Makes a link. It needs the rights of root, `ip` and `tc`.
+    /// Creates the link. Needs root, `ip` and `tc`.
     pub async fn make(quality: LinkQuality) -> anyhow::Result<Self> {
         remove_leftovers();
         let pid = std::process::id();
         let subnet = u8::try_from(pid % 254)?;
-        // 198.18.0.0/15 is set aside for benchmarks: nothing else has these addresses.
+        // 198.18.0.0/15 is reserved for benchmarks: no other interface uses these addresses.
         let (server, robots) =
             (Ipv4Addr::new(198, 18, subnet, 1), Ipv4Addr::new(198, 18, subnet, 2));
         let link =
@@ -87,12 +87,12 @@ impl Link {
         Ok(link)
     }
 
-    /// The server's address on it.
+    /// The server's address on the link.
     pub fn server(&self) -> IpAddr {
         self.server.into()
     }
 
-    /// What a program is started by to be on the robots' end.
+    /// The program that starts other programs in the robots' namespace.
     pub fn inside(&self) -> Program {
         Program::named("ip").args(["netns", "exec", &self.namespace])
     }
@@ -100,7 +100,7 @@ impl Link {
 
 impl Drop for Link {
     fn drop(&mut self) {
-        // Either may be missing, if making it failed half way.
+        // Either may be missing, if the setup failed half way.
         let _ = run_now("ip", &["link", "del", &self.interface]);
         let _ = run_now("ip", &["netns", "del", &self.namespace]);
     }

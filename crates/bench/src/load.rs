@@ -1,5 +1,5 @@
-//! A load run: its flags, its phases in their order, and what it leaves behind. Every phase is
-//! bounded by [`PHASE_LIMIT`], and a phase in which nothing succeeds ends the run.
+//! A load run: its flags, its phases in order, and its results. Every phase is bounded by
+//! [`PHASE_LIMIT`], and a phase without any success ends the run.
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
@@ -27,9 +27,9 @@ const REQUESTS_AT_ONCE: usize = 16;
 const CONNECTS_AT_ONCE: usize = 100;
 /// The label that robots of a run carry, and the name of the package they are ordered.
 const NAME: &str = "taskbench";
-/// How often the server is asked whether it shows what it has stored.
+/// Poll interval while waiting for the server to show stored state.
 const ASK_INTERVAL: Duration = Duration::from_millis(100);
-/// How long an enrolment token of a run is good for, if the run can't clean up.
+/// Lifetime of a run's enrollment token, in case the run can't clean up.
 const TOKEN_TTL_S: u64 = 3600;
 /// Files this process needs besides its robots' connections.
 const OTHER_FILES: u64 = 100;
@@ -68,14 +68,14 @@ pub struct LoadFlags {
 pub struct Load {
     flags: LoadFlags,
     server: Server,
-    /// Tells this run's robots and package from those of others.
+    /// Distinguishes this run's robots and package from those of other runs.
     run: String,
     manifest: Option<Digest>,
     report: LoadReport,
 }
 
 impl Load {
-    /// Checks what can be checked before anything is changed on the server.
+    /// Checks all preconditions before anything is changed on the server.
     pub async fn prepare(flags: LoadFlags) -> anyhow::Result<Self> {
         allow_files(u64::from(flags.robots) + OTHER_FILES)?;
         let text = std::fs::read_to_string(&flags.token_file);
@@ -130,13 +130,14 @@ impl Load {
         self.add("reconnect storm", begun, every(count, PHASE_LIMIT, steps).await)
     }
 
-    /// The last phase: removes this run's robots and package, however far it came.
+    /// The last phase: removes this run's robots and package, in whatever phase the run ended.
     pub async fn clean_up(&mut self) -> anyhow::Result<()> {
         if self.flags.keep {
             return Ok(());
         }
         let begun = Instant::now();
-        // The server's list, not ours: an enrolment may have been stored whose answer never came.
+        // The server's list, not ours: an enrollment may have been stored although its answer was
+        // lost.
         let left = self.server.robots(&self.label().parse()?).await?.robots;
         let steps = left.iter().map(async |robot| {
             let begun = Instant::now();
@@ -150,12 +151,12 @@ impl Load {
         self.add("remove", begun, samples)
     }
 
-    /// Prints what is left to print, and gives the number of failed steps.
+    /// Prints the remaining output, and returns the number of failed steps.
     pub fn finish(&self) -> usize {
         self.report.finish()
     }
 
-    /// The label of this run's robots, which is also the selector that means them.
+    /// The label of this run's robots, which is also their selector.
     pub fn label(&self) -> String {
         format!("{NAME}={}", self.run)
     }
@@ -174,7 +175,7 @@ impl Load {
             .server_key()
             .context("the enrolment token pins no key")?
             .clone();
-        // Locally administered addresses, apart from those of other runs.
+        // Locally administered addresses, distinct from those of other runs.
         let [a, b] = rand::random();
         let (server, flags, run) = (&self.server, &self.flags, &self.run);
         let begun = Instant::now();
@@ -215,8 +216,8 @@ impl Load {
         Ok(robots)
     }
 
-    /// Orders a package for all robots, which report it through its phases until it runs. Both are
-    /// measured from the order on.
+    /// Orders a package for all robots, which report its phases until it runs. Both are measured
+    /// from the order on.
     async fn order(&mut self, robots: &mut [Robot]) -> anyhow::Result<()> {
         let (package, version): (TaskName, Version) = (NAME.parse()?, self.run.parse()?);
         let manifest = self.server.push_package(&package, &version).await?;
@@ -255,8 +256,8 @@ impl Load {
         self.add("order to running", begun, running)
     }
 
-    /// Waits until the server shows `expected` robots running; gives how many are missing when
-    /// patience ends.
+    /// Waits until the server shows `expected` robots running; returns how many are missing at the
+    /// time limit.
     async fn missing(&self, deployment: &DeploymentId, expected: usize) -> anyhow::Result<usize> {
         let deadline = Instant::now() + PHASE_LIMIT;
         let mut tick = tokio::time::interval(ASK_INTERVAL);
@@ -272,8 +273,8 @@ impl Load {
         }
     }
 
-    /// Reports at a fixed rate, robot by robot. A report is measured from when it was due, so that
-    /// a server that falls behind shows.
+    /// Reports at a fixed rate, robot by robot. A report is measured from its due time, so that a
+    /// server that falls behind shows.
     async fn steady(&mut self, robots: &mut [Robot]) -> anyhow::Result<()> {
         let (count, rate) = (robots.len(), f64::from(self.flags.reports_per_s));
         let total = usize::try_from(self.flags.seconds * u64::from(self.flags.reports_per_s))?;

@@ -1,4 +1,4 @@
-//! What a run says on stdout: a table that grows with each phase, or one JSON document in the end.
+//! Output of a run on stdout: a table that grows with each phase, or one JSON document at the end.
 
 use std::io::Write as _;
 
@@ -17,7 +17,7 @@ pub enum Format {
     Json,
 }
 
-/// What must be known to compare one run with another.
+/// Facts needed to compare one run with another.
 #[derive(Serialize)]
 pub struct Facts {
     /// This program's version.
@@ -26,17 +26,17 @@ pub struct Facts {
     pub taskd: String,
     /// The server's URL.
     pub server: String,
-    /// Robots asked for.
+    /// Number of requested robots.
     pub robots: usize,
     /// Seconds of steady reports.
     pub seconds: u64,
     /// Reports in each of them, of all robots together.
     pub reports_per_s: u32,
-    /// Cores that this machine lets this program use. The server may be on the same machine.
+    /// Cores available to this program. The server may be on the same machine.
     pub cores: usize,
 }
 
-/// The result of a run, as far as it has come.
+/// The result of a run up to now.
 pub struct LoadReport {
     facts: Facts,
     format: Format,
@@ -44,7 +44,7 @@ pub struct LoadReport {
 }
 
 impl LoadReport {
-    /// Begins with the facts.
+    /// Prints the facts.
     pub fn begin(facts: Facts, format: Format) -> Self {
         let Facts { taskbench, taskd, server, robots, seconds, reports_per_s, cores } = &facts;
         if format == Format::Table {
@@ -58,7 +58,7 @@ impl LoadReport {
         Self { facts, format, phases: Vec::new() }
     }
 
-    /// Adds a phase. A phase without any success is an error: what comes after it would measure
+    /// Adds a phase. A phase without any success is an error: the phases after it would measure
     /// nothing.
     pub fn add(&mut self, phase: Phase) -> anyhow::Result<()> {
         if self.format == Format::Table {
@@ -72,7 +72,7 @@ impl LoadReport {
         outcome
     }
 
-    /// Prints what is left to print, and gives the number of failed steps.
+    /// Prints the remaining output, and returns the number of failed steps.
     pub fn finish(&self) -> usize {
         if self.format == Format::Json {
             let phases: Vec<_> = self.phases.iter().map(document).collect();
@@ -110,7 +110,7 @@ fn document(phase: &Phase) -> serde_json::Value {
     })
 }
 
-/// Nobody may be reading; the run goes on, because it has to clean up.
+/// The pipe may be closed; the run goes on, because its cleanup has to run.
 fn print(text: &str) {
     let mut stdout = std::io::stdout();
     let _ = writeln!(stdout, "{text}").and_then(|()| stdout.flush());

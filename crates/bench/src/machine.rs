@@ -1,5 +1,5 @@
-//! What a figure can't be read without: the machine and the commit it was measured with. What can't
-//! be found out is `unknown`, never an error. Also how much of the machine a run may use.
+//! Context of every measurement: the machine and the commit. Unknown values are `unknown`, never an
+//! error. Also limits how much of the machine a run may use.
 
 use std::path::Path;
 
@@ -12,12 +12,12 @@ use crate::process::Program;
 
 const UNKNOWN: &str = "unknown";
 
-/// The machine a run was made on.
+/// The machine of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Machine {
     /// The processor's model.
     pub cpu: String,
-    /// Cores this program may use.
+    /// Cores available to this program.
     pub cores: usize,
     /// Memory in bytes.
     pub memory_bytes: u64,
@@ -28,7 +28,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// This one.
+    /// This machine.
     pub fn here() -> Self {
         let read = |path: &str| std::fs::read_to_string(Path::new(path)).unwrap_or_default();
         let kilobytes: Option<u64> = field(&read("/proc/meminfo"), "MemTotal", ':')
@@ -48,7 +48,8 @@ impl Machine {
     }
 }
 
-/// The commit of the repository this program is run in, `-dirty` if files differ from it.
+/// The commit of the repository in the working directory, with `-dirty` if files differ from the
+/// commit.
 pub async fn commit() -> String {
     let git = Program::named("git").args([
         "describe",
@@ -71,8 +72,8 @@ fn field(text: &str, name: &str, separator: char) -> Option<String> {
     })
 }
 
-/// Lets this program and its children have `needed` open files each: every connection is one, on
-/// both sides.
+/// Raises the limit of open files to `needed` for this program and each of its children: every
+/// connection is one file, on both sides.
 pub fn allow_files(needed: u64) -> anyhow::Result<()> {
     let (soft, hard) = getrlimit(Resource::RLIMIT_NOFILE).context("the limit of open files")?;
     if soft >= needed {

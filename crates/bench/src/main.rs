@@ -1,5 +1,5 @@
-//! The `taskbench` binary: parses the command line, runs a scenario until it ends or is
-//! interrupted, and always cleans up. It never measures anything.
+//! The `taskbench` binary: parses the command line, runs a scenario until its end or an
+//! interruption, and always cleans up. The binary itself measures nothing.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -35,7 +35,7 @@ struct CommandLine {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Enrol simulated robots, connect them over MQTT, deploy to them, and measure each step
+    /// Enroll simulated robots, connect them over MQTT, deploy to them, and measure each step
     ///
     /// The robots are one machine's TCP connections with the MQTT client of an independent
     /// implementation. They verify and report what they are ordered like a real agent, but fetch
@@ -158,7 +158,7 @@ async fn run(command: Command) -> anyhow::Result<ExitCode> {
     }
 }
 
-/// The scenario's outcome. When it is interrupted it is dropped, and with it all that it has
+/// The scenario's outcome. An interruption drops the scenario, and with it all processes it has
 /// started.
 async fn until_interrupted<T>(
     scenario: impl Future<Output = anyhow::Result<T>>,
@@ -203,7 +203,7 @@ fn print(text: &str) -> anyhow::Result<()> {
     std::io::stdout().write_all(text.as_bytes()).context("stdout")
 }
 
-/// Says on stderr what went wrong, with all causes.
+/// Prints the error with all causes on stderr.
 fn complain(error: &anyhow::Error) -> ExitCode {
     say(&format!("taskbench: {error:#}"));
     ExitCode::FAILURE

@@ -1,15 +1,15 @@
-//! Many robots' steps at once, and what they took: latencies and failures of one phase. It never
-//! drops a failure.
+//! Runs many robots' steps at once, and records latencies and failures of one phase. A failure is
+//! never dropped.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use futures_util::StreamExt as _;
 
-/// How long a phase may take. A step that is not done by then has failed.
+/// Time limit of a phase. A step that is unfinished by then has failed.
 pub const PHASE_LIMIT: Duration = Duration::from_secs(300);
 
-/// What one robot's step took, or why it failed.
+/// Duration of one robot's step, or why the step failed.
 pub type Sample = anyhow::Result<Duration>;
 
 /// Runs `steps`, at most `at_once` at a time, until all are done or `limit` is over.
@@ -28,15 +28,15 @@ pub async fn every<T>(
     futures_util::stream::iter(steps).buffer_unordered(at_once).collect().await
 }
 
-/// A phase as it was measured.
+/// Measurements of a phase.
 pub struct Phase {
     /// Its name.
     pub name: &'static str,
-    /// From its begin to its last step's end.
+    /// From its start to the end of its last step.
     pub wall: Duration,
-    /// How often each failure happened.
+    /// Number of failures by message.
     pub failures: BTreeMap<String, usize>,
-    /// What the successful steps took, the shortest first.
+    /// Durations of the successful steps, the shortest first.
     latencies: Vec<Duration>,
 }
 

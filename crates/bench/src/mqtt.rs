@@ -1,6 +1,6 @@
-//! MQTT 3.1.1 as far as thousands of measuring clients need it, at the least cost: packets are
-//! built once and sent as bytes, and of what comes in only type, packet id and payload are looked
-//! at. A real robot's client is in `robot`.
+//! MQTT 3.1.1 as far as thousands of measuring clients need the protocol, at the least cost:
+//! packets are built once and sent as bytes, and of incoming packets only type, packet id and
+//! payload are read. A real robot's client is in `robot`.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -11,18 +11,18 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::tcp::{OwnedReadHalf, OwnedWriteHalf};
 use tokio::net::{TcpSocket, TcpStream};
 
-/// How long a broker may take for one answer.
+/// Time limit for one answer of a broker.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// No packet that is measured is larger.
 const MAX_PACKET_BYTES: usize = 1024 * 1024;
-/// Clients for which one source address has ports enough.
+/// Clients per source address: limited by the address's ports.
 const CLIENTS_PER_ADDRESS: usize = 20_000;
 
-/// Who connects.
+/// Credentials of a client.
 pub struct Login<'a> {
     /// The client id.
     pub client_id: &'a str,
-    /// User name and password, if the broker asks for them.
+    /// User name and password, if the broker requires them.
     pub credentials: Option<(&'a str, &'a str)>,
 }
 
@@ -32,14 +32,14 @@ pub struct Link {
     pub writer: OwnedWriteHalf,
 }
 
-/// The side of it that hears.
+/// The receiving half of a connection.
 pub struct Reader {
     half: OwnedReadHalf,
     bytes: Vec<u8>,
     used: usize,
 }
 
-/// What a client may hear.
+/// Packets that a client may receive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Heard<'a> {
     /// CONNACK with this code.
@@ -55,8 +55,8 @@ pub enum Heard<'a> {
 }
 
 impl Link {
-    /// Connects as the `number`th client of a run, which decides the loopback address it comes
-    /// from.
+    /// Connects as the `number`th client of a run; the number determines the client's loopback
+    /// address.
     pub async fn connect(
         broker: SocketAddr,
         number: usize,
@@ -119,7 +119,7 @@ impl Reader {
         }
     }
 
-    /// Where the body of the first packet lies, if all of it is here.
+    /// Range of the first packet's body; `None` while the packet is incomplete.
     fn whole(&self) -> anyhow::Result<Option<(usize, usize)>> {
         let rest = &self.bytes[self.used..];
         let mut length = 0;

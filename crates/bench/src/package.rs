@@ -1,5 +1,5 @@
-//! Packages of a wanted size whose bytes nothing can compress and nobody has seen before, as the
-//! packer would write them.
+//! Packages of a given size with incompressible bytes that were never used before, in the packer's
+//! format.
 
 use rand::rngs::SmallRng;
 use rand::{Rng as _, SeedableRng as _};
@@ -20,12 +20,12 @@ pub struct Package {
     pub config: Vec<u8>,
     /// tar+zstd.
     pub content: Vec<u8>,
-    /// What the payload hashes to.
+    /// The payload's digest.
     pub payload: Digest,
 }
 
 impl Package {
-    /// A package with one file of `bytes` bytes, made from `seed`. Takes a while if they are many.
+    /// A package with one file of `bytes` bytes, generated from `seed`. Slow for large sizes.
     pub fn random(name: TaskName, version: Version, bytes: u64, seed: u64) -> Self {
         let mut payload = vec![0; usize::try_from(bytes).unwrap_or(usize::MAX)];
         SmallRng::seed_from_u64(seed).fill_bytes(&mut payload);
@@ -49,12 +49,12 @@ impl Package {
         Self { name, version, config, content, payload: Digest::of(&payload) }
     }
 
-    /// How its config is named.
+    /// Reference of the config blob.
     pub fn config_blob(&self) -> BlobRef {
         BlobRef { digest: Digest::of(&self.config), size: self.config.len() as u64 }
     }
 
-    /// How its content is named.
+    /// Reference of the content blob.
     pub fn content_blob(&self) -> BlobRef {
         BlobRef { digest: Digest::of(&self.content), size: self.content.len() as u64 }
     }

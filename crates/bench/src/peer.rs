@@ -1,5 +1,5 @@
-//! The programs that taskd is measured beside, with the settings that make them fastest. Where one
-//! is not installed, that is said and the run goes on without it.
+//! The programs that taskd is compared with, in their fastest settings. If a program is not
+//! installed, the run says so and goes on without the program.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -13,27 +13,27 @@ use tokio::time::Instant;
 use crate::encryption::Certificate;
 use crate::process::{Process, Program, Usage};
 
-/// Where programs lie that are not on an ordinary user's `PATH`.
+/// Directories of programs outside an ordinary user's `PATH`.
 const SYSTEM_DIRECTORIES: [&str; 2] = ["/usr/sbin", "/usr/local/sbin"];
-/// How long one may take to accept connections.
+/// Time limit for a program to accept connections.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
-/// How often that is tried.
+/// Interval between connection attempts.
 const LOOK_INTERVAL: Duration = Duration::from_millis(20);
 
-/// A program that runs. Dropping it kills it.
+/// A running program. Dropping the handle kills the program.
 pub struct Peer {
     process: Process,
-    /// Where it listens.
+    /// The address the program listens on.
     pub address: SocketAddr,
-    /// Of its certificate's authority, if it encrypts.
+    /// Pin of the certificate's authority; `None` without encryption.
     pub pin: Option<CaPin>,
-    /// What it says of its version.
+    /// The program's version.
     pub version: String,
 }
 
 impl Peer {
-    /// nginx, which serves the files in `root`, with OpenSSL if it gets a certificate. `None` if it
-    /// is not installed.
+    /// nginx, which serves the files in `root`, with OpenSSL if a certificate is given. `None` if
+    /// nginx is not installed.
     pub async fn nginx(
         dir: &Path,
         root: &Path,
@@ -71,12 +71,13 @@ impl Peer {
         let file = prefix.join("nginx.conf");
         std::fs::write(&file, configuration).context("nginx's configuration")?;
         let program = Program::named(path).args([Path::new("-p"), &prefix, Path::new("-c"), &file]);
-        // It says its version on stderr; what matters is which Debian or upstream release it is.
+        // nginx prints its version on stderr; the relevant version is that of the Debian package or
+        // the upstream release.
         let nginx = Self::start(program, &dir.join("nginx.log"), address, "nginx").await?;
         Ok(Some(Self { pin: certificate.map(|certificate| certificate.pin), ..nginx }))
     }
 
-    /// mosquitto, which lets everybody in and bounds nobody. `None` if it is not installed.
+    /// mosquitto, without authentication and without limits. `None` if mosquitto is not installed.
     pub async fn mosquitto(dir: &Path) -> anyhow::Result<Option<Self>> {
         let Some(path) = find("mosquitto") else { return Ok(None) };
         let address = free_address().await?;
@@ -115,31 +116,31 @@ impl Peer {
         }
     }
 
-    /// What it and its workers have used until now.
+    /// Resource usage of the program and its workers until now.
     pub fn usage(&self) -> Usage {
         self.process.family_usage()
     }
 
-    /// Ends it.
+    /// Ends the program.
     pub async fn end(self) {
         self.process.end().await;
     }
 }
 
-/// The program on the `PATH` or where the system keeps its servers.
+/// The program on the `PATH` or in the system directories.
 fn find(name: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let directories = std::env::split_paths(&path).chain(SYSTEM_DIRECTORIES.map(PathBuf::from));
     directories.map(|directory| directory.join(name)).find(|path| path.is_file())
 }
 
-/// The version of the package that brought the program, where dpkg knows it.
+/// The version of the program's package, if dpkg knows the package.
 async fn version(name: &str) -> String {
     let query = Program::named("dpkg-query").args(["-W", "-f", "${Version}", name]);
     query.output().await.unwrap_or_else(|_| "unknown".to_owned())
 }
 
-/// A loopback address that was free a moment ago, for programs that can't say which one they took.
+/// A loopback address that was free a moment ago, for programs that can't report their port.
 async fn free_address() -> anyhow::Result<SocketAddr> {
     let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).await.context("no free port")?;
     listener.local_addr().context("no free port")

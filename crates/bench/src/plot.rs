@@ -1,6 +1,6 @@
 //! Draws a plot as inline SVG: a line and a mark for each series, a thin line from the median to
-//! the 99th percentile, a cross where something failed. Colours are the page's style sheet's; what
-//! a point is stands in its tooltip.
+//! the 99th percentile, a cross for failures. Colours come from the page's style sheet; a point's
+//! values are in its tooltip.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -18,7 +18,7 @@ const BOTTOM: f64 = 52.0;
 /// Half the size of a mark.
 const MARK: f64 = 3.6;
 
-/// What is drawn of the points of one series that lie at one place of the horizontal axis.
+/// All points of one series at one position of the horizontal axis.
 #[derive(Debug, Default)]
 struct Spot {
     values: Vec<f64>,
@@ -34,7 +34,7 @@ struct Frame {
     y_unit: Unit,
 }
 
-/// The plot as SVG; `None` if no point belongs to it. `colours` numbers each series of the whole
+/// The plot as SVG; `None` if the plot has no points. `colours` numbers each series of the whole
 /// run.
 pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Option<String> {
     let shown: Vec<&Point> = plot.points(points).collect();
@@ -67,8 +67,8 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
     Some(svg)
 }
 
-/// Spots by series and by the bits of their place, whose order is that of the places, which are not
-/// below zero.
+/// Spots by series and by the bits of their position. The bits sort like the positions, which are
+/// not negative.
 fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u64, Spot>> {
     let mut series: BTreeMap<&str, BTreeMap<u64, Spot>> = BTreeMap::new();
     for point in shown {
@@ -87,7 +87,7 @@ fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u6
     series
 }
 
-/// The mean, so that no bad point is hidden by good ones.
+/// The mean, so that good points do not hide a bad one.
 fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
@@ -187,7 +187,7 @@ impl Frame {
     }
 }
 
-/// The mark of a series, so that colour is not all that tells two apart.
+/// The mark of a series, so that series differ by more than colour.
 pub fn mark(colour: usize, x: f64, y: f64) -> String {
     let (m, w) = (MARK, MARK * 1.3);
     match colour % 4 {

@@ -1,6 +1,6 @@
-//! Starts programs and ends them: the only module that does. Each is ended by its own pid when its
-//! handle goes, and dies with this process even when that is killed. It also reads what a process
-//! has used from `/proc/<pid>`.
+//! Starts and ends child processes: no other module does. Each child is ended by its own pid when
+//! its handle is dropped, and dies with this process even on SIGKILL. This module also reads a
+//! process's resource usage from `/proc/<pid>`.
 #![expect(clippy::disallowed_methods, reason = "this is where processes are started")]
 
 use std::ffi::{OsStr, OsString};
@@ -18,7 +18,7 @@ use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
 /// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ.
 const TICKS_PER_SECOND: f64 = 100.0;
-/// How long a program that only answers may take.
+/// Time limit for a program that only prints an answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// How long a program may take to end after SIGTERM before it is killed.
 const END_TIMEOUT: Duration = Duration::from_secs(15);
@@ -26,36 +26,36 @@ const END_TIMEOUT: Duration = Duration::from_secs(15);
 /// Why a program is of no use.
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
-    /// It did not start.
+    /// The program did not start.
     #[error("{program} can't be started")]
     Start {
-        /// Which.
+        /// The program.
         program: String,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// It is not where it should be.
+    /// The program is not at its expected path.
     #[error("{name} is not beside {}: build it (cargo build --release --bins) or give --{name} PATH", dir.display())]
     Missing {
-        /// Which.
+        /// The program.
         name: &'static str,
-        /// Where it was looked for.
+        /// The directory searched.
         dir: PathBuf,
     },
-    /// It ended with a failure.
+    /// The program ended with a failure.
     #[error("{program} ended with {status}: {said}")]
     Failed {
-        /// Which.
+        /// The program.
         program: String,
-        /// How.
+        /// Its exit status.
         status: std::process::ExitStatus,
-        /// The end of what it wrote to stderr.
+        /// The end of its stderr.
         said: String,
     },
-    /// It takes too long.
+    /// The program ran longer than its time limit.
     #[error("{program} did not end within {ANSWER_TIMEOUT:?}")]
     Late {
-        /// Which.
+        /// The program.
         program: String,
     },
 }
@@ -74,7 +74,7 @@ impl Program {
         Self { path: path.into(), arguments: Vec::new(), environment: Vec::new() }
     }
 
-    /// The workspace's program `name`: `given`, else the one in this program's own directory.
+    /// The workspace's program `name`: `given`, otherwise the one in this program's own directory.
     pub fn beside(name: &'static str, given: Option<&Path>) -> Result<Self, ProcessError> {
         if let Some(path) = given {
             return Ok(Self::named(path));
@@ -82,7 +82,7 @@ impl Program {
         let own = std::env::current_exe()
             .map_err(|source| ProcessError::Start { program: name.to_owned(), source })?;
         let dir = own.parent().unwrap_or(Path::new(".")).to_owned();
-        // An end-to-end test's program lies one level deeper.
+        // An end-to-end test's program is one directory deeper.
         let path =
             [dir.join(name), dir.join("..").join(name)].into_iter().find(|path| path.is_file());
         path.map(Self::named).ok_or(ProcessError::Missing { name, dir })
@@ -102,7 +102,7 @@ impl Program {
         self
     }
 
-    /// Started by another program, which gets its path and arguments after its own.
+    /// The program started by `outer`, which gets its path and arguments after its own.
     #[must_use]
     pub fn within(self, outer: Program) -> Self {
         let inner = std::iter::once(self.path.into_os_string()).chain(self.arguments);
@@ -111,7 +111,7 @@ impl Program {
         outer
     }
 
-    /// Runs it to its end; gives its stdout if it succeeded.
+    /// Runs the program to its end and returns its stdout on success.
     pub async fn output(&self) -> Result<String, ProcessError> {
         let running = self.command().stdout(Stdio::piped()).stderr(Stdio::piped()).output();
         let program = self.name();
@@ -127,7 +127,7 @@ impl Program {
         Err(ProcessError::Failed { program, status: output.status, said })
     }
 
-    /// Starts it; what it says goes to `log`.
+    /// Starts the program; stdout and stderr go to `log`.
     pub fn start(&self, log: &Path) -> Result<Process, ProcessError> {
         self.spawn(|command| {
             let log = File::options().create(true).append(true).open(log)?;
@@ -135,8 +135,8 @@ impl Program {
         })
     }
 
-    /// Starts it with pipes to talk over: one line, one message. What it says beside them goes to
-    /// `log`.
+    /// Starts the program with pipes for stdin and stdout: one line, one message. Its stderr goes
+    /// to `log`.
     pub fn converse(&self, log: &Path) -> Result<(Process, ChildStdin, ChildStdout), ProcessError> {
         let mut process = self.spawn(|command| {
             let log = File::options().create(true).append(true).open(log)?;
@@ -165,12 +165,12 @@ impl Program {
         let mut command = Command::new(&self.path);
         command.args(&self.arguments).stdin(Stdio::null()).kill_on_drop(true);
         command.envs(self.environment.iter().map(|(name, value)| (name, value)));
-        // Ctrl-C is for this program, which ends its children in its own order.
+        // Ctrl-C must reach only this program, which ends its children in its own order.
         command.process_group(0);
         let parent = Pid::this();
         let die_with_parent = move || {
             nix::sys::prctl::set_pdeathsig(Signal::SIGKILL)?;
-            // The parent may have ended before that was said.
+            // The parent may have ended before prctl took effect.
             if nix::unistd::getppid() == parent {
                 Ok(())
             } else {
@@ -188,7 +188,7 @@ impl Program {
     }
 }
 
-/// Runs a program to its end from where nothing can be awaited; whether it succeeded.
+/// Runs a program to its end in code that cannot await; returns whether the program succeeded.
 pub fn run_now(path: &str, arguments: &[&str]) -> bool {
     let mut command = std::process::Command::new(path);
     command.args(arguments).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
@@ -202,8 +202,8 @@ pub fn ended_children_cpu_s() -> io::Result<f64> {
     Ok(seconds(usage.user_time()) + seconds(usage.system_time()))
 }
 
-/// A program that runs. Dropping it kills it, with all of its process group: a server's workers
-/// outlive its main process.
+/// A running program. Dropping the handle kills the whole process group: a server's workers outlive
+/// its main process.
 #[derive(Debug)]
 pub struct Process {
     child: Child,
@@ -211,12 +211,12 @@ pub struct Process {
 }
 
 impl Process {
-    /// Its pid; none once it has ended and was noticed.
+    /// The pid; `None` once the end of the process was noticed.
     pub fn pid(&self) -> Option<u32> {
         self.child.id()
     }
 
-    /// How it ended, if it has.
+    /// How the process ended; `None` while the process runs.
     pub fn ended(&mut self) -> Option<String> {
         match self.child.try_wait() {
             Ok(None) => None,
@@ -225,7 +225,7 @@ impl Process {
         }
     }
 
-    /// Asks it to end, and kills it if it takes too long.
+    /// Sends SIGTERM, and kills the process after a timeout.
     pub async fn end(mut self) {
         let pid = self.child.id().and_then(|pid| i32::try_from(pid).ok());
         if pid.is_some_and(|pid| kill(Pid::from_raw(pid), Signal::SIGTERM).is_ok()) {
@@ -235,20 +235,20 @@ impl Process {
         let _ = self.child.kill().await;
     }
 
-    /// Kills it and what it started in its process group, unless it was waited for: until then its
-    /// pid, and with it that of the group, is nobody else's.
+    /// Kills the process group, unless the process was already reaped: until then the pid, and with
+    /// it the process group id, cannot be reused.
     fn kill_group(&self) {
         if let Some(pid) = self.pid().and_then(|pid| i32::try_from(pid).ok()) {
             let _ = killpg(Pid::from_raw(pid), Signal::SIGKILL);
         }
     }
 
-    /// What it has used until now; nothing, once it has ended.
+    /// Resource usage until now; zero once the process has ended.
     pub fn usage(&self) -> Usage {
         self.pid().and_then(Usage::of).unwrap_or_default()
     }
 
-    /// The same of it and its children, for a server whose workers are processes.
+    /// Resource usage of the process and its children, for a server whose workers are processes.
     pub fn family_usage(&self) -> Usage {
         let Some(pid) = self.pid() else { return Usage::default() };
         let children =
@@ -267,7 +267,7 @@ impl Drop for Process {
     }
 }
 
-/// What a process has used, and holds.
+/// Resources that a process has used, and holds.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Usage {
     /// Seconds of processor time, all threads together, user and system.

@@ -1,14 +1,13 @@
-//! Progress on stderr: a bar with what is being done now, or plain lines where nobody sees a bar
-//! move.
+//! Progress on stderr: a bar with the current step, or plain lines without a terminal.
 
 use std::io::{IsTerminal as _, Write as _};
 
 use indicatif::{ProgressBar, ProgressFinish, ProgressStyle};
 
-/// How often a line is written at least, in hundredths of all steps, where there is no terminal.
+/// Maximum percentage of steps between two printed lines without a terminal.
 const LINE_EVERY_PERCENT: u64 = 10;
 
-/// How far a run has come.
+/// Progress of a run.
 pub struct RunProgress {
     bar: Option<ProgressBar>,
     steps: u64,
@@ -16,7 +15,7 @@ pub struct RunProgress {
 }
 
 impl RunProgress {
-    /// A run of so many steps.
+    /// A run of `steps` steps.
     pub fn new(steps: usize) -> Self {
         let steps = steps as u64;
         let bar = std::io::stderr().is_terminal().then(|| {
@@ -31,7 +30,7 @@ impl RunProgress {
         Self { bar, steps, done: 0 }
     }
 
-    /// What is done now.
+    /// Sets the current step.
     pub fn says(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.set_message(text.to_owned()),

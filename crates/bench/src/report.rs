@@ -1,5 +1,5 @@
-//! A run as one HTML file that needs nothing else: no network, no script, light or dark as the
-//! reader's system is.
+//! A run as one self-contained HTML file: no network, no script, light or dark by the reader's
+//! system.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -54,7 +54,7 @@ pub fn page(run: &Run) -> String {
     page
 }
 
-/// Text that stands for itself in HTML and in its attributes.
+/// Escapes text for HTML and its attributes.
 pub fn escaped(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -1,5 +1,5 @@
-//! One simulated robot: an MQTT session in a task of its own, and the steps a run asks of it. What
-//! it is ordered it verifies with the pinned key and reports on; it never fetches or runs anything.
+//! One simulated robot: an MQTT session in its own task, and the steps that a run requests. The
+//! robot verifies orders with the pinned key and reports on them; nothing is fetched or run.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ use tokio::task::JoinHandle;
 
 use crate::simulated::{Machine, VITALS_INTERVAL};
 
-/// How long the server may take for any one thing.
+/// Time limit for any single answer of the server.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// As the agent's.
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
@@ -31,7 +31,7 @@ const QUEUED_REQUESTS: usize = 8;
 /// Why a robot's step failed.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RobotError {
-    /// The session ended, says the broker or the MQTT client.
+    /// The session ended, according to the broker or the MQTT client.
     #[error("the MQTT session ended: {0}")]
     Ended(String),
     /// An earlier step failed.
@@ -42,15 +42,15 @@ pub enum RobotError {
     Late(&'static str),
 }
 
-/// Where a robot connects to, as whom, and whose orders it takes.
+/// The server's address, the robot's credentials, and the key that signs its orders.
 pub struct Identity {
-    /// What the server said at enrolment.
+    /// The server's answer to the enrollment.
     pub enrolled: EnrollResponse,
     /// The MQTT broker's host.
     pub host: String,
     /// Its port.
     pub port: u16,
-    /// The key pinned by the enrolment token.
+    /// The key pinned by the enrollment token.
     pub key: PublicKey,
 }
 
@@ -65,7 +65,7 @@ pub struct Robot {
     session: Option<Session>,
 }
 
-/// What has been heard in a session, with the time of it.
+/// Messages received in a session, with their times.
 #[derive(Default)]
 struct Heard {
     subscribed: Option<Instant>,
@@ -75,7 +75,8 @@ struct Heard {
     ended: Option<String>,
 }
 
-/// An MQTT session. Dropping it closes the connection without a goodbye, as a power cut does.
+/// An MQTT session. Dropping the session closes the connection without DISCONNECT, as a power cut
+/// does.
 struct Session {
     client: AsyncClient,
     heard: watch::Receiver<Heard>,
@@ -92,7 +93,7 @@ impl Drop for Session {
 }
 
 impl Robot {
-    /// A robot that is not connected.
+    /// A robot without a connection.
     pub fn new(identity: Identity) -> Self {
         let (instance, began) = (InstanceId::random(), Instant::now());
         Self {
@@ -106,8 +107,8 @@ impl Robot {
         }
     }
 
-    /// Connects and subscribes; gives the time from now to SUBACK. The status is published after
-    /// it.
+    /// Connects and subscribes; returns the time from now to SUBACK. The status is published
+    /// afterwards.
     pub async fn connect(&mut self) -> Result<Duration, RobotError> {
         self.connection += 1;
         let begun = Instant::now();
@@ -131,7 +132,7 @@ impl Robot {
         self.session = None;
     }
 
-    /// Waits for the signed order of `deployment`; gives when it came.
+    /// Waits for the signed order of `deployment`; returns the time of its arrival.
     pub async fn receive(&mut self, deployment: &DeploymentId) -> Result<Instant, RobotError> {
         let find = |heard: &Heard| {
             let (state, at) = heard.desired.as_ref()?;
@@ -143,7 +144,7 @@ impl Robot {
         Ok(at)
     }
 
-    /// Reports that what was ordered, if anything was, is in `phase`; gives the time from now to
+    /// Reports that the ordered deployment, if any, is in `phase`; returns the time from now to
     /// PUBACK.
     pub async fn report(&mut self, phase: Phase) -> Result<Duration, RobotError> {
         self.seq += 1;
@@ -153,8 +154,8 @@ impl Robot {
         let session = self.session.as_mut().ok_or(RobotError::NoSession)?;
         session.published += 1;
         let published = session.published;
-        // The queue has room, as one report is under way at a time; a session that ended says so
-        // below.
+        // The queue has room, as only one report is in flight at a time; the event loop below
+        // reports an ended session.
         let _ = session.client.try_publish(topic, QoS::AtLeastOnce, false, payload);
         let stored = |heard: &Heard| heard.last_report.filter(|_| heard.reports >= published);
         Ok(self.hear("PUBACK of a report", stored).await? - begun)
@@ -269,15 +270,15 @@ async fn listen(
     status: Vec<u8>,
     heard: watch::Sender<Heard>,
 ) {
-    // The first publish of a session is the status. Its packet id is free for reports once it is
-    // acknowledged.
+    // The first publish of a session is the status. Its packet id is free for reports once the
+    // status is acknowledged.
     let (mut first_publish, mut status_acknowledged) = (None, false);
     let ended = loop {
         let event = match event_loop.poll().await {
             Ok(event) => event,
             Err(error) => break error.to_string(),
         };
-        // The queue is empty at the start of a session, so nothing that is tried here is refused.
+        // The queue is empty at the start of a session, so no attempt here is refused.
         match event {
             Event::Incoming(Incoming::ConnAck(_)) => {
                 let _ = client.try_subscribe(identity.topic(RobotTopic::Desired), QoS::AtLeastOnce);
@@ -317,7 +318,7 @@ async fn listen(
     heard.send_modify(|heard| heard.ended = Some(ended));
 }
 
-/// Says how the robot does, once in a while, from some moment on.
+/// Publishes the robot's vitals periodically, starting at a random moment.
 async fn tell_vitals(client: AsyncClient, identity: Arc<Identity>) {
     let mut machine = Machine::new();
     let first = tokio::time::Instant::now() + VITALS_INTERVAL.mul_f64(rand::random());
@@ -326,7 +327,7 @@ async fn tell_vitals(client: AsyncClient, identity: Arc<Identity>) {
         ticks.tick().await;
         let telemetry =
             Telemetry { robot_id: identity.enrolled.robot_id.clone(), vitals: machine.look() };
-        // Where there is no room the next ones say more.
+        // Without room in the queue the next vitals follow.
         let payload = json_bytes(&telemetry);
         let _ = client.try_publish(
             identity.topic(RobotTopic::Telemetry),

@@ -1,6 +1,7 @@
-//! A process of a run's robots: `taskbench robots`, which the run starts and talks to. Each robot
-//! is the agent's own driver, plan, link, MQTT session, fetch and verification around a [`Body`]
-//! that starts nothing. It measures nothing but moments, and ends when its input does.
+//! A process of a run's robots: `taskbench robots`, started by the run and connected to the run by
+//! pipes. Each robot is the agent's own driver, plan, link, MQTT session, fetch and verification
+//! around a [`Body`] that starts nothing. The process measures only points in time, and ends when
+//! its input ends.
 
 mod body;
 pub mod words;
@@ -43,7 +44,7 @@ use crate::simulated::{Machine, VITALS_INTERVAL};
 const QUEUED_MESSAGES: usize = 16;
 /// Words that were not written yet.
 const QUEUED_WORDS: usize = 1024;
-/// The same boot for all robots: they are told apart by their ids.
+/// One boot id for all robots: they are distinguished by their ids.
 const BOOT_ID: &str = "00000000-0000-0000-0000-000000000000";
 
 /// A robot that is put together and not started.
@@ -83,7 +84,7 @@ pub async fn run() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The input's lines, read by a thread of their own, which ends with the input or the process.
+/// The input's lines, read by a separate thread, which ends with the input or the process.
 fn input() -> mpsc::Receiver<String> {
     let (lines, read) = mpsc::channel(1);
     std::thread::spawn(move || {
@@ -93,7 +94,7 @@ fn input() -> mpsc::Receiver<String> {
     read
 }
 
-/// A word a line, by a thread of its own: whoever measures must not wait for whoever listens.
+/// Writes one word per line, in a separate thread: the measuring side must not wait for the reader.
 fn write_words(mut said: mpsc::Receiver<Word>) -> std::io::Result<()> {
     let mut output = std::io::stdout().lock();
     while let Some(word) = said.blocking_recv() {
@@ -197,13 +198,13 @@ fn start(number: usize, robot: Assembled, crew: &Crew, words: mpsc::Sender<Word>
     tokio::spawn(driver.run(messages));
     tokio::spawn(state::over_http(server, shared.clone(), intervals, heard.clone()));
     tokio::spawn(async move {
-        // Their tasks say nothing.
+        // These tasks log nothing.
         let (_batches, lines) = mpsc::channel(1);
         mqtt::run(access, shared, heard, Talk { requests, messages: to_say, lines }).await;
     });
 }
 
-/// Answers how the robot does, and nothing else.
+/// Answers requests for the robot's health, and no others.
 async fn answer(
     robot_id: RobotId,
     mut machine: Machine,
@@ -223,12 +224,12 @@ async fn answer(
     }
 }
 
-/// Says what the robot's reports show, each once it is acknowledged.
+/// Sends a word for each event in the robot's reports, once the report is acknowledged.
 async fn witness(robot: usize, shared: Shared, words: mpsc::Sender<Word>) {
     let (mut reports, mut confirmed) = (shared.reports.subscribe(), shared.confirmed.subscribe());
     let (mut mqtt_up, mut settled) = (shared.mqtt_up.subscribe(), shared.settled.subscribe());
     let mut said: BTreeSet<DeploymentId> = BTreeSet::new();
-    // What to say, and the report whose acknowledgement allows it.
+    // Words to send, and the report whose acknowledgement allows each.
     let mut waiting: Vec<(u64, DeploymentId, Option<String>)> = Vec::new();
     let mut reconciled = false;
     loop {
@@ -257,7 +258,7 @@ async fn witness(robot: usize, shared: Shared, words: mpsc::Sender<Word>) {
             let _ = words.send(word).await;
         }
         let changed = tokio::select! {
-            // All cancel-safe: a watch remembers that it changed.
+            // All cancel-safe: a watch remembers that its value changed.
             changed = reports.changed() => changed,
             changed = confirmed.changed() => changed,
             changed = mqtt_up.changed() => changed,
@@ -269,7 +270,7 @@ async fn witness(robot: usize, shared: Shared, words: mpsc::Sender<Word>) {
     }
 }
 
-/// The orders that a report says are verified, or failed and why.
+/// The orders that a report shows as verified, or as failed with a reason.
 fn news(report: &Report) -> impl Iterator<Item = (DeploymentId, Option<String>)> {
     let told = |task: &TaskReport| match task.phase {
         Phase::Building | Phase::Staged | Phase::Starting | Phase::Running | Phase::Succeeded => {

@@ -1,6 +1,6 @@
-//! The result of a run, whatever it measured: facts, points and the plots that show them, written
-//! as JSON, CSV and HTML. One shape for all, so that runs can be compared and drawn again. A
-//! failure is part of a point and never dropped.
+//! The result of a run of any scenario: facts, points and the plots that show them, written as
+//! JSON, CSV and HTML. All scenarios share one shape, so that runs can be compared and drawn again.
+//! A failure is part of a point and never dropped.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -31,23 +31,23 @@ pub struct RunFlags {
 }
 
 impl RunFlags {
-    /// The seed given, or one that was not used before.
+    /// The given seed, or a random one.
     pub fn seed(&self) -> u64 {
         // 53 bits, so that every reader of JSON reads the same number.
         self.seed.unwrap_or_else(|| rand::random::<u64>() >> 11)
     }
 }
 
-/// A run: everything that is needed to read it, compare it and make it again.
+/// A run, with all data needed to read, compare and repeat the run.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Run {
-    /// What was measured: the subcommand.
+    /// The scenario: the subcommand.
     pub scenario: String,
-    /// When it began, UTC.
+    /// Start time, UTC.
     pub began: String,
-    /// How long it took.
+    /// Duration in seconds.
     pub wall_s: f64,
-    /// The commit of the repository it was started in.
+    /// The commit of the repository in the working directory.
     pub commit: String,
     /// The machine.
     pub machine: Machine,
@@ -55,28 +55,28 @@ pub struct Run {
     pub versions: BTreeMap<String, String>,
     /// The command line, this program's path left out.
     pub command_line: Vec<String>,
-    /// What random bytes and the order of the runs came from.
+    /// The seed of random bytes and of the order of the runs.
     pub seed: u64,
-    /// What a reader should know.
+    /// Remarks for the reader.
     #[serde(default)]
     pub notes: Vec<String>,
-    /// How to show the points.
+    /// Plots of the points.
     #[serde(default)]
     pub plots: Vec<Plot>,
-    /// What was measured.
+    /// The measured points.
     pub points: Vec<Point>,
 }
 
-/// One point: what was set, what came of it.
+/// One point: its settings and its results.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// What stands side by side: a mechanism, a program.
+    /// The compared variant: a mechanism, a program.
     pub series: String,
-    /// What was set, by name with its unit last: `payload_bytes`, `robots`.
+    /// Settings by name with the unit last: `payload_bytes`, `robots`.
     pub settings: BTreeMap<String, f64>,
-    /// What was measured, by name.
+    /// Measured quantities by name.
     pub quantities: BTreeMap<String, Quantity>,
-    /// What failed, and how often.
+    /// Number of failures by reason.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub failures: BTreeMap<String, u64>,
 }
@@ -96,7 +96,7 @@ pub enum Unit {
     /// Bytes per second.
     #[serde(rename = "B/s")]
     BytesPerSecond,
-    /// So many each second.
+    /// A rate per second.
     #[serde(rename = "1/s")]
     PerSecond,
     /// Seconds for each gigabyte (10⁹ bytes).
@@ -111,7 +111,7 @@ pub enum Unit {
 }
 
 impl Unit {
-    /// As it is written behind a number.
+    /// The unit's symbol behind a number.
     pub fn symbol(self) -> &'static str {
         match self {
             Self::Milliseconds => "ms",
@@ -126,12 +126,12 @@ impl Unit {
     }
 }
 
-/// What was measured, once or many times.
+/// A quantity, measured once or many times.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Quantity {
-    /// The unit of all of it.
+    /// The unit of all samples.
     pub unit: Unit,
-    /// How many values there were.
+    /// Number of values.
     pub count: usize,
     /// The smallest.
     pub min: f64,
@@ -148,7 +148,7 @@ pub struct Quantity {
     pub samples: Vec<f64>,
 }
 
-/// Which figure of a quantity.
+/// A figure of a quantity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Figure {
@@ -168,18 +168,19 @@ pub struct Plot {
     pub title: String,
     /// The setting along the horizontal axis.
     pub x: String,
-    /// What is written there.
+    /// Label of the horizontal axis.
     pub x_label: String,
     /// The quantity along the vertical axis.
     pub y: String,
-    /// What is written there.
+    /// Label of the vertical axis.
     pub y_label: String,
-    /// Which figure of it. Points of a series with the same `x` are drawn as the mean of theirs.
+    /// The figure of the quantity to plot. Points of a series with the same `x` are drawn as the
+    /// mean of their figures.
     #[serde(default)]
     pub figure: Figure,
     /// Whether the horizontal axis is logarithmic.
     pub x_log: bool,
-    /// Whether the vertical one is.
+    /// Whether the vertical axis is logarithmic.
     pub y_log: bool,
     /// Only points whose settings lie in these ranges, both ends included.
     #[serde(default)]
@@ -190,7 +191,7 @@ pub struct Plot {
 }
 
 impl Plot {
-    /// The points it shows.
+    /// The points in this plot.
     pub fn points<'a>(&'a self, points: &'a [Point]) -> impl Iterator<Item = &'a Point> {
         let in_range = |point: &Point, (name, (least, most)): (&String, &(f64, f64))| {
             point.settings.get(name).is_some_and(|value| value >= least && value <= most)
@@ -204,7 +205,7 @@ impl Plot {
 }
 
 impl Quantity {
-    /// The figures of `samples`; `None` without any, or if one is no number.
+    /// The figures of `samples`; `None` without samples, or if one is not a number.
     pub fn of(unit: Unit, samples: impl IntoIterator<Item = f64>) -> Option<Self> {
         let samples: Vec<f64> = samples.into_iter().collect();
         let mut sorted = samples.clone();
@@ -224,7 +225,7 @@ impl Quantity {
         sorted.iter().all(|value| value.is_finite()).then_some(quantity)
     }
 
-    /// One of its figures.
+    /// The value of a figure.
     pub fn figure(&self, figure: Figure) -> f64 {
         match figure {
             Figure::Median => self.median,
@@ -235,13 +236,13 @@ impl Quantity {
 }
 
 impl Point {
-    /// A point of `series` at these settings.
+    /// A point of `series` with these settings.
     pub fn new(series: &str, settings: impl IntoIterator<Item = (&'static str, f64)>) -> Self {
         let settings = settings.into_iter().map(|(name, value)| (name.to_owned(), value)).collect();
         Self { series: series.to_owned(), settings, ..Self::default() }
     }
 
-    /// Adds what was measured; nothing, if there were no values.
+    /// Adds measured samples; does nothing if there are none.
     pub fn measure(&mut self, name: &str, unit: Unit, samples: impl IntoIterator<Item = f64>) {
         if let Some(quantity) = Quantity::of(unit, samples) {
             self.quantities.insert(name.to_owned(), quantity);
@@ -253,14 +254,14 @@ impl Point {
         *self.failures.entry(text.into()).or_default() += 1;
     }
 
-    /// How much failed.
+    /// Number of failures.
     pub fn failed(&self) -> u64 {
         self.failures.values().sum()
     }
 }
 
 impl Run {
-    /// A run that begins now, without points.
+    /// A run that starts now, without points.
     pub async fn begin(scenario: &str, seed: u64) -> Self {
         Self {
             scenario: scenario.to_owned(),
@@ -277,13 +278,13 @@ impl Run {
         }
     }
 
-    /// How many steps failed.
+    /// Number of failed steps.
     pub fn failed(&self) -> u64 {
         self.points.iter().map(Point::failed).sum()
     }
 
-    /// Writes the three files, making the directory if need be; gives their paths. `began` is when
-    /// the run began.
+    /// Writes the three files, creating the directory if needed; returns their paths. `began` is
+    /// the start of the run.
     pub fn write(&mut self, dir: &Path, began: Instant) -> io::Result<Vec<PathBuf>> {
         self.wall_s = (began.elapsed().as_secs_f64() * 1000.0).round() / 1000.0;
         std::fs::create_dir_all(dir)?;
@@ -306,7 +307,8 @@ impl Run {
             .map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error))
     }
 
-    /// A row for each quantity of each point; a point without any has one row, with its failures.
+    /// A row for each quantity of each point; a point without quantities has one row, with its
+    /// failures.
     pub fn csv(&self) -> String {
         let settings: std::collections::BTreeSet<&String> =
             self.points.iter().flat_map(|p| p.settings.keys()).collect();
@@ -353,7 +355,7 @@ impl Run {
     }
 }
 
-/// A value of a CSV, quoted if it has to be.
+/// A CSV value, quoted if necessary.
 fn cell(text: &str) -> String {
     let is_plain = !text.contains([',', '"', '\n', '\r']);
     if is_plain { text.to_owned() } else { format!("\"{}\"", text.replace('"', "\"\"")) }

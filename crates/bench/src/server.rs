@@ -1,5 +1,5 @@
-//! The server's HTTP API as far as a load run needs it. Nothing is retried: a run measures what one
-//! try does.
+//! The part of the server's HTTP API that a load run needs. Nothing is retried: a run measures
+//! single tries.
 
 use std::time::Duration;
 
@@ -19,25 +19,25 @@ use tokio::sync::Mutex;
 use crate::encryption::client_config;
 use crate::package::Package;
 
-/// How long one answer may take.
+/// Time limit of one answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
-/// After how long a robot asks again that has to wait to enrol.
+/// Pause before a robot repeats a refused enrollment.
 const AGAIN: Duration = Duration::from_secs(1);
 /// The payload of a package that only has to exist.
 const SMALL_BYTES: u64 = 32;
 
-/// Why the server did not do what it was asked.
+/// Why a request to the server failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// It could not be reached, went away, or answered something else than taskd does.
+    /// The server could not be reached, the connection was lost, or the answer is not one of taskd.
     #[error("no answer to {0}")]
     NoAnswer(&'static str, #[source] reqwest::Error),
-    /// It answered with an error.
+    /// The server answered with an error.
     #[error("{0} was refused with {1}: {2}")]
     Refused(&'static str, StatusCode, String),
 }
 
-/// A server and the operator's token for it.
+/// A server and the operator's token for that server.
 pub struct Server {
     http: reqwest::Client,
     base: Url,
@@ -47,8 +47,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// The one whose certificates are by the authority with this pin, if that is known. Nothing is
-    /// sent yet.
+    /// A client that accepts certificates by the authority with this pin, if a pin is given.
+    /// Nothing is sent yet.
     pub fn new(base: Url, token: &Token, pin: Option<CaPin>) -> Result<Self, ServerError> {
         let http = reqwest::Client::builder()
             .timeout(ANSWER_TIMEOUT)
@@ -58,7 +58,7 @@ impl Server {
         Ok(Self { http, base, token: token.reveal(), in_use: Mutex::default() })
     }
 
-    /// What it is, and what went over it.
+    /// The server's description, and its traffic.
     pub async fn info(&self) -> Result<ServerInfo, ServerError> {
         read("the question for its version", self.request(Method::GET, "/api/v1/server")).await
     }
@@ -75,7 +75,8 @@ impl Server {
         .await
     }
 
-    /// What a robot does with the enrolment token: where too many come at once it asks again.
+    /// Enrolls a robot with the enrollment token, as an agent does: if the server is overloaded,
+    /// the request is repeated.
     pub async fn enroll(
         &self,
         token: &str,
@@ -92,7 +93,7 @@ impl Server {
         }
     }
 
-    /// The robots that a selector means.
+    /// The robots that match a selector.
     pub async fn robots(&self, selector: &Selector) -> Result<RobotList, ServerError> {
         let get = self.request(Method::GET, "/api/v1/robots");
         read("the list of robots", get.query(&[("selector", selector.to_string())])).await
@@ -118,13 +119,13 @@ impl Server {
         read("the order", post.json(order)).await
     }
 
-    /// Where a deployment stands, robot by robot.
+    /// The state of a deployment, robot by robot.
     pub async fn deployment(&self, id: &DeploymentId) -> Result<DeploymentView, ServerError> {
         read("the deployment", self.request(Method::GET, &format!("/api/v1/deployments/{id}")))
             .await
     }
 
-    /// Pushes a package with one small file, and gives its manifest.
+    /// Pushes a package with one small file, and returns its manifest.
     pub async fn push_package(
         &self,
         name: &TaskName,
@@ -133,7 +134,7 @@ impl Server {
         self.push(Package::random(name.clone(), version.clone(), SMALL_BYTES, rand::random())).await
     }
 
-    /// Pushes a package, and gives its manifest.
+    /// Pushes a package, and returns its manifest.
     pub async fn push(&self, package: Package) -> Result<Digest, ServerError> {
         let (config, content) = (package.config_blob(), package.content_blob());
         let Package { name, version, config: config_bytes, content: content_bytes, .. } = package;
@@ -147,8 +148,8 @@ impl Server {
         Ok(digest)
     }
 
-    /// Deletes a package version. One that robots should have is deleted by a later call, once they
-    /// should not.
+    /// Deletes a package version. A version still assigned to robots is deleted by a later call,
+    /// once no robot should have it.
     pub async fn remove_package(
         &self,
         name: &TaskName,
@@ -207,7 +208,7 @@ async fn read<T: DeserializeOwned>(
 }
 
 async fn send(what: &'static str, request: RequestBuilder) -> Result<Response, ServerError> {
-    // Without the URL, which differs from robot to robot, the same failure has the same text.
+    // Without the URL, which differs from robot to robot, equal failures have equal texts.
     let response =
         request.send().await.map_err(|source| ServerError::NoAnswer(what, source.without_url()))?;
     if response.status().is_success() {

@@ -1,17 +1,17 @@
-//! What simulated robots say of the machines that they do not have: figures that wander, so that
-//! whoever watches sees something. They measure nothing.
+//! Vitals of simulated robots, which have no machine: figures that wander, so that dashboards show
+//! movement. Nothing is measured.
 
 use std::time::Duration;
 
 use task_agent::telemetry::vitals::Source;
 use task_proto::vitals::Vitals;
 
-/// As often as robots of ours say it.
+/// The interval of real robots.
 pub const VITALS_INTERVAL: Duration = Duration::from_secs(60);
 
 const GIB: f64 = (1u64 << 30) as f64;
 
-/// A machine that is none.
+/// A simulated machine.
 #[derive(Debug, Clone)]
 pub struct Machine {
     cpu: f64,
@@ -22,7 +22,7 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// One somewhere in the middle.
+    /// A machine with medium figures.
     pub fn new() -> Self {
         let within = |least: f64, most: f64| least + (most - least) * rand::random::<f64>();
         Self {
@@ -49,11 +49,11 @@ impl Source for Machine {
         self.memory = wander(self.memory, 0.02);
         self.disk = wander(self.disk, 0.001);
         self.network *= 0.8 + 0.4 * rand::random::<f64>();
-        // Whoever is empty is charged.
+        // An empty battery is charged.
         self.battery = if self.battery < 0.15 { 1.0 } else { self.battery - 0.002 };
         let bytes = |share: f64, gib: f64| (share * gib * GIB) as u64;
         Vitals {
-            // Whoever hears it goes by their own clock.
+            // The receiver uses its own clock.
             at_ms: 0,
             cpu_percent: Some((self.cpu * 1000.0).round() as f32 / 10.0),
             memory_used_bytes: Some(bytes(self.memory, 4.0)),

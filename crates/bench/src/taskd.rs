@@ -1,5 +1,5 @@
-//! A real `taskd serve` as a child, with a directory of its own, on free ports. It is ended by its
-//! pid, and its directory goes with it.
+//! A real `taskd serve` as a child, with its own directory, on free ports. The child is ended by
+//! its pid, and its directory is removed with the child.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
@@ -17,11 +17,11 @@ use tokio::time::Instant;
 use crate::process::{Process, Program, Usage};
 use crate::server::Server;
 
-/// How long it may take to be ready.
+/// Time limit for the server to become ready.
 const START_TIMEOUT: Duration = Duration::from_secs(60);
-/// How often it is looked at until then, and how often its memory is.
+/// Poll interval for readiness, and for memory afterwards.
 const LOOK_INTERVAL: Duration = Duration::from_millis(20);
-/// How much of its log is shown when it does not start.
+/// Bytes of the log's end shown when the server does not start.
 const LOG_TAIL_BYTES: usize = 2000;
 
 /// Which server to measure.
@@ -37,7 +37,7 @@ pub struct TaskdFlags {
     pub data: Option<PathBuf>,
 }
 
-/// How a server is started.
+/// Start options of a server.
 #[derive(Debug, Clone)]
 pub struct TaskdOrder {
     /// The address of both listeners.
@@ -49,7 +49,7 @@ pub struct TaskdOrder {
 }
 
 impl TaskdOrder {
-    /// The same, encrypted.
+    /// The same options with encryption.
     pub fn encrypted(mut self) -> Self {
         self.settings.push(("TASKD_TLS_PRIVATE_CA".to_owned(), "true".to_owned()));
         self
@@ -58,22 +58,22 @@ impl TaskdOrder {
 
 impl Default for TaskdOrder {
     fn default() -> Self {
-        // A fleet under measurement enrols all at once.
+        // A fleet under measurement enrolls all at once.
         let settings = vec![("TASKD_ENROLMENT_PER_MINUTE".to_owned(), "1000000".to_owned())];
         Self { listen: Ipv4Addr::LOCALHOST.into(), configuration: String::new(), settings }
     }
 }
 
-/// A server that runs. Dropping it kills it.
+/// A running server. Dropping the handle kills the server.
 pub struct Taskd {
     process: Process,
     program: Program,
     dir: TempDir,
-    /// Where HTTP listens.
+    /// Address of the HTTP listener.
     pub http: SocketAddr,
-    /// Where MQTT listens.
+    /// Address of the MQTT listener.
     pub mqtt: SocketAddr,
-    /// Of its certificate authority, if it encrypts.
+    /// Pin of the server's certificate authority; `None` without encryption.
     pub pin: Option<CaPin>,
     /// The operator's token.
     pub token: Token,
@@ -91,7 +91,7 @@ struct Addresses {
 }
 
 impl Taskd {
-    /// Starts one and waits until it is ready.
+    /// Starts a server and waits until it is ready.
     pub async fn start(flags: &TaskdFlags, order: &TaskdOrder) -> anyhow::Result<Self> {
         let mut builder = tempfile::Builder::new();
         builder.prefix("taskbench-");
@@ -114,8 +114,8 @@ impl Taskd {
         Self::launch(program, dir).await
     }
 
-    /// Ends it and starts it again on the same data, as new: nothing is in its memory. Its ports
-    /// are others.
+    /// Ends the server and starts a new process on the same data, with empty memory and different
+    /// ports.
     pub async fn restart(self) -> anyhow::Result<Self> {
         let Self { process, program, dir, .. } = self;
         process.end().await;
@@ -125,7 +125,7 @@ impl Taskd {
     async fn launch(program: Program, dir: TempDir) -> anyhow::Result<Self> {
         let (data, log) = (dir.path().join("data"), dir.path().join("taskd.log"));
         let addresses = data.join("addresses.json");
-        // Those of an earlier start.
+        // The addresses of an earlier start.
         let _ = std::fs::remove_file(&addresses);
         let mut process = program.start(&log)?;
         let Addresses { http, mqtt, ca_pin: pin } =
@@ -144,22 +144,22 @@ impl Taskd {
         url(self.http, self.pin)
     }
 
-    /// Where its blobs lie, each under the hexadecimal digits of its digest.
+    /// Directory of the server's blobs, each named by the hexadecimal digits of its digest.
     pub fn blobs(&self) -> PathBuf {
         self.dir.path().join("data/blobs/sha256")
     }
 
-    /// Its directory, for what else a scenario has to write.
+    /// The server's directory, for further files of a scenario.
     pub fn dir(&self) -> &Path {
         self.dir.path()
     }
 
-    /// What it has used until now.
+    /// Resource usage of the server until now.
     pub fn usage(&self) -> Usage {
         self.process.usage()
     }
 
-    /// Begins to watch how much memory it has, until the watch is asked.
+    /// Begins to watch the server's memory; the returned watch ends the sampling.
     pub fn watch_memory(&self) -> MemoryWatch {
         let pid = self.process.pid();
         let (stop, mut stopped) = tokio::sync::oneshot::channel();
@@ -179,27 +179,27 @@ impl Taskd {
         MemoryWatch { stop, watching }
     }
 
-    /// Why it is gone, if it is.
+    /// Why the server ended; `None` while the server runs.
     pub fn ended(&mut self) -> Option<String> {
         let how = self.process.ended()?;
         Some(format!("{how}: {}", tail(&self.dir.path().join("taskd.log"))))
     }
 
-    /// Ends it in good order and removes its directory.
+    /// Ends the server gracefully and removes its directory.
     pub async fn end(self) -> anyhow::Result<()> {
         self.process.end().await;
         self.dir.close().context("the server's directory can't be removed")
     }
 }
 
-/// Looks at a server's memory until it is asked for the most there was.
+/// Samples a server's memory and keeps the maximum.
 pub struct MemoryWatch {
     stop: tokio::sync::oneshot::Sender<()>,
     watching: tokio::task::JoinHandle<Usage>,
 }
 
 impl MemoryWatch {
-    /// The most there was of each kind of memory, by what was seen.
+    /// The maximum seen of each kind of memory.
     pub async fn most(self) -> Usage {
         let _ = self.stop.send(());
         self.watching.await.unwrap_or_default()

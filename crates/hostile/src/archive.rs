@@ -14,14 +14,14 @@ use taskd::package::contents::list;
 
 const LIMITS: Limits = Limits { bytes: 1 << 20, entries: 200, depth: 8, ratio: 200 };
 const BLOCK_BYTES: usize = 512;
-/// Where a header has its checksum, and where its magic.
+/// Positions of the checksum and of the magic in a header.
 const CHECKSUM: std::ops::Range<usize> = 148..156;
 const MAGIC: std::ops::Range<usize> = 257..262;
 
-/// An archive, compressed or not: whatever becomes of it, nothing is changed outside of its
-/// directory, and nothing in there leads out, has a mode of its own, or is larger than announced,
-/// or than may be where nothing was announced. One that is not compressed gets the checksums that
-/// its headers need, and compressed.
+/// An archive, compressed or not. In every case, nothing outside its directory changes, and no
+/// entry inside leads out, has a mode of its own, or is larger than announced (without an
+/// announcement: larger than the limits). For uncompressed input, we set the checksums that its
+/// headers need, and compress it.
 pub fn archive(bytes: &[u8]) {
     let plain = zstd::decode_all(bytes).ok().filter(|_| bytes.len() < 64 * 1024);
     let (content, tar) = match plain {
@@ -35,13 +35,13 @@ pub fn archive(bytes: &[u8]) {
     let mut facts =
         ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 0 };
     unannounced(&content, Compression::Zstd);
-    // How many entries there are is found out by announcing too few.
+    // We find the number of entries by announcing too few.
     while let Some(found) = unpacked(&content, &facts) {
         facts.entries = facts.entries.max(found);
     }
 }
 
-/// The same with a right checksum in every block that says that it is a header.
+/// The same bytes, with a valid checksum in every block that claims to be a header.
 fn with_checksums(bytes: &[u8]) -> Vec<u8> {
     let mut tar = bytes.to_vec();
     for block in tar.chunks_exact_mut(BLOCK_BYTES).filter(|block| &block[MAGIC] == b"ustar") {
@@ -52,8 +52,7 @@ fn with_checksums(bytes: &[u8]) -> Vec<u8> {
     tar
 }
 
-/// Unpacks an archive of which nothing is known. What is unpacked was listed before, entry by
-/// entry.
+/// Unpacks an archive without announced facts. Every unpacked entry must have been listed before.
 fn unannounced(content: &[u8], compression: Compression) {
     let mut listed = 0;
     let mut entries = Entries::unannounced(content, compression, &LIMITS).expect("bytes in memory");
@@ -75,8 +74,8 @@ fn unannounced(content: &[u8], compression: Compression) {
     );
 }
 
-/// Unpacks as announced; the number of entries found, if more were than announced. Who only checks
-/// the archive comes to the same verdict.
+/// Unpacks as announced. Returns the number of entries found, if more than announced. A check
+/// without unpacking must come to the same verdict.
 fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
     let size = content.len() as u64;
     let unpacked =
@@ -101,7 +100,7 @@ fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
     }
 }
 
-/// Unpacks and looks around; why it was refused, if it was.
+/// Unpacks and inspects the result; returns the reason of a refusal.
 fn in_staging(
     most_bytes: u64,
     unpack: impl FnOnce(&Path) -> Result<(), UnpackError>,
@@ -137,8 +136,8 @@ fn in_staging(
     }
 }
 
-/// Looks at everything below `directory`; the size of all files, those with several names counted
-/// once.
+/// Checks every entry below `directory`; returns the total size of all files, with each hard-linked
+/// file counted once.
 fn look(directory: &Path, staging: &Path, depth: usize) -> u64 {
     assert!(depth <= 8, "{} is too deep", directory.display());
     let mut size = 0;
@@ -163,7 +162,7 @@ fn look(directory: &Path, staging: &Path, depth: usize) -> u64 {
     size
 }
 
-/// Follows a link step by step, over what is not there as well: something may be made there later.
+/// Follows a link step by step, also over missing entries, because they may be created later.
 fn follow(link: &Path, staging: &Path) {
     let mut at = link.parent().expect("a directory").canonicalize().expect("a directory");
     for part in fs::read_link(link).expect("a target").components() {
@@ -174,7 +173,7 @@ fn follow(link: &Path, staging: &Path) {
             Component::RootDir | Component::Prefix(_) => panic!("{} is absolute", link.display()),
         }
         if at.is_symlink() {
-            // One that leads nowhere, or in a circle, is followed for itself.
+            // A link that leads nowhere, or in a circle, is checked as itself.
             let Ok(end) = at.canonicalize() else { return };
             at = end;
         }

@@ -25,17 +25,17 @@ pub use said::{part, reply, report};
 pub use signed::{desired, envelope};
 pub use websocket::websocket;
 
-/// One parser and what is asked of it.
+/// A parser and its test.
 pub struct Target {
-    /// The name of its program in `fuzz/` and of its directory in `fuzz/corpus`.
+    /// The name of the program in `fuzz/` and of the directory in `fuzz/corpus`.
     pub name: &'static str,
-    /// Reads any bytes; panics if that does harm.
+    /// Parses any bytes; panics if a promise is broken.
     pub run: fn(&[u8]),
-    /// How many changed inputs the tests try: so many that it takes about two seconds.
+    /// The number of changed inputs in the tests, chosen to take about two seconds.
     pub tries: u32,
 }
 
-/// All of them.
+/// All targets.
 pub const TARGETS: [Target; 17] = [
     Target { name: "archive", run: archive, tries: 500 },
     Target { name: "desired", run: desired, tries: 1_000 },

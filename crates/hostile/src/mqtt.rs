@@ -18,11 +18,11 @@ use taskd::broker::{
 use taskd::limits::conduct::{Conduct, ConductLimits};
 use tokio::runtime::Runtime;
 
-/// The largest packet that is tried.
+/// The largest packet that we try.
 const MAX_PACKET_BYTES: usize = 2048;
-/// More than anything here takes, unless it hangs.
+/// Timeout, longer than any step here takes unless it hangs.
 const PATIENCE: Duration = Duration::from_secs(20);
-/// The same robot does what it may not again and again.
+/// Limits for tests: the same robot breaks the rules again and again.
 const INDULGENT: ConductLimits = ConductLimits {
     messages_per_s: 1_000_000,
     bytes_per_s: 1 << 40,
@@ -31,14 +31,14 @@ const INDULGENT: ConductLimits = ConductLimits {
     backoff: Duration::ZERO,
     forgive_after: Duration::ZERO,
 };
-/// Who is let in.
+/// The only robot that may connect.
 const ROBOT: &str = "r00000000000000a1";
 /// CONNECT as that robot.
 const CONNECT: &[u8] =
     b"\x10\x32\x00\x04MQTT\x04\xc2\x00\x3c\x00\x11r00000000000000a1\x00\x11r00000000000000a1\x00\x00";
 
-/// Packets from a client: it does not matter in which pieces they come, and what is published has a
-/// topic that can be published to and is read again as it was.
+/// Packets from a client: the result does not depend on how the bytes are split, and every
+/// published message has a topic that can be published to and reads back the same.
 pub fn mqtt_packets(bytes: &[u8]) {
     let whole = read(bytes, bytes.len());
     for piece_bytes in [1, 7] {
@@ -62,7 +62,8 @@ pub fn mqtt_packets(bytes: &[u8]) {
     }
 }
 
-/// All packets in `bytes` that come in pieces of this length, and what is wrong with the next one.
+/// Reads all packets in `bytes`, split into pieces of this length; returns them with the error of
+/// the next packet.
 fn read(bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<DecodeError>) {
     let (mut packets, mut input) = (Vec::new(), BytesMut::new());
     for piece in bytes.chunks(piece_bytes.max(1)) {
@@ -78,13 +79,13 @@ fn read(bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<DecodeError>
     (packets, None)
 }
 
-/// A connection, from its first byte or, if that is odd, from behind a good CONNECT: it ends when
-/// the client has said all; one that is not let in is told so in one packet or not at all; the
-/// inbox hears of this robot only, and the next client is served.
+/// A connection, from its first byte or, if that is odd, after a valid CONNECT. The connection ends
+/// when the client has sent everything. A refused client receives one packet or none. The inbox
+/// receives messages of this robot only, and the next client is served.
 pub fn mqtt_session(bytes: &[u8]) {
     let Some((&first, said)) = bytes.split_first() else { return };
     let front = Front::running();
-    // Takeover would mix up those of several threads.
+    // Several threads would take over each other's sessions.
     let _turn = front.turn.lock().unwrap_or_else(PoisonError::into_inner);
     let heard = front.talk(&[if first % 2 == 0 { &[] } else { CONNECT }, said].concat());
     match heard.get(..4) {
@@ -130,12 +131,12 @@ impl Front {
         })
     }
 
-    /// Says `bytes` and nothing more; what was answered by the time the connection ended.
+    /// Sends `bytes` and nothing more; returns the answer received until the connection ended.
     fn talk(&self, bytes: &[u8]) -> Vec<u8> {
         let mut stream = TcpStream::connect(self.address).expect("connected");
         stream.set_read_timeout(Some(PATIENCE)).expect("set");
         let mut heard = Vec::new();
-        // It may have hung up already, and rightly so.
+        // The server may rightly have closed the connection already.
         let said = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
         match stream.read_to_end(&mut heard) {
             Ok(_) => {}

@@ -1,7 +1,7 @@
 //! Changes inputs as a fuzzer would, but always the same way for the same seed: a test that failed
 //! once fails again.
 
-/// Numbers on which parsers stumble.
+/// Numbers that often break parsers.
 const NUMBERS: [u64; 12] = [
     0,
     1,
@@ -16,7 +16,7 @@ const NUMBERS: [u64; 12] = [
     u64::MAX - 1,
     u64::MAX,
 ];
-/// Texts on which they do.
+/// Texts that often break parsers.
 const TEXTS: [&[u8]; 12] = [
     b"\0",
     b"\n",
@@ -31,7 +31,7 @@ const TEXTS: [&[u8]; 12] = [
     b"{{{{{{{{",
     b"18446744073709551616",
 ];
-/// The longest input that is made.
+/// The longest input that we make.
 const MAX_BYTES: usize = 64 * 1024;
 
 /// An endless source of changed inputs.
@@ -40,7 +40,7 @@ pub struct Mutation {
 }
 
 impl Mutation {
-    /// The source that begins with `seed`.
+    /// A source with the seed `seed`.
     pub fn new(seed: u64) -> Self {
         Self { state: seed }
     }
@@ -95,7 +95,7 @@ impl Mutation {
         (self.random() % limit.max(1) as u64) as usize
     }
 
-    /// SplitMix64: small, and the same with every version of every crate.
+    /// SplitMix64: small, and independent of crate versions.
     fn random(&mut self) -> u64 {
         self.state = self.state.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut mixed = self.state;

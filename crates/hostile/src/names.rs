@@ -12,8 +12,8 @@ use task_proto::{
     TaskName, TokenId, UserName, Version,
 };
 
-/// Every kind of name: what is accepted is written as it was read, has no control character, and
-/// where it becomes a file's name it is one component that is not `.` or `..`.
+/// Every type of name: an accepted name is written as it was read and has no control character. A
+/// name that becomes a file name is one component other than `.` or `..`.
 pub fn names(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let file_names = [
@@ -47,7 +47,7 @@ pub fn names(bytes: &[u8]) {
     }
 }
 
-/// Whether `text` is a `T`, which then is written as it was read and harms no line.
+/// Whether `text` parses as a `T`, which then must print as it was read and be safe in a log line.
 fn exact<T: FromStr + Display>(text: &str) -> bool {
     let Ok(name) = text.parse::<T>() else { return false };
     assert_eq!(name.to_string(), text);
@@ -55,7 +55,7 @@ fn exact<T: FromStr + Display>(text: &str) -> bool {
     true
 }
 
-/// A selector: read, written and read again it means the same robots.
+/// A selector: written and read again, it matches the same robots.
 pub fn selector(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let Some(selector) = same_again::<Selector>(text) else { return };
@@ -74,8 +74,8 @@ pub fn selector(bytes: &[u8]) {
     }
 }
 
-/// A token: as text it is what it was, and its secret shows nowhere else. The bytes are tried as
-/// they are and with the checksum that they would need.
+/// A token: its text reads back the same, and its secret shows nowhere else. We try the bytes as
+/// they are, and with the checksum that they would need.
 pub fn token(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let checksummed = format!("{text}_{:08x}", crc32fast::hash(text.as_bytes()));

@@ -10,7 +10,7 @@ use task_proto::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
 
 use crate::said::same_again;
 
-/// `task.toml`: a file without a problem makes a manifest that robots read as it was written.
+/// `task.toml`: a file without problems makes a manifest that robots read as written.
 pub fn task_toml(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let mut problems = Vec::new();
@@ -50,8 +50,8 @@ pub fn package_xml(bytes: &[u8]) {
     }
 }
 
-/// A task manifest that breaks no rule: it stays in its own directory, and the script that starts
-/// it has each of its words in quotes, as one word.
+/// A task manifest that breaks no rule: its paths stay in the task's own directory, and the start
+/// script has each word in quotes, as one word.
 pub fn manifest(bytes: &[u8]) {
     let Some(manifest) = same_again::<TaskManifest>(bytes) else { return };
     let problems = manifest.problems();
@@ -81,7 +81,7 @@ pub fn manifest(bytes: &[u8]) {
     assert_eq!(script.lines().count(), lines, "a value begins a line of its own:\n{script}");
 }
 
-/// The words of a line of shell that is nothing but words in single quotes.
+/// The words of a shell line that has only words in single quotes.
 fn words(line: &str) -> Vec<String> {
     let (mut words, mut rest) = (Vec::new(), line);
     loop {

@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use task_proto::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
 use taskd::http::registry::oci::parsed::Parsed;
 
-/// An OCI manifest: its parts are known each once, its texts fit a header, and one that calls
-/// itself a package is that package when it is written again.
+/// An OCI manifest: each part is known once, its texts fit a header, and a manifest that claims to
+/// be a package is the same package when written again.
 pub fn oci_manifest(bytes: &[u8]) {
     for content_type in [None, Some(MANIFEST_TYPE)] {
         let Ok(parsed) = Parsed::new(content_type, bytes) else { continue };

@@ -6,9 +6,9 @@ use std::cell::{Cell, RefCell};
 
 use rustdds::fuzzing::Receiver;
 
-/// What one input may make a thread hold in the end, whatever it says.
+/// The most memory that one input may leave allocated on a thread.
 const MAX_KEPT_BYTES: usize = 64 << 20;
-/// What it may take meanwhile, all allocations together: a datagram of 64 KiB can have thousands of
+/// The most memory that one input may allocate in total: a datagram of 64 KiB can have thousands of
 /// submessages.
 const MAX_TAKEN_BYTES: usize = 256 << 20;
 /// The most datagrams of one input.
@@ -21,8 +21,8 @@ thread_local! {
     static RECEIVER: RefCell<Receiver> = RefCell::new(Receiver::new());
 }
 
-/// The system's allocator, which counts for each thread what is taken. A program that runs [`rtps`]
-/// has it as its own; without it nothing is counted.
+/// The system's allocator, with a count of allocated bytes per thread. Programs that run [`rtps`]
+/// install it; otherwise nothing is counted.
 pub struct Counting;
 
 // SAFETY: all is passed on to the system's allocator as it comes.
@@ -53,18 +53,18 @@ unsafe impl GlobalAlloc for Counting {
 }
 
 fn count(taken: usize, freed: usize) {
-    // A thread that ends has nothing to count any more.
+    // A thread that is ending has nothing to count any more.
     let _ = TAKEN.try_with(|all| all.set(all.get().saturating_add(taken)));
     let _ = KEPT.try_with(|kept| kept.set(kept.get().saturating_add(taken).saturating_sub(freed)));
     let _ = LARGEST.try_with(|largest| largest.set(largest.get().max(taken)));
 }
 
-/// Datagrams, each behind two bytes that say how long it is, and the same bytes as samples of
-/// discovery: nothing panics or hangs, no single allocation is larger than the largest sample that
-/// is assembled, and little is kept.
+/// Datagrams, each after two bytes with its length, and the same bytes as discovery samples.
+/// Nothing panics or hangs, no single allocation is larger than the largest assembled sample, and
+/// little memory is kept.
 pub fn rtps(bytes: &[u8]) {
     RECEIVER.with_borrow_mut(|receiver| {
-        // What is made at the first use is not the input's.
+        // Memory allocated at the first use does not belong to the input.
         receiver.idle();
         let kept_before = KEPT.get();
         TAKEN.set(0);

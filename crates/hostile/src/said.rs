@@ -10,8 +10,7 @@ use task_proto::report::{Condition, Phase, Report, Status};
 use task_proto::request::{Reply, Request};
 use taskd::domain::deployment::Standing;
 
-/// A report, a status or a batch of log lines. An assignment goes on from a report as one that has
-/// an end.
+/// A report, a status or a batch of log lines. No report moves an assignment out of a final phase.
 pub fn report(bytes: &[u8]) {
     same_again::<Status>(bytes);
     same_again::<LogBatch>(bytes);
@@ -44,8 +43,8 @@ pub fn reply(bytes: &[u8]) {
     same_again::<Reply>(bytes);
 }
 
-/// A part of a package, after eight bytes that are the package's size: what is accepted lies inside
-/// of the package.
+/// A part of a package, after eight bytes with the package's size: an accepted part lies inside the
+/// package.
 pub fn part(bytes: &[u8]) {
     let Some((size, message)) = bytes.split_first_chunk::<8>() else { return };
     let size = u64::from_be_bytes(*size);
@@ -54,12 +53,12 @@ pub fn part(bytes: &[u8]) {
     let range = cut.range(part.index);
     assert!(part.index < part.count && part.count == cut.count() && part.count <= MAX_PARTS);
     assert!(range.end <= size && range.end - range.start == part.bytes.len() as u64);
-    // All but the reserved byte.
+    // All bytes except the reserved one.
     let again = part.encode();
     assert_eq!((again[0], &again[2..]), (message[0], &message[2..]));
 }
 
-/// The `T` that `bytes` are, if any; written and read again it is the same.
+/// Parses `bytes` as a `T`, if possible; written and read again, the value is the same.
 pub(crate) fn same_again<T: DeserializeOwned + Serialize + PartialEq + Debug>(
     bytes: &[u8],
 ) -> Option<T> {

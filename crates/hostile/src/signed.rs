@@ -7,14 +7,14 @@ use task_proto::{Digest, Generation, RobotId};
 
 use crate::said::same_again;
 
-/// What the key has signed: the envelopes of the corpus have no other payloads.
+/// The payloads that the key has signed: the envelopes of the corpus have no others.
 const SIGNED: [&[u8]; 2] = [b"{}", b"{\"generation\":1}"];
 const KEY: [u8; 32] = [9; 32];
-/// 2100: a state that expires later is in force.
+/// The year 2100: a state that expires later is in force.
 const NOW_MS: u64 = 4_102_444_800_000;
 
-/// An envelope, or what is said on a robot's `desired` topic: only what the key has signed comes
-/// out, and only blobs that hash to their name.
+/// An envelope, or a message on a robot's `desired` topic: only payloads signed by the key are
+/// returned, and only blobs that hash to their digest.
 pub fn envelope(bytes: &[u8]) {
     let (mut envelopes, mut inlines) = (Vec::new(), Vec::new());
     envelopes.extend(same_again::<Envelope>(bytes));
@@ -41,8 +41,8 @@ pub fn envelope(bytes: &[u8]) {
     }
 }
 
-/// A desired state that the server's key signed, whatever is in it: a robot obeys its own only,
-/// never one before it, and each task once.
+/// A desired state signed by the server's key, with any content: a robot obeys only its own state,
+/// never an earlier one, and each task once.
 pub fn desired(bytes: &[u8]) {
     let (key, robot) =
         (SigningKey::from_bytes(KEY), "r00000000000000a1".parse::<RobotId>().expect("valid"));

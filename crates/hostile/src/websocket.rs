@@ -3,8 +3,8 @@
 use bytes::BytesMut;
 use task_transport::websocket::frame::{Decoder, Opcode, Piece, Role, Violation, encode};
 
-/// Frames: it does not matter in which pieces they come, and what they carry arrives again when it
-/// is sent on.
+/// Frames: the result does not depend on how the bytes are split, and the payload arrives unchanged
+/// when sent on.
 pub fn websocket(bytes: &[u8]) {
     for role in [Role::Server, Role::Client] {
         let whole = read(role, bytes, bytes.len());
@@ -19,7 +19,7 @@ pub fn websocket(bytes: &[u8]) {
     }
 }
 
-/// What came, with data in one piece that came in several.
+/// A received message, with fragmented data joined.
 #[derive(Debug, PartialEq)]
 enum Came {
     Data(Vec<u8>),

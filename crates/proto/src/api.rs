@@ -60,17 +60,17 @@ use crate::settings::{EffectiveSettings, RobotSettings};
 use crate::vitals::Vitals;
 use crate::{DeploymentId, Digest, Generation, MacAddress, RobotId, RobotName, TaskName, Version};
 
-/// Where the API begins.
+/// Path prefix of every API route.
 pub const BASE: &str = "/api/v1";
-/// The header by which an agent names its instance, as in its reports.
+/// Request header with the agent's instance id, the same as in its reports.
 pub const INSTANCE_HEADER: &str = "taskd-instance";
-/// The header by which an agent says where it runs, as in its reports.
+/// Request header with the digest of the place where the agent runs, the same as in its reports.
 pub const PLACE_HEADER: &str = "taskd-place";
-/// Request header that makes an order safe to retry: the same key gives the same deployment. 1 to
-/// 128 visible characters.
+/// Request header that makes a deployment request safe to retry: the same key returns the same
+/// deployment. 1 to 128 visible characters.
 pub const IDEMPOTENCY_KEY: &str = "idempotency-key";
 
-/// Every error's body.
+/// The body of every error response.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ErrorBody {
@@ -85,48 +85,48 @@ pub struct ApiError {
     /// `not_found`, `invalid_request`, `unauthorized`, `forbidden`, `mac_known`, `no_robots_match`,
     /// …
     pub code: String,
-    /// What went wrong, naming the caller's own key.
+    /// Description of the error for people, naming the key that the caller sent.
     pub message: String,
 }
 
-/// `POST /enroll` (enrolment token).
+/// `POST /enroll` (enrollment token).
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollRequest {
-    /// The robot's MAC: its identity towards people.
+    /// The robot's MAC address: its identity for people.
     pub mac: MacAddress,
-    /// Its name; the server makes one from the MAC if absent.
+    /// The robot's name; the server derives one from the MAC if absent.
     #[serde(default)]
     pub name: Option<RobotName>,
-    /// Its labels.
+    /// The robot's labels.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// The key that it can show by a client certificate.
+    /// The public key that the robot can prove by a client certificate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub client_key: Option<PublicKey>,
 }
 
-/// Answer to an enrolment. The token is shown this once.
+/// Answer to an enrollment. The token is shown this once.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollResponse {
     /// The robot's new identity.
     pub robot_id: RobotId,
-    /// The name it got.
+    /// The robot's name as registered.
     pub name: RobotName,
-    /// Its bearer token and MQTT password.
+    /// The robot's bearer token and MQTT password.
     pub token: String,
-    /// How to reach MQTT.
+    /// The MQTT endpoint to connect to.
     pub mqtt: MqttEndpoint,
-    /// Whether it waits to be approved: until then it is refused everything with the code
+    /// Whether the robot awaits approval: until approved, every request is refused with the code
     /// [`AWAITS_APPROVAL`].
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub awaits_approval: bool,
 }
 
 /// Answer to a robot's `POST /robots/{robot}/token`. The token is shown this once; its first use
-/// ends the one before.
+/// revokes the previous token.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotToken {
@@ -134,125 +134,126 @@ pub struct RobotToken {
     pub token: String,
 }
 
-/// `GET /robots` (read), optionally `?selector=`, and `?limit=` (1 to 1,000) with `?after=`, a
-/// robot's name, for a page.
+/// `GET /robots` (read), optionally filtered by `?selector=`, and paged by `?limit=` (1 to 1,000)
+/// with `?after=`, a robot's name.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotList {
     /// Sorted by name.
     pub robots: Vec<RobotView>,
-    /// Names and ids in the selector that none of one's robots has, sorted: an order with this
-    /// selector is refused.
+    /// Names and ids in the selector that match none of the caller's robots, sorted: a deployment
+    /// with this selector is refused.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub unknown: Vec<RobotName>,
-    /// On a page that is not the last: what `after` has to be for the next one.
+    /// The value of `after` for the next page; absent on the last page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<RobotName>,
-    /// On a page: how many robots all pages have.
+    /// Number of robots on all pages; only in a paged answer.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub total: Option<u64>,
 }
 
-/// A robot as the operator sees it.
+/// A robot as operators see it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotView {
-    /// Its identity.
+    /// The robot's id.
     pub id: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// The MAC it was registered by.
+    /// The MAC address that the robot was registered by.
     pub mac: MacAddress,
-    /// Its labels.
+    /// The robot's labels.
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Whether it is connected over MQTT or polls.
+    /// Whether the robot is connected over MQTT or polls.
     pub online: bool,
-    /// Its last peer address, `ip:port`.
+    /// The robot's last peer address, `ip:port`.
     pub address: Option<String>,
-    /// When it was last heard.
+    /// When the server last heard from the robot.
     pub last_seen_ms: Option<u64>,
-    /// When it registered.
+    /// When the robot registered.
     pub enrolled_at_ms: u64,
-    /// The generation it should have.
+    /// The generation that the robot should have.
     pub generation: Generation,
-    /// The generation it last reported.
+    /// The generation that the robot last reported.
     pub observed_generation: Generation,
-    /// `diverged`, `duplicate_identity`, `instance_waits` and what the robot reported.
+    /// `diverged`, `duplicate_identity`, `instance_waits` and the conditions that the robot
+    /// reported.
     pub conditions: Vec<Condition>,
-    /// What it said of its machine.
+    /// Facts that the agent reported about its machine.
     pub host: Option<HostFacts>,
-    /// What it measured of its way to the server.
+    /// Measurements of the robot's connection to the server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkFacts>,
-    /// Its tasks, sorted by name.
+    /// The robot's tasks, sorted by name.
     pub tasks: Vec<RobotTask>,
-    /// Its MQTT connection, if it has one; only in `GET /robots/{robot}`.
+    /// The robot's MQTT connection, if connected; only in `GET /robots/{robot}`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mqtt: Option<MqttConnection>,
-    /// How its machine did last; absent: not said since the server started.
+    /// The machine's latest vitals; absent: none received since the server started.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub vitals: Option<Vitals>,
-    /// What was set for it here; absent: nothing.
+    /// Settings of this robot on the server; absent: none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub settings: Option<RobotSettings>,
-    /// What holds there, as it last said; absent: the agent's defaults.
+    /// Settings in effect on the robot, as last reported; absent: the agent's defaults.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effective_settings: Option<EffectiveSettings>,
 }
 
-/// A task on a robot: what is ordered, and where it stands.
+/// A task on a robot: its order and its state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotTask {
     /// The task's name.
     pub task: TaskName,
-    /// The version ordered.
+    /// The version that the deployment ordered.
     pub version: Version,
-    /// The order.
+    /// The deployment that ordered the task.
     pub deployment: DeploymentId,
-    /// Whether it should run.
+    /// Whether the task should run.
     pub wanted: Wanted,
-    /// How often it was asked to start.
+    /// Number of times the task was asked to start.
     pub run: u64,
-    /// How its bytes travel, and why.
+    /// How the package's bytes travel, and the reason for that choice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub delivery: Option<DeliveryDecision>,
-    /// Where it stands.
+    /// The task's current phase.
     pub phase: Phase,
-    /// How far the phase has come.
+    /// Progress within the phase.
     pub progress: Option<Progress>,
-    /// Why it failed.
+    /// Why the task failed.
     pub failure: Option<Failure>,
-    /// Why it runs, yet not as it should.
+    /// Why the running task is degraded.
     #[serde(default)]
     pub degraded: Option<Failure>,
-    /// The version whose process lives.
+    /// The version with a live process.
     pub active: Option<ActiveVersion>,
-    /// Whether the ordered version means another package by now: a forced push took it.
+    /// Whether the ordered version now names another package, after a forced push.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub outdated: bool,
-    /// Times the process was started again in this run.
+    /// Times the process was restarted in this run.
     pub restarts: u32,
 }
 
-/// `PATCH /robots/{robot}` (maintain): absent fields stay.
+/// `PATCH /robots/{robot}` (maintain): absent fields stay unchanged.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EditRobot {
     /// A new name.
     #[serde(default)]
     pub name: Option<RobotName>,
-    /// The new labels, all of them.
+    /// The new labels; they replace all existing labels.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Option<Labels>,
-    /// The new settings, all of them; null: none.
+    /// The new settings; they replace all existing settings. Null removes them.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "given")]
     pub settings: Option<Option<RobotSettings>>,
 }
 
-/// Null is something that was given.
+/// Tells an explicit null from an absent field.
 fn given<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
     deserializer: D,
 ) -> Result<Option<T>, D::Error> {
@@ -265,9 +266,9 @@ fn given<'de, D: Deserializer<'de>, T: Deserialize<'de>>(
 pub struct ReportReply {
     /// The generation the robot should have.
     pub generation: Generation,
-    /// The name and labels the server holds; the server's win over the robot's own.
+    /// The robot's name on the server; the server's value wins over the robot's own.
     pub name: RobotName,
-    /// Likewise.
+    /// The robot's labels on the server; the server's value wins over the robot's own.
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
 }
@@ -281,17 +282,17 @@ pub struct OutputList {
     pub outputs: Vec<OutputView>,
 }
 
-/// What one run brought back.
+/// Files that one run uploaded.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputView {
     /// The robot's name.
     pub robot_name: RobotName,
-    /// The artifact's manifest.
+    /// Digest of the artifact's manifest.
     pub manifest: Digest,
-    /// When it came.
+    /// When the output was pushed.
     pub pushed_at_ms: u64,
-    /// Which run, and its files.
+    /// The run and its files.
     #[serde(flatten)]
     pub output: OutputSet,
 }
@@ -300,39 +301,39 @@ pub struct OutputView {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateDeployment {
-    /// The package's name: its repository.
+    /// The package's name, which is the name of its repository.
     pub package: TaskName,
-    /// Its manifest, pushed before.
+    /// Digest of the package's manifest, which must be pushed already.
     pub manifest: Digest,
-    /// Which robots; resolved once, now.
+    /// The robots to deploy to; resolved once, at creation.
     pub selector: Selector,
-    /// How the bytes should travel.
+    /// How the package's bytes should travel.
     #[serde(default)]
     pub delivery: DeliveryChoice,
-    /// From -100 to 100: the higher comes first, on the robot and where transfers have to wait.
+    /// From -100 to 100: higher values come first, on the robot and in the queue for transfers.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(minimum = -100, maximum = 100))]
     pub priority: i32,
-    /// How many robots at a time; absent: all at once.
+    /// Number of robots at a time; absent: all at once.
     #[serde(default)]
     pub batch: Option<u64>,
     /// Pause when more than this many robots have failed; absent: never.
     #[serde(default)]
     pub max_failures: Option<u64>,
-    /// Seconds until what is not done expires; absent: the server's setting.
+    /// Seconds until unfinished assignments expire; absent: the server's setting.
     #[serde(default)]
     pub expires_in_s: Option<u64>,
-    /// Run a service anew also on robots that run this package already. Otherwise it goes on there,
-    /// and those robots have settled at once.
+    /// Restart a service also on robots that already run this package. Otherwise the service keeps
+    /// running there, and those robots settle at once.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub restart: bool,
-    /// Only say which robots it would be. Stores nothing, needs no key.
+    /// Only list the robots that match. Stores nothing, needs no key.
     #[serde(default)]
     pub dry_run: bool,
 }
 
 impl CreateDeployment {
-    /// An order that leaves everything else to the server.
+    /// A deployment request with defaults for all other fields.
     pub fn new(package: TaskName, manifest: Digest, selector: Selector) -> Self {
         Self {
             package,
@@ -349,7 +350,7 @@ impl CreateDeployment {
     }
 }
 
-/// Answer to a dry run, and to an order on tasks: the robots meant.
+/// Robots that a selector matched: the answer to a dry run and to an order on tasks.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MatchedRobots {
@@ -361,15 +362,15 @@ pub struct MatchedRobots {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MatchedRobot {
-    /// Its identity.
+    /// The robot's id.
     pub id: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// Whether it is connected now.
+    /// Whether the robot is connected now.
     pub online: bool,
 }
 
-/// The most that one page of a list holds.
+/// The largest page of a list, in entries.
 pub const MOST_ON_A_PAGE: u32 = 1_000;
 
 /// `GET /deployments` (read): the newest first, without assignments; optionally `?limit=` (1 to
@@ -379,45 +380,46 @@ pub const MOST_ON_A_PAGE: u32 = 1_000;
 pub struct DeploymentList {
     /// The deployments.
     pub deployments: Vec<DeploymentView>,
-    /// On a page that is not the last: what `before` has to be for the next one.
+    /// The value of `before` for the next page; absent on the last page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<DeploymentId>,
 }
 
-/// A deployment as the operator sees it.
+/// A deployment as operators see it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeploymentView {
-    /// Its identity.
+    /// The deployment's id.
     pub id: DeploymentId,
-    /// What it brings.
+    /// The package to deploy.
     pub package: PackageRef,
     /// Service or job.
     pub kind: TaskKind,
-    /// The selector as it was given. Absent in lists and events where it is longer than 1,000
-    /// characters, and for who is limited to some robots: it may name others.
+    /// The selector as ordered. Absent in lists and events if longer than 1,000 characters, and for
+    /// users limited to some robots, because the selector may name other robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selector: Option<Selector>,
-    /// How the bytes travel, as it was ordered.
+    /// The delivery method as ordered.
     pub delivery: DeliveryChoice,
-    /// The higher comes first.
+    /// Priority: higher values come first.
     #[serde(default)]
     pub priority: i32,
-    /// Where it stands as a whole.
+    /// State of the deployment as a whole.
     pub state: DeploymentState,
-    /// Robots at a time.
+    /// Number of robots at a time.
     pub batch: Option<u64>,
-    /// Failures it bears.
+    /// Number of failed robots above which the deployment pauses.
     pub max_failures: Option<u64>,
-    /// When it was ordered.
+    /// When the deployment was ordered.
     pub created_at_ms: u64,
-    /// When what is left expires.
+    /// When unfinished assignments expire.
     pub expires_at_ms: u64,
-    /// How many assignments stand in each phase, zeros left out, in the order of a life.
+    /// Number of assignments in each phase, in life-cycle order, without zeros.
     pub counts: Vec<PhaseCount>,
-    /// Deployments it took the place of on some robot; none for who is limited to some robots.
+    /// Deployments that this one replaced on at least one robot; empty for users limited to some
+    /// robots.
     pub supersedes: Vec<DeploymentId>,
-    /// Whether its version means another package by now: a forced push took it.
+    /// Whether the deployment's version now names another package, after a forced push.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub outdated: bool,
     /// One per robot, sorted by name; only in `GET /deployments/{id}` and the answer to an order.
@@ -425,59 +427,60 @@ pub struct DeploymentView {
     pub assignments: Option<Vec<AssignmentView>>,
 }
 
-/// How many assignments stand in a phase.
+/// Number of assignments in a phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PhaseCount {
     /// The phase.
     pub phase: Phase,
-    /// How many.
+    /// Number of assignments.
     pub count: u64,
 }
 
-/// Where a deployment stands as a whole.
+/// State of a deployment as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum DeploymentState {
-    /// Some assignment is not settled.
+    /// Some assignments are not settled.
     Active,
-    /// Too many robots failed; no further batch is begun until it is resumed.
+    /// Too many robots failed; no further batch starts until the deployment is resumed.
     Paused,
     /// Every assignment is settled.
     Settled,
-    /// The operator took it back.
+    /// An operator cancelled the deployment.
     Cancelled,
 }
 
-/// A deployment's part for one robot.
+/// A deployment's assignment to one robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AssignmentView {
     /// The robot.
     pub robot: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// Whether it is connected now.
+    /// Whether the robot is connected now.
     pub online: bool,
-    /// Whether its batch has begun.
+    /// Whether the robot's batch has begun.
     pub released: bool,
-    /// How its bytes travel, and why; absent until its batch begins.
+    /// How the package's bytes travel, and the reason for that choice; absent until the robot's
+    /// batch begins.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub delivery: Option<DeliveryDecision>,
-    /// Where it stands.
+    /// The current phase.
     pub phase: Phase,
-    /// How far the phase has come.
+    /// Progress within the phase.
     pub progress: Option<Progress>,
-    /// Why it failed.
+    /// Why the assignment failed.
     pub failure: Option<Failure>,
-    /// Tries of the phase.
+    /// Attempts in the phase.
     pub attempts: u32,
-    /// The newer deployment that took its place.
+    /// The newer deployment that replaced this one on the robot.
     pub superseded_by: Option<DeploymentId>,
-    /// When it last changed.
+    /// Time of the latest change.
     pub updated_at_ms: u64,
-    /// The phases it went through, the oldest first; only with `?timeline=true`.
+    /// Past phases, the oldest first; only with `?timeline=true`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub timeline: Option<Vec<TimelineEntry>>,
 }
@@ -487,45 +490,45 @@ pub struct AssignmentView {
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OrderTask {
-    /// Which robots; those that have no such task are left out.
+    /// The robots to order; robots without this task are left out.
     pub selector: Selector,
-    /// Only say which robots it would be.
+    /// Only list the robots that match.
     #[serde(default)]
     pub dry_run: bool,
 }
 
-/// What `GET /events` (read) streams: each is the `data` of a server-sent event whose `event` is
-/// the tag's value. A view replaces what was known before. After (re)connecting, fetch the lists
-/// once.
+/// An event of the stream `GET /events` (read): each is the `data` of a server-sent event whose
+/// `event` is the tag's value. A view replaces the client's earlier copy. After each connection,
+/// fetch the lists once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Event {
     /// A robot is new or has changed.
     Robot {
-        /// As it is now.
+        /// The robot's current view.
         robot: Box<RobotView>,
     },
     /// A robot was removed.
     RobotRemoved {
-        /// Which.
+        /// The robot's id.
         id: RobotId,
     },
     /// A deployment is new or has changed; without assignments.
     Deployment {
-        /// As it is now.
+        /// The deployment's current view.
         deployment: Box<DeploymentView>,
     },
     /// A package was pushed or deleted.
     Package {
-        /// Which.
+        /// The package's name.
         name: TaskName,
     },
-    /// Something happened that is worth a look.
+    /// The feed has a new entry.
     Feed {
-        /// What.
+        /// The new entry.
         entry: FeedEntry,
     },
-    /// The listener was too slow and missed events: fetch the lists again.
+    /// The client was too slow and missed events: fetch the lists again.
     Missed,
 }

@@ -11,52 +11,52 @@ use serde_json::value::RawValue;
 
 use crate::{Digest, TokenId};
 
-/// One act, as it is written down. Its JSON, byte for byte, is what the chain covers.
+/// One action in the audit. The chain covers its JSON, byte for byte.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditEntry {
-    /// 1 for the first; each next one is one higher.
+    /// Sequence number, from 1 and without gaps.
     pub number: u64,
-    /// When, by the server's clock.
+    /// Time by the server's clock.
     pub at_ms: u64,
-    /// Who: a user's name, `operator.token` for the first token, or `enrolment` for a machine that
-    /// enrols.
+    /// The actor: a user's name, `operator.token` for the first token, or `enrolment` for a machine
+    /// that enrolls.
     pub who: String,
-    /// By which token.
+    /// Id of the token used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub token: Option<TokenId>,
-    /// From where.
+    /// The actor's address.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(value_type = Option<String>))]
     pub address: Option<IpAddr>,
-    /// What was done, like `deployment.create`.
+    /// The action, like `deployment.create`.
     pub act: String,
-    /// To what: an id or a name.
+    /// The target: an id or a name.
     pub target: String,
-    /// What else there is to know, by key.
+    /// Further details, by key.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub detail: BTreeMap<String, String>,
 }
 
-/// An entry with its place in the chain. Also a line of an export.
+/// An entry with its digest in the chain. Also a line of an export.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditRecord {
-    /// The SHA-256 of the digest before it, as text, and of the entry's bytes.
+    /// The SHA-256 of the previous digest, as text, and of the entry's bytes.
     pub digest: Digest,
-    /// An [`AuditEntry`], byte for byte as it was chained.
+    /// An [`AuditEntry`], byte for byte as chained.
     #[cfg_attr(feature = "openapi", schema(value_type = AuditEntry))]
     pub entry: Box<RawValue>,
 }
 
 impl AuditRecord {
-    /// What it says. One that a newer server wrote may say more.
+    /// The entry. A newer server's entry may have further fields.
     pub fn read(&self) -> Option<AuditEntry> {
         serde_json::from_str(self.entry.get()).ok()
     }
 }
 
-/// How far a chain goes.
+/// The end of a chain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Link {
     /// The last entry's number; 0 before the first.
@@ -66,16 +66,16 @@ pub struct Link {
 }
 
 impl Link {
-    /// Where every chain begins.
+    /// The start of every chain.
     pub const START: Self = Self { number: 0, digest: Digest::from_sha256([0; 32]) };
 
-    /// The link that an entry with this text makes after this one.
+    /// The link after an entry with this text.
     pub fn next(&self, entry: &str) -> Self {
         let digest = Digest::of(format!("{}\n{entry}", self.digest).as_bytes());
         Self { number: self.number + 1, digest }
     }
 
-    /// Goes one record on; an error if that is not the one that belongs here.
+    /// Appends one record; an error if the record does not fit.
     pub fn follow(self, record: &AuditRecord) -> Result<Self, BrokenChain> {
         let next = self.next(record.entry.get());
         let Some(entry) = record.read() else {
@@ -92,29 +92,29 @@ impl Link {
     }
 }
 
-/// Where a chain does not hold.
+/// Where a chain is broken.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BrokenChain {
-    /// There is a gap, or the order is another.
+    /// An entry is missing, or the order differs.
     #[error("entry {expected} is missing: entry {found} is in its place")]
     Missing {
-        /// The number that should be here.
+        /// The expected number.
         expected: u64,
-        /// The number that is.
+        /// The number found.
         found: u64,
     },
-    /// An entry is not what it was, or the ones before it are not.
+    /// The entry, or an earlier one, has been changed.
     #[error(
         "entry {number} does not fit what is before it: it, or something before it, was changed"
     )]
     Changed {
-        /// Which.
+        /// The entry's number.
         number: u64,
     },
-    /// It is no entry.
+    /// The entry can't be parsed.
     #[error("entry {number} can't be read")]
     Unreadable {
-        /// Which.
+        /// The entry's number.
         number: u64,
     },
 }
@@ -171,7 +171,7 @@ mod tests {
         let text = changed[1].entry.get().replace("alice", "mallo");
         changed[1].entry = RawValue::from_string(text).expect("json");
         assert_eq!(verified(&changed), Err(BrokenChain::Changed { number: 2 }));
-        // Whoever chains the changed one anew breaks the next.
+        // Chaining the changed entry anew breaks the next one.
         let forged = Link::START.follow(&records[0]).expect("holds").next(changed[1].entry.get());
         changed[1].digest = forged.digest;
         assert_eq!(verified(&changed), Err(BrokenChain::Changed { number: 3 }));

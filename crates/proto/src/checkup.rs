@@ -3,41 +3,41 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What was found, in the order in which it was looked at.
+/// The results of all checks, in the order of the checks.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Checkup {
     /// The checks.
     pub checks: Vec<Check>,
 }
 
-/// One thing that was looked at.
+/// The result of one check.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Check {
-    /// What was looked at, in a word.
+    /// Subject of the check, in a word.
     pub check: String,
-    /// How it is.
+    /// Verdict of the check.
     pub verdict: Verdict,
-    /// What was found.
+    /// Description of the result.
     pub found: String,
-    /// How to mend it; absent where there is nothing to mend.
+    /// How to repair the problem; absent without a problem.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mend: Option<String>,
 }
 
-/// How something is.
+/// Verdict of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// As it should be.
+    /// The checked item is in order.
     Good,
-    /// It works, and may not for long or not for all.
+    /// The checked item works, but perhaps not for long or not for all.
     Notice,
-    /// It does not work.
+    /// The checked item does not work.
     Bad,
 }
 
 impl Verdict {
-    /// The sign that stands before a line; the line's words say the same.
+    /// The sign that precedes a line; the line's words say the same.
     pub fn sign(self) -> char {
         match self {
             Self::Good => '✓',
@@ -48,17 +48,17 @@ impl Verdict {
 }
 
 impl Checkup {
-    /// Something is as it should be.
+    /// Adds a check with a good result.
     pub fn good(&mut self, check: &str, found: impl Into<String>) {
         self.add(check, Verdict::Good, found.into(), None);
     }
 
-    /// Something should be looked at.
+    /// Adds a check with a notice.
     pub fn notice(&mut self, check: &str, found: impl Into<String>, mend: impl Into<String>) {
         self.add(check, Verdict::Notice, found.into(), Some(mend.into()));
     }
 
-    /// Something does not work.
+    /// Adds a check with a bad result.
     pub fn bad(&mut self, check: &str, found: impl Into<String>, mend: impl Into<String>) {
         self.add(check, Verdict::Bad, found.into(), Some(mend.into()));
     }
@@ -67,13 +67,13 @@ impl Checkup {
         self.checks.push(Check { check: check.to_owned(), verdict, found, mend });
     }
 
-    /// Whether nothing is bad.
+    /// Whether no check is bad.
     pub fn is_healthy(&self) -> bool {
         self.checks.iter().all(|check| check.verdict != Verdict::Bad)
     }
 
-    /// A line for each check, below it how to mend it, and at the end how many are not good.
-    /// Control characters are left out; `paint` may put colours around a sign.
+    /// Renders a line for each check, its repair below it, and at the end the number of checks that
+    /// are not good. Control characters are left out; `paint` may put colours around a sign.
     pub fn text(&self, paint: impl Fn(Verdict) -> String) -> String {
         let one_line = |text: &str| text.replace(char::is_control, " ");
         let mut text = String::new();

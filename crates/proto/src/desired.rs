@@ -12,30 +12,31 @@ use crate::envelope::Envelope;
 use crate::settings::{RobotSettings, each_readable};
 use crate::{DeploymentId, Digest, Generation, RobotId, TaskName, Version};
 
-/// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message; above it only
-/// the generation does.
+/// The largest [`Envelope`], in bytes of JSON, that travels inside an MQTT message. For a larger
+/// one, the message has only the generation.
 pub const MAX_PUSHED_ENVELOPE_BYTES: usize = 64 * 1024;
-/// The largest [`Doorbell`], in bytes of JSON: an envelope and the blobs that ride beside it.
+/// The largest [`Doorbell`], in bytes of JSON: an envelope and the inline blobs.
 pub const MAX_DOORBELL_BYTES: usize = 128 * 1024;
 
-/// Everything one robot should run. Travels as the payload of an [`Envelope`].
+/// All tasks that one robot should run. Travels as the payload of an [`Envelope`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DesiredState {
-    /// The robot this is for; any other refuses it.
+    /// The robot that the state is for; any other robot refuses it.
     pub robot_id: RobotId,
     /// A robot refuses a generation below the last it accepted.
     pub generation: Generation,
     /// When it was signed: milliseconds since the Unix epoch, by the server's clock.
     pub issued_at_ms: u64,
-    /// Until when new work may be begun by it, likewise.
+    /// When the state expires: no new work starts by it afterwards. Milliseconds since the Unix
+    /// epoch.
     pub expires_at_ms: u64,
-    /// The tasks, at most one of a name, sorted by name.
+    /// The tasks, at most one per name, sorted by name.
     pub tasks: Vec<DesiredTask>,
-    /// Where a robot that asks whether it may run them finds what publishers have signed. It is no
-    /// part of what is desired: it may change without the generation.
+    /// Blobs signed by publishers, for a robot that requires signatures to run the tasks. They are
+    /// no part of the desired state: they may change without a new generation.
     #[serde(default, skip_serializing_if = "Evidence::is_empty")]
     pub evidence: Evidence,
-    /// What the robot's administrator has set at the server; the robot's own settings win.
+    /// Settings that the robot's administrator has set on the server; the robot's own settings win.
     #[serde(
         default,
         skip_serializing_if = "RobotSettings::is_empty",
@@ -44,12 +45,13 @@ pub struct DesiredState {
     pub settings: RobotSettings,
 }
 
-/// Blobs that publishers have signed, see [`crate::publisher`]. That the server names them proves
-/// nothing.
+/// References to blobs that publishers have signed, see [`crate::publisher`]. The reference itself
+/// proves nothing.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Evidence {
-    /// Lists of publishers: those by which their keepers changed, and the newest, the oldest first.
+    /// Lists of publishers: each list that changed the keepers, and the newest list; the oldest
+    /// first.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub lists: Vec<BlobRef>,
     /// Signatures of the packages named in the state.
@@ -57,17 +59,17 @@ pub struct Evidence {
     pub signatures: Vec<SignatureRef>,
 }
 
-/// An envelope in which somebody says that a package may be run.
+/// Reference to an envelope with a signed statement that a package may be run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SignatureRef {
-    /// The package, by its OCI manifest.
+    /// The package, by the digest of its OCI manifest.
     pub manifest: Digest,
     /// The envelope's bytes.
     pub envelope: BlobRef,
 }
 
 impl Evidence {
-    /// Whether there is none.
+    /// Whether there are no references.
     pub fn is_empty(&self) -> bool {
         self.lists.is_empty() && self.signatures.is_empty()
     }
@@ -78,7 +80,7 @@ impl Evidence {
         self.signatures.iter().filter(same).map(|signature| signature.envelope).collect()
     }
 
-    /// All of its blobs.
+    /// All blobs of the evidence.
     pub fn blobs(&self) -> impl Iterator<Item = BlobRef> {
         self.lists.iter().copied().chain(self.signatures.iter().map(|signature| signature.envelope))
     }
@@ -87,20 +89,20 @@ impl Evidence {
 /// One task as it should be on the robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DesiredTask {
-    /// The task's name: that of its package.
+    /// The task's name, which is its package's name.
     pub task: TaskName,
-    /// The order that put it here.
+    /// The deployment that ordered the task.
     pub deployment: DeploymentId,
-    /// What to run.
+    /// The package to run.
     pub package: PackageRef,
-    /// Whether it should be running.
+    /// Whether the task should be running.
     pub wanted: Wanted,
-    /// How often it was asked to start, from 1. A job runs once for each value.
+    /// Number of times the task was asked to start, from 1. A job runs once for each value.
     pub run: u64,
-    /// How the bytes should travel.
+    /// How the package's bytes should travel.
     #[serde(default)]
     pub delivery: Delivery,
-    /// What the robot does first: the highest. From -100 to 100.
+    /// Tasks with a higher priority are handled first. From -100 to 100.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub priority: i32,
 }
@@ -125,18 +127,18 @@ pub struct PackageRef {
     pub content: BlobRef,
 }
 
-/// Bytes by digest.
+/// A blob, by digest and size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BlobRef {
-    /// What they hash to.
+    /// Digest of the bytes.
     pub digest: Digest,
-    /// How many they are.
+    /// Number of bytes.
     pub size: u64,
 }
 
 impl BlobRef {
-    /// That of these bytes.
+    /// The reference to these bytes.
     pub fn of(bytes: &[u8]) -> Self {
         Self { digest: Digest::of(bytes), size: bytes.len() as u64 }
     }
@@ -147,7 +149,7 @@ impl BlobRef {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Wanted {
-    /// Yes.
+    /// The task should be running.
     Running,
     /// Installed, but not running.
     Stopped,
@@ -164,17 +166,17 @@ pub enum Delivery {
     Poll,
     /// The bytes come as parts on the package's topic, see [`crate::part`].
     DirectPush,
-    /// They ride beside the state, see [`Inline`].
+    /// The bytes travel in the same message as the state, see [`Inline`].
     Inline,
-    /// MQTT pushes the link, the robot pulls over HTTP. Also what an agent does with a mechanism it
-    /// does not know.
+    /// MQTT announces the package, the robot pulls it over HTTP. Also an agent's fallback for a
+    /// method that it does not know.
     #[default]
     #[serde(other)]
     PushPull,
 }
 
 impl Delivery {
-    /// The mechanism as it is written on the wire.
+    /// The delivery method as it is written on the wire.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Poll => "poll",
@@ -196,28 +198,28 @@ impl fmt::Display for Delivery {
     }
 }
 
-/// What the server publishes on a robot's `desired` topic.
+/// The message that the server publishes on a robot's `desired` topic.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Doorbell {
-    /// The whole signed state.
+    /// The complete signed state.
     State {
-        /// The state.
+        /// The signed state.
         #[serde(flatten)]
         envelope: Envelope,
-        /// Blobs that it names.
+        /// Blobs that the state names.
         #[serde(default, skip_serializing_if = "Inline::is_empty")]
         inline: Inline,
     },
-    /// Too large for a message: the robot GETs it.
+    /// The state is too large for a message: the robot fetches it by GET.
     Notice {
-        /// The generation that waits.
+        /// The generation to fetch.
         generation: Generation,
     },
 }
 
-/// Blobs that ride beside a signed state, in base64. They are not signed: they are only reached by
-/// the digest that the state names, which they must hash to.
+/// Blobs that travel beside a signed state, in base64. They are not signed: each is looked up by
+/// the digest that the state names, and must hash to that digest.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Inline(BTreeMap<Digest, Vec<u8>>);
 
@@ -227,12 +229,12 @@ impl Inline {
         self.0.insert(digest, bytes);
     }
 
-    /// Whether there are none.
+    /// Whether there are no blobs.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The bytes of `blob`, if they came along and are what it says.
+    /// The bytes of `blob`, if present and of the right size and digest.
     pub fn get(&self, blob: &BlobRef) -> Option<&[u8]> {
         let bytes = self.0.get(&blob.digest)?;
         (bytes.len() as u64 == blob.size && Digest::of(bytes) == blob.digest).then_some(bytes)
@@ -246,7 +248,7 @@ impl Serialize for Inline {
     }
 }
 
-/// What can't be read is passed over, for the state beside it counts all the same.
+/// Unreadable blobs are skipped, because the state beside them is valid without them.
 impl<'de> Deserialize<'de> for Inline {
     fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let given: BTreeMap<String, serde_json::Value> = Deserialize::deserialize(deserializer)?;

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256, Sha512};
 
-/// What some bytes hash to.
+/// Digest of a sequence of bytes.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^(sha256:[0-9a-f]{64}|sha512:[0-9a-f]{128})$", example = "sha256:e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
 #[serde(try_from = "String", into = "String")]
@@ -19,7 +19,7 @@ enum Bytes {
     Sha512([u8; 64]),
 }
 
-/// What a digest is made with.
+/// Hash algorithm of a digest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Algorithm {
     /// SHA-256.
@@ -28,16 +28,16 @@ pub enum Algorithm {
     Sha512,
 }
 
-/// A text that is not `sha256:` or `sha512:` and as many lower-case hex digits as it has.
+/// A text that is not `sha256:` or `sha512:` followed by 64 or 128 lower-case hex digits.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("not a digest: expected \"sha256:\" and 64 lower-case hex digits, or \"sha512:\" and 128")]
 pub struct InvalidDigest;
 
 impl Algorithm {
-    /// Both.
+    /// Both algorithms.
     pub const ALL: [Self; 2] = [Self::Sha256, Self::Sha512];
 
-    /// Its name before the colon.
+    /// The algorithm's name before the colon.
     pub const fn as_str(self) -> &'static str {
         match self {
             Self::Sha256 => "sha256",
@@ -70,7 +70,7 @@ impl Digest {
         Self(Bytes::Sha512(bytes))
     }
 
-    /// What it is made with.
+    /// The hash algorithm.
     pub const fn algorithm(&self) -> Algorithm {
         match self.0 {
             Bytes::Sha256(_) => Algorithm::Sha256,

@@ -41,9 +41,9 @@ pub enum EnvelopeError {
     /// The payload is of another type than expected.
     #[error("payload is {found:?}, expected {expected:?}")]
     WrongType {
-        /// What the envelope says.
+        /// The type in the envelope.
         found: String,
-        /// What the caller asked for.
+        /// The type that the caller expected.
         expected: &'static str,
     },
     /// A base64 field does not decode.
@@ -52,7 +52,7 @@ pub enum EnvelopeError {
     /// No signature is by the pinned key.
     #[error("no valid signature by key {0}")]
     NotSigned(String),
-    /// Nobody would look at one more.
+    /// The envelope already has the maximum number of signatures.
     #[error("it has {MAX_SIGNATURES} signatures already")]
     TooManySignatures,
 }
@@ -71,7 +71,7 @@ impl Envelope {
         }
     }
 
-    /// A payload that nobody has signed yet.
+    /// An envelope without signatures.
     pub fn unsigned(payload_type: &'static str, payload: &[u8]) -> Self {
         Self {
             payload: STANDARD.encode(payload),
@@ -80,7 +80,8 @@ impl Envelope {
         }
     }
 
-    /// Adds a signature of the same payload by another key; one that has signed already stays once.
+    /// Adds a signature of the same payload by another key; a key that has already signed is not
+    /// added again.
     pub fn sign_also(
         &mut self,
         expected: &'static str,
@@ -97,7 +98,7 @@ impl Envelope {
         Ok(())
     }
 
-    /// The payload, once a signature by `key` has been verified. Key ids are hints only and are not
+    /// The payload, after verification of a signature by `key`. Key ids are hints only and are not
     /// trusted.
     pub fn open(&self, expected: &'static str, key: &PublicKey) -> Result<Vec<u8>, EnvelopeError> {
         let payload = self.unverified_payload(expected)?;
@@ -105,7 +106,8 @@ impl Envelope {
         if signed { Ok(payload) } else { Err(EnvelopeError::NotSigned(key.id())) }
     }
 
-    /// The payload, and which of `keys` have signed it, in their order and each once: perhaps none.
+    /// The payload, and those of `keys` that have signed it, in the order of `keys` and without
+    /// duplicates; possibly none.
     pub fn signers<'a>(
         &self,
         expected: &'static str,
@@ -122,8 +124,7 @@ impl Envelope {
         Ok((payload, signers))
     }
 
-    /// The payload as somebody sent it, for whoever shows it, signs it or only passes it on. It
-    /// proves nothing.
+    /// The payload as received, to show, sign or pass on. It proves nothing.
     pub fn unverified_payload(&self, expected: &'static str) -> Result<Vec<u8>, EnvelopeError> {
         if self.payload_type != expected {
             return Err(EnvelopeError::WrongType {
@@ -134,13 +135,13 @@ impl Envelope {
         STANDARD.decode(&self.payload).map_err(|_| EnvelopeError::Encoding("payload"))
     }
 
-    /// What the signatures say of whose they are, not verified.
+    /// The key ids claimed by the signatures, not verified.
     pub fn claimed_signers(&self) -> impl Iterator<Item = &str> {
         self.signatures.iter().take(MAX_SIGNATURES).map(|signature| signature.keyid.as_str())
     }
 
-    /// Whether one of the signatures is by `key`. One that names another key is not tried: a
-    /// verification costs time.
+    /// Whether one of the signatures is by `key`. A signature that names another key is not tried,
+    /// because each verification costs time.
     fn has_signed(&self, message: &[u8], key: &PublicKey) -> bool {
         let id = key.id();
         let may_be =
@@ -155,8 +156,8 @@ impl Envelope {
     }
 }
 
-/// More signatures than this are not looked at: each costs a verification. All keepers of a list of
-/// publishers may have to sign one that hands over to as many others, who sign it too.
+/// The most signatures that we examine, because each costs a verification. A list of publishers
+/// that hands over to a full set of new keepers may need signatures by all old and all new keepers.
 const MAX_SIGNATURES: usize = 2 * MAX_KEYS;
 
 /// DSSE's `PAE(type, body)`: "DSSEv1", then each field's length and bytes, separated by single
@@ -205,7 +206,7 @@ impl PublicKey {
         ed25519_dalek::VerifyingKey::from_bytes(&bytes).ok().map(Self)
     }
 
-    /// Its 32 bytes.
+    /// The 32 bytes of the public key.
     pub fn to_bytes(&self) -> [u8; 32] {
         self.0.to_bytes()
     }
@@ -281,7 +282,8 @@ mod tests {
         let keys = [&bob, &eve, &ada, &ada].map(SigningKey::public_key);
         let (payload, signers) = envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens");
         assert_eq!((payload, signers), (b"{}".to_vec(), vec![&keys[0], &keys[2]]));
-        // A key id is what its writer says: another's name on a signature makes it nobody's.
+        // A key id is only a claim of its writer: a signature with another key's id counts for no
+        // key.
         envelope.signatures[0].keyid = eve.public_key().id();
         assert_eq!(envelope.signers(DESIRED_STATE_TYPE, &keys).expect("opens").1, [&keys[0]]);
         envelope.signatures[0].keyid.clear();

@@ -1,8 +1,8 @@
 //! What a parser says it expected, in the words of the files that people write. It knows no file
 //! and no key.
 
-/// A message of serde's with its types named as TOML and JSON have them: `expected a sequence`
-/// becomes `expected a list`.
+/// Rewrites a message of serde with the type names of TOML and JSON: `expected a sequence` becomes
+/// `expected a list`.
 ///
 /// ```
 /// use task_proto::expected::in_file_words;
@@ -10,7 +10,7 @@
 /// assert_eq!(in_file_words("invalid type: map, expected u64"), "invalid type: table, expected a whole number");
 /// ```
 pub fn in_file_words(message: &str) -> String {
-    // What was given stands before, in quotes, and may have any words.
+    // The given value comes first, in quotes, and may contain any words.
     let (given, expected) = message.rsplit_once(", expected ").unwrap_or((message, ""));
     let given = match given {
         "invalid type: sequence" => "invalid type: list",

@@ -8,7 +8,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// A text that is not a valid identifier; says which kind and what is allowed.
+/// A text that is not a valid identifier; the error names the kind and the allowed form.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{given:?} is not a valid {kind}: {expected}")]
 pub struct InvalidId {
@@ -195,7 +195,7 @@ text_id!(
     }
 );
 text_id!(
-    /// A person's name: what they sign in with, and how the audit names them.
+    /// A user's name, for sign-in and in the audit.
     UserName like "alice" r"^[a-z0-9][a-z0-9._@-]{0,63}$",
     "user name", "1 to 64 lower-case letters, digits, '.', '_', '-' and '@', starting with a letter or digit", |t| {
         t.len() <= 64
@@ -204,7 +204,7 @@ text_id!(
     }
 );
 text_id!(
-    /// A file or directory on a robot, as its administrator names it.
+    /// A file or directory on a robot, as named by the robot's administrator.
     AbsolutePath like "/opt/ros/jazzy/setup.bash" r"^/",
     "absolute path",
     "it starts with '/', has at most 1024 bytes, no '.' or '..' between its '/', and only printable characters", |t| {
@@ -216,7 +216,7 @@ text_id!(
     }
 );
 text_id!(
-    /// The public part of a token, by which it is listed and revoked: 12 lower-case hex digits.
+    /// The public part of a token, used to list and revoke the token: 12 lower-case hex digits.
     TokenId like "0123456789ab" r"^[0-9a-f]{12}$",
     "token id", "12 lower-case hex digits", |t| t.len() == 12 && is_lower_hex(t)
 );
@@ -289,7 +289,7 @@ impl InstanceId {
 pub struct Generation(pub u64);
 
 impl Generation {
-    /// The one after this.
+    /// The next generation.
     pub fn next(self) -> Self {
         Self(self.0 + 1)
     }
@@ -315,7 +315,7 @@ impl MacAddress {
         (octets != [0; 6] && octets[0] & 1 == 0).then_some(Self(octets))
     }
 
-    /// Whether the "locally administered" bit is set, as it is in randomised and virtual addresses.
+    /// Whether the "locally administered" bit is set, as in randomised and virtual addresses.
     pub fn is_locally_administered(&self) -> bool {
         self.0[0] & 2 != 0
     }

@@ -4,18 +4,18 @@
 
 use std::io::{self, Write};
 
-/// What stands for a character that must not be in a line.
+/// Replaces a character that is not allowed in a line.
 const REPLACEMENT: char = '\u{fffd}';
 
-/// Writes each event, which comes whole, as one line.
+/// Writes each event, which arrives in one piece, as one line.
 pub struct OneLineEach<W> {
     to: W,
     has_colours: bool,
 }
 
 impl<W: Write> OneLineEach<W> {
-    /// To `to`. `has_colours`: the log's formatter puts escape sequences into events, and makes
-    /// those in values harmless.
+    /// A writer to `to`. `has_colours`: the log's formatter puts escape sequences into events, and
+    /// makes those in values harmless.
     pub fn new(to: W, has_colours: bool) -> Self {
         Self { to, has_colours }
     }

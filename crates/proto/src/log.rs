@@ -17,27 +17,27 @@ pub const MAX_KEPT_LINES: usize = 5000;
 /// The largest batch, in bytes of JSON.
 pub const MAX_BATCH_BYTES: usize = 200 * 1024;
 
-/// How serious a line is: the five levels of ROS, each more serious than the one before.
+/// Severity of a line: the five levels of ROS, in ascending order.
 #[derive(
     Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize,
 )]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogLevel {
-    /// For whoever wrote the program.
+    /// For the program's developers.
     Debug,
-    /// Also what has no level: a line on standard output.
+    /// Also the level of lines without one on standard output.
     #[default]
     Info,
-    /// Also what came on standard error without a level.
+    /// Also the level of lines without one on standard error.
     Warn,
-    /// Something failed.
+    /// An operation failed.
     Error,
-    /// Nothing works any more.
+    /// The program can't continue.
     Fatal,
 }
 
-/// Where a line comes from.
+/// Origin of a line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
@@ -52,7 +52,7 @@ pub enum LogSource {
     Diagnostics,
     /// The build tool's output.
     Build,
-    /// The agent, or a source this version does not know.
+    /// The agent, or a source unknown to this version.
     #[serde(other)]
     Agent,
 }
@@ -61,42 +61,42 @@ pub enum LogSource {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogLine {
-    /// When, by the robot's clock: milliseconds since the Unix epoch.
+    /// Time by the robot's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
-    /// How serious.
+    /// Severity of the line.
     pub level: LogLevel,
-    /// Where from.
+    /// Origin of the line.
     pub source: LogSource,
-    /// The task it belongs to; `None`: none of ours, or the robot as a whole.
+    /// The task that the line belongs to; `None`: no task of ours, or the robot as a whole.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<TaskName>,
-    /// The node that said it, where one did.
+    /// The node that logged the line, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub node: Option<GraphName>,
-    /// One line, without its end and without control characters.
+    /// One line, without its line end and without control characters.
     pub text: String,
 }
 
-/// What a robot publishes on its `log` topic, and part of the answer to
+/// The batch that a robot publishes on its `log` topic; also part of the answer to
 /// [`crate::request::Ask::Logs`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogBatch {
-    /// Who speaks.
+    /// The robot that sent the batch.
     pub robot_id: RobotId,
-    /// The robot's clock when it was sent, as in [`LogLine::at_ms`]: with it a line's age is known
-    /// to whoever's clock.
+    /// The robot's clock at sending, as in [`LogLine::at_ms`]: gives a line's age independently of
+    /// the reader's clock.
     pub now_ms: u64,
-    /// The oldest first.
+    /// The lines, the oldest first.
     pub lines: Vec<LogLine>,
-    /// Lines that were left out since the batch before because they were too many; they are counted
-    /// here and kept on the robot.
+    /// Number of lines left out since the previous batch because of the rate limit; the robot keeps
+    /// them.
     #[serde(default)]
     pub suppressed: u64,
 }
 
 impl LogLevel {
-    /// Every level, the least serious first.
+    /// Every level, the least severe first.
     pub const ALL: [Self; 5] = [Self::Debug, Self::Info, Self::Warn, Self::Error, Self::Fatal];
 
     /// The level as text.

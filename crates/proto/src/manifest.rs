@@ -17,18 +17,19 @@ pub const MAX_LIST_LEN: usize = 256;
 pub const MAX_MANIFEST_BYTES: usize = 1024 * 1024;
 /// The largest uncompressed content that is packed, in bytes, and that a robot unpacks by default.
 pub const MAX_CONTENT_TAR_BYTES: u64 = 16 << 30;
-/// The most files, directories and links, likewise.
+/// The most files, directories and links that are packed, and that a robot unpacks by default.
 pub const MAX_CONTENT_ENTRIES: u64 = 100_000;
-/// The most components of a path, likewise.
+/// The most components of a path that is packed, and that a robot unpacks by default.
 pub const MAX_CONTENT_DEPTH: usize = 48;
-/// The longest path, likewise.
+/// The longest path that is packed, and that a robot unpacks by default, in bytes.
 pub const MAX_CONTENT_PATH_BYTES: usize = 1024;
-/// Uncompressed bytes for one compressed byte, beyond [`CONTENT_RATIO_FREE_BYTES`], likewise.
+/// The highest ratio of uncompressed to compressed bytes beyond [`CONTENT_RATIO_FREE_BYTES`] that
+/// is packed, and that a robot unpacks by default.
 pub const MAX_CONTENT_RATIO: u64 = 200;
-/// Content up to this size may compress as well as it likes.
+/// Content up to this size may have any compression ratio.
 pub const CONTENT_RATIO_FREE_BYTES: u64 = 64 << 20;
 
-/// What a package is and how it is built, run and watched.
+/// Description of a package: how the package is built, run and watched.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TaskManifest {
@@ -36,30 +37,30 @@ pub struct TaskManifest {
     pub name: TaskName,
     /// The package's version.
     pub version: Version,
-    /// How it is built.
+    /// How the package is built.
     #[serde(default)]
     pub build: Build,
-    /// How it is run.
+    /// How the task is run.
     pub run: Run,
-    /// What must hold on the ROS graph before it counts as running.
+    /// Conditions on the ROS graph for the task to count as running.
     #[serde(default)]
     pub ready: Ready,
     /// ROS parameters by node and name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
-    /// Files that come back when the task ends.
+    /// Files to upload to the server when the task ends.
     #[serde(default)]
     pub outputs: Outputs,
-    /// What the robot must have.
+    /// Requirements on the robot.
     #[serde(default)]
     pub requires: Requires,
-    /// What it may use of the robot.
+    /// Resource limits of the task.
     #[serde(default, skip_serializing_if = "Limits::is_empty")]
     pub limits: Limits,
-    /// Names of the packages that `package.xml` says are needed to run it.
+    /// Names of the packages that `package.xml` declares as needed at run time.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exec_depends: Vec<String>,
-    /// What the content blob holds.
+    /// Facts about the content blob.
     pub content: ContentFacts,
 }
 
@@ -102,19 +103,19 @@ pub struct Run {
     /// Service or job.
     #[serde(default)]
     pub kind: TaskKind,
-    /// What a reboot does.
+    /// Behaviour after a reboot.
     #[serde(default)]
     pub on_boot: OnBoot,
-    /// When the process is started again after it ended by itself.
+    /// When to restart the process after it ends by itself.
     #[serde(default)]
     pub restart: Restart,
-    /// Whether an interrupted job may be started again.
+    /// Whether an interrupted job may be restarted.
     #[serde(default)]
     pub idempotent: bool,
     /// Seconds between SIGINT and SIGTERM, and again between SIGTERM and SIGKILL.
     #[serde(default = "default_stop_timeout_s")]
     pub stop_timeout_s: u32,
-    /// Seconds a job may run; absent: any time.
+    /// Seconds a job may run; absent: no limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deadline_s: Option<u32>,
 }
@@ -151,40 +152,40 @@ pub enum TaskKind {
     Job,
 }
 
-/// What a reboot does to a task.
+/// Behaviour of a task after a reboot.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum OnBoot {
-    /// It is started.
+    /// The task starts.
     #[default]
     Start,
-    /// It stays down until it is asked to start.
+    /// The task stays stopped until an operator starts it.
     Hold,
 }
 
-/// When a process that ended by itself is started again.
+/// When to restart a process that ended by itself.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum Restart {
-    /// When it failed.
+    /// After a failure.
     #[default]
     OnFailure,
-    /// Whenever it ended.
+    /// After every end.
     Always,
     /// Never.
     Never,
 }
 
-/// What must hold before a task counts as running.
+/// Conditions for a task to count as running.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Ready {
     /// Nodes that must be on the graph.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub nodes: Vec<String>,
-    /// Lifecycle nodes the agent configures and activates.
+    /// Lifecycle nodes that the agent configures and activates.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub lifecycle: Vec<String>,
     /// Services that must answer.
@@ -193,10 +194,10 @@ pub struct Ready {
     /// Topics that must have a publisher.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub topics: BTreeMap<String, ReadyTopic>,
-    /// Seconds all of it must hold.
+    /// Seconds that all conditions must hold.
     #[serde(default = "default_hold_s")]
     pub hold_s: u32,
-    /// Seconds it may take.
+    /// Seconds until the conditions must hold.
     #[serde(default = "default_ready_timeout_s")]
     pub timeout_s: u32,
 }
@@ -214,11 +215,11 @@ impl Default for Ready {
     }
 }
 
-/// What must hold of a topic beside having a publisher.
+/// Further conditions on a topic, besides having a publisher.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ReadyTopic {
-    /// Messages a second it must carry.
+    /// Minimum rate of the topic, in messages per second.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub min_hz: Option<f64>,
 }
@@ -231,7 +232,7 @@ fn default_ready_timeout_s() -> u32 {
     30
 }
 
-/// Files that come back to the server when the task ends.
+/// Files to upload to the server when the task ends.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Outputs {
@@ -240,45 +241,45 @@ pub struct Outputs {
     pub paths: Vec<String>,
 }
 
-/// What a robot must have; an empty list accepts anything.
+/// Requirements on a robot; an empty list accepts any value.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Requires {
-    /// Labels the robot must carry.
+    /// Labels that the robot must have.
     #[serde(default, skip_serializing_if = "Labels::is_empty")]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// ROS distributions, any of which will do.
+    /// Accepted ROS distributions; one is enough.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub ros_distro: Vec<String>,
-    /// Architectures, any of which will do.
+    /// Accepted architectures; one is enough.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub arch: Vec<String>,
 }
 
-/// What a task may use of the robot; enforced where the robot has control groups.
+/// Resource limits of a task; enforced if the robot has control groups.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Limits {
-    /// Memory of all its processes together, in MiB.
+    /// Memory of all the task's processes together, in MiB.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub memory_mb: Option<u64>,
-    /// Its share of the processors where they are short: 1 to 10,000, others having 100.
+    /// CPU weight under contention, 1 to 10,000; tasks without a weight have 100.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub cpu_weight: Option<u32>,
-    /// Processes and threads.
+    /// Number of processes and threads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pids: Option<u32>,
 }
 
 impl Limits {
-    /// Whether it limits nothing.
+    /// Whether no limit is set.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 }
 
-/// What the packer measured of the content blob, so that a robot knows before it pulls.
+/// Measurements of the content blob by the packer, known to the robot before the transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ContentFacts {
@@ -290,18 +291,18 @@ pub struct ContentFacts {
     pub entries: u64,
 }
 
-/// A rule a manifest breaks, named by the user's own key.
+/// A rule that a manifest breaks, named by the user's own key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{key}: {reason}")]
 pub struct ManifestProblem {
     /// The key as it is written in `task.toml`, for example `run.exec`.
     pub key: String,
-    /// What is wrong with it.
+    /// The problem with this key's value.
     pub reason: String,
 }
 
 impl TaskManifest {
-    /// Every rule this manifest breaks; empty when it can be deployed.
+    /// Every rule that this manifest breaks; empty if the manifest can be deployed.
     pub fn problems(&self) -> Vec<ManifestProblem> {
         let mut problems = Problems(Vec::new());
         self.check_run(&mut problems);

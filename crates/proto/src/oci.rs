@@ -17,9 +17,9 @@ pub const PACKAGE_TYPE: &str = "application/vnd.taskd.package.v1";
 pub const CONFIG_TYPE: &str = "application/vnd.taskd.config.v1+json";
 /// Media type of a package's one layer.
 pub const CONTENT_TYPE: &str = "application/vnd.taskd.content.v1.tar+zstd";
-/// Media type of a config that says nothing: `{}`.
+/// Media type of an empty config: `{}`.
 pub const EMPTY_TYPE: &str = "application/vnd.oci.empty.v1+json";
-/// The bytes of such a config.
+/// The bytes of an empty config.
 pub const EMPTY: &[u8] = b"{}";
 /// Media type of a layer that is a [`crate::envelope::Envelope`].
 pub const ENVELOPE_TYPE: &str = "application/vnd.dsse.envelope.v1+json";
@@ -37,7 +37,7 @@ pub struct Descriptor {
     /// The type of the artifact a manifest descriptor points to (referrers lists).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub artifact_type: Option<String>,
-    /// Free annotations.
+    /// Arbitrary annotations.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub annotations: BTreeMap<String, String>,
 }
@@ -54,7 +54,7 @@ impl Descriptor {
         }
     }
 
-    /// Digest and size alone.
+    /// The blob's digest and size.
     pub fn blob(&self) -> BlobRef {
         BlobRef { digest: self.digest, size: self.size }
     }
@@ -69,7 +69,7 @@ pub struct ImageManifest {
     /// [`MANIFEST_TYPE`]; other writers may leave it out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub media_type: Option<String>,
-    /// What kind of artifact this is.
+    /// Type of the artifact.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub artifact_type: Option<String>,
     /// The config blob.
@@ -79,7 +79,7 @@ pub struct ImageManifest {
     /// The manifest this one refers to, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub subject: Option<Descriptor>,
-    /// Free annotations.
+    /// Arbitrary annotations.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub annotations: BTreeMap<String, String>,
 }
@@ -98,7 +98,7 @@ impl ImageManifest {
         }
     }
 
-    /// The manifest of an artifact of type `artifact_type` that is a signed document, about
+    /// The manifest of an artifact of type `artifact_type` that holds a signed document, about
     /// `subject` or on its own.
     pub fn signed_document(
         artifact_type: &str,
@@ -116,7 +116,7 @@ impl ImageManifest {
         }
     }
 
-    /// The signed document that is all this artifact has.
+    /// The signed document, if the artifact has no other content.
     pub fn lone_envelope(&self) -> Option<BlobRef> {
         let [envelope] = &self.layers[..] else { return None };
         (envelope.media_type == ENVELOPE_TYPE).then(|| envelope.blob())

@@ -21,15 +21,15 @@ pub const MAX_FILES: usize = 256;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputSet {
-    /// The robot it ran on.
+    /// The robot that ran the task.
     pub robot_id: RobotId,
-    /// The task.
+    /// The task's name.
     pub task: TaskName,
-    /// Its version.
+    /// The task's version.
     pub version: Version,
-    /// The order that asked for it.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of the order's runs.
+    /// Number of the run within the deployment.
     pub run: u64,
     /// The files, sorted by path; at most [`MAX_FILES`].
     pub files: Vec<OutputFile>,
@@ -39,25 +39,25 @@ pub struct OutputSet {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OutputFile {
-    /// Its path below the directory the task ran in.
+    /// Path below the directory that the task ran in.
     pub path: OutputPath,
-    /// Its bytes.
+    /// The file's bytes.
     #[serde(flatten)]
     pub blob: BlobRef,
 }
 
 impl OutputSet {
-    /// The repository it belongs to: `outputs/<robot id>/<task>`.
+    /// The repository of the output: `outputs/<robot id>/<task>`.
     pub fn repository(&self) -> Option<RepositoryName> {
         repository(&self.robot_id, &self.task)
     }
 
-    /// The tag it gets: `<deployment>-<run>`.
+    /// The tag of the output: `<deployment>-<run>`.
     pub fn tag(&self) -> Option<Tag> {
         format!("{}-{}", self.deployment, self.run).parse().ok()
     }
 
-    /// Its manifest, once `config` is its own JSON as a blob.
+    /// The manifest of the output, where `config` is the blob of the set's own JSON.
     pub fn manifest(&self, config: BlobRef) -> ImageManifest {
         let layer = |file: &OutputFile| {
             let mut layer = Descriptor::new(FILE_TYPE, file.blob);
@@ -78,13 +78,13 @@ impl OutputSet {
     }
 }
 
-/// The repository of a robot's outputs of a task. `None` never happens for ids and names as they
-/// are made today.
+/// The repository of a robot's outputs of a task. Never `None` for ids and names as generated
+/// today.
 pub fn repository(robot: &RobotId, task: &TaskName) -> Option<RepositoryName> {
     format!("outputs/{robot}/{task}").parse().ok()
 }
 
-/// The robot and task a repository is for, if it is one for outputs.
+/// The robot and task of an output repository; `None` for other repositories.
 pub fn owner(repository: &RepositoryName) -> Option<(RobotId, TaskName)> {
     let (robot, task) = repository.as_str().strip_prefix("outputs/")?.split_once('/')?;
     Some((robot.parse().ok()?, task.parse().ok()?))

@@ -17,17 +17,18 @@ use serde::{Deserialize, Serialize};
 
 /// The header's length in bytes.
 pub const HEADER_BYTES: usize = 14;
-/// The version that is written, and the only one that is read.
+/// The version that we write, and the only one that we accept.
 pub const VERSION: u8 = 1;
 /// The smallest part a blob is cut into.
 pub const MIN_PART_BYTES: u32 = 1024;
-/// The largest: MQTT has no larger messages.
+/// The largest part; MQTT messages can't be larger.
 pub const MAX_PART_BYTES: u32 = 256 * 1024 * 1024 - 1024;
-/// The size of parts unless the server's settings say otherwise.
+/// The default part size, unless the server's settings change it.
 pub const DEFAULT_PART_BYTES: u32 = 64 * 1024;
-/// The most parts of one blob: whoever receives them remembers which ones it has.
+/// The most parts of one blob: the receiver keeps track of every part.
 pub const MAX_PARTS: u32 = 1 << 20;
-/// The most ranges in a robot's report of what it lacks; it reports more once it has those.
+/// The most ranges in a robot's report of missing parts; the robot reports more once those have
+/// arrived.
 pub const MAX_MISSING_RANGES: usize = 64;
 
 /// How a blob is cut into parts.
@@ -41,36 +42,36 @@ pub struct Cut {
 /// One part as it travels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Part<'a> {
-    /// Which, from 0.
+    /// Index of the part, from 0.
     pub index: u32,
-    /// Of how many.
+    /// Number of parts of the blob.
     pub count: u32,
     /// The size of every part but the last.
     pub part_bytes: u32,
-    /// Its bytes.
+    /// The part's bytes.
     pub bytes: &'a [u8],
 }
 
-/// A run of parts that a robot lacks.
+/// A range of parts that a robot lacks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PartRange {
-    /// The first, from 0.
+    /// The first missing part, from 0.
     pub from: u32,
-    /// The last; it is lacking too.
+    /// The last missing part, inclusive.
     pub to: u32,
 }
 
-/// Why something is not a part, or no part of this blob.
+/// Why a message is not a valid part of this blob.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum PartError {
-    /// It is shorter than a header.
+    /// The message is shorter than a header.
     #[error("a part of {0} bytes has no header")]
     Short(usize),
-    /// It was made by another version.
+    /// The part was made by another version.
     #[error("a part of version {0}, expected {VERSION}")]
     Version(u8),
-    /// A blob can't be cut so.
+    /// A blob can't be cut into parts of this size.
     #[error("{size} bytes can't be cut into parts of {part_bytes}")]
     Cut {
         /// The blob's size.
@@ -83,13 +84,13 @@ pub enum PartError {
         "part {index} of {count}, {part_bytes} bytes each, with {bytes} bytes does not belong to this blob"
     )]
     Foreign {
-        /// As in the header.
+        /// Index of the part, from the header.
         index: u32,
-        /// Likewise.
+        /// Number of parts, from the header.
         count: u32,
-        /// Likewise.
+        /// The size of every part but the last, from the header.
         part_bytes: u32,
-        /// What came after the header.
+        /// Number of bytes after the header.
         bytes: usize,
     },
 }
@@ -105,7 +106,7 @@ impl Cut {
         }
     }
 
-    /// How many parts there are.
+    /// Number of parts.
     pub fn count(&self) -> u32 {
         self.count
     }
@@ -115,7 +116,7 @@ impl Cut {
         self.part_bytes
     }
 
-    /// Where in the blob the part with this index lies; empty beyond the last.
+    /// The byte range of the part with this index in the blob; empty beyond the last part.
     pub fn range(&self, index: u32) -> Range<u64> {
         let from = (u64::from(index) * u64::from(self.part_bytes)).min(self.size);
         from..(from + u64::from(self.part_bytes)).min(self.size)
@@ -133,7 +134,7 @@ impl Cut {
 }
 
 impl<'a> Part<'a> {
-    /// Reads a message that came for a blob of `size` bytes, whatever its sender cut it into.
+    /// Decodes a message for a blob of `size` bytes, with any part size that the sender chose.
     pub fn decode(message: &'a [u8], size: u64) -> Result<Self, PartError> {
         let (header, bytes) =
             message.split_first_chunk::<HEADER_BYTES>().ok_or(PartError::Short(message.len()))?;
@@ -160,7 +161,7 @@ impl<'a> Part<'a> {
 }
 
 impl PartRange {
-    /// The first [`MAX_MISSING_RANGES`] runs in `missing`, which ascends.
+    /// The first [`MAX_MISSING_RANGES`] ranges of `missing`, which must be ascending.
     pub fn runs(missing: impl IntoIterator<Item = u32>) -> Vec<Self> {
         let mut runs: Vec<Self> = Vec::new();
         for index in missing {
@@ -176,8 +177,7 @@ impl PartRange {
         runs
     }
 
-    /// The parts meant, of a blob that has `count`: a robot's word is taken only as far as it makes
-    /// sense.
+    /// The range within a blob of `count` parts. `None` if a robot's report makes no sense.
     pub fn within(&self, count: u32) -> Option<RangeInclusive<u32>> {
         let last = count.checked_sub(1)?;
         (self.from <= self.to && self.from <= last).then(|| self.from..=self.to.min(last))
@@ -209,7 +209,7 @@ mod tests {
             prop_assert!(cut.range(cut.count()).is_empty());
         }
 
-        /// Whatever comes, what is accepted lies inside of the blob.
+        /// Every accepted part lies inside the blob, for any input.
         #[test]
         fn hostile_messages_never_reach_beyond_the_blob(
             message in proptest::collection::vec(any::<u8>(), 0..3_000),

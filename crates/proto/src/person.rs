@@ -14,30 +14,30 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// What a route of the API, or a part of it, takes.
+/// Permission that an API route, or a part of it, requires.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Permission {
     /// See robots, deployments, packages, logs and outputs, and pull packages.
     Read,
-    /// Order what robots do.
+    /// Order deployments and task actions on robots.
     Operate,
     /// Push and delete packages.
     Publish,
-    /// Change robots themselves: their names and labels, and whether they are there at all.
+    /// Change robots: their names and labels, and remove them.
     Maintain,
-    /// What concerns everybody: people and their tokens, enrolment, the list of publishers, the
-    /// broker's files, the audit. Only ever for who is limited to no robots.
+    /// Manage matters of all users: people and their tokens, enrollment, the list of publishers,
+    /// the broker's files, the audit. Only for users who may see all robots.
     Administer,
 }
 
 impl Permission {
-    /// All there are.
+    /// Every permission.
     pub const ALL: [Self; 5] =
         [Self::Read, Self::Operate, Self::Publish, Self::Maintain, Self::Administer];
 
-    /// Its name.
+    /// The permission's name.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Read => "read",
@@ -60,21 +60,21 @@ impl fmt::Display for Permission {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
-    /// Looks.
+    /// May read.
     Viewer,
-    /// Looks and orders what robots do.
+    /// May read and order actions on robots.
     Operator,
-    /// Looks and pushes packages.
+    /// May read and push packages.
     Publisher,
-    /// Does everything.
+    /// Has every permission.
     Admin,
 }
 
 impl Role {
-    /// All there are.
+    /// Every role.
     pub const ALL: [Self; 4] = [Self::Viewer, Self::Operator, Self::Publisher, Self::Admin];
 
-    /// Its name.
+    /// The role's name.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Viewer => "viewer",
@@ -84,7 +84,7 @@ impl Role {
         }
     }
 
-    /// What it allows.
+    /// Permissions of the role.
     pub fn permissions(self) -> &'static [Permission] {
         match self {
             Self::Viewer => &[Permission::Read],
@@ -118,25 +118,24 @@ impl FromStr for Role {
     }
 }
 
-/// One role or several: who has several may do what any of them allows. On the wire a list of
-/// names.
+/// One or more roles, which combine their permissions. On the wire, a list of names.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = Vec<Role>, min_items = 1))]
 #[serde(try_from = "Vec<Role>", into = "Vec<Role>")]
 pub struct Roles(BTreeSet<Role>);
 
 impl Roles {
-    /// Just one.
+    /// A set of one role.
     pub fn one(role: Role) -> Self {
         Self(BTreeSet::from([role]))
     }
 
-    /// Whether one of them allows it.
+    /// Whether at least one of the roles has this permission.
     pub fn allow(&self, permission: Permission) -> bool {
         self.0.iter().any(|role| role.permissions().contains(&permission))
     }
 
-    /// What both allow, as the roles that are allowed by both: `None` if nothing is.
+    /// The roles of this set with no permission beyond `limit`: `None` if there are none.
     pub fn within(&self, limit: &Self) -> Option<Self> {
         let is_allowed =
             |role: &&Role| role.permissions().iter().all(|&permission| limit.allow(permission));
@@ -144,7 +143,7 @@ impl Roles {
         (!common.is_empty()).then_some(Self(common))
     }
 
-    /// Each of them.
+    /// Each of the roles.
     pub fn iter(&self) -> impl Iterator<Item = Role> {
         self.0.iter().copied()
     }

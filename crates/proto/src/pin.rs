@@ -1,5 +1,5 @@
-//! The pin of a server's private certificate authority: what an enrolment token says of it, so that
-//! a robot knows its server without asking anybody else.
+//! The pin of a server's private certificate authority: what an enrollment token says of it, so
+//! that a robot knows its server without asking anybody else.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,12 +9,13 @@ use sha2::{Digest as _, Sha256};
 
 use crate::digest::{hex, unhex};
 
-/// What a client asks for by ALPN (RFC 7301) if it trusts a pinned authority: a server that has
-/// both shows it the certificate which that authority made, and everybody else its own.
+/// The ALPN protocol (RFC 7301) that a client requests if it trusts a pinned authority. A server
+/// with two certificates shows such a client the one issued by that authority, and all other
+/// clients its own.
 pub const PINNED_PROTOCOL: &[u8] = b"taskd-pinned";
 
-/// The SHA-256 of an authority's SubjectPublicKeyInfo (DER), 64 hex digits. Its certificate may be
-/// made anew.
+/// The SHA-256 of an authority's SubjectPublicKeyInfo (DER), 64 hex digits. The authority's
+/// certificate may be renewed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[0-9a-f]{64}$", example = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"))]
 #[serde(try_from = "String", into = "String")]

@@ -19,20 +19,20 @@ pub const SIGNATURE_ARTIFACT: &str = "application/vnd.taskd.signature.v1";
 pub const LIST_ARTIFACT: &str = "application/vnd.taskd.publisher-list.v1";
 /// The repository of the lists; each has its version as tag.
 pub const LIST_REPOSITORY: &str = "taskd/publishers";
-/// The most keys of a role.
+/// The most keys in a role.
 pub const MAX_KEYS: usize = 16;
 /// The most packages a list withdraws.
 pub const MAX_WITHDRAWN: usize = 256;
 /// The largest envelope about a package, as JSON.
 pub const MAX_SIGNATURE_BYTES: u64 = 16 * 1024;
-/// The most envelopes about one package that anyone looks at.
+/// The most envelopes about one package that we examine.
 pub const MAX_SIGNATURES: usize = 16;
 /// The largest envelope of a list, as JSON.
 pub const MAX_LIST_BYTES: u64 = 64 * 1024;
-/// The most lists one robot is told of.
+/// The most lists that one robot is told about.
 pub const MAX_LISTS: usize = 16;
 
-/// Keys, and how many of them it takes.
+/// Keys, and the number of signatures required.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(try_from = "RoleFields")]
 pub struct Role {
@@ -46,27 +46,27 @@ struct RoleFields {
     threshold: u32,
 }
 
-/// Keys and a number that are no role.
+/// Why keys and a threshold do not form a role.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidRole {
-    /// Nobody, or too many.
+    /// No keys, or too many.
     #[error("{0} keys, expected 1 to {MAX_KEYS}")]
     Keys(usize),
-    /// One key would count twice.
+    /// A key is listed twice and would count twice.
     #[error("key {0} is there twice")]
     Twice(String),
-    /// Nobody could be asked for, or nobody could ever do it.
+    /// A threshold of zero, or one that can't be reached.
     #[error("a threshold of {threshold} with {keys} keys")]
     Threshold {
-        /// What is asked for.
+        /// The requested threshold.
         threshold: u32,
-        /// How many keys there are.
+        /// The number of keys.
         keys: usize,
     },
 }
 
 impl Role {
-    /// `threshold` of `keys`.
+    /// A role that requires `threshold` of `keys`.
     pub fn new(keys: Vec<PublicKey>, threshold: u32) -> Result<Self, InvalidRole> {
         if keys.is_empty() || keys.len() > MAX_KEYS {
             return Err(InvalidRole::Keys(keys.len()));
@@ -80,17 +80,17 @@ impl Role {
         Ok(Self { keys, threshold })
     }
 
-    /// Whose signatures count.
+    /// The keys that count towards the threshold.
     pub fn keys(&self) -> &[PublicKey] {
         &self.keys
     }
 
-    /// How many of them it takes.
+    /// The number of signatures required.
     pub fn threshold(&self) -> u32 {
         self.threshold
     }
 
-    /// Whether so many different keys are enough.
+    /// Whether this number of distinct signers reaches the threshold.
     fn is_reached_by(&self, signers: usize) -> bool {
         signers >= self.threshold as usize
     }
@@ -103,9 +103,10 @@ impl TryFrom<RoleFields> for Role {
     }
 }
 
-/// What a publisher signs: that just this package may be run. All its blobs are in it with digest
-/// and size, so that no part can be exchanged for another's and none has more bytes than was
-/// signed. Nothing else is in it: whoever signs the same package twice has signed the same bytes.
+/// The statement that a publisher signs: exactly this package may be run. The statement has all
+/// blobs of the package with digest and size, so that no part can be exchanged for another
+/// package's and none can have more bytes than were signed. It has nothing else: signing the same
+/// package twice signs the same bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PackageStatement {
     /// The package.
@@ -113,88 +114,89 @@ pub struct PackageStatement {
 }
 
 impl PackageStatement {
-    /// Signs it.
+    /// Signs the statement.
     pub fn seal(&self, key: &SigningKey) -> Envelope {
         let payload = serde_json::to_vec(self).expect("a statement always has a JSON form");
         Envelope::seal(STATEMENT_TYPE, &payload, key)
     }
 
-    /// What an envelope says, as somebody sent it.
+    /// The statement in an envelope, without verification.
     pub fn unverified(envelope: &Envelope) -> Result<Self, Refused> {
         let payload = envelope.unverified_payload(STATEMENT_TYPE)?;
         serde_json::from_slice(&payload).map_err(|error| Refused::Malformed(error.to_string()))
     }
 }
 
-/// Who may publish from now on, and who says so the next time.
+/// The keys that may publish from now on, and the keys that sign the next list.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PublisherList {
-    /// From 1, and only growing: a robot goes back to none below the one it has.
+    /// Starts at 1 and only grows: a robot never goes back to a version below its own.
     pub version: u64,
-    /// When it was made: milliseconds since the Unix epoch.
+    /// When the list was made: milliseconds since the Unix epoch.
     pub issued_at_ms: u64,
-    /// Until when new work may be begun by it, likewise.
+    /// When the list expires: no new work starts by it afterwards. Milliseconds since the Unix
+    /// epoch.
     pub expires_at_ms: u64,
-    /// Whose signatures a package needs.
+    /// The role that signs packages.
     pub publishers: Role,
-    /// Whose signatures the next list needs.
+    /// The role that signs the next list.
     pub keepers: Role,
-    /// Packages that are not to be run any more, whoever has signed them: their manifests.
+    /// Packages that must not be run any more, regardless of signatures, by their manifests.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub withdrawn: Vec<Digest>,
 }
 
-/// Why a list, or an envelope about a package, is not taken.
+/// Why a list, or an envelope about a package, is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
     /// The envelope can't be read.
     #[error("its envelope can't be used: {0}")]
     Envelope(#[from] EnvelopeError),
-    /// What was signed can't be read.
+    /// The signed payload can't be read.
     #[error("what is signed can't be read: {0}")]
     Malformed(String),
-    /// Too few of those have signed it whose say it is.
+    /// Too few of the responsible keepers have signed the list.
     #[error(
         "signed by {signed} of the {needed} keepers that it takes: those of the list before it, or for the first, of the robot"
     )]
     NotByKeepers {
-        /// How many have.
+        /// The number of signatures.
         signed: usize,
-        /// How many it takes.
+        /// The number required.
         needed: u32,
     },
-    /// Too few of the keepers that it names itself have shown that they have their keys.
+    /// Too few of the keepers named in the list itself have proved that they hold their keys.
     #[error("signed by {signed} of the {needed} keepers that it names itself")]
     NotByItsOwn {
-        /// How many have.
+        /// The number of signatures.
         signed: usize,
-        /// How many it takes.
+        /// The number required.
         needed: u32,
     },
-    /// Not newer than what is known.
+    /// The list is not newer than the known one.
     #[error("its version {offered} is not newer than {known}, which is known")]
     NotNewer {
-        /// Its version.
+        /// The version offered.
         offered: u64,
-        /// What is known.
+        /// The known version.
         known: u64,
     },
-    /// It would never have counted.
+    /// The list expires before its issue date, so it would never be valid.
     #[error("it expires before it was made")]
     NoLifetime,
-    /// More packages than anybody keeps in mind.
+    /// The list withdraws more packages than the limit.
     #[error("it withdraws {0} packages, at most {MAX_WITHDRAWN} are possible")]
     TooManyWithdrawn(usize),
 }
 
 impl PublisherList {
-    /// Signs it.
+    /// Signs the list.
     pub fn seal(&self, key: &SigningKey) -> Envelope {
         let payload = serde_json::to_vec(self).expect("a list always has a JSON form");
         Envelope::seal(LIST_TYPE, &payload, key)
     }
 
-    /// The list in `envelope`, if it may follow the one with `version` (0: none) whose keepers are
+    /// The list in `envelope`, if it may follow the list with `version` (0: none) and the keepers
     /// `keepers`.
     pub fn follow(envelope: &Envelope, keepers: &Role, version: u64) -> Result<Self, Refused> {
         let (payload, signers) = envelope.signers(LIST_TYPE, &keepers.keys)?;
@@ -209,19 +211,20 @@ impl PublisherList {
         Ok(list)
     }
 
-    /// The list in `envelope`, if its own keepers have signed it: what can be told of the first.
+    /// The list in `envelope`, if its own keepers have signed it: the only possible check of a
+    /// first list.
     pub fn alone(envelope: &Envelope) -> Result<Self, Refused> {
         let list = Self::unverified(envelope)?;
         list.check_own_keepers(envelope)?;
         Ok(list)
     }
 
-    /// What an envelope says, as somebody sent it.
+    /// The list in an envelope, without verification.
     pub fn unverified(envelope: &Envelope) -> Result<Self, Refused> {
         Self::read(&envelope.unverified_payload(LIST_TYPE)?)
     }
 
-    /// Whether its lifetime is over.
+    /// Whether the list has expired.
     pub fn is_expired(&self, now_ms: u64) -> bool {
         now_ms >= self.expires_at_ms
     }
@@ -247,19 +250,19 @@ impl PublisherList {
     }
 }
 
-/// Too few of those who count have signed a package.
+/// Too few trusted publishers have signed a package.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{signed} of the {needed} trusted publishers that it takes have signed it (have not: {})", missing.join(", "))]
 pub struct Unsigned {
-    /// How many have.
+    /// The number of signatures.
     pub signed: usize,
-    /// How many it takes.
+    /// The number required.
     pub needed: u32,
-    /// The ids of those who count and have not.
+    /// The ids of the trusted keys that have not signed.
     pub missing: Vec<String>,
 }
 
-/// Those of `envelopes` by which a threshold of `publishers` say that just this package may be run.
+/// The envelopes by which a threshold of `publishers` state that exactly this package may be run.
 pub fn vouching<'a>(
     publishers: &Role,
     package: &PackageRef,
@@ -354,7 +357,7 @@ mod tests {
             let unsigned = vouching(&publishers, &talker, &few).expect_err("too few");
             assert_eq!((unsigned.needed, unsigned.signed + unsigned.missing.len()), (2, 3));
         }
-        // Both in one envelope.
+        // Both signatures in one envelope.
         let mut both = ada.clone();
         both.sign_also(STATEMENT_TYPE, &key(2)).expect("signed");
         assert_eq!(signed(&[&both]), 1);
@@ -366,8 +369,8 @@ mod tests {
         let envelopes = [said_by(1, &talker)];
         assert!(vouching(&publishers, &talker, &envelopes).is_ok());
         let other = package("other");
-        // Mix and match: parts of other packages, also signed ones, in its place; and more bytes
-        // than were signed.
+        // Mix and match: parts of other packages, also of signed ones, in place of the package's
+        // own; and more bytes than were signed.
         let endless = BlobRef { size: u64::MAX, ..talker.content };
         for changed in [
             PackageRef { content: other.content, ..talker.clone() },
@@ -416,7 +419,7 @@ mod tests {
         let most = MAX_KEYS as u8;
         let seeds = |from: u8| (from..from + most).collect::<Vec<_>>();
         let all_of = |from: u8| role(&seeds(from), u32::from(most));
-        // The longest list there can be, which all keepers hand on to as many others.
+        // The longest possible list, which all keepers hand over to the same number of new keepers.
         let withdrawn = vec![Digest::of(b"x"); MAX_WITHDRAWN];
         let next = PublisherList {
             issued_at_ms: u64::MAX - 1,

@@ -15,22 +15,22 @@ use crate::part::PartRange;
 use crate::settings::{EffectiveSettings, tolerant};
 use crate::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
 
-/// The largest report, in bytes of JSON, by whatever way it comes.
+/// The largest report, in bytes of JSON, over MQTT or HTTP.
 pub const MAX_REPORT_BYTES: usize = 1024 * 1024;
 
-/// A robot's whole state. A later one replaces an earlier one; (start, seq) says which is later.
+/// A robot's whole state. A later report replaces an earlier one, in the order of (start, seq).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Report {
-    /// Who speaks.
+    /// The robot that sent the report.
     pub robot_id: RobotId,
-    /// How many times this robot's agent has been started, from 1; kept in its ledger.
+    /// Number of times this robot's agent has started, from 1; kept in the agent's ledger.
     pub start: u64,
-    /// This start of the agent. Two instances alive at once are a cloned identity.
+    /// Identity of this start of the agent. Two live instances mean a cloned identity.
     pub instance: InstanceId,
-    /// Where this start runs: one data directory, during one boot of one machine. Of two starts in
-    /// the same place the second has begun after the first had ended. Absent: an agent that is too
-    /// old to say.
+    /// Where this instance runs: one data directory, during one boot of one machine. Of two starts
+    /// in the same place, the second began after the first had ended. Absent: an agent too old to
+    /// report it.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
     pub place: Option<Digest>,
     /// The kernel's boot id.
@@ -43,10 +43,10 @@ pub struct Report {
     pub uptime_ms: u64,
     /// Facts about the machine.
     pub host: HostFacts,
-    /// Everything out of the ordinary that concerns the robot as a whole.
+    /// All unusual conditions of the robot as a whole.
     #[serde(default)]
     pub conditions: Vec<Condition>,
-    /// The robot's way to the server, once something was measured.
+    /// Measurements of the robot's connection to the server, once there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkFacts>,
     /// All tasks in the ledger, sorted by name.
@@ -54,11 +54,12 @@ pub struct Report {
 }
 
 impl Report {
-    /// The condition of a robot that was sent the generation it obeys with other content.
+    /// The condition of a robot that received its accepted generation again with other content.
     pub const STATE_CONTRADICTED: &str = "state_contradicted";
 
-    /// How far the robot has come. Of two states with one generation the one that it obeys counts
-    /// as the later: the other is by a server whose database was put back to an older copy.
+    /// The generation that the robot has reached. Of two states with one generation, the accepted
+    /// one counts as the later: the other comes from a server whose database was restored from an
+    /// older copy.
     pub fn reached_generation(&self) -> Generation {
         let is_contradicted =
             self.conditions.iter().any(|condition| condition.code == Self::STATE_CONTRADICTED);
@@ -66,25 +67,25 @@ impl Report {
     }
 }
 
-/// What earlier transfers have shown of a robot's way to the server.
+/// Measurements of a robot's connection to the server, from earlier transfers.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct LinkFacts {
-    /// Moving average of fetches; absent before the first that was long enough to measure.
+    /// Moving average over fetches; absent before the first fetch long enough to measure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub throughput_bytes_per_s: Option<u64>,
     /// Moving average of the time from a request to the first byte of its answer; absent before the
-    /// first.
+    /// first answer.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rtt_ms: Option<u32>,
-    /// Sessions that were lost in the last hour.
+    /// Sessions lost in the last hour.
     pub reconnects: u32,
     /// Transfers that broke off in the last hour.
     pub losses: u32,
 }
 
-/// What the agent found out about its machine.
+/// Facts that the agent found out about its machine.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct HostFacts {
@@ -94,7 +95,7 @@ pub struct HostFacts {
     pub hostname: String,
     /// `x86_64`, `aarch64`, …
     pub arch: String,
-    /// The MAC the robot was registered by.
+    /// The MAC address that the robot was registered by.
     #[serde(default)]
     pub mac: Option<MacAddress>,
     /// ROS distributions found, for example `jazzy`.
@@ -103,32 +104,32 @@ pub struct HostFacts {
     /// Free bytes on the data directory's file system.
     #[serde(default)]
     pub disk_free_bytes: u64,
-    /// How tasks meet ROS; absent where no ROS was found.
+    /// ROS configuration of tasks; absent if no ROS was found.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ros: Option<RosFacts>,
-    /// What keeps tasks from using more than their limits.
+    /// The mechanism that enforces the tasks' resource limits.
     #[serde(default)]
     pub isolation: Isolation,
-    /// Under which accounts tasks run; absent: an agent that does not say.
+    /// The accounts that tasks run under; absent: an older agent that does not report them.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
     pub accounts: Option<TaskAccounts>,
-    /// What is left of its battery; absent where it has none that can be read.
+    /// Battery charge in percent; absent without a readable battery.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u8>,
-    /// The version of the list of publishers whose signatures it asks for; 0: it goes by its own
-    /// settings. Absent: it runs whatever its server orders.
+    /// Version of the publisher list that the robot requires signatures from; 0: the robot follows
+    /// its own settings. Absent: the robot runs every package that its server orders.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub publishers: Option<u64>,
-    /// What holds of all that can be set for it; absent where everything is the agent's default.
+    /// Settings in effect on the robot; absent if all are the agent's defaults.
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
     pub settings: Option<EffectiveSettings>,
 }
 
-/// How tasks on a robot meet ROS.
+/// ROS configuration of tasks on a robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RosFacts {
-    /// The distribution tasks use unless they require another, for example `jazzy`.
+    /// The distribution that tasks use unless they require another, for example `jazzy`.
     pub distro: String,
     /// The middleware: `RMW_IMPLEMENTATION`, or the distribution's default. Absent with ROS 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -136,36 +137,36 @@ pub struct RosFacts {
     /// `ROS_DOMAIN_ID`. Absent with ROS 1.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub domain_id: Option<u16>,
-    /// Whether nodes are only found on the robot itself.
+    /// Whether nodes are discovered only on the robot itself.
     #[serde(default)]
     pub localhost_only: bool,
 }
 
-/// What keeps tasks from using more than their limits.
+/// The mechanism that enforces the tasks' resource limits.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Isolation {
     /// A control group per task, with its controllers.
     Cgroup,
-    /// Nothing, or something this version does not know.
+    /// No mechanism, or one unknown to this version.
     #[default]
     #[serde(other)]
     None,
 }
 
-/// Under which accounts tasks run.
+/// The accounts that tasks run under.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TaskAccounts {
-    /// Each task under its own; what was unpacked and built is read-only to it and verified before
-    /// each start.
+    /// Each task has its own account; the unpacked and built files are read-only to the task and
+    /// verified before each start.
     PerTask,
-    /// All under one, which may not change what was unpacked and built either.
+    /// All tasks share one account, which also may not change the unpacked and built files.
     Shared,
-    /// All under the agent's: nothing keeps a task from other tasks' files and processes, or from
-    /// changing its own package.
+    /// All tasks run under the agent's account: a task can reach other tasks' files and processes,
+    /// and change its own package.
     Agent,
 }
 
@@ -175,7 +176,7 @@ pub enum TaskAccounts {
 pub struct Condition {
     /// For programs: `held`, `state_refused`, `step_failed`, …
     pub code: String,
-    /// For people: what and where.
+    /// Description for people, with the cause and the place.
     pub text: String,
 }
 
@@ -185,48 +186,48 @@ pub struct Condition {
 pub struct TaskReport {
     /// The task's name.
     pub task: TaskName,
-    /// The order this entry is about.
+    /// The deployment of this entry.
     pub deployment: DeploymentId,
-    /// The package it ordered.
+    /// The package that the deployment ordered.
     pub package: PackageRef,
-    /// What the desired state last asked for.
+    /// Whether the task should run, by the latest desired state.
     pub wanted: Wanted,
-    /// The run last asked for.
+    /// The run requested last.
     pub run: u64,
-    /// Service or job; unknown until the task manifest is there.
+    /// Service or job; unknown until the task manifest has been fetched.
     #[serde(default)]
     pub kind: Option<TaskKind>,
-    /// Where it stands.
+    /// The current phase.
     pub phase: Phase,
-    /// Milliseconds it has stood there.
+    /// Milliseconds spent in this phase.
     pub phase_ms: u64,
-    /// How far the phase has come, where that is known.
+    /// Progress within the phase, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
-    /// While the package's parts are awaited: the first runs of those it lacks, at most
-    /// [`crate::part::MAX_MISSING_RANGES`]. Empty: it listens and asks for nothing yet. Absent: it
-    /// does not listen.
+    /// While the robot awaits the package's parts: the first ranges of missing parts, at most
+    /// [`crate::part::MAX_MISSING_RANGES`]. Empty: the robot listens and requests nothing yet.
+    /// Absent: the robot does not listen.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub missing_parts: Option<Vec<PartRange>>,
-    /// Tries of the current phase, from 1.
+    /// Attempts in the current phase, from 1.
     #[serde(default)]
     pub attempts: u32,
-    /// Times the restart policy has started the process again in this run.
+    /// Times the restart policy has restarted the process in this run.
     #[serde(default)]
     pub restarts: u32,
-    /// Why it failed, is unmet or deferred.
+    /// Why the task failed, is unmet or is deferred.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Failure>,
-    /// Why it runs, yet not as it should; it is a health of `running`, not a phase.
+    /// Why the running task is degraded; this is a health of `running`, not a phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub degraded: Option<Failure>,
-    /// The version whose process lives, which need not be the one ordered.
+    /// The version with a live process, which may differ from the ordered one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub active: Option<ActiveVersion>,
 }
 
 impl TaskReport {
-    /// Of a desired task that has just come into a phase and has nothing else to say.
+    /// The report of a desired task that has just entered a phase, with all other fields empty.
     pub fn of(task: &DesiredTask, phase: Phase) -> Self {
         Self {
             task: task.task.clone(),
@@ -252,18 +253,19 @@ impl TaskReport {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ActiveVersion {
-    /// The order that brought it.
+    /// The deployment that installed this version.
     pub deployment: DeploymentId,
-    /// Its version.
+    /// The version that runs.
     pub version: Version,
-    /// The digest of its manifest, as several may have one version. Older agents don't say it.
+    /// Digest of the package manifest, because several packages may share one version. Older agents
+    /// omit this field.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub manifest: Option<Digest>,
     /// The task's process id on the robot.
     pub pid: u32,
 }
 
-/// How far a phase has come.
+/// Progress within a phase.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Progress {
@@ -273,50 +275,50 @@ pub struct Progress {
     pub total: u64,
 }
 
-/// Where an assignment stands.
+/// State of an assignment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Phase {
-    /// Ordered; the robot has not begun.
+    /// Ordered; the robot has not started.
     Assigned,
     /// The package's bytes are being pulled.
     Fetching,
-    /// They are being unpacked.
+    /// The package is being unpacked.
     Unpacking,
-    /// The build tool runs.
+    /// The build tool is running.
     Building,
-    /// Ready to start.
+    /// The package is ready to start.
     Staged,
     /// The process has been started and is not ready yet.
     Starting,
-    /// It runs and is ready.
+    /// The process runs and is ready.
     Running,
     /// A job ran to its end with exit code 0.
     Succeeded,
-    /// It ended, or could not go on; see the failure.
+    /// The process ended, or the task could not continue; see the failure.
     Failed,
-    /// It was asked to stop, and has.
+    /// The task was stopped on request.
     Stopped,
-    /// This robot can't run it.
+    /// This robot can't run the task.
     Unmet,
-    /// Not now; it is tried again.
+    /// Put off for now; the robot will retry.
     Deferred,
-    /// A newer deployment of the same task took its place.
+    /// A newer deployment of the same task replaced this one.
     Superseded,
-    /// The operator took it back.
+    /// An operator cancelled the deployment.
     Cancelled,
-    /// It was not done in time.
+    /// The assignment was not done in time.
     Expired,
-    /// The new version did not get ready, the old one runs again.
+    /// The new version did not become ready; the old version runs again.
     RolledBack,
-    /// Written by a newer version of the other side.
+    /// A phase unknown to this version, written by a newer peer.
     #[serde(other)]
     Unknown,
 }
 
 impl Phase {
-    /// Every phase that this version writes, in the order of a life.
+    /// Every phase that this version writes, in life-cycle order.
     pub const ALL: [Self; 16] = [
         Self::Assigned,
         Self::Fetching,
@@ -359,12 +361,12 @@ impl Phase {
         }
     }
 
-    /// Reads what [`Phase::as_str`] wrote; anything else is `Unknown`.
+    /// Parses the text written by [`Phase::as_str`]; any other text becomes `Unknown`.
     pub fn from_text(text: &str) -> Self {
         Self::ALL.into_iter().find(|phase| phase.as_str() == text).unwrap_or(Self::Unknown)
     }
 
-    /// Whether nothing more will happen without a new order.
+    /// Whether the phase is final: nothing more will happen without a new order.
     pub fn is_final(self) -> bool {
         matches!(
             self,
@@ -379,12 +381,12 @@ impl Phase {
         )
     }
 
-    /// Whether someone who waits for the order may go: it is final, or a service runs.
+    /// Whether a client may stop waiting for the order: the phase is final, or a service runs.
     pub fn is_settled(self, kind: TaskKind) -> bool {
         self.is_final() || (self == Self::Running && kind == TaskKind::Service)
     }
 
-    /// Whether a settled order did what it was meant to.
+    /// Whether a settled order succeeded.
     pub fn is_success(self, kind: TaskKind) -> bool {
         match kind {
             TaskKind::Service => self == Self::Running,
@@ -399,13 +401,14 @@ impl fmt::Display for Phase {
     }
 }
 
-/// Why something failed: a stable code for programs and a text that says what and where.
+/// Why something failed: a stable code for programs and a text for people with the cause and the
+/// place.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Failure {
-    /// For programs.
+    /// Stable code, for programs.
     pub code: FailureCode,
-    /// For people.
+    /// Description, for people.
     pub text: String,
 }
 
@@ -423,17 +426,17 @@ impl fmt::Display for Failure {
     }
 }
 
-/// A failure's stable code. Codes of newer versions pass through unchanged; of what is none, only
-/// what could be one is kept.
+/// A failure's stable code. Codes of newer versions pass through unchanged; invalid text is reduced
+/// to the characters and length that a code may have.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, example = "process_exited"))]
 #[serde(from = "String")]
 pub struct FailureCode(Cow<'static, str>);
 
-/// The longest code that is read.
+/// The longest code that we accept, in bytes.
 const MAX_CODE_BYTES: usize = 64;
 
-/// Declares the failure codes this version gives.
+/// Declares the failure codes that this version emits.
 macro_rules! failure_codes {
     ($($(#[$doc:meta])* $name:ident = $text:literal;)*) => {
         impl FailureCode {
@@ -443,31 +446,31 @@ macro_rules! failure_codes {
 }
 
 failure_codes! {
-    /// Too little disk for blob, tree, build and reserve.
+    /// Too little disk space for blob, tree, build and reserve.
     DISK_FULL = "disk_full";
-    /// The bytes do not hash to the digest that was ordered.
+    /// The bytes do not hash to the ordered digest.
     DIGEST_MISMATCH = "digest_mismatch";
-    /// The package can't be had from the server: deleted, or access refused.
+    /// The package can't be fetched from the server: deleted, or access refused.
     PACKAGE_UNAVAILABLE = "package_unavailable";
-    /// The server can't be reached, is overloaded, or something else answers in its place.
+    /// The server can't be reached or is overloaded, or another program answers in its place.
     SERVER_UNREACHABLE = "server_unreachable";
     /// The server does not accept the robot's token.
     UNAUTHORIZED = "unauthorized";
     /// The task manifest does not parse or contradicts the order.
     MANIFEST_INVALID = "manifest_invalid";
-    /// An archive entry that is not allowed, or more of them than the limits.
+    /// An archive entry is not allowed, or the archive exceeds the limits.
     ARCHIVE_REFUSED = "archive_refused";
     /// The build tool failed or took too long.
     BUILD_FAILED = "build_failed";
-    /// The robot lacks what the package requires.
+    /// The robot does not meet the package's requirements.
     REQUIREMENTS_UNMET = "requirements_unmet";
     /// The process could not be started.
     START_FAILED = "start_failed";
     /// The process ended with a code or by a signal.
     PROCESS_EXITED = "process_exited";
-    /// It was not ready within its time.
+    /// The task was not ready within its time limit.
     NOT_READY = "not_ready";
-    /// A node or service of that name was on the graph before the task was started.
+    /// A node or service of that name was on the graph before the task started.
     NODE_NAME_TAKEN = "node_name_taken";
     /// A node does not accept a parameter of the package.
     PARAMETER_REJECTED = "parameter_rejected";
@@ -475,11 +478,11 @@ failure_codes! {
     LIFECYCLE_FAILED = "lifecycle_failed";
     /// A node that was ready left the graph.
     NODE_VANISHED = "node_vanished";
-    /// A lifecycle node that was active is so no more.
+    /// A lifecycle node that was active is no longer active.
     NODE_INACTIVE = "node_inactive";
-    /// A topic lost its publisher, or carries less than it should.
+    /// A topic lost its publisher, or carries fewer messages than it should.
     TOPIC_SILENT = "topic_silent";
-    /// A service that was ready does not answer any more.
+    /// A service that was ready no longer answers.
     SERVICE_LOST = "service_lost";
     /// The robot's ROS graph can't be watched.
     GRAPH_UNAVAILABLE = "graph_unavailable";
@@ -487,16 +490,16 @@ failure_codes! {
     OUT_OF_MEMORY = "out_of_memory";
     /// The robot has no user to run tasks as.
     NO_TASK_USER = "no_task_user";
-    /// What is on the robot's disk of a package is not what was unpacked and built: it was not
+    /// The package's files on disk differ from the unpacked and built files, so the task was not
     /// started.
     TREE_CHANGED = "tree_changed";
-    /// The robot's gate said not now.
+    /// The robot's gate refused the action for now.
     GATE_REFUSED = "gate_refused";
     /// The robot's gate hung, crashed or could not be run.
     GATE_FAILED = "gate_failed";
-    /// Files that were to come back did not.
+    /// Output files of the task were not uploaded.
     OUTPUTS_LOST = "outputs_lost";
-    /// A job's process was gone after a restart of robot or agent.
+    /// A job's process was gone after a restart of the robot or the agent.
     INTERRUPTED = "interrupted";
     /// A step did not end within its deadline.
     DEADLINE_EXCEEDED = "deadline_exceeded";
@@ -504,10 +507,10 @@ failure_codes! {
     IO_ERROR = "io_error";
     /// A person at the robot said `hold`.
     HELD = "held";
-    /// Too few of the publishers that the robot trusts have signed the package, or it was
+    /// Too few publishers that the robot trusts have signed the package, or the package was
     /// withdrawn.
     UNTRUSTED_PACKAGE = "untrusted_package";
-    /// The robot's list of publishers is past its lifetime, or it has none and must have one.
+    /// The robot's list of publishers has expired, or the robot has none and must have one.
     PUBLISHERS_EXPIRED = "publishers_expired";
 }
 
@@ -537,9 +540,9 @@ pub struct Status {
     pub start: u64,
     /// The agent's instance.
     pub instance: InstanceId,
-    /// Counts this instance's connections from 1; a status with a lower one is out of date.
+    /// Counts this instance's connections from 1; a status with a lower count is out of date.
     pub connection: u64,
-    /// Where it runs, as in [`Report::place`].
+    /// Where the agent runs, as in [`Report::place`].
     #[serde(default, skip_serializing_if = "Option::is_none", deserialize_with = "tolerant")]
     pub place: Option<Digest>,
 }

@@ -10,196 +10,197 @@ use crate::ros::{LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummar
 use crate::vitals::Vitals;
 use crate::{RobotId, TaskName};
 
-/// The largest reply, in bytes of JSON; older brokers of ours take packets up to 256 KiB.
+/// The largest reply, in bytes of JSON; our older brokers accept packets up to 256 KiB.
 pub const MAX_REPLY_BYTES: usize = 240 * 1024;
-/// The longest a robot may take for an answer, in milliseconds.
+/// Maximum time for a robot's answer, in milliseconds.
 pub const MAX_TTL_MS: u64 = 60_000;
 /// The payload type of a signed [`Action`].
 pub const ACTION_TYPE: &str = "application/vnd.taskd.action.v1+json";
 
-/// What the server publishes on a robot's `request` topic.
+/// The message that the server publishes on a robot's `request` topic.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Request {
-    /// Comes back in the reply.
+    /// The request's id; the reply repeats it.
     pub id: RequestId,
-    /// Milliseconds from its arrival in which an answer is of use; nothing is begun after that.
+    /// Milliseconds from arrival during which an answer is useful; the robot begins no work later.
     pub ttl_ms: u64,
-    /// What is asked.
+    /// The question.
     pub ask: Ask,
-    /// The [`Action`], where the question changes something: a broker that is not the server's, or
-    /// who listens in, must not be able to ask that.
+    /// The signed [`Action`], if the question changes the robot's state: an external broker or an
+    /// eavesdropper must not be able to forge such a request.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub signed: Option<Envelope>,
 }
 
-/// What the server signs of a question that changes something. It is good for one robot, one start
-/// of its agent, and once.
+/// The signed content of a question that changes the robot's state. Valid for one robot and one
+/// start of its agent, and only once.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Action {
-    /// Whom it is for.
+    /// The robot that the action is for.
     pub robot_id: RobotId,
-    /// The start of the agent that is to do it.
+    /// The start of the agent that the action is for.
     pub instance: InstanceId,
-    /// The request's.
+    /// The request's id.
     pub id: RequestId,
-    /// What is asked.
+    /// The question.
     pub ask: Ask,
 }
 
-/// What can be asked of a robot. Also the body of `POST /robots/{robot}/ask` (read, or operate if
-/// it changes something).
+/// A question to a robot. Also the body of `POST /robots/{robot}/ask` (read; operate if the
+/// question changes the robot's state).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Ask {
-    /// The nodes on its ROS graph.
+    /// The nodes on the robot's ROS graph.
     Nodes,
     /// One node with its endpoints.
     Node {
-        /// Which.
+        /// The node's name.
         name: GraphName,
     },
-    /// The topics on its ROS graph.
+    /// The topics on the robot's ROS graph.
     Topics,
-    /// A node's parameters, all of them.
+    /// All parameters of a node.
     Parameters {
-        /// Which node.
+        /// The node's name.
         node: GraphName,
     },
     /// One parameter of a node.
     Parameter {
-        /// Which node.
+        /// The node's name.
         node: GraphName,
-        /// Which parameter.
+        /// The parameter's name.
         name: String,
     },
-    /// Sets a parameter now. It lasts as long as the node: the next start sets what the package
-    /// says.
+    /// Sets a parameter now. The value lasts as long as the node: the next start applies the
+    /// package's values.
     SetParameter {
-        /// Which node.
+        /// The node's name.
         node: GraphName,
-        /// Which parameter and to what.
+        /// The parameter and its new value.
         parameter: Parameter,
     },
     /// Asks a lifecycle node for a transition.
     Lifecycle {
-        /// Which node.
+        /// The node's name.
         node: GraphName,
-        /// Which transition.
+        /// The requested transition.
         transition: Transition,
     },
-    /// Lines that the robot kept, the newest that fit.
+    /// Stored log lines, the newest that fit into the answer.
     Logs {
-        /// Of one task; absent: of all.
+        /// Only lines of this task; absent: all tasks.
         #[serde(default)]
         task: Option<TaskName>,
-        /// Only these and more serious ones.
+        /// Minimum severity.
         #[serde(default)]
         level: LogLevel,
-        /// Not older than this many milliseconds.
+        /// Maximum age in milliseconds.
         #[serde(default)]
         since_ms: Option<u64>,
-        /// At most so many.
+        /// Maximum number of lines.
         max_lines: u64,
     },
-    /// Publish lines of this level and above as they come, for so long; a later one replaces it.
+    /// Publishes new lines of this level and above until the lease ends; a later request replaces
+    /// this one.
     Follow {
-        /// Only these and more serious ones.
+        /// Minimum severity.
         level: LogLevel,
-        /// For how many milliseconds.
+        /// Duration in milliseconds.
         lease_ms: u64,
     },
-    /// How its machine does now.
+    /// Current vitals of the robot's machine.
     Vitals,
-    /// A question of a newer version; it is refused as `unsupported`.
+    /// A question of a newer version; the robot refuses it as `unsupported`.
     #[serde(other)]
     Unknown,
 }
 
 impl Ask {
-    /// Whether the robot is not the same afterwards.
+    /// Whether the question changes the robot's state.
     pub fn changes_something(&self) -> bool {
         matches!(self, Self::SetParameter { .. } | Self::Lifecycle { .. })
     }
 }
 
-/// What a robot publishes on its `reply` topic.
+/// The message that a robot publishes on its `reply` topic.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Reply {
-    /// Who speaks.
+    /// The robot that replies.
     pub robot_id: RobotId,
-    /// The request's.
+    /// The request's id.
     pub id: RequestId,
-    /// What came of it: the field `answer` or `refusal`.
+    /// The outcome: the field `answer` or `refusal`.
     #[serde(flatten)]
     pub outcome: Outcome,
 }
 
-/// What came of a request.
+/// The outcome of a request.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// An answer.
     Answer(Answer),
-    /// None, and why.
+    /// A refusal, with its reason.
     Refusal(Refusal),
 }
 
-/// An answer, of the kind that was asked for.
+/// An answer, of the requested type.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum Answer {
-    /// To [`Ask::Nodes`].
+    /// Answer to [`Ask::Nodes`].
     Nodes {
-        /// How old the picture is, in milliseconds.
+        /// Age of the robot's view of the graph, in milliseconds.
         age_ms: u64,
         /// Sorted by name.
         nodes: Vec<NodeSummary>,
     },
-    /// To [`Ask::Node`].
+    /// Answer to [`Ask::Node`].
     Node {
-        /// How old the picture is, in milliseconds.
+        /// Age of the robot's view of the graph, in milliseconds.
         age_ms: u64,
-        /// The node; several of one name are one after the other.
+        /// The node; nodes with the same name are separate elements.
         nodes: Vec<NodeDetail>,
     },
-    /// To [`Ask::Topics`].
+    /// Answer to [`Ask::Topics`].
     Topics {
-        /// How old the picture is, in milliseconds.
+        /// Age of the robot's view of the graph, in milliseconds.
         age_ms: u64,
         /// Sorted by name.
         topics: Vec<TopicSummary>,
     },
-    /// To [`Ask::Parameters`] and [`Ask::Parameter`]: asked of the node now.
+    /// Answer to [`Ask::Parameters`] and [`Ask::Parameter`], with values read from the node now.
     Parameters {
         /// Sorted by name.
         parameters: Vec<Parameter>,
     },
-    /// To [`Ask::SetParameter`]: the value the node has now.
+    /// Answer to [`Ask::SetParameter`]: the value that the node has now.
     ParameterSet {
-        /// As it is now.
+        /// The parameter's current value.
         parameter: Parameter,
     },
-    /// To [`Ask::Lifecycle`]: the state the node is in now.
+    /// Answer to [`Ask::Lifecycle`]: the state that the node is in now.
     Lifecycle {
-        /// As it is now.
+        /// The node's current state.
         state: LifecycleState,
     },
-    /// To [`Ask::Logs`].
+    /// Answer to [`Ask::Logs`].
     Logs(LogBatch),
-    /// To [`Ask::Follow`].
+    /// Answer to [`Ask::Follow`].
     Following,
-    /// To [`Ask::Vitals`].
+    /// Answer to [`Ask::Vitals`].
     Vitals(Vitals),
 }
 
-/// Why a robot gives no answer: a stable code for programs, a sentence for people.
+/// Why a robot refuses a request: a stable code for programs, a sentence for people.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Refusal {
     /// `no_ros`, `no_such_node`, `no_such_parameter`, `no_such_task`, `rejected`, `timeout`,
     /// `too_large`, `busy`, `unsupported`, …
     pub code: String,
-    /// What and why.
+    /// Description of the refusal and its reason.
     pub text: String,
 }

@@ -38,7 +38,7 @@ impl LifecycleState {
     }
 }
 
-/// What a lifecycle node can be asked for, as in `lifecycle_msgs/msg/Transition`.
+/// A transition that a lifecycle node can be asked for, as in `lifecycle_msgs/msg/Transition`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
@@ -76,12 +76,12 @@ impl Transition {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct NodeSummary {
-    /// Its full name.
+    /// The node's full name.
     pub name: GraphName,
-    /// The task whose process it is in, where that is known.
+    /// The task that runs the node, if known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub task: Option<TaskName>,
-    /// Its state, if it is a lifecycle node that answered.
+    /// The node's state, if it is a lifecycle node that answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lifecycle: Option<LifecycleState>,
 }
@@ -93,13 +93,13 @@ pub struct NodeDetail {
     /// Name, task and state.
     #[serde(flatten)]
     pub node: NodeSummary,
-    /// Topics it publishes.
+    /// Topics that the node publishes.
     pub publishers: Vec<Endpoint>,
-    /// Topics it subscribes to.
+    /// Topics that the node subscribes to.
     pub subscriptions: Vec<Endpoint>,
-    /// Services it offers.
+    /// Services that the node offers.
     pub services: Vec<Endpoint>,
-    /// Services it calls.
+    /// Services that the node calls.
     pub clients: Vec<Endpoint>,
 }
 
@@ -107,35 +107,35 @@ pub struct NodeDetail {
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Endpoint {
-    /// Its full name.
+    /// The full name of the topic or service.
     pub name: GraphName,
     /// `package/msg/Type` or `package/srv/Type`.
     #[serde(rename = "type")]
     pub kind: String,
 }
 
-/// A topic with who is at its ends.
+/// A topic with its publishers and subscribers.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TopicSummary {
-    /// Its full name.
+    /// The topic's full name.
     pub name: GraphName,
-    /// Its types; more than one means that its ends disagree.
+    /// The topic's types; more than one means that publishers and subscribers disagree.
     pub types: Vec<String>,
-    /// The nodes that publish it.
+    /// The nodes that publish the topic.
     pub publishers: Vec<GraphName>,
-    /// The nodes that subscribe to it.
+    /// The nodes that subscribe to the topic.
     pub subscriptions: Vec<GraphName>,
 }
 
-/// A node's parameter. Its value is a truth value, a number, a text, a list of one of these, or
-/// null where it is not set.
+/// A node's parameter. The value is a boolean, a number, a string, a list of one of these, or null
+/// if unset.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Parameter {
-    /// Its name.
+    /// The parameter's name.
     pub name: String,
-    /// Its value.
+    /// The parameter's value.
     pub value: serde_json::Value,
 }
 

@@ -26,7 +26,7 @@ pub struct Selector(Box<Parsed>);
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Parsed {
-    /// As it was written, without the spaces.
+    /// The text as written, without spaces.
     text: String,
     adds: Terms,
     takes_away: Terms,
@@ -35,12 +35,12 @@ struct Parsed {
 /// Robots that meet one of the terms.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 struct Terms {
-    /// Terms that are but a name or an id: as many as there are robots, and so looked up.
+    /// Terms that are only a name or an id: there may be as many as robots, so we look them up.
     named: HashSet<RobotName>,
-    /// Terms that are but a label: looked up as well.
+    /// Terms that are only a label: looked up as well.
     labelled: HashMap<LabelKey, HashSet<LabelValue>>,
-    /// The others: a robot has to meet all conditions of one. Each is tried on every robot, so they
-    /// are few.
+    /// All other terms: a robot must meet all conditions of one. Each is tried on every robot, so
+    /// we limit their number.
     described: Vec<Vec<Condition>>,
 }
 
@@ -54,28 +54,28 @@ enum Condition {
 /// A text that is not a selector.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidSelector {
-    /// One of its parts is nothing that there is.
+    /// One of the parts is not a valid term.
     #[error(
         "{0:?} in the selector is none of \"*\", a robot's name or id, and label=value, with or without \"!\" before it"
     )]
     Part(String),
-    /// It is longer than [`MAX_SELECTOR_BYTES`].
+    /// The text is longer than [`MAX_SELECTOR_BYTES`].
     #[error("a selector of {0} bytes is too long: it may have {MAX_SELECTOR_BYTES}")]
     TooLong(usize),
-    /// More than [`MAX_CONDITIONS`].
+    /// The text has more than [`MAX_CONDITIONS`].
     #[error(
         "the selector has more than {MAX_CONDITIONS} conditions in terms that are more than a name, an id or a label"
     )]
     TooManyConditions,
 }
 
-/// The most bytes a selector's text may have: ten thousand robots by their ids.
+/// The longest selector, in bytes: enough for ten thousand robots by their ids.
 pub const MAX_SELECTOR_BYTES: usize = 200 * 1024;
-/// The most conditions in those of a selector's terms that are more than a name, an id or a label.
+/// The most conditions in a selector's terms that are more than a name, an id or a label.
 pub const MAX_CONDITIONS: usize = 256;
 
 impl Selector {
-    /// Whether a robot with this id, name and labels is meant.
+    /// Whether the selector matches a robot with this id, name and labels.
     pub fn matches(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
         let Parsed { adds, takes_away, .. } = &*self.0;
         (adds.is_empty() || adds.have(id, name, labels)) && !takes_away.have(id, name, labels)
@@ -83,7 +83,7 @@ impl Selector {
 }
 
 impl Selector {
-    /// The names and ids in it, also those that it takes away, sorted.
+    /// The names and ids in the selector, including excluded ones, sorted.
     pub fn names(&self) -> BTreeSet<RobotName> {
         self.0.adds.names().chain(self.0.takes_away.names()).cloned().collect()
     }
@@ -165,7 +165,7 @@ impl FromStr for Selector {
         if adds.conditions() + takes_away.conditions() > MAX_CONDITIONS {
             return Err(InvalidSelector::TooManyConditions);
         }
-        // Within what is valid there are none.
+        // Valid parts contain no spaces.
         let text = text.split_whitespace().collect();
         Ok(Self(Box::new(Parsed { text, adds, takes_away })))
     }

@@ -14,14 +14,13 @@ pub const MAX_UNDERLAYS: usize = 16;
 /// ROS 2's last domain whose ports exist everywhere.
 pub const MAX_ROS_DOMAIN_ID: u32 = 232;
 
-/// What an administrator sets for a robot at the server. What is absent is the robot's own
-/// business.
+/// Settings of a robot on the server. An absent value is left to the robot.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RobotSettings {
-    /// Setup files that are sourced before a task is built or run, in this order, instead of what
-    /// is found in `/opt/ros`.
+    /// Setup files to source before a task is built or run, in this order, instead of those found
+    /// in `/opt/ros`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub underlays: Option<Vec<AbsolutePath>>,
     /// The robot's own ROS workspace, whose `install/` or `devel/` setup file is sourced after the
@@ -31,87 +30,88 @@ pub struct RobotSettings {
     /// `ROS_DOMAIN_ID` of every task, 0 to 232.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ros_domain_id: Option<u32>,
-    /// What tasks may use.
+    /// Resource limits of tasks.
     #[serde(skip_serializing_if = "RobotLimits::is_empty")]
     pub limits: RobotLimits,
-    /// The least serious log lines that go to the server while nobody follows.
+    /// The least severe log level that the robot forwards while no client follows its log.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub forward_level: Option<LogLevel>,
-    /// The keys of what is set and could not be read, because the server that set it is of another
-    /// version.
+    /// Keys of stored settings that could not be read, because a server of another version wrote
+    /// them.
     #[serde(skip)]
     pub unreadable: Vec<String>,
 }
 
-/// What tasks on a robot may use, by the names of the robot's property file.
+/// Resource limits of tasks on a robot, named as in the robot's property file.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RobotLimits {
-    /// Bytes a package may have when it is unpacked.
+    /// Largest size of an unpacked package, in bytes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub archive_bytes: Option<u64>,
-    /// Files, directories and links a package may have.
+    /// Largest number of files, directories and links in a package.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub archive_entries: Option<u64>,
-    /// Bytes that stay free on the disk.
+    /// Bytes to keep free on the disk.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub disk_reserve_bytes: Option<u64>,
-    /// Bytes of a task's log file before it is rotated.
+    /// Size at which a task's log file is rotated, in bytes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub log_bytes: Option<u64>,
-    /// Bytes of files that a run may bring back.
+    /// Largest total size of the output files of a run, in bytes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub output_bytes: Option<u64>,
-    /// Memory that a build may have; each of its processes, where there are no control groups.
+    /// Memory limit of a build, in bytes; without control groups, of each of its processes.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub build_memory_bytes: Option<u64>,
-    /// Seconds a build may take, 1 to 86,400.
+    /// Time limit of a build in seconds, 1 to 86,400.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub build_timeout_s: Option<u64>,
-    /// Versions that are prepared at the same time, 1 to 64.
+    /// Number of versions prepared at the same time, 1 to 64.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parallel_tasks: Option<u64>,
-    /// Memory of a task whose package says nothing of it, in MiB, 1 to 16,777,216; absent: all
-    /// there is.
+    /// Memory limit, in MiB, of a task whose package sets none, 1 to 16,777,216; absent: all of the
+    /// robot's memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_memory_mb: Option<u64>,
-    /// Processes and threads of such a task, and of a build, 1 to 4,194,304.
+    /// Limit of processes and threads of a task whose package sets none, and of a build, 1 to
+    /// 4,194,304.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub task_pids: Option<u64>,
 }
 
-/// What holds on a robot, of all that [`RobotSettings`] has. What is absent is the agent's default.
+/// Settings in effect on a robot. An absent value is the agent's default.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct EffectiveSettings {
-    /// The values that hold.
+    /// The values in effect.
     #[serde(flatten)]
     pub values: RobotSettings,
-    /// The settings, by their keys (`underlays`, `limits.log_bytes`), whose values are the robot's
-    /// own: setting them at the server changes nothing.
+    /// Keys of the settings (`underlays`, `limits.log_bytes`) whose values come from the robot's
+    /// own configuration: setting them on the server has no effect.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub own: Vec<String>,
-    /// Those that the server has set and the robot does not take: its own settings do not allow it,
-    /// or it can't use the value.
+    /// Keys of the server's settings that the robot refused: its own settings forbid the change, or
+    /// the value is unusable.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub refused: Vec<String>,
 }
 
-/// A setting that can't be used; names it by its key.
+/// A setting with an unusable value, named by its key.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidSetting {
     /// A number out of its bounds.
     #[error("{key}: {value} is not between {least} and {most}")]
     OutOfBounds {
-        /// Which.
+        /// The setting's key.
         key: &'static str,
-        /// What was given.
+        /// The given value.
         value: u64,
-        /// The least it may be.
+        /// The least allowed value.
         least: u64,
-        /// The most.
+        /// The greatest allowed value.
         most: u64,
     },
     /// Too many setup files.
@@ -130,13 +130,13 @@ impl InvalidSetting {
 }
 
 impl RobotSettings {
-    /// Whether there is a setting of this key, like `workspace` or `limits.log_bytes`.
+    /// Whether a setting with this key exists, like `workspace` or `limits.log_bytes`.
     pub fn has(key: &str) -> bool {
         ["underlays", "workspace", "ros_domain_id", "forward_level"].contains(&key)
             || RobotLimits::default().bounds().iter().any(|(known, ..)| *known == key)
     }
 
-    /// Whether nothing is set.
+    /// Whether no setting is set.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
@@ -146,7 +146,7 @@ impl RobotSettings {
         self.faults().into_iter().next().map_or(Ok(()), Err)
     }
 
-    /// The values that can't be used.
+    /// The settings with unusable values.
     pub fn faults(&self) -> Vec<InvalidSetting> {
         let underlays = self.underlays.as_ref().map_or(0, Vec::len);
         let too_many =
@@ -161,7 +161,7 @@ impl RobotSettings {
         too_many.into_iter().chain(out_of_bounds).collect()
     }
 
-    /// The same without what can't be used, and the keys of that.
+    /// Returns the usable settings, and the keys of the removed ones.
     #[must_use]
     pub fn usable(mut self) -> (Self, Vec<String>) {
         let mut unusable = std::mem::take(&mut self.unreadable);
@@ -179,12 +179,12 @@ impl RobotSettings {
 }
 
 impl RobotLimits {
-    /// Whether none is set.
+    /// Whether no limit is set.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
     }
 
-    /// These, and those of `other` where these say nothing.
+    /// These limits, with `other` as the fallback for absent ones.
     #[must_use]
     pub fn or(self, other: Self) -> Self {
         Self {
@@ -201,7 +201,7 @@ impl RobotLimits {
         }
     }
 
-    /// Takes back the one of this key.
+    /// Clears the limit with this key.
     fn forget(&mut self, key: &str) {
         let limit = match key {
             "limits.archive_bytes" => &mut self.archive_bytes,
@@ -219,9 +219,9 @@ impl RobotLimits {
         *limit = None;
     }
 
-    /// Each with its key, its value, the least and the most it may be.
+    /// Each limit with its key, its value, and its least and greatest allowed value.
     pub fn bounds(&self) -> [(&'static str, Option<u64>, u64, u64); 10] {
-        // What a signed 64-bit column and every program's numbers can hold.
+        // Fits a signed 64-bit column and the number types of all common programs.
         const MAX_BYTES: u64 = 1 << 50;
         [
             ("limits.archive_bytes", self.archive_bytes, 1, MAX_BYTES),
@@ -238,8 +238,8 @@ impl RobotLimits {
     }
 }
 
-/// Reads the settings that are of this version, and notes the keys of those that are not: they must
-/// not make a state unreadable, nor each other.
+/// Reads the settings that this version knows, and records the keys of the others. An unreadable
+/// setting must not make a state, or another setting, unreadable.
 pub(crate) fn each_readable<'de, D: Deserializer<'de>>(
     deserializer: D,
 ) -> Result<RobotSettings, D::Error> {
@@ -264,8 +264,8 @@ pub(crate) fn each_readable<'de, D: Deserializer<'de>>(
     Ok(RobotSettings { unreadable, ..read })
 }
 
-/// Reads what is of this version, and passes over what is not: what is told must not make a report
-/// unreadable.
+/// Reads a value, and ignores one that this version can't read: an informational field must not
+/// make a report unreadable.
 pub(crate) fn tolerant<'de, D: Deserializer<'de>, T: DeserializeOwned + Default>(
     deserializer: D,
 ) -> Result<T, D::Error> {

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-/// The last millisecond of the year 9999: what lies beyond has no text of its own.
+/// The last millisecond of the year 9999: later times have no text of their own.
 const LAST_MS: u64 = 253_402_300_799_999;
 /// Days from 1 March of the year 0 to 1 January 1970.
 const EPOCH_DAY: u64 = 719_468;
@@ -30,7 +30,7 @@ pub fn timestamp(ms: u64) -> String {
     format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{millisecond:03}Z")
 }
 
-/// What [`timestamp`] was made of; `None` for any other text.
+/// Parses the text written by [`timestamp`]; `None` for any other text.
 pub fn parse_timestamp(text: &str) -> Option<u64> {
     const SHAPE: &[u8; 24] = b"0000-00-00T00:00:00.000Z";
     let fits = |(byte, shape): (u8, &u8)| {

@@ -1,5 +1,5 @@
-//! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrolment, robot), an id, 256 random bits
-//! and a CRC-32, so that a mistyped token is refused before anything is looked up. An enrolment
+//! Bearer tokens: `tsko_`, `tske_`, `tskr_` (operator, enrollment, robot), an id, 256 random bits
+//! and a CRC-32, so that a mistyped token is refused before anything is looked up. An enrollment
 //! token also carries the server's public key and, where the server has a private certificate
 //! authority, the pin of that. Only the SHA-256 of a secret is ever stored; tokens never appear in
 //! `Debug` output.
@@ -11,7 +11,7 @@ use crate::digest::{hex, unhex};
 use crate::envelope::PublicKey;
 use crate::{CaPin, Digest};
 
-/// Whose token it is.
+/// Type of a token's holder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum TokenKind {
     /// A person at the command line or the page.
@@ -32,7 +32,7 @@ impl TokenKind {
     }
 }
 
-/// A token with its secret. Write it only to a file of mode 0600 or to the person it is made for.
+/// A token with its secret. Write it only to a file of mode 0600 or to its intended user.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token {
     kind: TokenKind,
@@ -53,13 +53,13 @@ impl Token {
         Self { kind, id: rand::random(), secret: rand::random(), server_key: None, ca_pin: None }
     }
 
-    /// A fresh enrolment token that pins `server_key` and, if there is one, the server's
+    /// A fresh enrollment token that pins `server_key` and, if there is one, the server's
     /// certificate authority.
     pub fn random_enrolment(server_key: PublicKey, ca_pin: Option<CaPin>) -> Self {
         Self { server_key: Some(server_key), ca_pin, ..Self::random(TokenKind::Enrolment) }
     }
 
-    /// Whose token it is.
+    /// Type of the token's holder.
     pub fn kind(&self) -> TokenKind {
         self.kind
     }
@@ -69,17 +69,17 @@ impl Token {
         hex(&self.id)
     }
 
-    /// What is stored and compared: the SHA-256 of the secret.
+    /// The SHA-256 of the secret, which is stored and compared.
     pub fn secret_digest(&self) -> Digest {
         Digest::of(&self.secret)
     }
 
-    /// The pinned server key of an enrolment token.
+    /// The pinned server key of an enrollment token.
     pub fn server_key(&self) -> Option<&PublicKey> {
         self.server_key.as_ref()
     }
 
-    /// The pinned certificate authority of an enrolment token.
+    /// The pinned certificate authority of an enrollment token.
     pub fn ca_pin(&self) -> Option<CaPin> {
         self.ca_pin
     }

@@ -17,20 +17,20 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Digest, RobotId};
 
-/// The levels all topics start with: no leading or trailing `/`, no wildcard, at most 64 bytes.
+/// The prefix of all topics: no leading or trailing `/`, no wildcard, at most 64 bytes.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(value_type = String, pattern = "^[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*$", example = "tasks"))]
 #[serde(try_from = "String", into = "String")]
 pub struct TopicPrefix(String);
 
-/// A prefix that MQTT or our parsing could not live with.
+/// A prefix that MQTT or our parser does not accept.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{0:?} is not a topic prefix: 1 to 64 letters, digits, '.', '_' and '-' in levels joined by single '/'"
 )]
 pub struct InvalidPrefix(String);
 
-/// What a topic is about.
+/// The subject of a topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Topic {
     /// One robot's own topic.
@@ -50,7 +50,7 @@ pub enum RobotTopic {
     Status,
     /// Robot to server: a [`crate::vitals::Telemetry`].
     Telemetry,
-    /// Robot to server: log lines.
+    /// Robot to server: a [`crate::log::LogBatch`].
     Log,
     /// Server to robot: a question or a one-off action.
     Request,
@@ -95,7 +95,7 @@ impl TopicPrefix {
         &self.0
     }
 
-    /// The full topic name.
+    /// The full name of a topic.
     pub fn format(&self, topic: &Topic) -> String {
         match topic {
             Topic::Robot(robot, topic) => format!("{}/r/{robot}/{}", self.0, topic.as_str()),
@@ -103,7 +103,7 @@ impl TopicPrefix {
         }
     }
 
-    /// The topic a name or filter stands for; `None` for foreign names and for wildcards.
+    /// Parses a topic name or filter; `None` for foreign names and for wildcards.
     pub fn parse(&self, name: &str) -> Option<Topic> {
         let rest = name.strip_prefix(&self.0)?.strip_prefix('/')?;
         if let Some(digest) = rest.strip_prefix("p/") {

@@ -9,52 +9,53 @@ use crate::RobotId;
 /// The largest [`Telemetry`], in bytes of JSON.
 pub const MAX_TELEMETRY_BYTES: usize = 4096;
 
-/// One look at the machine. What is not known of it is absent.
+/// A measurement of the machine. Unknown values are absent.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Vitals {
-    /// When the server got it, by its clock; from a robot: when it looked, by its own.
+    /// Time of receipt by the server's clock; in a robot's message, time of measurement by the
+    /// robot's clock.
     pub at_ms: u64,
-    /// Of all processors together, since the look before, 0 to 100.
+    /// Load of all processors together since the previous measurement, 0 to 100.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cpu_percent: Option<f32>,
-    /// Memory that programs could not have.
+    /// Memory that is unavailable to programs.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_used_bytes: Option<u64>,
-    /// Memory there is.
+    /// Total memory.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory_total_bytes: Option<u64>,
-    /// What is not free for the agent on the data directory's file system.
+    /// Bytes on the data directory's file system that are not free for the agent.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub disk_used_bytes: Option<u64>,
-    /// That file system's size.
+    /// Size of the data directory's file system.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub disk_total_bytes: Option<u64>,
-    /// Over all network interfaces but the loopback, since the look before.
+    /// Received over all network interfaces except the loopback, since the previous measurement.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub network_in_bytes_per_s: Option<u64>,
-    /// Likewise.
+    /// Sent over all network interfaces except the loopback, since the previous measurement.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub network_out_bytes_per_s: Option<u64>,
     /// The kernel's load average of the last minute.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub load_1m: Option<f32>,
-    /// What is left of its battery; absent where it has none that can be read.
+    /// Battery charge in percent; absent without a readable battery.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u8>,
-    /// Of the hottest place the kernel knows, in degrees Celsius.
+    /// Temperature of the hottest sensor that the kernel knows, in degrees Celsius.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub temperature_c: Option<f32>,
 }
 
-/// What a robot publishes on its `telemetry` topic, QoS 0; without MQTT the body of its
-/// `POST /robots/{robot}/telemetry`.
+/// The message that a robot publishes on its `telemetry` topic, QoS 0; without MQTT, the body of
+/// the robot's `POST /robots/{robot}/telemetry`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Telemetry {
-    /// Who speaks.
+    /// The robot that sent the message.
     pub robot_id: RobotId,
-    /// How its machine does.
+    /// Vitals of the robot's machine.
     pub vitals: Vitals,
 }

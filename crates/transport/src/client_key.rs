@@ -1,5 +1,6 @@
-//! A client's own key, and the certificate by which it shows that it holds it. The certificate says
-//! nothing else: nobody vouches for it, and whoever knows the key knows whose it is.
+//! A client's own key, and the certificate by which the client proves possession of the key. The
+//! certificate carries no other statement: no authority signs it, and a peer that knows the key
+//! knows its owner.
 
 use std::fmt;
 use std::sync::Arc;
@@ -15,11 +16,11 @@ use rustls::sign::{CertifiedKey, SingleCertAndKey};
 use serde::{Deserialize, Serialize};
 use task_proto::envelope::{PublicKey, SigningKey};
 
-/// What stands before the seed in an ed25519 key as PKCS #8 (RFC 8410, section 7).
+/// DER prefix before the seed in an ed25519 key as PKCS #8 (RFC 8410, section 7).
 const PKCS8_PREFIX: [u8; 16] = [
     0x30, 0x2e, 0x02, 0x01, 0x00, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x04, 0x22, 0x04, 0x20,
 ];
-/// What stands before the key in its SubjectPublicKeyInfo.
+/// DER prefix before the key in its SubjectPublicKeyInfo.
 const INFO_PREFIX: [u8; 12] =
     [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
 
@@ -33,23 +34,23 @@ pub struct ClientKey(SigningKey);
 #[error("not a key: expected 32 bytes in base64")]
 pub struct InvalidKey;
 
-/// The certificate can't be made.
+/// The certificate can't be created.
 #[derive(Debug, thiserror::Error)]
 #[error("no certificate can be made with this key")]
 pub struct CertificateError(#[source] Box<dyn std::error::Error + Send + Sync>);
 
 impl ClientKey {
-    /// A fresh one.
+    /// A fresh random key.
     pub fn random() -> Self {
         Self(SigningKey::random())
     }
 
-    /// What the other side knows it by.
+    /// The public key, by which the other side identifies the client.
     pub fn public_key(&self) -> PublicKey {
         self.0.public_key()
     }
 
-    /// Has `config` show it to whoever asks.
+    /// Makes `config` present the certificate to servers that request one.
     pub fn show_in(&self, config: &mut ClientConfig) -> Result<(), CertificateError> {
         let certificate = self.certificate().map_err(CertificateError)?;
         config.client_auth_cert_resolver = Arc::new(SingleCertAndKey::from(certificate));
@@ -67,7 +68,7 @@ impl ClientKey {
     }
 }
 
-/// The key that a certificate shows; `None` for a key of another kind.
+/// The key in a certificate; `None` for a key of another kind.
 pub fn key_in(certificate: &CertificateDer<'_>) -> Option<PublicKey> {
     let parsed = ParsedCertificate::try_from(certificate).ok()?;
     let info = parsed.subject_public_key_info();

@@ -1,6 +1,5 @@
-//! Opens a connection to the server: TCP, TLS over it if the server speaks that, WebSocket over
-//! that if it is to look like HTTP. It gives up nothing and waits for ever: whoever calls it has
-//! the time.
+//! Opens a connection to the server: TCP, TLS if the server speaks TLS, WebSocket on top if the
+//! connection has to look like HTTP. There is no timeout here: the caller sets the deadline.
 
 use std::io;
 use std::net::SocketAddr;
@@ -17,61 +16,61 @@ use tokio_rustls::TlsConnector;
 
 use crate::websocket::{WebSocket, WebSocketError};
 
-/// A connection, whatever it is made of.
+/// A connection, independent of its transport.
 pub trait Duplex: AsyncRead + AsyncWrite + Send + Unpin {}
 
 impl<S: AsyncRead + AsyncWrite + Send + Unpin> Duplex for S {}
 
-/// Where to, and through what.
+/// The address, and the protocols to reach the server.
 #[derive(Debug, Clone)]
 pub struct Route {
     /// Host name or address; an IPv6 address may stand in brackets, as in a URL.
     pub host: String,
     /// TCP port.
     pub port: u16,
-    /// How TLS is spoken there; `None`: it is not.
+    /// TLS configuration; `None`: plain text.
     pub tls: Option<Arc<ClientConfig>>,
-    /// The path of the WebSocket there, if it is one.
+    /// The path of the WebSocket; `None`: no WebSocket.
     pub websocket: Option<String>,
 }
 
-/// Why there is no connection.
+/// Why the connection failed.
 #[derive(Debug, thiserror::Error)]
 pub enum DialError {
-    /// Nobody answers.
+    /// The TCP connection failed.
     #[error("cannot connect to {host}:{port}")]
     Connect {
         /// The host.
         host: String,
         /// The port.
         port: u16,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// The name can't stand in a certificate.
+    /// The name is not a valid name in a certificate.
     #[error("{0:?} is neither a host name nor an address")]
     Name(String),
-    /// TLS did not come about: the certificate is not to be trusted, or nobody speaks TLS there.
+    /// The TLS handshake failed: the certificate is not trusted, or the server does not speak TLS.
     #[error("no TLS with {host}:{port}")]
     Tls {
         /// The host.
         host: String,
         /// The port.
         port: u16,
-        /// What TLS says.
+        /// The TLS library's error.
         source: io::Error,
     },
-    /// The other side does not speak WebSocket there.
+    /// The other side does not speak WebSocket on this path.
     #[error(transparent)]
     WebSocket(#[from] WebSocketError),
 }
 
-/// What an address has before the next is tried beside it; RFC 8305 recommends it.
+/// Head start of an address before the next is tried in parallel; RFC 8305 recommends this value.
 const HEAD_START: Duration = Duration::from_millis(250);
 /// The most addresses of a name that are tried.
 const MAX_ADDRESSES: usize = 16;
 
-/// The addresses of both families in turns, beginning with the one that the system prefers.
+/// The addresses of both families alternating, beginning with the family that the system prefers.
 fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
     let addresses: Vec<_> = addresses.collect();
     let is_first = addresses.first().map(SocketAddr::is_ipv6);
@@ -84,8 +83,8 @@ fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
     pairs.flatten().flatten().take(MAX_ADDRESSES).collect()
 }
 
-/// A connection to the first of these addresses that answers: one that is silent, as a family that
-/// is not routed, holds nobody up.
+/// Connects to the first of these addresses that answers. A silent address, such as one of a family
+/// that is not routed, does not delay the others.
 async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     let mut addresses = addresses.into_iter();
     let mut tries = JoinSet::new();
@@ -95,7 +94,7 @@ async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
             tries.spawn(TcpStream::connect(address));
         }
         let head_start = if addresses.len() > 0 { HEAD_START } else { Duration::MAX };
-        // Cancel-safe: a try that has ended stays in the set until it is taken.
+        // Cancel-safe: a try that has ended stays in the set until the next join.
         match timeout(head_start, tries.join_next()).await {
             Ok(None) => return Err(failed),
             Ok(Some(Ok(Ok(stream)))) => return Ok(stream),
@@ -119,7 +118,7 @@ pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
         Ok(stream) => stream,
         Err(source) => return Err(DialError::Connect { host, port, source }),
     };
-    // Small packets, each of which somebody waits for. If it can't be set, they come a little
+    // Packets are small and latency matters. If the option can't be set, packets arrive a little
     // later.
     let _ = stream.set_nodelay(true);
     let stream: Box<dyn Duplex> = if let Some(tls) = &route.tls {
@@ -160,7 +159,7 @@ mod tests {
     async fn an_address_that_is_silent_or_refuses_holds_nobody_up() {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let open = listener.local_addr().expect("its address");
-        // Whose queue is full: what else comes there gets no answer.
+        // A listener with a full queue: further connections get no answer.
         let silent = tokio::net::TcpSocket::new_v4().expect("a socket");
         silent.bind(address("127.0.0.1:0")).expect("a port");
         let silent = silent.listen(0).expect("listens");

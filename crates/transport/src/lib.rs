@@ -1,6 +1,6 @@
-//! What both ends of a connection to the server share: whom a client takes for the server, how it
-//! shows who it is itself, and MQTT over WebSocket. It knows no message, keeps no file and reads no
-//! clock: the time is handed in.
+//! Code shared by both ends of a connection to the server: how a client authenticates the server,
+//! how the client authenticates itself, and MQTT over WebSocket. The crate knows no message, keeps
+//! no file and reads no clock: the time is a parameter.
 
 mod client_key;
 mod dial;

@@ -1,8 +1,8 @@
-//! Lends rumqttc a connection that it can't make itself. Its own TLS and WebSocket bring an old
-//! certificate verifier, know no pin and no clock that may be wrong, it waits for an address that
-//! is silent though the name has others, and it takes no stream that somebody else has opened; but
-//! it does connect to a local socket. So it gets one that has a name nobody knows and takes just
-//! this process, and what passes there is carried over.
+//! Lends rumqttc a connection that it can't open itself. The TLS and WebSocket of rumqttc bring an
+//! old certificate verifier and support neither a pin nor a clock that may be wrong; its dialer
+//! waits for a silent address though the name has others; and it accepts no stream opened by other
+//! code. It does connect to a local socket. So we give rumqttc a local socket with an unguessable
+//! name that accepts this process only, and relay the bytes.
 
 use std::io;
 use std::time::Duration;
@@ -13,31 +13,32 @@ use tokio::time::timeout;
 
 use crate::dial::{DialError, Duplex, Route, dial};
 
-/// What is on its way, in each direction.
+/// Buffer size in each direction.
 const BUFFER_BYTES: usize = 64 * 1024;
 
-/// Why there is no line.
+/// Why the line was not established.
 #[derive(Debug, thiserror::Error)]
 pub enum LineError {
     /// The other end can't be reached this way.
     #[error(transparent)]
     Dial(#[from] DialError),
-    /// It did not answer in time.
+    /// The connection was not established in time.
     #[error("{host}:{port} does not answer within {time:?}")]
     Late {
         /// The host.
         host: String,
         /// The port.
         port: u16,
-        /// How long it had.
+        /// The time limit.
         time: Duration,
     },
-    /// The system gives no local socket.
+    /// The system refused the local socket.
     #[error("no local socket")]
     Local(#[source] io::Error),
 }
 
-/// What a session goes over: an open connection, and the local socket by which rumqttc gets to it.
+/// The path of a session: an open connection, and the local socket by which rumqttc reaches that
+/// connection.
 pub struct Line {
     name: String,
     listener: UnixListener,
@@ -49,7 +50,7 @@ impl Line {
     pub async fn open(route: &Route, time: Duration) -> Result<Self, LineError> {
         let late = |_| LineError::Late { host: route.host.clone(), port: route.port, time };
         let far = timeout(time, dial(route)).await.map_err(late)??;
-        // In the abstract namespace: there is no file that would have to be removed.
+        // In the abstract namespace: there is no file to remove.
         let name = format!("\0task-line-{:032x}", rand::random::<u128>());
         let listener = UnixListener::bind(&name).map_err(LineError::Local)?;
         Ok(Self { name, listener, far })
@@ -60,8 +61,8 @@ impl Line {
         &self.name
     }
 
-    /// Carries bytes both ways until either end is through, which the session sees by itself; then
-    /// it rests.
+    /// Relays bytes both ways until either end closes, which the session notices by itself; then
+    /// waits forever.
     pub async fn carry(self) {
         self.carry_all().await;
         std::future::pending().await

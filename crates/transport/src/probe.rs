@@ -1,6 +1,5 @@
-//! Looks whether somebody answers as it should, for those who search for what is wrong. Greetings
-//! let nobody in: no password travels, and no failed attempt is counted. Only [`displaces`] signs
-//! in, with accounts that are there for nothing else.
+//! Probes of a server's ports, for diagnosis. Greetings do not sign in: no password is sent, and no
+//! failed attempt is counted. Only [`displaces`] signs in, with accounts created for this test.
 
 use std::io;
 use std::sync::Arc;
@@ -13,8 +12,8 @@ use tokio::time::timeout;
 use crate::dial::{DialError, Duplex, Route, dial};
 use crate::trust::{Clock, Trust};
 
-/// A CONNECT of a protocol that there is not: whoever speaks MQTT refuses it by that reason, before
-/// asking who it is.
+/// A CONNECT with an unknown protocol version: an MQTT server refuses the packet for that reason,
+/// before authentication.
 const GREETING: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 0x7f, 0x02, 0, 10, 0, 0];
 /// The first byte of a CONNACK.
 const CONNACK: u8 = 0x20;
@@ -25,21 +24,21 @@ const PONG: [u8; 2] = [0xd0, 0];
 const CONNECT_FLAGS: u8 = 0b1100_0010;
 /// The keepalive of a session that is over within seconds.
 const KEEP_ALIVE_S: u16 = 30;
-/// How long a broker may take to close the session that it replaces.
+/// Time limit for a broker to close the session that is replaced.
 const CLOSING: Duration = Duration::from_millis(500);
 /// 2200-01-01: no certificate of today is good then.
 const FAR_FUTURE_MS: u64 = 7_258_118_400_000;
 
-/// What answered.
+/// The result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probed {
     /// MQTT.
     Mqtt,
-    /// Something else, or somebody who hung up.
+    /// Another protocol, or the connection was closed.
     SomethingElse,
 }
 
-/// Whether MQTT is spoken there. Waits for as long as it takes.
+/// Whether the port speaks MQTT. There is no timeout.
 pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
     let mut stream = dial(route).await?;
     let mut answer = [0];
@@ -61,10 +60,10 @@ pub struct MqttLogin<'a> {
     pub password: &'a str,
 }
 
-/// Why it can't be said whether one account displaces another.
+/// Why the displacement test gave no result.
 #[derive(Debug, thiserror::Error)]
 pub enum DisplaceError {
-    /// There is no connection.
+    /// The connection failed.
     #[error(transparent)]
     Dial(#[from] DialError),
     /// The broker does not let the account in.
@@ -86,7 +85,7 @@ pub enum DisplaceError {
 }
 
 /// Whether an MQTT 3.1.1 broker ends the session of the first account when the second one connects
-/// with the same client id. Waits for as long as the broker takes to answer.
+/// with the same client id. There is no timeout.
 pub async fn displaces(
     route: &Route,
     client_id: &str,
@@ -133,7 +132,7 @@ fn connect_packet(client_id: &str, login: MqttLogin<'_>) -> Vec<u8> {
     let mut body = vec![0, 4, b'M', b'Q', b'T', b'T', 4, CONNECT_FLAGS];
     body.extend(KEEP_ALIVE_S.to_be_bytes());
     for text in [client_id, login.user_name, login.password] {
-        // Longer ones than MQTT allows are cut, and refused by the broker.
+        // Texts above MQTT's limit are cut, and refused by the broker.
         let bytes = &text.as_bytes()[..text.len().min(usize::from(u16::MAX))];
         body.extend((bytes.len() as u16).to_be_bytes());
         body.extend(bytes);
@@ -149,9 +148,9 @@ fn connect_packet(client_id: &str, login: MqttLogin<'_>) -> Vec<u8> {
     packet
 }
 
-/// When the certificate ends that is shown there, in milliseconds since the Unix epoch: what TLS
-/// complains of when its clock shows a time at which none is good. `None` where that can't be found
-/// out. Waits for as long as it takes.
+/// Expiry of the certificate shown by the server, in milliseconds since the Unix epoch: TLS reports
+/// this error when its clock shows a time at which no certificate is valid. `None` if the expiry
+/// can't be determined. There is no timeout.
 pub async fn certificate_end_ms(host: &str, port: u16, trust: Trust) -> Option<u64> {
     let clock = Clock { now_ms: || FAR_FUTURE_MS, earliest_ms: 0 };
     let tls = Some(Arc::new(trust.client_config(clock)));

@@ -1,6 +1,6 @@
-//! Whom a client takes for the server: the one whose private authority an enrolment token pinned,
-//! or whoever the system's root certificates vouch for under the name that was asked for. A clock
-//! that can't be right does not keep a client out.
+//! How a client authenticates the server: by the private authority that an enrollment token pinned,
+//! or by the system's root certificates and the requested name. A clock that can't be right does
+//! not keep a client out.
 
 use std::fmt;
 use std::sync::Arc;
@@ -21,37 +21,37 @@ use rustls::{
 use task_proto::CaPin;
 use task_proto::pin::PINNED_PROTOCOL;
 
-/// Certificates whose beginnings a wrong clock may be moved to: more than any chain has.
+/// Certificates whose start of validity a wrong clock may be moved to: more than any chain has.
 const MAX_CHAIN: usize = 8;
 
-/// Whom a client trusts.
+/// The authorities a client trusts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Trust {
-    /// The authority with this pin and nobody else. It vouches for one server only, so its name
-    /// does not matter.
+    /// Only the authority with this pin. That authority signs for one server only, so the server's
+    /// name does not matter.
     Pinned(CaPin),
-    /// Whom the system's root certificates vouch for, by name. `SSL_CERT_FILE` and `SSL_CERT_DIR`
-    /// name others.
+    /// The system's root certificates, with a check of the name. `SSL_CERT_FILE` and `SSL_CERT_DIR`
+    /// select other root certificates.
     System,
 }
 
-/// When this program was made, in milliseconds since the Unix epoch, at the earliest: a clock that
-/// shows less is wrong. A build that says its time as reproducible builds do, in
-/// `SOURCE_DATE_EPOCH`, is held to that.
+/// The earliest build time of this program, in milliseconds since the Unix epoch: a clock that
+/// shows less is wrong. A build that sets `SOURCE_DATE_EPOCH`, as reproducible builds do, uses that
+/// time.
 pub const BUILT_MS: u64 = built_ms(option_env!("SOURCE_DATE_EPOCH"));
-/// 2026-01-01: there was no such program before.
+/// 2026-01-01: the program did not exist earlier.
 const BEGINNING_MS: u64 = 1_767_225_600_000;
 
 /// A machine's clock, which may be wrong.
 #[derive(Debug, Clone, Copy)]
 pub struct Clock {
-    /// What it shows: milliseconds since the Unix epoch.
+    /// The clock's time: milliseconds since the Unix epoch.
     pub now_ms: fn() -> u64,
-    /// What it shows at least if it is right.
+    /// The earliest time that a correct clock can show.
     pub earliest_ms: u64,
 }
 
-/// What answered has no certificate by the authority that was pinned.
+/// The server has no certificate by the pinned authority.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct WrongServer;
 
@@ -64,13 +64,12 @@ impl fmt::Display for WrongServer {
 impl std::error::Error for WrongServer {}
 
 impl Trust {
-    /// In the authority that was pinned, or in the system's roots where none was.
+    /// Trust in the pinned authority, or in the system's roots without a pin.
     pub fn by(pin: Option<CaPin>) -> Self {
         pin.map_or(Self::System, Self::Pinned)
     }
 
-    /// How a client with this trust connects by TLS. Reads the system's certificates where they
-    /// count.
+    /// TLS configuration of a client with this trust. Reads the system's certificates if needed.
     pub fn client_config(self, clock: Clock) -> ClientConfig {
         let provider = Arc::new(ring::default_provider());
         let algorithms = provider.signature_verification_algorithms;
@@ -105,7 +104,8 @@ impl TimeProvider for Clock {
     }
 }
 
-/// Whole seconds since the Unix epoch, as text, in milliseconds. What is none says nothing.
+/// Converts whole seconds since the Unix epoch, as text, to milliseconds. Any other text, and any
+/// earlier time, gives `BEGINNING_MS`.
 const fn built_ms(seconds: Option<&str>) -> u64 {
     let Some(text) = seconds else { return BEGINNING_MS };
     let (digits, mut at, mut read) = (text.as_bytes(), 0, 0u64);
@@ -123,13 +123,13 @@ fn at(unix_ms: u64) -> UnixTime {
     UnixTime::since_unix_epoch(Duration::from_millis(unix_ms))
 }
 
-/// The pin of an authority by its certificate; `None` if that is none.
+/// The pin of an authority from its certificate; `None` if the bytes are no certificate.
 pub fn pin_of(certificate: &CertificateDer<'_>) -> Option<CaPin> {
     let parsed = ParsedCertificate::try_from(certificate).ok()?;
     Some(CaPin::of(&parsed.subject_public_key_info()))
 }
 
-/// A machine without root certificates trusts nobody; plain text and pins need none.
+/// A machine without root certificates trusts no server; plain text and pins need none.
 fn system_roots() -> RootCertStore {
     let mut roots = RootCertStore::empty();
     roots.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
@@ -185,9 +185,9 @@ impl Verifier {
         }
     }
 
-    /// Checks at `now`. If that can't be right, a certificate's beginning is not held against the
-    /// server: the earliest moment counts at which all of them had begun, and what ended before
-    /// that stays ended.
+    /// Verifies at time `now`. If the clock can't be right, a certificate's start of validity is
+    /// not held against the server: we use the earliest moment at which all certificates had begun,
+    /// and certificates that ended before that stay invalid.
     fn at_a_possible_time(
         &self,
         now: UnixTime,
@@ -326,10 +326,10 @@ mod tests {
             BUILT_MS,
         );
         assert!(matches!(refused, Err(Error::Other(_))), "{refused:?}");
-        // The pinned certificate beside another's server proves nothing.
+        // Sending the pinned certificate beside another server's certificate proves nothing.
         let both = [other.certificate.clone(), own.certificate.clone()];
         assert!(check(&pinned, &foreign, &both, "server.lab", BUILT_MS).is_err());
-        // Nor does a certificate that was made for something else.
+        // Nor does a certificate for another purpose.
         let client = own.server(2025, 2100, ExtendedKeyUsagePurpose::ClientAuth);
         assert!(check(&pinned, &client, &chain, "server.lab", BUILT_MS).is_err());
     }
@@ -364,12 +364,13 @@ mod tests {
         for impossible_ms in [0, BUILT_MS - 1] {
             assert_eq!(check(&pinned, &later, &chain, "server.lab", impossible_ms), Ok(()));
         }
-        // A clock that may be right is believed, both ways.
+        // A clock that may be right is trusted, both ways.
         let year_2040_ms = BUILT_MS + 14 * 366 * DAY_MS;
         for possible_ms in [BUILT_MS, year_2040_ms] {
             assert!(check(&pinned, &later, &chain, "server.lab", possible_ms).is_err());
         }
-        // What had ended before the program existed has ended, whatever the clock shows.
+        // A certificate that ended before the program was built has ended, whatever the clock
+        // shows.
         let past = own.server(2020, 2025, ExtendedKeyUsagePurpose::ServerAuth);
         for now_ms in [0, BUILT_MS] {
             assert!(check(&pinned, &past, &chain, "server.lab", now_ms).is_err());

@@ -1,5 +1,5 @@
-//! MQTT over WebSocket (MQTT 3.1.1, section 6): a stream of bytes in binary frames, as either end.
-//! It begins as an HTTP request, so it passes what lets nothing but HTTP pass.
+//! MQTT over WebSocket (MQTT 3.1.1, section 6): a stream of bytes in binary frames, for both ends.
+//! The connection begins as an HTTP request, and therefore passes proxies that allow only HTTP.
 
 pub mod frame;
 
@@ -18,29 +18,29 @@ use self::frame::{Decoder, NORMAL, Opcode, Piece, Role, Violation, encode};
 
 /// The subprotocol's name.
 pub const MQTT: &str = "mqtt";
-/// What both ends hash behind the client's key (RFC 6455, section 1.3).
+/// The GUID that both ends hash behind the client's key (RFC 6455, section 1.3).
 const KEY_SUFFIX: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
 /// The head of the answer that a client reads.
 const MAX_HEAD_BYTES: usize = 16 * 1024;
-/// The headers in it.
+/// Maximum number of headers in the answer.
 const MAX_HEADERS: usize = 64;
-/// What goes into one frame.
+/// Payload of one frame, in bytes.
 const FRAME_BYTES: usize = 16 * 1024;
 /// Encoded and not written yet, before nothing more is taken.
 const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
-/// Frames in a row that carry no byte of MQTT: pings, pongs, empty ones. They cost time, and nobody
-/// else counts them.
+/// Limit on consecutive frames that carry no byte of MQTT: pings, pongs, empty frames. They cost
+/// time, and no other limit counts them.
 const MAX_VAIN_FRAMES: usize = 64;
-/// What is read at once.
+/// Bytes per read.
 const READ_BYTES: usize = 8 * 1024;
 
-/// Why there is no WebSocket.
+/// Why the WebSocket was not established.
 #[derive(Debug, thiserror::Error)]
 pub enum WebSocketError {
     /// The connection failed.
     #[error("the connection failed before the WebSocket was there")]
     Io(#[from] io::Error),
-    /// An HTTP answer that grants none.
+    /// An HTTP status other than 101.
     #[error("the server answers {0} where MQTT over WebSocket should be")]
     Refused(StatusCode),
     /// The request or the answer is not one for MQTT over WebSocket.
@@ -82,13 +82,13 @@ fn accept_of(key: &[u8]) -> String {
     STANDARD.encode(hash.finalize())
 }
 
-/// Whether one of the comma-separated words of the header is `token`.
+/// Whether the header's comma-separated list contains `token`.
 fn has_token(headers: &HeaderMap, name: &HeaderName, token: &str) -> bool {
     let lines = headers.get_all(name).iter().filter_map(|value| value.to_str().ok());
     lines.flat_map(|line| line.split(',')).any(|word| word.trim().eq_ignore_ascii_case(token))
 }
 
-/// A WebSocket as a stream of bytes. Where its messages begin and end does not matter.
+/// A WebSocket as a stream of bytes. Message boundaries are ignored.
 #[derive(Debug)]
 pub struct WebSocket<S> {
     stream: S,
@@ -98,14 +98,14 @@ pub struct WebSocket<S> {
     input: BytesMut,
     /// Taken apart and not handed out yet.
     unread: BytesMut,
-    /// Whether the other end has said that nothing follows, or what nobody may say.
+    /// Whether the other end has sent a close frame, or has violated the protocol.
     is_over: bool,
     /// Frames without a byte since the last byte.
     vain_frames: usize,
     output: BytesMut,
-    /// What this end says when it closes: the code, or nothing to whoever gave none.
+    /// The close code of this end; `None` answers a close frame without a code.
     closing: Option<u16>,
-    /// Whether it has.
+    /// Whether the close frame has been queued.
     is_closed: bool,
 }
 
@@ -115,7 +115,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Self::new(stream, Role::Server, BytesMut::new())
     }
 
-    /// Asks for a WebSocket. `host` is what the server is known by, with its port.
+    /// Requests a WebSocket. `host` is the server's host name, with its port.
     pub async fn connect(mut stream: S, host: &str, path: &str) -> Result<Self, WebSocketError> {
         let key = STANDARD.encode(rand::random::<[u8; 16]>());
         let request = format!(
@@ -159,13 +159,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         encode(opcode, payload, mask, &mut self.output);
     }
 
-    /// Nothing more is read of the other end, which is told why when this one closes.
+    /// Stops reading from the other end, which receives the reason when this end closes.
     fn refuse(&mut self, violation: Violation) -> io::Error {
         (self.is_over, self.closing) = (true, Some(violation.code()));
         io::Error::new(io::ErrorKind::InvalidData, violation)
     }
 
-    /// Writes what waits to be written.
+    /// Writes pending bytes.
     fn poll_drain(&mut self, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         while !self.output.is_empty() {
             let written = ready!(Pin::new(&mut self.stream).poll_write(context, &self.output))?;
@@ -179,7 +179,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         Poll::Ready(Ok(()))
     }
 
-    /// Acts on the frames that are here; `unread` has what there is to read.
+    /// Handles the received frames; payload bytes go to `unread`.
     fn act_on_input(&mut self) -> io::Result<()> {
         while self.unread.is_empty() && !self.is_over {
             let piece =
@@ -192,7 +192,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             }
             match piece {
                 Some(Piece::Data(bytes)) => self.unread = bytes,
-                // Who asks without reading the answers gets no more of them.
+                // A client that sends pings without reading the pongs gets no more pongs.
                 Some(Piece::Ping(bytes))
                     if !self.is_closed && self.output.len() < MAX_UNWRITTEN_BYTES =>
                 {
@@ -212,7 +212,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 }
 
-/// The length of the answer's head if it grants the WebSocket; `None` until it has come whole.
+/// The length of the answer's head if the head grants the WebSocket; `None` until the head is
+/// complete.
 fn judge(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
     let mut fields = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut answer = httparse::Response::new(&mut fields);
@@ -247,8 +248,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocket<S> {
         loop {
             this.act_on_input()?;
             if !this.output.is_empty() {
-                // A pong. Whatever can't be written now is written later; an error is one of the
-                // next write as well.
+                // A pong. Bytes that cannot be written now are written later; the next write
+                // reports the error as well.
                 let _ = this.poll_drain(context)?;
             }
             if !this.unread.is_empty() {
@@ -285,8 +286,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for WebSocket<S> {
         }
         let taken = &bytes[..bytes.len().min(FRAME_BYTES)];
         this.queue(Opcode::Binary, taken);
-        // What is taken is on its way even if nobody flushes; what does not fit now goes before the
-        // next.
+        // Accepted bytes are sent even without a flush; bytes that do not fit now go before the
+        // next write.
         let _ = this.poll_drain(context)?;
         Poll::Ready(Ok(taken.len()))
     }
@@ -404,7 +405,7 @@ mod tests {
             let (client, mut server) = pair(1024).await;
             let WebSocket { mut stream, .. } = client;
             stream.write_all(&frame).await.expect("written");
-            // Whether it is data, the end or an error.
+            // The result may be data, the end or an error.
             let _ = server.read(&mut [0; 8]).await;
             server.shutdown().await.expect("closed");
             let mut came = Vec::new();

@@ -1,6 +1,6 @@
-//! Waits until an administrator approves a robot that has just registered, or turns it away. Who it
-//! is has been written down, so that the wait goes on after a restart; an agent that runs meanwhile
-//! notices by itself.
+//! Waits until an administrator approves or rejects a robot that has just registered. The robot's
+//! identity is stored first, so that the wait continues after a restart; an agent that runs
+//! meanwhile notices the approval by itself.
 
 use std::time::Duration;
 
@@ -16,19 +16,21 @@ use crate::system::layout::DataDir as Layout;
 use crate::task::plan::backoff_ms;
 use crate::transfer::server::{Sent, Server, ServerError};
 
-/// The longest pause between two questions; the shortest is a quarter of it.
+/// Maximum pause between two requests; the minimum is a quarter of it.
 const PAUSE: Duration = Duration::from_secs(8);
-/// The longest while the server can't be reached.
+/// Maximum pause while the server can't be reached.
 const MAX_AWAY_MS: u64 = 60 * 1000;
 
-/// The server must hold the key that the token pins: a desired state that it signed shows it.
+/// Checks that the server holds the key that the token pins: a desired state signed with that key
+/// proves this.
 pub(super) fn check_key(sent: &Sent, robot: &Identity) -> anyhow::Result<()> {
     admission::open(&sent.envelope, &robot.server_key, &robot.robot_id)
         .context("the server does not hold the key that the enrolment token names")?;
     Ok(())
 }
 
-/// Waits, and makes `robot` the registered one or forgets it. `before` is who this robot was.
+/// Waits, and makes `robot` the registered robot or forgets it. `before` is the robot's previous
+/// identity.
 pub(super) async fn wait(
     data: &Layout,
     server: &Server,
@@ -61,13 +63,12 @@ pub(super) async fn wait(
     }
 }
 
-/// Whether the robot was not registered anew, and has not gone over to another token, while it
-/// waited.
+/// Whether, during the wait, the robot was not registered again and did not change its token.
 fn is_still(data: &Layout, robot: &Identity) -> bool {
     Identity::read(&data.identity()).is_ok_and(|known| known.token == robot.token)
 }
 
-/// Who this robot was before, or nobody.
+/// Restores the robot's previous identity, or removes the identity if there was none.
 pub(super) fn forget(data: &Layout, before: Option<Identity>) -> anyhow::Result<()> {
     match before {
         Some(before) => Ok(before.write(&data.identity())?),
@@ -75,7 +76,7 @@ pub(super) fn forget(data: &Layout, before: Option<Identity>) -> anyhow::Result<
     }
 }
 
-/// What comes of the wait: the state the server sends first, or why the robot was turned away.
+/// The result of the wait: the first state from the server, or the reason for the rejection.
 async fn answer(server: &Server) -> Result<Option<Sent>, String> {
     let mut failures = 0;
     loop {
@@ -86,7 +87,7 @@ async fn answer(server: &Server) -> Result<Option<Sent>, String> {
                 failures = 0;
                 PAUSE.mul_f64(0.25 + 0.75 * rand::random::<f64>())
             }
-            // It is let in; why it gets no state now is not this command's to settle.
+            // The robot is approved. Another refusal to send a state is not this command's concern.
             Err(ServerError::Refused { .. }) => return Ok(None),
             Err(error) => {
                 failures += 1;

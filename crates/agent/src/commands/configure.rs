@@ -1,6 +1,6 @@
-//! `task-agent configure`: the paper's form. It shows the MAC that was found, asks for what it
-//! can't know, and writes the property file. Flags answer questions; with `--yes` the rest keeps
-//! its value.
+//! `task-agent configure`: the settings form from the paper. The command shows the MAC that was
+//! found, asks for the values that it can't determine, and writes the property file. Flags answer
+//! questions; with `--yes` the other settings keep their values.
 
 use std::io::{IsTerminal as _, Write as _};
 use std::path::PathBuf;
@@ -40,7 +40,7 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Asks, and writes the property file.
+/// Asks the questions, and writes the property file.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let data = Layout::new(&arguments.data.data)?;
     let mut settings = Settings::read(data.root())?;
@@ -113,8 +113,8 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
     Ok(())
 }
 
-/// Asks until the answer can be used; an empty one takes the default, and where that is empty too,
-/// nothing.
+/// Asks until the answer is valid. An empty answer selects the default, or no value where there is
+/// no default.
 fn ask<T>(
     question: &str,
     default: &str,

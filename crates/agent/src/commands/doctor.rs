@@ -1,5 +1,5 @@
-//! `task-agent doctor`: looks for what commonly goes wrong on a robot and between it and its
-//! server, and says how to mend it. It changes nothing, and disturbs no agent that runs.
+//! `task-agent doctor`: checks for common problems on a robot and between the robot and its server,
+//! and suggests fixes. The command changes nothing, and does not disturb a running agent.
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -36,15 +36,15 @@ use crate::task::ledger::Ledger;
 use crate::transfer::credential::Credential;
 use crate::transfer::server::{self, Server, ServerError};
 
-/// How long each answer may take.
+/// Maximum time for each answer.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// A clock that is wrong by more confuses whoever reads logs.
+/// A clock error above this limit confuses readers of logs.
 const SKEW_NOTICE_S: u64 = 10;
-/// By more than this, signed orders and certificates end at wrong times.
+/// With a clock error above this limit, signed orders and certificates expire at wrong times.
 const SKEW_BAD_S: u64 = 60 * 60;
-/// A certificate that ends sooner is a reason to look.
+/// A certificate that expires within this time is reported.
 const SOON_MS: u64 = 14 * 24 * 60 * 60 * 1000;
-/// Files that a robot with many tasks has open.
+/// Number of open files that a robot with many tasks needs.
 const WANTED_FILES: u64 = 1024;
 
 /// Arguments of `doctor`.
@@ -57,7 +57,7 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Looks at everything; fails when something is bad.
+/// Runs all checks; fails when one of them has a bad result.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     let checkup = runtime.block_on(check(&arguments.data.data))?;
@@ -121,17 +121,17 @@ fn settings(checkup: &mut Checkup, data: &Path) -> Option<Config> {
     }
 }
 
-/// The settings that hold: the robot's `own`, and what its server has said last.
+/// The effective settings: the robot's `own`, and the last ones from its server.
 fn settled(own: &Config, layout: &Layout, identity: &Identity) -> Config {
     let accepted = Ledger::peek(&layout.ledger()).ok().flatten().and_then(|ledger| ledger.accepted);
     let state = accepted.and_then(|accepted| {
-        // One that is not this server's says nothing, as in the agent.
+        // A state that this server did not sign is ignored, as in the agent.
         admission::open(&accepted.envelope, &identity.server_key, &identity.robot_id).ok()
     });
     state.map_or_else(|| own.clone(), |state| settle(own, &state.settings).config)
 }
 
-/// The directory, who the robot is, and whether its agent runs.
+/// Checks the data directory, the robot's identity, and whether the agent runs.
 fn directory(checkup: &mut Checkup, data: &Path) -> Option<(Layout, Identity)> {
     let flags = AccessFlags::R_OK | AccessFlags::W_OK | AccessFlags::X_OK;
     match access(data, flags) {
@@ -214,7 +214,7 @@ async fn server(
         Some(config) if !config.mqtt => checkup.good("mqtt", "is turned off: the robot polls"),
         config => {
             let transport = config.map(|config| config.mqtt_transport).unwrap_or_default();
-            // As the agent: where the enrolment said, until the server says something else.
+            // As in the agent: the address from the enrollment, until the server names another one.
             mqtt(
                 checkup,
                 base,
@@ -228,7 +228,7 @@ async fn server(
     Ok(())
 }
 
-/// The ways that a session may take.
+/// Checks the routes that a session may take.
 async fn mqtt(
     checkup: &mut Checkup,
     base: &Url,
@@ -238,7 +238,7 @@ async fn mqtt(
 ) {
     let host = base.host_str().unwrap_or_default().to_owned();
     let has_websocket = mqtt.external.is_none() && transport != MqttTransport::Tcp;
-    // A broker that is not the server's own has nothing but its port.
+    // An external broker has nothing but its port.
     let has_port = mqtt.external.is_some() || transport != MqttTransport::Websocket;
     let mqtt_tls = |is_encrypted| match (&mqtt.external, is_encrypted) {
         (_, false) => None,
@@ -269,7 +269,7 @@ async fn mqtt(
     }
 }
 
-/// The first answer, and by its date the clock.
+/// Checks the server's first answer, and the clock by the answer's date.
 async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> bool {
     let url = format!("{}/healthz", base.as_str().trim_end_matches('/'));
     let response = match client.get(url).timeout(PATIENCE).send().await {
@@ -334,7 +334,7 @@ async fn certificate(checkup: &mut Checkup, host: &str, port: u16, identity: &Id
     }
 }
 
-/// Whether the token is accepted, and where the server says that MQTT is.
+/// Checks whether the server accepts the token, and returns the address of MQTT from the server.
 async fn token(checkup: &mut Checkup, server: &Server) -> Option<MqttEndpoint> {
     match timeout(PATIENCE, server.mqtt_endpoint()).await {
         Ok(Ok(endpoint)) => {
@@ -362,7 +362,7 @@ async fn token(checkup: &mut Checkup, server: &Server) -> Option<MqttEndpoint> {
     None
 }
 
-/// Whether MQTT is spoken there. One of two ways is enough.
+/// Checks whether MQTT is spoken at the route's address. One of two routes is enough.
 async fn greet(checkup: &mut Checkup, name: &str, route: &Route, has_other: bool) -> bool {
     let at = format!("{}:{}", route.host, route.port);
     let found = match timeout(PATIENCE, greet_mqtt(route)).await {
@@ -452,14 +452,14 @@ fn ros(checkup: &mut Checkup, config: &Config) {
     }
 }
 
-/// Where an installation has programs: beside its setup file, as in a virtual environment, or in
-/// `bin`.
+/// Directories of an installation's programs: beside its setup file, as in a virtual environment,
+/// or in `bin`.
 fn own_programs(installation: &Installation) -> Vec<PathBuf> {
     let dirs = installation.setups.iter().filter_map(|setup| setup.parent());
     dirs.flat_map(|dir| [dir.to_owned(), dir.join("bin")]).collect()
 }
 
-/// What tasks run in, and as whom.
+/// Checks the environment and the account of tasks.
 fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
     let mend = "tasks run all the same, without limits that hold; use a kernel with cgroup v2 and let systemd delegate \
                 (Delegate=yes in the agent's unit)";
@@ -511,7 +511,7 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
     }
 }
 
-/// An HTTP date, like `Sun, 06 Nov 1994 08:49:37 GMT`, in seconds since the Unix epoch.
+/// Parses an HTTP date, like `Sun, 06 Nov 1994 08:49:37 GMT`, to seconds since the Unix epoch.
 fn parse_date(text: &str) -> Option<u64> {
     const MONTHS: [&str; 12] =
         ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];

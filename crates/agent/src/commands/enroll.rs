@@ -1,5 +1,5 @@
-//! `task-agent enroll`: registers this robot at a server with an enrolment token, and keeps who it
-//! is.
+//! `task-agent enroll`: registers this robot at a server with an enrollment token, and stores its
+//! identity.
 
 use std::process::ExitCode;
 use std::time::Duration;
@@ -21,9 +21,9 @@ use crate::system::layout::DataDir as Layout;
 use crate::task::plan::backoff_ms;
 use crate::transfer::server::{self, Server, ServerError};
 
-/// How often the server is asked.
+/// Maximum number of requests to the server.
 const TRIES: u32 = 4;
-/// The longest pause between two tries.
+/// Maximum pause between two attempts.
 const MAX_PAUSE_MS: u64 = 4000;
 
 /// Arguments of `enroll`.
@@ -32,7 +32,7 @@ pub struct Arguments {
     /// The server's URL [default: the one in the property file]
     #[arg(long, value_name = "URL")]
     server: Option<String>,
-    /// The enrolment token: `taskd enroll-token create` makes one. Other users of the machine can
+    /// The enrollment token: `taskd enroll-token create` makes one. Other users of the machine can
     /// read it here, but not in the variable
     #[arg(long, value_name = "TOKEN", env = "TASK_AGENT_ENROLL_TOKEN", hide_env_values = true)]
     token: Option<String>,
@@ -52,7 +52,7 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Reads `key=value`.
+/// Parses `key=value`.
 pub(super) fn parse_label(text: &str) -> Result<(LabelKey, LabelValue), String> {
     let (key, value) = text.split_once('=').ok_or("expected key=value")?;
     let key = key.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?;
@@ -131,8 +131,8 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
         mac,
         awaits_approval: response.awaits_approval,
     };
-    // Written before the token is used: once it was, the server gives no other for the same
-    // enrolment token.
+    // The identity is written before the token is used: after the first use, the server gives no
+    // other token for the same enrollment token.
     let before = Identity::read(&data.identity()).ok();
     robot.write(&data.identity())?;
     let registered =
@@ -140,8 +140,8 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     if response.awaits_approval {
         approval::wait(&data, &registered, robot, before).await?;
     } else if let Ok(Some(sent)) = registered.desired(None).await
-        // Without that answer the robot is registered all the same and must not forget who it is:
-        // every state is verified before it is obeyed.
+        // Without that answer the robot is registered all the same and must not forget its
+        // identity: every state is verified before it is obeyed.
         && let Err(error) = check_key(&sent, &robot)
     {
         approval::forget(&data, before)?;
@@ -154,7 +154,7 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Waits on for what an earlier call of the command waited for.
+/// Resumes the wait of an earlier call of the command.
 async fn go_on_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCode> {
     let (server, id) = (parse_server(&robot.server)?, robot.robot_id.clone());
     refuse_plain_text(robot.ca_pin, &server, "server")?;
@@ -165,8 +165,8 @@ async fn go_on_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCod
     Ok(ExitCode::SUCCESS)
 }
 
-/// Registers, again if no answer came: while nobody has used the token that was in it, the same
-/// answer can be had anew.
+/// Registers the robot, with another attempt if no answer came: until the token in the answer has
+/// been used, the server repeats the same answer.
 async fn register(
     client: &reqwest::Client,
     server: &reqwest::Url,
@@ -190,7 +190,7 @@ async fn register(
     }
 }
 
-/// Keeps in the property file what was given on the command line.
+/// Stores the values from the command line in the property file.
 fn remember_settings(
     data: &Layout,
     arguments: &Arguments,

@@ -11,10 +11,10 @@ use tokio::net::unix::pipe;
 use crate::process::confinement;
 use crate::ros::graph::serve;
 
-/// What takes more than a moment, and so has a thread of its own: opening the graph, leaving it.
+/// Maximum number of threads for blocking work: opening the graph and leaving it.
 const MAX_BLOCKING_THREADS: usize = 2;
 
-/// Does what is read on standard input until that ends.
+/// Executes requests from standard input until its end.
 pub fn run() -> anyhow::Result<ExitCode> {
     start_logging();
     confinement::hide_this_process();
@@ -30,7 +30,7 @@ pub fn run() -> anyhow::Result<ExitCode> {
             pipe::Sender::from_owned_fd(owned(output.as_fd())?).context("standard output")?;
         serve::serve(input, output).await.context("the agent")
     });
-    // A thread of the DDS library that hangs is no reason to stay.
+    // The command does not wait for a thread of the DDS library that hangs.
     runtime.shutdown_background();
     outcome.map(|()| ExitCode::SUCCESS)
 }
@@ -39,7 +39,7 @@ fn owned(stream: BorrowedFd<'_>) -> anyhow::Result<std::os::fd::OwnedFd> {
     stream.try_clone_to_owned().context("cannot use the pipes to the agent")
 }
 
-/// What strangers send is no reason to write a line for each of it.
+/// Limits the logging: untrusted messages must not cause one line each.
 fn start_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,rustdds=off"));

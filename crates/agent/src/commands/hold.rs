@@ -1,5 +1,5 @@
-//! `task-agent hold` and `release`: a person at the robot has the last word. A flag file in the
-//! data directory, so that both work without server and without a running agent.
+//! `task-agent hold` and `release`: a person at the robot has the last word. Both commands use a
+//! flag file in the data directory, so that they work without a server and without a running agent.
 
 use std::process::ExitCode;
 
@@ -16,7 +16,7 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// From now on nothing is started or switched, also after a power cut.
+/// Blocks starts and switches from now on, also after a power cut.
 pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let path = arguments.data.data.join(HOLD_FILE);
     durable::write(&path, b"", 0o644)
@@ -24,7 +24,7 @@ pub fn hold(arguments: Arguments) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// From now on orders are followed again.
+/// Lets the agent follow orders again.
 pub fn release(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let path = arguments.data.data.join(HOLD_FILE);
     match std::fs::remove_file(&path) {
@@ -43,8 +43,7 @@ mod tests {
         let dir = tempfile::tempdir().expect("a directory");
         let arguments = || Arguments { data: DataDir { data: dir.path().to_owned() } };
         let path = dir.path().join(HOLD_FILE);
-        // What is written so that it lasts takes the place of what was there, and is not written
-        // into it.
+        // A durable write replaces the old file and does not write into it.
         std::os::unix::fs::symlink(dir.path().join("elsewhere"), &path).expect("linked");
         hold(arguments()).expect("held");
         assert!(

@@ -1,4 +1,4 @@
-//! `task-agent man`: its man pages, made of the command line itself.
+//! `task-agent man`: the program's man pages, generated from its command line definition.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -22,7 +22,7 @@ pub mod run;
 pub mod shim;
 pub mod status;
 
-/// Where a robot keeps everything, unless `--data` or `TASK_AGENT_DATA` say otherwise.
+/// Default directory of all data of a robot, overridden by `--data` or `TASK_AGENT_DATA`.
 pub const DEFAULT_DATA_DIR: &str = "/var/lib/task-agent";
 
 /// The data directory, which every subcommand takes.
@@ -42,7 +42,7 @@ enum Output {
     Json,
 }
 
-/// Whoever knows the server by a pin says nothing to it in plain text. `setting` is what gave the
+/// Refuses plain text where the server is identified by a pin. `setting` is the source of the
 /// server's address.
 fn refuse_plain_text(
     pin: Option<CaPin>,
@@ -58,8 +58,8 @@ fn refuse_plain_text(
     Ok(())
 }
 
-/// How the agent speaks TLS: whom it takes for the server, and the key that it shows if it is asked
-/// for one.
+/// The agent's TLS configuration: the trusted certificates for the server, and the agent's key for
+/// servers that request a client certificate.
 fn tls(pin: Option<CaPin>, key: Option<&ClientKey>) -> anyhow::Result<ClientConfig> {
     let mut config = Trust::by(pin).client_config(clock::for_certificates());
     if let Some(key) = key {
@@ -74,7 +74,7 @@ pub fn print_error(error: &anyhow::Error) {
     eprintln!("task-agent: {error:#}");
 }
 
-/// Prints a line on stdout. A reader that has gone away is no reason to fail.
+/// Prints a line on stdout. A closed reader is no error.
 fn say(line: std::fmt::Arguments<'_>) {
     use std::io::Write as _;
     let _ = writeln!(std::io::stdout(), "{line}");

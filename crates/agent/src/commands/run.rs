@@ -1,4 +1,4 @@
-//! `task-agent run`: puts the agent together and drives until a signal. Tasks go on running
+//! `task-agent run`: assembles the agent and runs it until a signal. Tasks go on running
 //! afterwards; under systemd that needs `KillMode=process`.
 
 use std::fs::{File, OpenOptions, Permissions, TryLockError};
@@ -41,11 +41,11 @@ use crate::telemetry::vitals::{self, Gauge, Places};
 use crate::transfer::credential::Credential;
 use crate::transfer::server::{self, Server};
 
-/// Messages from the link that the driver has not taken yet.
+/// Maximum number of link messages that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
-/// Questions that wait to be answered.
+/// Maximum number of unanswered questions.
 const QUEUED_QUESTIONS: usize = 32;
-/// How long what is left may take after a signal.
+/// Maximum time for the remaining work after a signal.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Arguments of `run`.
@@ -62,8 +62,7 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::from(status.as_shell_code()));
     }
     confinement::protect_this_process();
-    // Two, also on one core: writing the ledger to a slow card must not keep the link from being
-    // served.
+    // Two threads, also on one core: writing the ledger to a slow card must not block the link.
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;
     let outcome = runtime.block_on(drive(arguments));
@@ -169,7 +168,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         let talk = (said, messages_out);
         converse(access, shared, heard, data, robot, orders, talk);
     } else {
-        // Nobody is to wait for a session, or for parts.
+        // Nothing may wait for a session, or for parts.
         shared.mqtt_tried.send_replace(true);
         shared.listening.session(false);
     }
@@ -180,14 +179,14 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Where the server is: as the settings say, else where the robot enrolled.
+/// The server's URL: from the settings, else from the enrollment.
 fn server_of(config: &Config, identity: &Identity) -> anyhow::Result<reqwest::Url> {
     let base = config.server.clone().map_or_else(|| parse_server(&identity.server), Ok)?;
     refuse_plain_text(identity.ca_pin, &base, "server")?;
     Ok(base)
 }
 
-/// Keeps a session up, answers what is asked in it and publishes what tasks say.
+/// Keeps a session up, answers its requests and publishes the messages of tasks.
 fn converse(
     access: MqttAccess,
     shared: Shared,
@@ -219,8 +218,8 @@ fn start_logging() {
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
-/// Keeps a second agent away from the data directory while this one lives. The file is this user's
-/// alone: whoever could open it could lock it, and so keep every agent from starting.
+/// Prevents a second agent from using the data directory while this one lives. Only this user may
+/// access the file: a user who could open it could lock it, and so keep every agent from starting.
 fn lock(data: &Layout) -> anyhow::Result<File> {
     let path = data.root().join("lock");
     let open = || {
@@ -240,7 +239,7 @@ fn lock(data: &Layout) -> anyhow::Result<File> {
     }
 }
 
-/// The ledger, and what to say if an earlier one could not be read.
+/// The ledger, and a message if an earlier one could not be read.
 fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
     // The start counter must be above that of the lost ledger; seconds since 1970 are above any
     // count of starts.
@@ -270,7 +269,7 @@ async fn cancel_on_signal(shutdown: CancellationToken) {
             tokio::select! {
                 // Cancel-safe, and nothing follows: a signal stays noticed until it is received.
                 _ = interrupt.recv() => {}
-                // Cancel-safe, likewise.
+                // Cancel-safe, for the same reason.
                 _ = terminate.recv() => {}
             }
             shutdown.cancel();

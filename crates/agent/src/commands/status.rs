@@ -1,5 +1,5 @@
-//! `task-agent status`: where this robot's tasks stand, read from what the agent wrote down. Works
-//! without server and without a running agent.
+//! `task-agent status`: the state of this robot's tasks, read from the agent's files. The command
+//! works without a server and without a running agent.
 
 use std::process::ExitCode;
 

@@ -1,9 +1,10 @@
-//! Which settings hold, where the robot's own file and environment and its administrator at the
-//! server both say something: the robot's own, for whoever set it stands next to it. A function of
-//! values; it reads nothing.
+//! Decides which settings apply when both the robot's own file and environment and its
+//! administrator at the server set a value. The robot's own settings win, because they were set by
+//! a person next to the robot. A function of values; it reads no files or variables.
 //!
-//! A setup file is a shell script that whoever names it gets run. So a robot that runs only what
-//! its publishers have signed takes none from its server, unless its own settings say that it may.
+//! A setup file is a shell script, so naming one means running code. A robot that runs only
+//! packages signed by its publishers therefore takes no setup files from its server, unless its own
+//! settings allow this.
 
 use std::path::{Path, PathBuf};
 
@@ -13,21 +14,21 @@ use task_proto::settings::{EffectiveSettings, RobotSettings};
 
 use crate::config::{Config, count};
 
-/// What holds.
+/// The effective settings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settled {
-    /// The robot's settings with what is taken from the server.
+    /// The robot's settings with the values taken from the server.
     pub config: Config,
-    /// The same as it is reported; `None`: all of it is the default.
+    /// The same settings for the report; `None`: all have their defaults.
     pub effective: Option<EffectiveSettings>,
 }
 
-/// The keys of settings that name what a shell reads.
+/// Keys of the settings that name files for a shell.
 const SHELL_KEYS: [&str; 2] = ["underlays", "workspace"];
 
-/// What holds of a robot's `own` settings and of what was `set` at the server, whose values have
-/// been checked there and are checked again, each for itself: a server's mistake must not keep the
-/// robot from its tasks, nor from the other settings.
+/// Combines the robot's `own` settings with the values `set` at the server. The server has checked
+/// its values, and they are checked again here, each separately: a server's mistake must not keep
+/// the robot from its tasks, nor from the other settings.
 pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
     let mut config = own.clone();
     let mut mine = Vec::new();
@@ -78,7 +79,8 @@ pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
     Settled { config, effective }
 }
 
-/// As it can be said on the wire; a person at the robot may have named stranger ones.
+/// The path in its wire form, where it has one: a user at the robot may have named a path that the
+/// wire form does not allow.
 fn shown_path(path: &Path) -> Option<AbsolutePath> {
     path.to_str()?.parse().ok()
 }

@@ -1,6 +1,6 @@
-//! Whom this robot trusts to publish packages: what its settings say, and after that the newest
-//! list of publishers it was shown, which is kept on the disk. It judges lists and packages; it
-//! fetches nothing, and the server has no say in it.
+//! The publishers that this robot trusts to publish packages: at first those in its settings, later
+//! those in the newest list of publishers that the robot received and stored on disk. This module
+//! judges lists and packages. It fetches nothing, and the server cannot influence its decisions.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -20,50 +20,51 @@ use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
 use crate::system::durable;
 use crate::system::untrusted_file;
 
-/// Whom the robot's settings trust.
+/// The trust settings of the robot.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TrustSettings {
-    /// Who may publish until a list says otherwise.
+    /// The keys that may publish until a list replaces them.
     pub publishers: Role,
-    /// Who may make the first list.
+    /// The keys that may sign the first list.
     pub keepers: Role,
-    /// Nothing is run before there is one.
+    /// Whether nothing is run before there is a list.
     pub requires_list: bool,
 }
 
-/// What is to be done with a package.
+/// The intended use of a package.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Use {
-    /// It is new here.
+    /// The package is new on this robot.
     Begin,
-    /// It has run here, and is started again.
+    /// The package has run on this robot and is started again.
     GoOn,
 }
 
-/// Why a package is not run.
+/// Reasons why a package is not run.
 #[derive(Debug, thiserror::Error)]
 pub enum Distrust {
-    /// Too few have signed it.
+    /// Too few publishers have signed the package.
     #[error(transparent)]
     Unsigned(#[from] Unsigned),
-    /// The publishers have taken it back.
+    /// The publishers have withdrawn the package.
     #[error("version {0} of the list of publishers withdraws it")]
     Withdrawn(u64),
-    /// Somebody may be keeping a newer list from the robot.
+    /// An attacker may be withholding a newer list from the robot.
     #[error(
         "version {version} of the list of publishers, the newest this robot was shown, has expired"
     )]
     Expired {
-        /// Of the list.
+        /// Version of the list.
         version: u64,
     },
-    /// What list counted can't be told any more, and to go by the settings could be to go back.
+    /// The list that applied is no longer known. A fallback to the settings could be a rollback to
+    /// older keys.
     #[error("the list of publishers in {path} can't be read: only a person can remove it")]
     Unreadable {
-        /// The file.
+        /// Path of the stored list.
         path: PathBuf,
     },
-    /// There must be a list and is none.
+    /// The settings require a list and there is none.
     #[error(
         "trusted_publishers.require_list is set, and this robot was shown no list of publishers"
     )]
@@ -71,7 +72,7 @@ pub enum Distrust {
 }
 
 impl Distrust {
-    /// It as a failure of what `package` was ordered for.
+    /// The error as a failure of the order for `package`.
     pub fn failure(&self, package: &PackageRef) -> Failure {
         let code = if self.may_pass() {
             FailureCode::PUBLISHERS_EXPIRED
@@ -81,52 +82,52 @@ impl Distrust {
         Failure::new(code, format!("{} {} may not run here: {self}", package.name, package.version))
     }
 
-    /// Whether a newer list alone, which may come at any time, sets it right.
+    /// Whether a newer list alone, which may come at any time, resolves the error.
     pub fn may_pass(&self) -> bool {
         matches!(self, Self::Expired { .. } | Self::NoList)
     }
 }
 
-/// Why a list was not taken over.
+/// Reasons why a list was not accepted.
 #[derive(Debug, thiserror::Error)]
 pub enum NotTaken {
-    /// It does not follow the one that counts.
+    /// The list is no valid successor of the current one.
     #[error(transparent)]
     Refused(#[from] Refused),
-    /// It could not be kept, and what is forgotten at the next start must not count now.
+    /// The list could not be stored, and a list that is lost at the next start must not apply now.
     #[error("the list can't be kept")]
     Disk(#[source] io::Error),
 }
 
-/// Whom a robot trusts.
+/// The robot's current trust decisions.
 pub struct Trust {
     settings: TrustSettings,
     path: PathBuf,
-    /// Whether there is a list at `path` that can't be read.
+    /// Whether the list at `path` exists and can't be read.
     is_unreadable: bool,
     list: RwLock<Option<Counting>>,
 }
 
-/// The list that counts.
+/// The list that applies.
 struct Counting {
     list: PublisherList,
-    /// Of the bytes it came in.
+    /// Digest of the bytes in which the list arrived.
     digest: Digest,
 }
 
-/// The file's content.
+/// Content of the stored file.
 #[derive(Serialize, Deserialize)]
 struct Kept {
-    /// The list as it was signed.
+    /// The list with its signatures.
     envelope: Envelope,
-    /// What it was fetched by.
+    /// Digest by which the list was fetched.
     digest: Digest,
-    /// The settings under which it was taken over.
+    /// The settings under which the list was accepted.
     settings: TrustSettings,
 }
 
 impl Trust {
-    /// What `settings` say, and the list at `path` if one was kept there.
+    /// The trust given by `settings`, and by the list at `path` if one is stored there.
     pub fn open(settings: TrustSettings, path: PathBuf) -> Self {
         let list = match untrusted_file::read(&path, 2 * MAX_LIST_BYTES) {
             Ok(bytes) => Kept::read(&bytes).and_then(|kept| kept.list(&settings)),
@@ -144,22 +145,22 @@ impl Trust {
         }
     }
 
-    /// The version of the list that counts; 0: the settings do.
+    /// The version of the list that applies; 0: the settings apply.
     pub fn version(&self) -> u64 {
         self.list().as_ref().map_or(0, |counting| counting.list.version)
     }
 
-    /// The digest of the list that counts.
+    /// The digest of the list that applies.
     pub fn counting(&self) -> Option<Digest> {
         self.list().as_ref().map(|counting| counting.digest)
     }
 
-    /// Takes over a list, which came in bytes of this digest, if it may follow the one that counts.
+    /// Accepts a list, which arrived in bytes with this digest, if it may follow the current one.
     pub fn take(&self, envelope: &Envelope, digest: Digest) -> Result<(), NotTaken> {
         if self.is_unreadable {
             return Err(NotTaken::Disk(io::Error::other("there is one that can't be read")));
         }
-        // Held over the write to the disk: lists are taken one after another.
+        // The lock is held during the write to the disk: lists are accepted one after another.
         let mut current = self.list.write().unwrap_or_else(PoisonError::into_inner);
         let (keepers, version) =
             current.as_ref().map_or((&self.settings.keepers, 0), |Counting { list, .. }| {
@@ -173,7 +174,8 @@ impl Trust {
         Ok(())
     }
 
-    /// Those of `envelopes` by which `package` may be used so; or why it may not.
+    /// The envelopes of `envelopes` that allow this use of `package`; or the reason why the use is
+    /// refused.
     pub fn judge<'a>(
         &self,
         package: &PackageRef,
@@ -201,13 +203,13 @@ impl Trust {
         Ok(counted)
     }
 
-    /// Whether the lifetime of the list that counts is over.
+    /// Whether the list that applies has expired.
     pub fn is_over(&self, wall_ms: u64) -> bool {
         self.list().as_ref().is_some_and(|Counting { list, .. }| is_over(list, wall_ms))
     }
 
     fn list(&self) -> RwLockReadGuard<'_, Option<Counting>> {
-        // A list is put in its place whole.
+        // A list is always replaced as a whole.
         self.list.read().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -217,8 +219,8 @@ impl Kept {
         Ok(serde_json::from_slice(bytes)?)
     }
 
-    /// The list, if it counts under `settings`. A person who changes them has the last word: then
-    /// it counts only if those who keep the lists now have signed it.
+    /// The list, if it applies under `settings`. The settings have the last word: after a change of
+    /// the settings the list applies only if the keepers in the new settings have signed it.
     fn list(&self, settings: &TrustSettings) -> io::Result<Option<Counting>> {
         let list = if self.settings.keepers == settings.keepers {
             Some(PublisherList::unverified(&self.envelope).map_err(io::Error::other)?)
@@ -229,20 +231,20 @@ impl Kept {
     }
 }
 
-/// As with desired states: a clock that shows a time before this program existed is wrong and locks
-/// nobody out.
+/// As with desired states: a clock that shows a time before this program existed is wrong and must
+/// not lock the robot out.
 fn is_over(list: &PublisherList, wall_ms: u64) -> bool {
     wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms)
 }
 
-/// The envelopes kept about a package; none if there are none that can be read.
+/// The stored envelopes of a package; none if there are no readable ones.
 pub fn read_signatures(path: &Path) -> Vec<Envelope> {
     let bytes = untrusted_file::read(path, (MAX_SIGNATURES as u64 + 1) * MAX_SIGNATURE_BYTES)
         .unwrap_or_default();
     serde_json::from_slice(&bytes).unwrap_or_default()
 }
 
-/// Keeps the envelopes about a package.
+/// Stores the envelopes of a package.
 pub fn write_signatures(path: &Path, envelopes: &[&Envelope]) -> io::Result<()> {
     if let Some(parent) = path.parent() {
         durable::create_dir_all(parent)?;
@@ -303,7 +305,7 @@ mod tests {
     }
 
     impl Robot {
-        /// Publisher 1 and keeper 2, by the settings.
+        /// A robot whose settings name publisher 1 and keeper 2.
         fn new() -> Self {
             let dir = tempfile::tempdir().expect("a directory");
             Self { trust: Self::open(&dir, 1, 2, false), dir }
@@ -355,7 +357,7 @@ mod tests {
             assert_eq!(robot.trust.version(), 1);
             robot.restart();
         }
-        // The publisher is not the keeper, nor is one who kept it before.
+        // Neither the publisher's key nor a former keeper's key may sign a list.
         assert!(matches!(robot.take(&list(2, 9, 9).seal(&key(3))), Err(NotTaken::Refused(_))));
         let mut handed_on = list(2, 4, 5).seal(&key(2));
         handed_on.sign_also(LIST_TYPE, &key(5)).expect("signed");
@@ -394,7 +396,7 @@ mod tests {
         assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 1000), Err("publishers_expired".to_owned()));
         assert_eq!(robot.judge(3, Use::GoOn, NOW_MS + 1000), Ok(1), "what runs goes on");
         assert_eq!(robot.judge(9, Use::Begin, NOW_MS + 1000), Err("untrusted_package".to_owned()));
-        // A clock that can't be right.
+        // A clock value that can't be right.
         assert_eq!(robot.judge(3, Use::Begin, 0), Ok(1));
         let renewed = PublisherList { expires_at_ms: NOW_MS + 9000, ..list(2, 3, 2) };
         robot.take(&renewed.seal(&key(2))).expect("follows");
@@ -429,10 +431,10 @@ mod tests {
     fn whoever_changes_the_settings_has_the_last_word() {
         let robot = Robot::new();
         robot.take(&list(5, 3, 2).seal(&key(2))).expect("follows");
-        // Other publishers, the same keeper: the list still counts, and so does its version.
+        // Other publishers, the same keeper: the list and its version still apply.
         let trust = Robot::open(&robot.dir, 9, 2, false);
         assert_eq!(trust.version(), 5);
-        // Another keeper: it does not.
+        // Another keeper: the list no longer applies.
         assert_eq!(Robot::open(&robot.dir, 1, 7, false).version(), 0);
     }
 

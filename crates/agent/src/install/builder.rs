@@ -1,7 +1,7 @@
-//! Builds a package with the build tool its manifest names: in a bash of its own, out of the way of
-//! everything else, within limits of time, memory, processes and output, and gone without a trace
-//! of processes when it ends. A build begins with empty `build` and `install` directories, so one
-//! that was interrupted is simply done again.
+//! Builds a package with the build tool that its manifest names. The build runs in its own bash at
+//! low priority, with limits on time, memory, processes and output, and leaves no processes behind.
+//! Each build starts with empty `build` and `install` directories, so an interrupted build is
+//! simply repeated.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, File};
@@ -23,116 +23,117 @@ use crate::system::layout::VersionDir;
 use crate::system::task_user::{self, TaskUser};
 use crate::system::untrusted_file;
 
-/// How long the processes of a build may take to be gone.
+/// Longest time for the processes of a build to end.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long the rest of the output may take once no known process of the build is left.
+/// Longest time for the remaining output after the last known process of the build has ended.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(5);
-/// The end of the output that goes into a failure's text, which a report cuts at 4096 characters.
+/// Length of the output's tail in the text of a failure. A report cuts that text at 4096
+/// characters.
 const TAIL_BYTES: usize = 3500;
 /// Added to the agent's niceness.
 const NICE: i32 = 10;
-/// The longest `package.xml` that is looked at.
+/// Largest `package.xml` that is read.
 const MAX_PACKAGE_XML_BYTES: u64 = 1024 * 1024;
 
-/// What to build, and with what.
+/// A build: tool, place, environment and limits.
 #[derive(Debug, Clone)]
 pub struct BuildOrder {
     /// The build tool.
     pub tool: BuildTool,
-    /// Where `src` is and `build` and `install` go.
+    /// The version's directory, with `src`; `build` and `install` are created there.
     pub version: VersionDir,
-    /// The setup files to source first.
+    /// Setup files that are sourced first.
     pub underlays: Vec<PathBuf>,
-    /// The whole environment.
+    /// The complete environment; the agent's own is not inherited.
     pub environment: BTreeMap<String, String>,
-    /// Where the output goes; what an earlier build wrote there is replaced.
+    /// Log file of the output. A new build replaces the log of an earlier one.
     pub log: PathBuf,
-    /// What it may use.
+    /// Limits of the build.
     pub limits: BuildLimits,
-    /// Whom it runs as; `None`: whoever the agent is.
+    /// Account that the build runs as; `None` is the agent's own account.
     pub user: Option<TaskUser>,
-    /// Where it gets its control group.
+    /// Parent of the build's control group.
     pub cgroups: Option<Cgroups>,
 }
 
-/// What a build may use.
+/// Limits of a build.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BuildLimits {
-    /// The time it may take.
+    /// Longest duration.
     pub timeout: Duration,
-    /// The memory all of it may have; without a control group the data that each of its processes
-    /// may have. `None` does not limit it.
+    /// Memory limit of the whole build; without a control group, the limit on the data of each
+    /// process. `None` is unlimited.
     pub memory_bytes: Option<u64>,
-    /// The processes and threads it may have.
+    /// Most processes and threads.
     pub pids: Option<u64>,
-    /// Whether system calls are denied that only an administrator needs.
+    /// Whether to deny system calls that only an administrator needs.
     pub filter_calls: bool,
-    /// The output that is kept.
+    /// Most bytes of output that the log keeps.
     pub log_bytes: u64,
 }
 
-/// What a build said: all that was kept is in a file, its end is here.
+/// Output of a build: the log file, and the tail in memory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Output {
-    /// The file.
+    /// The log file.
     pub log: PathBuf,
-    /// The end of it.
+    /// The last bytes of the output.
     pub tail: String,
 }
 
-/// Why there is no build.
+/// Reasons why a build has no result.
 #[derive(Debug, thiserror::Error)]
 pub enum BuildError {
-    /// The caller no longer wanted it.
+    /// The caller cancelled the build.
     #[error("the build was cancelled")]
     Cancelled,
-    /// It took too long.
+    /// The build exceeded its time limit.
     #[error("the build did not end within {} s; {output}", timeout.as_secs())]
     TimedOut {
-        /// The time it had.
+        /// The time limit.
         timeout: Duration,
-        /// What it said.
+        /// Output of the build.
         output: Output,
     },
-    /// The build tool failed, or is not there.
+    /// The build tool failed or is missing.
     #[error("the build {status}; {output}")]
     Failed {
-        /// How it ended.
+        /// Exit status.
         status: ExitStatus,
-        /// What it said.
+        /// Output of the build.
         output: Output,
     },
-    /// It used more memory than it may.
+    /// The build exceeded its memory limit.
     #[error("the build used more than the {limit_mb} MiB of memory it may; {output}")]
     OutOfMemory {
-        /// What it may use.
+        /// The memory limit, in MiB.
         limit_mb: u64,
-        /// What it said.
+        /// Output of the build.
         output: Output,
     },
-    /// The build tool was content, but the package is not there.
+    /// The build tool succeeded, but the package is not installed.
     #[error("the build tool succeeded without installing {missing}; {output}")]
     NotInstalled {
-        /// What should be there.
+        /// The missing path.
         missing: String,
-        /// What it said.
+        /// Output of the build.
         output: Output,
     },
-    /// Processes of the build could not be ended.
+    /// Some processes of the build could not be ended.
     #[error(transparent)]
     Containment(#[from] ContainmentError),
-    /// The disk or the system refused something.
+    /// The disk or the operating system returned an error.
     #[error("cannot use {}", path.display())]
     Io {
-        /// On what.
+        /// The path in use.
         path: PathBuf,
-        /// What it said.
+        /// The operating system's error.
         source: io::Error,
     },
 }
 
 impl BuildError {
-    /// The code that a report gives; `None` for a build that was cancelled, which is no failure.
+    /// The failure code in a report. `None` for a cancelled build, which is not a failure.
     pub fn code(&self) -> Option<FailureCode> {
         match self {
             Self::Cancelled => None,
@@ -145,7 +146,7 @@ impl BuildError {
 }
 
 impl BuildLimits {
-    /// Half an hour, and three quarters of this machine's memory, so that a build alone can't drive
+    /// Half an hour and three quarters of this machine's memory, so that a build alone can't drive
     /// a robot into the out-of-memory killer.
     pub fn of_this_machine() -> Self {
         let memory_bytes = program::total_memory_bytes().ok().map(|total| total / 4 * 3);
@@ -165,8 +166,8 @@ impl std::fmt::Display for Output {
     }
 }
 
-/// Builds `order`; at once done when there is nothing to build. When it returns, no process of the
-/// build is left and what was installed is on the disk.
+/// Builds `order`; returns at once if the package needs no build. On return, all processes of the
+/// build have ended and the installed files are on the disk.
 pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
     let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else {
         return Ok(());
@@ -174,7 +175,7 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     let root = order.version.root();
     let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.group(root).path().to_owned());
     let guard = KillOnDrop::new(Containment::new(root, None, cgroup));
-    // An agent that was killed leaves its build running.
+    // If an agent was killed, its build is still running.
     guard.end(KILL_TIMEOUT).await?;
     prepare(order, &text)?;
     let Ran { status, tail, out_of_memory } = run(order, &guard, cancel).await?;
@@ -198,7 +199,7 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     }
     let (version, user) = (order.version.clone(), order.user.clone());
     let finishing = tokio::task::spawn_blocking(move || {
-        // What was built is for every account to run and for none to change.
+        // All accounts may run the built files, and none may change them.
         let made = user.iter().flat_map(|user| made(&version).map(|tree| (tree, user.uid)));
         made.into_iter().try_for_each(|(tree, uid)| task_user::take_back(&tree, uid))?;
         durable::sync_file_system(version.root())
@@ -206,7 +207,7 @@ pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(),
     finishing.await.unwrap_or_else(|error| Err(error.into())).map_err(failed(root))
 }
 
-/// What a build writes into.
+/// Directories that a build writes.
 fn made(version: &VersionDir) -> [PathBuf; 3] {
     [version.build(), version.install(), version.root().join("log")]
 }
@@ -215,7 +216,7 @@ fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
     let root = order.version.root();
     for tree in made(&order.version) {
         durable::remove_dir_all(&tree).map_err(failed(&tree))?;
-        // The rest of the version is read-only to its build.
+        // The rest of the version is read-only for the build.
         order.user.as_ref().map_or(Ok(()), |user| user.make_home(&tree)).map_err(failed(&tree))?;
     }
     if let Some(logs) = order.log.parent() {
@@ -230,11 +231,11 @@ fn script_path(order: &BuildOrder) -> PathBuf {
     order.version.root().join("build.sh")
 }
 
-/// What became of a build.
+/// Result of the build's process.
 struct Ran {
-    /// How it ended, or `None` when it was ended here.
+    /// Exit status, or `None` if we ended the process.
     status: Option<ExitStatus>,
-    /// The end of its output.
+    /// The last bytes of the output.
     tail: Vec<u8>,
     out_of_memory: bool,
 }
@@ -266,10 +267,10 @@ async fn run(
         () = tokio::time::sleep(order.limits.timeout) => None,
     };
     let (status, out_of_memory) = (status.map(ExitStatus::from), containment.is_out_of_memory());
-    // The output ends when the last process that could write any has.
+    // The output ends with the last process that holds the pipe.
     containment.end(KILL_TIMEOUT).await?;
     let Ok(copied) = tokio::time::timeout(DRAIN_TIMEOUT, copying).await else {
-        // One that cleared its environment got away and holds the output open.
+        // A process that cleared its environment has escaped and holds the output open.
         return Ok(Ran {
             status,
             tail: b"a process of the build got away and still writes".to_vec(),
@@ -280,8 +281,8 @@ async fn run(
     Ok(Ran { status, tail, out_of_memory })
 }
 
-/// Copies the first `limit` bytes of `output` into `log`, reads on to its end, and returns its last
-/// bytes.
+/// Copies the first `limit` bytes of `output` into `log`, reads `output` to its end, and returns
+/// the last bytes.
 fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
     let (mut room, mut tail) = (limit, VecDeque::with_capacity(TAIL_BYTES));
     let mut buffer = vec![0; 16 * 1024];
@@ -293,16 +294,17 @@ fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
             Err(_) => return tail.into(),
         };
         let kept = count.min(usize::try_from(room).unwrap_or(usize::MAX));
-        // A full disk fails the build by itself; the log is not what it fails for.
+        // On a full disk the build fails by itself. A failed write of the log must not fail the
+        // build.
         room = if log.write_all(&buffer[..kept]).is_ok() { room - kept as u64 } else { 0 };
         tail.extend(&buffer[count.saturating_sub(TAIL_BYTES)..count]);
         tail.drain(..tail.len().saturating_sub(TAIL_BYTES));
     }
 }
 
-/// The package that should have been installed and was not. Build tools skip what they don't
-/// recognise and succeed. The build may have left links anywhere: only the account that it ran
-/// under looks.
+/// Returns the package that the build should have installed and did not. Build tools skip packages
+/// that they don't recognise, and succeed. The build may have left links anywhere, so this check
+/// runs under the build's own account.
 fn missing_package(version: &VersionDir) -> Option<String> {
     let installed = version.install();
     if let Some(name) = package_name(&version.src().join("package.xml")) {
@@ -317,12 +319,11 @@ fn missing_package(version: &VersionDir) -> Option<String> {
     })
 }
 
-/// The name in a `package.xml`. It was checked when the package was pushed, so looking for the
-/// element is enough. The build may have put anything in its place: what is no plain file is not
-/// read.
+/// Reads the name in a `package.xml`. The push already checked the file, so searching for the
+/// element is enough. The build may have replaced the file, so only a regular file is read.
 fn package_name(path: &Path) -> Option<String> {
     let text = String::from_utf8(untrusted_file::read(path, MAX_PACKAGE_XML_BYTES).ok()?).ok()?;
-    // Each piece but the first begins in a comment.
+    // Each piece after the first begins inside a comment.
     let mut pieces = text.split("<!--");
     let mut plain = pieces.next()?.to_owned();
     for piece in pieces {

@@ -1,12 +1,12 @@
-//! Pulls a package from the server in one pass: stream, hash, decompress, unpack. What has arrived
-//! is kept in a `.part` file, so that a pull goes on where the last one ended, across restarts of
-//! the agent: the `.part` is replayed, the rest is asked for by Range. Bytes that were pushed, as
-//! parts or with the order itself, go the same way.
+//! Pulls a package from the server in one pass: stream, hash, decompress, unpack. A `.part` file
+//! keeps the received bytes, so a pull resumes after a cut or a restart of the agent: the `.part`
+//! is replayed and a Range request fetches the rest. Bytes that the server pushes, as parts or with
+//! the order itself, take the same path.
 //!
-//! Invariants: a tree gets its place only when all its bytes had the ordered digest and are on the
-//! disk; the bytes of a pull that failed for good are gone. When a pull is dropped or cancelled
-//! nothing is left but the `.part`. The compressed bytes are not kept once the tree is there: it is
-//! what they were for, and a robot's disk is small.
+//! Invariants: a tree moves to its place only after all its bytes matched the ordered digest and
+//! are on the disk. The bytes of a pull that failed for good are deleted. A dropped or cancelled
+//! pull leaves only the `.part`. The compressed bytes are deleted once the tree is in place: they
+//! have served their purpose, and a robot's disk is small.
 
 mod download;
 mod error;
@@ -55,39 +55,38 @@ use crate::transfer::parts::Listening;
 
 /// The largest task manifest that is held in memory.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
-/// Chunks between the connection and the disk. A chunk is what hyper reads at once, at most about
-/// 400 KiB.
+/// Capacity, in chunks, of the queue between the connection and the disk. A chunk is one read by
+/// hyper, at most about 400 KiB.
 const QUEUED_CHUNKS: usize = 16;
-/// How often one pull connects anew after a cut before it is given back to the caller's slower
-/// retries.
+/// Number of reconnects of one pull before the error goes back to the caller's slower retries.
 const MAX_RECONNECTS: u32 = 5;
-/// A connection that brought as much counts as good: the next cut is the first again.
+/// A connection that delivered this many bytes counts as good and resets the reconnect counter.
 const PROGRESS_BYTES: u64 = 1 << 20;
-/// Contents that are remembered as not to be waited for.
+/// Most contents remembered as given up: we no longer wait for their parts.
 const MAX_GIVEN_UP: usize = 64;
 
-/// Where the bytes come from that are not there.
+/// Source of the missing bytes.
 enum Source {
     Download(Box<Download>),
-    /// They came with the order.
+    /// The bytes came with the order.
     Offered(Bytes),
-    /// All are there.
+    /// No bytes are missing.
     Nothing,
 }
 
 /// Limits of a pull.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FetchSettings {
-    /// How large a package may get.
+    /// Size limits of a package.
     pub limits: Limits,
-    /// Bytes that stay free on the disk whatever is pulled.
+    /// Bytes that every pull leaves free on the disk.
     pub reserve_bytes: u64,
-    /// How long the server may take for each further 16 KiB, and for its first answer.
+    /// Longest time for the server's first answer, and for each further 16 KiB.
     pub stall_timeout: Duration,
-    /// The longest wait before the first new connection after a cut; it grows with each further
-    /// one.
+    /// Longest wait before the first reconnect after a cut. The wait grows with each further
+    /// reconnect.
     pub reconnect_wait: Duration,
-    /// How long parts are waited for that the server pushes.
+    /// Timeouts for parts that the server pushes.
     pub parts: PartPatience,
 }
 
@@ -109,18 +108,18 @@ pub struct Fetcher {
     server: reqwest::Url,
     token: Credential,
     data: DataDir,
-    /// As they were given, under the robot's limits.
+    /// The configured settings, before the robot's limits apply.
     given: FetchSettings,
     settings: RwLock<FetchSettings>,
     turns: Turns,
     meter: LinkMeter,
     offered: Offered,
-    /// Contents that were pushed and did not come: not waited for again.
+    /// Pushed contents that did not arrive completely. We no longer wait for their parts.
     given_up: Mutex<HashSet<Digest>>,
 }
 
 impl Fetcher {
-    /// Lets what is pulled from now on have no more than `limits` say.
+    /// Applies `limits` to all later pulls.
     pub fn limit(&self, limits: &RobotLimits) {
         let mut settings = self.given;
         settings.limits.bytes = limits.archive_bytes.unwrap_or(settings.limits.bytes);
@@ -155,19 +154,19 @@ impl Fetcher {
         }
     }
 
-    /// The same, with what transfers show of the link told to `meter`.
+    /// Reports the transfers' link measurements to `meter`.
     pub fn measured_by(self, meter: LinkMeter) -> Self {
         Self { meter, ..self }
     }
 
-    /// Blobs that came with an order; only those count that are what they say.
+    /// Stores blobs that came with an order. Blobs that do not match their digest are ignored.
     pub fn offer(&self, blobs: impl IntoIterator<Item = (BlobRef, Bytes)>) {
         let is_itself = |(blob, bytes): &(BlobRef, Bytes)| Digest::of(bytes) == blob.digest;
         self.offered.replace(blobs.into_iter().filter(is_itself));
     }
 
-    /// The package's task manifest, from the disk if it is there whole. Its bytes are verified
-    /// either way.
+    /// Returns the package's task manifest, from the disk if a complete copy is there. The bytes
+    /// are verified either way.
     pub async fn manifest(
         &self,
         package: &PackageRef,
@@ -196,9 +195,9 @@ impl Fetcher {
         Ok(manifest)
     }
 
-    /// Pulls the package's content into its version's `src`; at once done if that is there.
-    /// `progress` counts its compressed bytes, those of earlier tries included. Returns when
-    /// nothing of the pull is going on any more.
+    /// Pulls the package's content into its version's `src`, or returns at once if `src` exists.
+    /// `progress` counts compressed bytes, including those of earlier attempts. On return, no work
+    /// of the pull is still running.
     pub async fn content(
         &self,
         package: &PackageRef,
@@ -210,8 +209,9 @@ impl Fetcher {
         self.content_in_turn(package, manifest, progress, cancel, turn).await
     }
 
-    /// The same for a content that the server pushes: gathers its parts from `listening` first, and
-    /// pulls what does not come. `asks` is what a report says of the parts that are lacking.
+    /// Like [`Self::content`], for a content that the server pushes: collects parts from
+    /// `listening` first, then pulls the missing rest. `asks` carries the missing parts for the
+    /// robot's report.
     pub async fn pushed_content(
         &self,
         package: &PackageRef,
@@ -271,15 +271,15 @@ impl Fetcher {
                 self.offered.forget(&content.digest);
                 self.given_up().remove(&content.digest);
             }
-            // Nobody comes back for these bytes, or the disk is full and the ledger needs their
-            // room.
+            // No later attempt uses these bytes, or the disk is full and the ledger needs the
+            // space.
             Err(error) if error.spoils_gathered() => self.discard(package)?,
             Err(_) => {}
         }
         result
     }
 
-    /// Two tasks may share a content, and a pull that was dropped takes a moment to end.
+    /// Locks the content: two tasks may share one, and a dropped pull takes a moment to end.
     async fn turn(
         &self,
         package: &PackageRef,
@@ -300,8 +300,7 @@ impl Fetcher {
         self.pull_whole(&RepositoryName::of_package(&package.name), package.config).await
     }
 
-    /// A blob that is held in memory, of at most `most` bytes: one that came with the order, or
-    /// pulled.
+    /// Returns a blob of at most `most` bytes in memory, from the order or by a pull.
     pub async fn small(
         &self,
         repository: &RepositoryName,
@@ -335,7 +334,8 @@ impl Fetcher {
         progress.send_replace(Progress { done: offset, total: package.content.size });
         let need = Need::of(package, manifest, offset, self.settings().reserve_bytes);
         self.check_room(need)?;
-        // Ask first: a replay for nothing each time the server is away would wear the disk out.
+        // Send the request first. Replaying the `.part` on each attempt while the server is away
+        // would wear the disk out.
         let source = if offset == package.content.size {
             Source::Nothing
         } else if let Some(bytes) = self.offered.get(&package.content) {
@@ -344,7 +344,7 @@ impl Fetcher {
             let answer = cancel.run_until_cancelled(self.download_content(package, offset)).await;
             Source::Download(Box::new(answer.ok_or(FetchError::Cancelled)??))
         };
-        // Ends the blocking half even if this future is dropped while it replays.
+        // Stops the blocking half even if this future is dropped during the replay.
         let stop = cancel.child_token();
         let _stop_on_drop = stop.clone().drop_guard();
         let (sender, receiver) = mpsc::channel(QUEUED_CHUNKS);
@@ -354,7 +354,7 @@ impl Fetcher {
         let feeding = async {
             match source {
                 Source::Download(download) => return self.feed(package, *download, sender).await,
-                // Nobody takes them if the disk fails, which the blocking half knows better.
+                // Sending fails only if the disk failed, and the blocking half reports that error.
                 Source::Offered(bytes) => drop(sender.send(bytes).await),
                 Source::Nothing => {}
             }
@@ -373,8 +373,8 @@ impl Fetcher {
         }
     }
 
-    /// Passes the content's bytes on, connecting anew after a cut. Ends early, and well, if nobody
-    /// takes them.
+    /// Forwards the content's bytes and reconnects after a cut. Ends early and without an error if
+    /// the receiver is gone.
     async fn feed(
         &self,
         package: &PackageRef,
@@ -390,13 +390,13 @@ impl Fetcher {
         while reconnects < MAX_RECONNECTS {
             reconnects += 1;
             tracing::info!(package = %package.name, position, %cut, "connecting anew");
-            // A server that restarts cuts a whole fleet off at once.
+            // Random wait: a server restart cuts off the whole fleet at once.
             let longest = self.settings().reconnect_wait * reconnects;
             tokio::time::sleep(longest.mul_f64(rand::random())).await;
             let ended = match self.download_content(package, position).await {
                 Ok(mut download) => {
                     let ended = self.pass_on(&mut download, &sender).await;
-                    // On a network that cuts all the time it does get on.
+                    // Reset on progress: on a network with constant cuts the pull still advances.
                     if download.position() - position >= PROGRESS_BYTES {
                         reconnects = 0;
                     }
@@ -413,7 +413,7 @@ impl Fetcher {
         Err(cut)
     }
 
-    /// Passes on what one answer has, and measures it.
+    /// Forwards the bytes of one answer and measures the transfer.
     async fn pass_on(
         &self,
         download: &mut Download,
@@ -438,20 +438,20 @@ impl Fetcher {
             .await
     }
 
-    /// Asks for a range of a blob, over a connection of its own.
+    /// Requests a range of a blob over its own connection.
     async fn download_range(
         &self,
         repository: &RepositoryName,
         blob: BlobRef,
         range: Range<u64>,
     ) -> Result<Download, FetchError> {
-        // Nothing is asked for after it.
+        // No further request uses this connection.
         let request = || Ok(self.request(repository, blob)?.header(CONNECTION, "close"));
         self.start(request, repository, blob, range).await
     }
 
-    /// Sends a request. That a blob is not to be had ends an order, and is believed once it was
-    /// said twice: a byte that flips on its way to the server makes the digest another one.
+    /// Sends a request. An unavailable blob ends an order, so we believe the answer only after a
+    /// second one: a byte that flips on its way to the server changes the digest in the request.
     async fn start(
         &self,
         request: impl Fn() -> Result<reqwest::RequestBuilder, FetchError>,
@@ -518,7 +518,7 @@ impl Fetcher {
         gone.map_err(|source| FetchError::disk(&part, source))
     }
 
-    /// How many bytes of the content are there from earlier tries.
+    /// Bytes of the content on the disk from earlier attempts.
     fn present(&self, package: &PackageRef) -> Result<u64, FetchError> {
         let part = self.data.blob_part(&package.content.digest);
         match fs::metadata(&part) {
@@ -532,9 +532,9 @@ impl Fetcher {
     }
 }
 
-/// The package's task manifest if it was pulled before and is still there whole.
+/// Returns the package's task manifest if an earlier pull stored it and the file is intact.
 pub fn stored_manifest(data: &DataDir, package: &PackageRef) -> Option<TaskManifest> {
-    // It lies among the task's own files, which the task may have exchanged.
+    // The file lies among the task's own files, and the task may have replaced it.
     let path = data.task(&package.name).version(&package.manifest.digest).manifest();
     let bytes = untrusted_file::read(&path, MAX_MANIFEST_BYTES).ok()?;
     if Digest::of(&bytes) != package.config.digest {
@@ -559,7 +559,7 @@ fn read_manifest(bytes: &[u8], package: &PackageRef) -> Result<TaskManifest, Fet
     }
 }
 
-/// One pull of a blob at a time.
+/// Locks per digest: a blob has at most one pull at a time.
 #[derive(Default)]
 struct Turns(Mutex<HashMap<Digest, Weak<tokio::sync::Mutex<()>>>>);
 

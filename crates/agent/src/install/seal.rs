@@ -1,7 +1,7 @@
-//! What was unpacked and built of a version, as one digest for each tree. It is noted beside the
-//! version's directory, where only the agent writes, and compared before each start: what runs is
-//! what came with the signed package. A digest covers the names, kinds, contents, link targets and
-//! execute bits of all entries, not their owners and times.
+//! One digest for each tree of a version, unpacked and built. The digests are stored beside the
+//! version's directory, where only the agent writes, and compared before each start, so that only
+//! the content of the signed package runs. A digest covers the names, kinds, contents, link targets
+//! and execute bits of all entries, not their owners and times.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -19,32 +19,32 @@ use crate::system::layout::VersionDir;
 use crate::system::task_user;
 use crate::system::untrusted_file;
 
-/// The longest note that is read.
+/// Largest seal file that is read.
 const MAX_BYTES: u64 = 64 * 1024;
-/// How deep a tree may be.
+/// Deepest tree that is read.
 const MAX_DEPTH: usize = task_user::MAX_DEPTH;
 
 /// The digests of a version's trees.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Seal {
-    /// Of the unpacked package.
+    /// Digest of the unpacked package.
     src: Digest,
-    /// Of what was built; absent: nothing was.
+    /// Digest of the built tree; absent if the version has none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     install: Option<Digest>,
 }
 
-/// What does not agree with a seal.
+/// The tree that does not match its seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Broken {
     /// The unpacked package.
     Source,
-    /// What was built.
+    /// The built tree.
     Install,
 }
 
 impl Seal {
-    /// The seal of what is on the disk.
+    /// Computes the seal of the trees on the disk.
     pub fn of(version: &VersionDir) -> io::Result<Self> {
         let install = match tree(&version.install()) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => None,
@@ -53,8 +53,7 @@ impl Seal {
         Ok(Self { src: tree(&version.src())?, install })
     }
 
-    /// The seal that was noted at `path`. One that can't be understood is none that anything agrees
-    /// with.
+    /// Reads the seal stored at `path`. An unreadable seal matches no tree.
     pub fn read(path: &Path) -> io::Result<Option<Result<Self, serde_json::Error>>> {
         match untrusted_file::read(path, MAX_BYTES) {
             Ok(bytes) => Ok(Some(serde_json::from_slice(&bytes))),
@@ -63,15 +62,15 @@ impl Seal {
         }
     }
 
-    /// Notes it at `path`.
+    /// Stores the seal at `path`.
     pub fn write(&self, path: &Path) -> io::Result<()> {
         durable::write(path, &serde_json::to_vec(self)?, 0o600)
     }
 
-    /// What of `version` is not as it was sealed.
+    /// The first tree of `version` that does not match this seal.
     pub fn broken(&self, version: &VersionDir) -> io::Result<Option<Broken>> {
         let now = match Self::of(version) {
-            // The package itself is gone, or has what no package has.
+            // The package is missing, or contains an entry that no package contains.
             Err(error)
                 if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidData) =>
             {
@@ -106,8 +105,8 @@ fn tree(root: &Path) -> io::Result<Digest> {
     Ok(Digest::from_sha256(hasher.finalize().into()))
 }
 
-/// Each entry is its kind, its name and what is in it, all of known length or ended, so that no two
-/// trees give the same bytes.
+/// Hashes the kind, name and content of each entry. All fields have a known length or a terminator,
+/// so that two different trees never give the same bytes.
 fn add_directory(hasher: &mut Sha256, dir: &Path, depth: usize) -> io::Result<()> {
     if depth > MAX_DEPTH {
         return Err(io::Error::new(
@@ -147,8 +146,8 @@ fn add_content(hasher: &mut Sha256, mut file: File) -> io::Result<()> {
     let (mut size, mut buffer) = (0_u64, vec![0; 128 * 1024]);
     loop {
         match file.read(&mut buffer)? {
-            // The size comes last: a file that grows while it is read is no other file with a known
-            // end.
+            // The size comes last: a file that grows while being read can't pass as another file
+            // with a known end.
             0 => {
                 hasher.update(size.to_le_bytes());
                 return Ok(());

@@ -1,6 +1,6 @@
-//! Gets what publishers have signed: follows the lists that desired states name, and finds out
-//! whether a package may be used. What to make of the bytes is [`crate::config::trust`]'s to say;
-//! where they come from proves nothing.
+//! Fetches publishers' signatures: follows the publisher lists that desired states name, and
+//! determines whether a package may be used. [`crate::config::trust`] judges the bytes; their
+//! origin proves nothing.
 
 use std::collections::HashSet;
 use std::io;
@@ -27,56 +27,56 @@ use crate::system::layout::DataDir;
 use crate::task::observed::{TrustFacts, Vouched};
 use crate::task::plan::backoff_ms;
 
-/// Lists that are remembered as judged; beyond it all are looked at again.
+/// Most lists remembered as judged. Beyond this number all lists are judged again.
 const MAX_JUDGED: usize = 1024;
-/// The longest wait before what could not be had is asked for again.
+/// Longest wait before a failed fetch is repeated.
 const MAX_BACKOFF_MS: u64 = 5 * 60 * 1000;
 
-/// Why a package may not be used.
+/// Reasons why a package may not be used.
 #[derive(Debug, thiserror::Error)]
 pub enum NotVouched {
-    /// By all that was signed.
+    /// All signatures are known, and the package is not trusted.
     #[error(transparent)]
     Distrusted(#[from] Distrust),
-    /// Something that was signed could not be had.
+    /// A list or a signature could not be fetched.
     #[error("what publishers have signed can't be had")]
     Fetch(#[from] FetchError),
 }
 
-/// Finds out who vouches for packages.
+/// Determines which publishers vouch for packages.
 pub struct Vouching {
     trust: Trust,
     fetcher: Arc<Fetcher>,
     data: DataDir,
     told: Mutex<Told>,
-    /// Changes with all that may change a judgement.
+    /// Changes with every event that may change a judgement.
     epoch: AtomicU64,
 }
 
-/// What the server said, and what came of it.
+/// Evidence named by the server, and the results of following it.
 #[derive(Default)]
 struct Told {
     evidence: Evidence,
-    /// Lists that need not be fetched again.
+    /// Lists that are not fetched again.
     judged: HashSet<Digest>,
     /// Why the last list was not taken over.
     refused: Option<String>,
-    /// Whoever follows what was said last.
+    /// The task that follows the latest evidence.
     follower: Option<AbortHandle>,
 }
 
 impl Vouching {
-    /// Judges by `trust`, fetches with `fetcher`, keeps signatures in `data`.
+    /// Judges with `trust`, fetches with `fetcher`, and keeps signatures in `data`.
     pub fn new(trust: Trust, fetcher: Arc<Fetcher>, data: DataDir) -> Self {
         Self { trust, fetcher, data, told: Mutex::default(), epoch: AtomicU64::new(0) }
     }
 
-    /// The version of the list of publishers that counts; 0: the settings do.
+    /// Version of the publisher list in force; 0 if the settings are in force.
     pub fn version(&self) -> u64 {
         self.trust.version()
     }
 
-    /// What judgements depend on now.
+    /// The facts that current judgements depend on.
     pub fn facts(&self) -> TrustFacts {
         TrustFacts {
             epoch: self.epoch.load(Ordering::Acquire),
@@ -85,8 +85,8 @@ impl Vouching {
         }
     }
 
-    /// Notes what a desired state names, and begins to get what is new of it: lists of publishers,
-    /// and signatures of what is installed.
+    /// Records the evidence of a desired state and starts to fetch its new parts: publisher lists,
+    /// and signatures of installed packages.
     pub fn heed(self: &Arc<Self>, state: &DesiredState) {
         let mut told = self.told();
         if told.evidence == state.evidence {
@@ -100,7 +100,7 @@ impl Vouching {
         }
     }
 
-    /// What the signatures on the disk say.
+    /// Judges the package by the signatures on the disk.
     pub fn look(&self, package: &PackageRef) -> Vouched {
         match self.judge(package, Use::Begin) {
             Ok(()) => Vouched::Yes,
@@ -109,19 +109,19 @@ impl Vouching {
         }
     }
 
-    /// Whether the package may be used so by the signatures on the disk.
+    /// Whether the signatures on the disk allow this use of the package.
     pub fn judge(&self, package: &PackageRef, purpose: Use) -> Result<(), Distrust> {
         self.trust.judge(package, &self.kept(package), purpose, clock::wall_ms()).map(drop)
     }
 
-    /// The same, with the lists and signatures that are to be had.
+    /// Like [`Self::judge`], after fetching the available lists and signatures.
     pub async fn vouch(
         &self,
         package: &PackageRef,
         purpose: Use,
         cancel: &CancellationToken,
     ) -> Result<(), NotVouched> {
-        // What runs already is not held up by a server that is away.
+        // A package that already runs does not wait for an unreachable server.
         if purpose == Use::GoOn && self.judge(package, purpose).is_ok() {
             return Ok(());
         }
@@ -132,12 +132,12 @@ impl Vouching {
         let signatures = self.take_signatures(package, cancel).await;
         let Err(distrust) = self.judge(package, purpose) else { return Ok(()) };
         let (signatures, distrust) = match signatures {
-            // It has seen more than what is on the disk.
+            // This judgement includes signatures that are not on the disk.
             Ok(Err(by_all)) => (None, by_all),
             Ok(Ok(())) => (None, distrust),
             Err(error) => (Some(error), distrust),
         };
-        // By what could not be had, or not be kept, it might be otherwise.
+        // The missing list or signature might change the judgement.
         let missing = [lists.err(), signatures].into_iter().flatten();
         let may_come = |error: &FetchError| {
             error.is_retryable() || matches!(error, FetchError::Cancelled | FetchError::Disk { .. })
@@ -145,7 +145,7 @@ impl Vouching {
         Err(missing.filter(may_come).map(NotVouched::Fetch).next().unwrap_or(distrust.into()))
     }
 
-    /// Gets what the newest state names until nothing of it is left to be had.
+    /// Fetches the evidence of the newest state until all of it is here or can't be fetched.
     async fn follow(self: Arc<Self>, packages: Vec<PackageRef>) {
         let cancel = CancellationToken::new();
         let mut failures = 0;
@@ -153,13 +153,13 @@ impl Vouching {
             let mut outcome = self.take_lists(&cancel).await;
             for package in &packages {
                 let version = self.data.task(&package.name).version(&package.manifest.digest);
-                // What is not installed is looked at before it is.
+                // A package that is not installed is judged before its installation.
                 if version.src().is_dir() && self.look(package) == Vouched::No {
                     outcome = outcome.and(self.take_signatures(package, &cancel).await.map(drop));
                 }
             }
-            // Whatever came instead: a robot that gave up would never hear that somebody is not
-            // trusted any more.
+            // Retry after every error: a robot that gave up would never learn that a publisher is
+            // no longer trusted.
             let Err(error) = outcome else { return };
             tracing::info!(error = %chain(&error), "what publishers have signed can't be had yet");
             failures += 1;
@@ -168,8 +168,7 @@ impl Vouching {
         }
     }
 
-    /// Gets the lists that were named after the one that counts, and takes them over in their
-    /// order.
+    /// Fetches the lists named after the one in force, and adopts them in order.
     async fn take_lists(&self, cancel: &CancellationToken) -> Result<(), FetchError> {
         let repository: RepositoryName = LIST_REPOSITORY.parse().expect("a repository's name");
         for blob in self.fresh_lists() {
@@ -192,7 +191,7 @@ impl Vouching {
             let refused = match serde_json::from_slice(&bytes) {
                 Ok(envelope) => match self.trust.take(&envelope, blob.digest) {
                     Ok(()) => None,
-                    // Whoever follows the lists and whoever waits for one may have got it both.
+                    // The follower and a task that waits for a list may both have fetched this one.
                     Err(_) if self.trust.counting() == Some(blob.digest) => None,
                     Err(NotTaken::Disk(source)) => {
                         return Err(self.not_kept(&self.data.publishers(), source));
@@ -215,7 +214,7 @@ impl Vouching {
                 told.judged.clear();
             }
             told.judged.insert(blob.digest);
-            // What is said of the newest, which is the last, is what stays.
+            // The result of the newest list, which comes last, is kept.
             told.refused = refused
                 .map(|why| format!("the list of publishers {} was refused: {why}", blob.digest));
             self.epoch.fetch_add(1, Ordering::AcqRel);
@@ -223,8 +222,8 @@ impl Vouching {
         Ok(())
     }
 
-    /// Gets the signatures of a package that were named, and keeps those that count if they are
-    /// enough; if not, says why.
+    /// Fetches the named signatures of a package. Keeps the valid ones if they suffice, and
+    /// otherwise returns the reason.
     async fn take_signatures(
         &self,
         package: &PackageRef,
@@ -235,14 +234,14 @@ impl Vouching {
         let named = self.told().evidence.signatures_of(package);
         for blob in named.into_iter().take(MAX_SIGNATURES) {
             match self.fetcher.small(&repository, blob, MAX_SIGNATURE_BYTES, cancel).await {
-                // Anything else is nobody's signature.
+                // Other bytes are not a signature.
                 Ok(bytes) => envelopes.extend(serde_json::from_slice::<Envelope>(&bytes).ok()),
                 Err(error) => failed = Some(error),
             }
         }
-        // Those that are kept come last: they may be as many as are looked at.
+        // Kept signatures come last: their number may already be the most that is checked.
         envelopes.extend(self.kept(package));
-        // A list whose lifetime is over says nothing against a signature.
+        // An expired list does not invalidate a signature.
         let counted = match self.trust.judge(package, &envelopes, Use::GoOn, clock::wall_ms()) {
             Ok(counted) => counted,
             Err(distrust) => return failed.map_or(Ok(Err(distrust)), Err),
@@ -253,7 +252,7 @@ impl Vouching {
         Ok(Ok(()))
     }
 
-    /// The lists that were named after the one that counts and not refused before.
+    /// Lists named after the one in force that were not refused before.
     fn fresh_lists(&self) -> Vec<BlobRef> {
         let told = self.told();
         let lists = &told.evidence.lists[..told.evidence.lists.len().min(MAX_LISTS)];

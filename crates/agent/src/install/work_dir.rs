@@ -1,8 +1,8 @@
-//! The directory that a task runs in. It is the task's own, and beside the trees that are read-only
-//! to it; links lead from here to them, so that a package finds its files where it had them:
-//! `./start.sh` for one without a build, `src/` and `install/` for one that is built. Before each
-//! start every name of the package is the package's again. What the task has written under other
-//! names stays.
+//! The directory that a task runs in. The task owns this directory; the package's trees beside it
+//! are read-only to the task. Links lead from here to those trees, so that a package finds its
+//! files at their usual paths: `./start.sh` for a package without a build, `src/` and `install/`
+//! for one that is built. Before each start every name of the package is restored. Files that the
+//! task has written under other names stay.
 
 use std::fs;
 use std::io;
@@ -15,8 +15,8 @@ use crate::system::durable;
 use crate::system::layout::VersionDir;
 use crate::system::task_user::{MAX_DEPTH, TaskUser};
 
-/// What lies in a version's directory that no task wrote: the rest is what it wrote there when that
-/// was where it ran.
+/// Names in a version's directory that no task wrote. All others are files that a task wrote there
+/// when the version's directory was its working directory.
 const OWN_NAMES: [&str; 10] = [
     "src",
     "build",
@@ -30,7 +30,7 @@ const OWN_NAMES: [&str; 10] = [
     "node_logs",
 ];
 
-/// Makes the directory if need be, and the links in it. No process of the task may run.
+/// Creates the directory if necessary, and the links in it. No process of the task may run.
 pub fn refresh(tool: BuildTool, version: &VersionDir, user: Option<&TaskUser>) -> io::Result<()> {
     let work = version.work();
     durable::create_dir_all(&work)?;
@@ -45,12 +45,13 @@ pub fn refresh(tool: BuildTool, version: &VersionDir, user: Option<&TaskUser>) -
     };
     let Some(user) = user else { return link() };
     user.hand_over(&work)?;
-    // What a task has put into its directory is worth as much as its own rights.
+    // A task controls the content of its directory, so the links are made with the task's rights
+    // only.
     user.with_its_rights(link)?
 }
 
-/// Links everything in `from` to the same name in `to`: its files, not its directories, so that a
-/// task may write into these.
+/// Links every file in `from` to the same name in `to`. Directories are created, not linked, so
+/// that a task may write into them.
 fn link_below(from: &Path, to: &Path, depth: usize) -> io::Result<()> {
     if depth > MAX_DEPTH {
         return Err(io::Error::other(format!(
@@ -81,16 +82,16 @@ fn link_to(target: &Path, place: &Path) -> io::Result<()> {
     symlink(target, place)
 }
 
-/// When a version was given to the account of all tasks, as an earlier agent did at its first
-/// start: the package was unpacked before, and what the task wrote is younger.
+/// When an earlier agent gave a version to the account of all tasks, at its first start. The
+/// package was unpacked before this time, and files that the task wrote are younger.
 pub fn handed_over(version: &VersionDir) -> io::Result<(i64, i64)> {
     let about = fs::symlink_metadata(version.manifest())?;
     Ok((about.ctime(), about.ctime_nsec()))
 }
 
-/// Moves what a task has written since to where it runs now; it ran where its package lay. Nobody
-/// but the agent may have rights to the version any more, or what is looked at is not what is
-/// moved.
+/// Moves files that a task has written since that time from the package's directory, its former
+/// working directory, to its current one. Only the agent may have rights to the version by now;
+/// otherwise the file that is checked may not be the file that is moved.
 pub fn move_written(tool: BuildTool, version: &VersionDir, since: (i64, i64)) -> io::Result<()> {
     let mut found = Vec::new();
     if tool == BuildTool::None {
@@ -107,7 +108,7 @@ pub fn move_written(tool: BuildTool, version: &VersionDir, since: (i64, i64)) ->
         if let Some(parent) = to.parent() {
             durable::create_dir_all(parent)?;
         }
-        // It changes hands with the directory that it is in.
+        // The file's owner changes together with its directory's.
         fs::rename(from, to)?;
     }
     Ok(())
@@ -194,12 +195,12 @@ mod tests {
     fn what_a_task_wrote_into_its_package_moves_to_where_it_runs() {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
-        // The manifest changes hands at the first start, after the package came.
+        // The manifest's owner changes at the first start, after the package was unpacked.
         fs::write(version.manifest(), "{}").expect("written");
         fs::set_permissions(version.manifest(), fs::Permissions::from_mode(0o644)).expect("set");
         let since = handed_over(&version).expect("there");
         let new = version.src().join("maps/new.pgm");
-        // The clock of files does not tick at each write.
+        // Two writes may get the same file timestamp.
         while fs::metadata(&new).map_or(true, |new| (new.mtime(), new.mtime_nsec()) <= since) {
             fs::write(&new, "new").expect("written");
         }

@@ -1,5 +1,6 @@
-//! Where the robot's MQTT session goes: as the enrolment said, until the server says otherwise.
-//! Nothing of it is written down, for whoever starts asks again. It never connects to a broker.
+//! The endpoint of the robot's MQTT session: the one from the enrollment, until the server names
+//! another. The endpoint is not stored on the disk, because each start asks again. This module
+//! never connects to a broker.
 
 use std::time::Duration;
 
@@ -7,13 +8,13 @@ use crate::link::state::Shared;
 use crate::system::error_chain::chain;
 use crate::transfer::server::Server;
 
-/// Asks the server where its robots' sessions go: at the start, whenever none comes about, and
-/// every `interval` while they go to a broker that lives on when the server is told to use another.
-/// Until the agent ends.
+/// Asks the server for the endpoint at the start, whenever no session can be opened, and every
+/// `interval` while the sessions go to an external broker, which stays up when the server switches
+/// to another. Runs until the agent ends.
 pub async fn follow(server: Server, shared: Shared, interval: Duration) {
     loop {
         tokio::select! {
-            // A request that is dropped at the agent's end changes nothing.
+            // Dropping the request at the agent's end has no effect.
             () = ask(&server, &shared) => {}
             () = shared.shutdown.cancelled() => return,
         }
@@ -21,7 +22,7 @@ pub async fn follow(server: Server, shared: Shared, interval: Duration) {
             shared.endpoint.borrow().as_ref().is_some_and(|endpoint| endpoint.external.is_some());
         let spread = 0.5 + rand::random::<f64>();
         tokio::select! {
-            // Cancel-safe: a timer that is made anew each time.
+            // Cancel-safe: the timer is recreated on each iteration.
             () = tokio::time::sleep(interval.mul_f64(spread)), if is_external => {}
             // Cancel-safe: a permit that was not taken stays.
             () = shared.find.notified() => {}

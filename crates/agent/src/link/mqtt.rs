@@ -1,11 +1,12 @@
-//! The MQTT half of the link, and the only place that names rumqttc: one session after another,
-//! each with a last will; the doorbell, questions and the parts of packages in, status, the newest
-//! report, answers and log lines out. A report is confirmed by its PUBACK, which the server sends
-//! once the report is stored; a broker that is not the server's own gets none. It never decides
-//! what to do with what it hears.
+//! The MQTT half of the link, and the only module that names rumqttc. It keeps one session after
+//! another, each with a last will. Incoming: the doorbell, requests and package parts. Outgoing:
+//! status, the newest report, responses and log lines. The PUBACK of a report confirms it, because
+//! the server sends the PUBACK once the report is stored. An external broker gets no reports. This
+//! module never decides how to react to the received messages.
 //!
-//! What is heard is acknowledged by hand: a part once it was written, all else at once. A part that
-//! nobody takes is all that is held here; until somebody does, nothing more is read.
+//! Messages are acknowledged manually: a part after its write, all others at once. At most one part
+//! is held here while its receiver is busy; until the receiver takes the part, the session reads
+//! nothing more.
 
 mod destination;
 mod room;
@@ -39,73 +40,73 @@ use crate::task::plan::backoff_ms;
 use crate::transfer::credential::Credential;
 use crate::transfer::parts::{Acknowledgement, Arrived, Due};
 
-/// How often the broker hears from an idle robot.
+/// MQTT keep-alive: how often an idle robot contacts the broker.
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
-/// How long connecting may take.
+/// Timeout for opening a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
-/// The longest wait between two tries to connect.
+/// Longest wait between two connection attempts.
 const MAX_BACKOFF_MS: u64 = 60 * 1000;
-/// The longest wait after the broker refused this robot.
+/// Longest wait after the broker refused this robot.
 const MAX_REFUSED_BACKOFF_MS: u64 = 5 * 60 * 1000;
-/// The shortest; up to half as much is added.
+/// Shortest wait after a refusal; up to half of this is added at random.
 const MIN_REFUSED_BACKOFF_MS: u64 = 10 * 1000;
-/// A session that lasted this long shows that the way is good: the backoff begins anew.
+/// A session that lasted this long proves the route good and resets the backoff.
 const GOOD_SESSION: Duration = Duration::from_secs(60);
-/// Requests between this task and rumqttc.
+/// Capacity of the queue of requests from this task to rumqttc.
 const QUEUED_REQUESTS: usize = 16;
-/// What has been read and not been looked at yet.
+/// Capacity of the queue of received events that are not yet handled.
 const QUEUED_EVENTS: usize = 2;
-/// Messages that were dealt with and whose acknowledgements wait; brokers have fewer in flight.
+/// Capacity of the queue of acknowledgements that are due. Brokers have fewer messages in flight.
 const QUEUED_ACKNOWLEDGEMENTS: usize = 1024;
-/// The largest packet that is sent: the largest report.
+/// Largest packet that we send: the largest report.
 const MAX_SENT_BYTES: usize = MAX_REPORT_BYTES + AROUND_MESSAGE_BYTES;
-/// The largest message that is read unless the server is seen to send whole packages as one: a part
-/// of 1 MiB.
+/// Largest message that we read, unless the server sends whole packages as one message: a part of 1
+/// MiB.
 pub const MESSAGE_BYTES: usize = 1024 * 1024 + AROUND_MESSAGE_BYTES;
-/// The largest that MQTT has.
+/// Largest message that MQTT allows.
 const MAX_MESSAGE_BYTES: u64 = 256 * 1024 * 1024 - 1;
-/// What a message has around its bytes: topic, packet id, a part's header.
+/// Overhead of a message: topic, packet id, a part's header.
 const AROUND_MESSAGE_BYTES: usize = 4096;
 
-/// Where and as whom to connect, if [`Shared::endpoint`] says nothing else.
+/// Address and credentials of the default connection, unless [`Shared::endpoint`] names another.
 #[derive(Clone)]
 pub struct MqttAccess {
-    /// Host name or address; also of an endpoint that names none.
+    /// Host name or address, also for an endpoint without one.
     pub host: String,
     /// TCP port.
     pub port: u16,
-    /// What all topics start with.
+    /// Prefix of all topics.
     pub prefix: TopicPrefix,
-    /// User name, and the client id unless the endpoint names another one.
+    /// User name, and the client id unless the endpoint names another.
     pub robot: RobotId,
-    /// The password at the server's own broker.
+    /// Password at the server's own broker.
     pub token: Credential,
-    /// What every status says; `connection` counts up from it.
+    /// Fields of every status. `connection` counts up from the value here.
     pub status: Status,
-    /// The largest message that is read at first, [`MESSAGE_BYTES`]. Only for a wanted package it
-    /// gets larger.
+    /// Initial limit on the size of a message that we read, [`MESSAGE_BYTES`]. Only a wanted
+    /// package raises the limit.
     pub message_bytes: usize,
-    /// How to get there.
+    /// Routes to the broker.
     pub ways: Ways,
 }
 
-/// Why a session ended.
+/// Reasons for the end of a session.
 enum Ended {
-    /// The broker does not accept this robot.
+    /// The broker refuses this robot.
     Refused,
-    /// A part of a wanted package is larger than what this session can read.
+    /// A part of a wanted package exceeds this session's message limit.
     TooNarrow,
-    /// The server says that it goes elsewhere.
+    /// The server names another broker for the session.
     Moved,
-    /// The way to the broker is not open.
+    /// The connection to the broker can't be opened.
     Unreachable(LineError),
-    /// Anything else.
+    /// Any other error.
     Lost(ConnectionError),
-    /// The agent ends.
+    /// The agent is shutting down.
     Closed,
 }
 
-/// Keeps a session up until the agent ends; after each end it waits with full jitter.
+/// Keeps a session up until the agent ends. After each session it waits with full jitter.
 pub async fn run(
     mut access: MqttAccess,
     shared: Shared,
@@ -113,11 +114,11 @@ pub async fn run(
     mut talk: Talk,
 ) {
     let mut failures = 0u32;
-    // Whether the server has been seen to send packages as messages larger than usual.
+    // Whether the server has sent a package as a message above the usual limit.
     let mut sends_large = false;
     let mut endpoint = shared.endpoint.subscribe();
     let (mut told, mut place) = (None, 0);
-    // How often the server's place was tried since a session was good there.
+    // Number of attempts to return to the server's place since the last good session there.
     let mut returns = 0u32;
     loop {
         access.status.connection += 1;
@@ -133,10 +134,12 @@ pub async fn run(
         let way = access.ways.next(&there.host, there.port, there.is_encrypted, external);
         let session = session(&at, external, way, &shared, &heard, &mut talk, room);
         let ended = tokio::select! {
-            // Cancel-safe: nothing follows. The broker notices that the session is gone.
+            // Cancel-safe: no later code uses the future. The broker detects the end of the
+            // session.
             ended = session => ended,
             () = moved(&mut endpoint, &access, &there) => Ended::Moved,
-            // Cancel-safe: it only asks, and counts where the count lasts.
+            // Cancel-safe: the future only asks questions, and its counter lives outside of the
+            // future.
             () = server_elsewhere(&access, &shared, &there, &mut returns), if places > 1 => Ended::Moved,
         };
         let was_up = shared.mqtt_up.send_replace(false);
@@ -149,7 +152,7 @@ pub async fn run(
                 access.ways.turn();
             }
         }
-        // Whoever waits for parts need not give up if the next session comes at once.
+        // Tasks that wait for parts need not give up if the next session begins at once.
         shared.listening.session(matches!(ended, Ended::TooNarrow));
         let was_good = begun.elapsed() >= GOOD_SESSION;
         if was_good && place == 0 {
@@ -169,8 +172,7 @@ pub async fn run(
             }
             Ended::Refused => {
                 tracing::warn!("the MQTT broker refuses this robot");
-                // Whether the robot was removed is asked over HTTP, whose answer is the server's
-                // own.
+                // The server's own answer over HTTP tells whether the robot was removed.
                 shared.poll.notify_one();
                 (
                     MIN_REFUSED_BACKOFF_MS + rand::random_range(0..=MIN_REFUSED_BACKOFF_MS / 2),
@@ -189,13 +191,13 @@ pub async fn run(
                 (0, MAX_BACKOFF_MS)
             }
         };
-        // The wait grows with each round of all places.
+        // The wait grows with each full round of all places.
         let rounds = failures.div_ceil(places as u32);
         let wait = Duration::from_millis(backoff_ms(rounds, max_ms, rand::random()).max(min_ms));
         tokio::select! {
-            // Cancel-safe: a timer that is made anew each time.
+            // Cancel-safe: the timer is recreated on each iteration.
             () = tokio::time::sleep(wait) => {}
-            // Cancel-safe: a watch remembers that it changed.
+            // Cancel-safe: a watch remembers a change.
             Ok(()) = endpoint.changed() => failures = 0,
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => return,
@@ -203,8 +205,8 @@ pub async fn run(
     }
 }
 
-/// Waits until the server is at another place than `there` and that place can be reached from here;
-/// until then the session stays up. Each of the earlier `returns` doubles the wait.
+/// Waits until the server names another place than `there` and this robot can reach that place.
+/// Until then the session stays up. Each of the earlier `returns` doubles the wait.
 async fn server_elsewhere(
     access: &MqttAccess,
     shared: &Shared,
@@ -233,7 +235,7 @@ async fn server_elsewhere(
     }
 }
 
-/// What was published and is not acknowledged, the first one first.
+/// Kinds of messages that were published and are not yet acknowledged, oldest first.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Published {
     Status,
@@ -287,40 +289,41 @@ async fn session(
         }
         let parked = session.parked.as_ref().map(|(way, _)| way.clone());
         tokio::select! {
-            // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
+            // Cancel-safe: the future is pinned outside of the loop and resumes where it stopped.
             ended = &mut pump => return ended,
-            // Cancel-safe, likewise. Neither ends before the session does.
+            // Cancel-safe, for the same reason. Neither future ends before the session.
             () = &mut acknowledgements => {}
             () = &mut carrying => {}
-            // Cancel-safe: a message stays in the channel until it is received.
+            // Cancel-safe: a message stays in the channel until received.
             Some(event) = events.recv(), if session.parked.is_none() => session.take(event).await,
-            // Cancel-safe: a place that was not taken stays free.
+            // Cancel-safe: a permit that was not taken stays free.
             place = place_for(parked) => session.unpark(place),
-            // Cancel-safe: a watch remembers that it changed.
+            // Cancel-safe: a watch remembers a change.
             Ok(()) = wishes.changed() => session.tune(),
-            // Cancel-safe: a timer that is made anew each time.
+            // Cancel-safe: the timer is recreated on each iteration.
             () = tokio::time::sleep_until(session.subscriptions.next_try()) => session.tune(),
-            // Cancel-safe: a watch remembers that it changed.
+            // Cancel-safe: a watch remembers a change.
             Ok(()) = reports.changed() => session.publish_report(),
-            // Cancel-safe: a message stays in the channel until it is received.
+            // Cancel-safe: a message stays in the channel until received.
             Some(Message { topic, payload }) = messages.recv(), if session.has_room() => {
                 session.publish(topic, payload, Published::Message);
             }
-            // Cancel-safe, likewise.
+            // Cancel-safe: a message stays in the channel until received.
             Some(payload) = lines.recv(), if session.has_room() && !session.is_under_way(|it| *it == Published::Lines) => {
                 session.publish(RobotTopic::Log, payload, Published::Lines);
             }
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => {
-                // Without DISCONNECT the broker publishes the will, which says just what is true.
+                // Without a DISCONNECT the broker publishes the will, whose content is correct
+                // here.
                 return Ended::Closed;
             }
         }
     }
 }
 
-/// Reads and writes until the session ends. rumqttc's poll must not be dropped half way, so it runs
-/// in one future that lives as long as the session.
+/// Drives rumqttc until the session ends. rumqttc's poll must not be dropped midway, so it runs in
+/// one future that lives as long as the session.
 async fn pump(
     event_loop: &mut EventLoop,
     events: mpsc::Sender<Event>,
@@ -347,10 +350,10 @@ async fn pump(
     }
 }
 
-/// Acknowledges what is due, until nobody can say any more what is.
+/// Sends acknowledgements until all senders are gone.
 async fn acknowledge_all(client: AsyncClient, mut due: mpsc::Receiver<Due>) {
     while let Some(due) = due.recv().await {
-        // A session that is over has nobody to acknowledge anything to; the pump notices it.
+        // An error means that the session has ended, and the pump reports that.
         let _ = client.ack(&answered(due)).await;
     }
 }
@@ -363,18 +366,18 @@ struct Session<'a> {
     requests: &'a mpsc::Sender<(Request, Instant)>,
     client: AsyncClient,
     up: bool,
-    /// Handed to rumqttc, which has not given them a packet id yet.
+    /// Passed to rumqttc, but without a packet id so far.
     unsent: VecDeque<Published>,
-    /// Sent under this packet id.
+    /// Sent with this packet id.
     sent: VecDeque<(u16, Published)>,
     subscriptions: Subscriptions,
     acknowledge: mpsc::Sender<Due>,
-    /// A part that there is no room for, and where it goes.
+    /// A part that waits for space in its receiver's queue, and that receiver.
     parked: Option<(mpsc::Sender<Arrived>, Arrived)>,
     pinged_at: Option<Instant>,
 }
 
-/// A place for the part that waits for one; `None` if nobody wants it any more.
+/// Waits for a free slot for the parked part. `None` if its receiver is gone.
 async fn place_for(way: Option<mpsc::Sender<Arrived>>) -> Option<mpsc::OwnedPermit<Arrived>> {
     match way {
         Some(way) => way.reserve_owned().await.ok(),
@@ -382,7 +385,7 @@ async fn place_for(way: Option<mpsc::Sender<Arrived>>) -> Option<mpsc::OwnedPerm
     }
 }
 
-/// As much of a message as its acknowledgement takes.
+/// A message with the two fields that its acknowledgement needs.
 fn answered(due: Due) -> Publish {
     let qos = rumqttc::qos(due.qos).unwrap_or(QoS::AtMostOnce);
     let mut message = Publish::new("", qos, Vec::new());
@@ -409,7 +412,7 @@ impl Session<'_> {
             Event::Outgoing(Outgoing::PingReq) => self.pinged_at = Some(Instant::now()),
             Event::Outgoing(Outgoing::Subscribe(id)) => self.subscriptions.sent(id),
             Event::Outgoing(Outgoing::Publish(id)) => {
-                // Without a packet id nothing comes back.
+                // A message without a packet id gets no acknowledgement.
                 if let Some(published) = self.unsent.pop_front().filter(|_| id != 0) {
                     self.sent.push_back((id, published));
                 }
@@ -425,8 +428,7 @@ impl Session<'_> {
         self.shared.mqtt_tried.send_replace(true);
         tracing::info!(host = self.access.host, port = self.access.port, "connected to MQTT");
         for topic in [RobotTopic::Desired, RobotTopic::Request] {
-            // The queue is empty at the start of a session, and a lost session is noticed by the
-            // pump.
+            // The queue is empty at the start of a session, and the pump detects a lost session.
             if self.client.try_subscribe(topic_name(self.access, topic), QoS::AtLeastOnce).is_ok() {
                 self.subscriptions.asked_for_own();
             }
@@ -436,7 +438,7 @@ impl Session<'_> {
         self.publish_report();
     }
 
-    /// Subscribes to what is wanted and not subscribed to, and ends what is not wanted any more.
+    /// Subscribes to wanted contents, and unsubscribes from contents that are no longer wanted.
     fn tune(&mut self) {
         if self.up {
             self.subscriptions.tune(&self.client, &self.access.prefix, &self.shared.listening);
@@ -460,8 +462,8 @@ impl Session<'_> {
             Some(Topic::Robot(robot, RobotTopic::Desired)) if robot == self.access.robot => {
                 self.hear_desired(&message.payload).await;
                 if self.is_external {
-                    // It is also how a server that has lost sight of its robots finds out who is
-                    // there.
+                    // This status also tells a server that has lost track of its robots which of
+                    // them are online.
                     self.publish(
                         RobotTopic::Status,
                         status_payload(self.access, true),
@@ -476,7 +478,7 @@ impl Session<'_> {
     fn pass_on(&mut self, way: mpsc::Sender<Arrived>, part: Arrived) {
         match way.try_send(part) {
             Err(mpsc::error::TrySendError::Full(part)) => self.parked = Some((way, part)),
-            // Nobody wants it any more: letting go of it acknowledges it.
+            // The receiver is gone: dropping the part acknowledges it.
             Ok(()) | Err(mpsc::error::TrySendError::Closed(_)) => {}
         }
     }
@@ -494,7 +496,8 @@ impl Session<'_> {
         }
         match serde_json::from_slice::<Doorbell>(payload) {
             Ok(Doorbell::State { envelope, inline }) => {
-                // The driver ends before this task: nobody listens only when the agent ends.
+                // The driver ends before this task, and the channel closes only when the agent
+                // ends.
                 let heard =
                     Heard::Desired { envelope: Box::new(envelope), inline, was_asked_for: false };
                 let _ = self.heard.send(heard).await;
@@ -506,7 +509,8 @@ impl Session<'_> {
 
     fn hear_request(&self, payload: &[u8]) {
         match serde_json::from_slice::<Request>(payload) {
-            // Who asks waits only so long; a question that finds no room may be asked again.
+            // Requesters wait only for a limited time. A request that finds the queue full may be
+            // repeated.
             Ok(request) => {
                 if self.requests.try_send((request, Instant::now())).is_err() {
                     tracing::warn!("too many questions at a time");
@@ -529,7 +533,7 @@ impl Session<'_> {
         }
     }
 
-    /// Whether something may be published without taking a report's place.
+    /// Whether the queue has space for a message other than a report.
     fn has_room(&self) -> bool {
         self.up && self.unsent.len() < QUEUED_REQUESTS / 2
     }
@@ -538,7 +542,8 @@ impl Session<'_> {
         self.unsent.iter().any(&kind) || self.sent.iter().any(|(_, published)| kind(published))
     }
 
-    /// Publishes the newest report, unless one is under way: its acknowledgement calls this again.
+    /// Publishes the newest report, unless one is in flight. The acknowledgement of that one calls
+    /// this function again.
     fn publish_report(&mut self) {
         let busy = self.is_under_way(|published| matches!(published, Published::Report { .. }));
         let Some(report) = self.shared.reports.borrow().clone() else { return };
@@ -546,8 +551,8 @@ impl Session<'_> {
             return;
         }
         match serde_json::to_vec(&*report) {
-            // The server would cut the robot off for it. Over HTTP it says what is wrong, and the
-            // session stays.
+            // The server would disconnect the robot for this message. Over HTTP the server returns
+            // an error, and the session stays.
             Ok(payload) if payload.len() > MAX_REPORT_BYTES => self.shared.post.notify_one(),
             Ok(payload) => {
                 self.publish(RobotTopic::Report, payload, Published::Report { seq: report.seq })
@@ -558,7 +563,7 @@ impl Session<'_> {
 
     fn publish(&mut self, topic: RobotTopic, payload: Vec<u8>, published: Published) {
         let name = topic_name(self.access, topic);
-        // Of vitals the next ones say more than a repetition.
+        // The next vitals are more useful than a repetition of old ones.
         let qos = if topic == RobotTopic::Telemetry { QoS::AtMostOnce } else { QoS::AtLeastOnce };
         if self.client.try_publish(name, qos, false, payload).is_ok() {
             self.unsent.push_back(published);
@@ -599,6 +604,6 @@ fn topic_name(access: &MqttAccess, topic: RobotTopic) -> String {
 }
 
 fn status_payload(access: &MqttAccess, online: bool) -> Vec<u8> {
-    // A status is plain numbers and texts: it can always be written.
+    // A status holds only numbers and text, so serialization can't fail.
     serde_json::to_vec(&Status { online, ..access.status.clone() }).unwrap_or_default()
 }

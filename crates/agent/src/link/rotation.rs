@@ -1,7 +1,7 @@
-//! Goes over to a new token now and then, so that one that leaked is not good for ever. A new token
-//! is on the disk before it is used, for its first use ends the old one; until that is seen to have
-//! worked the old one is kept beside it. So whenever the power goes, one of the two in
-//! `identity.json` works.
+//! Rotates the robot's token from time to time, so that a leaked token does not stay valid forever.
+//! The new token is written to the disk before its first use, because that use invalidates the old
+//! token. The old token is kept beside the new one until the new one is known to work. So after a
+//! power cut at any moment, one of the two tokens in `identity.json` works.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -15,41 +15,41 @@ use crate::system::identity::Identity;
 use crate::transfer::credential::Credential;
 use crate::transfer::server::{Server, ServerError};
 
-/// How often the token's age is looked at.
+/// Interval between checks of the token's age.
 const CHECK: Duration = Duration::from_secs(3600);
-/// How long to wait when the server could not be asked, or the disk not written.
+/// Wait after a failed write to the disk or a failed attempt to use the new token.
 const RETRY: Duration = Duration::from_secs(60);
 
-/// What goes over from one token to the next.
+/// Task that replaces the token.
 pub struct Rotation {
-    /// The server.
+    /// Client for requests to the server.
     pub server: Server,
-    /// What everything else talks to the server with.
+    /// The token shared by all other users of the server.
     pub credential: Credential,
-    /// Who the robot is.
+    /// The robot's identity, with its tokens.
     pub identity: Identity,
-    /// Where that is written.
+    /// File of the identity.
     pub path: PathBuf,
-    /// The age at which a token is replaced.
+    /// Age at which a token is replaced.
     pub lifetime: Duration,
 }
 
 impl Rotation {
-    /// Looks after the token until the agent ends.
+    /// Rotates the token until the agent ends.
     pub async fn run(mut self, shared: Shared, wall_ms: impl Fn() -> u64) {
-        // A fleet that was enrolled together does not ask together.
+        // Random wait: robots that were enrolled together must not ask together.
         let mut wait =
             if self.identity.next_token.is_some() { Duration::ZERO } else { spread(CHECK) };
         loop {
             tokio::select! {
-                // Cancel-safe: a timer that is made anew each time.
+                // Cancel-safe: the timer is recreated on each iteration.
                 () = sleep(wait) => {}
                 // Cancel-safe: a permit that was not taken stays.
                 () = shared.token_refused.notified(), if self.identity.next_token.is_some() => {}
                 // Cancel-safe: a token can be awaited again.
                 () = shared.shutdown.cancelled() => return,
             }
-            // A request that is dropped at the agent's end is repeated after its start.
+            // A request dropped at the agent's end is repeated after the next start.
             wait = tokio::select! {
                 wait = self.step(wall_ms()) => wait,
                 () = shared.shutdown.cancelled() => return,
@@ -57,12 +57,13 @@ impl Rotation {
         }
     }
 
-    /// Does what is due at `wall_ms` by the robot's clock, and says when to look again.
+    /// Performs the step due at `wall_ms` by the robot's clock. Returns the wait until the next
+    /// step.
     pub async fn step(&mut self, wall_ms: u64) -> Duration {
         if self.identity.next_token.is_some() {
             return self.go_over(wall_ms).await;
         }
-        // The clock was ahead when the token came: it begins anew.
+        // The clock was ahead when the token was issued: restart the token's age.
         if (PROGRAM_EXISTS_SINCE_MS..self.identity.token_since_ms).contains(&wall_ms) {
             self.keep(Identity { token_since_ms: wall_ms, ..self.identity.clone() });
         }
@@ -82,7 +83,7 @@ impl Rotation {
         }
     }
 
-    /// Uses the token that lies ready. The server's answer says whether it is good.
+    /// Uses the prepared token. The server's answer shows whether the token is valid.
     async fn go_over(&mut self, wall_ms: u64) -> Duration {
         let Some(next) = self.identity.next_token.clone() else { return Duration::ZERO };
         match self.server.with_token(next.clone()).desired(None).await {
@@ -102,7 +103,7 @@ impl Rotation {
             }
             Err(ServerError::TokenRefused(_)) => {
                 tracing::info!("the server does not accept the token that lay ready");
-                // With one that was made for nothing there is no hurry to ask for another.
+                // The prepared token was issued in vain, so the next one is not urgent.
                 let identity =
                     Identity { next_token: None, token_since_ms: wall_ms, ..self.identity.clone() };
                 if self.keep(identity) { spread(CHECK) } else { spread(RETRY) }
@@ -114,8 +115,8 @@ impl Rotation {
         }
     }
 
-    /// Writes the identity, unless somebody registered the robot anew meanwhile: that must not be
-    /// lost.
+    /// Writes the identity, unless the robot was registered anew meanwhile. That new identity must
+    /// not be overwritten.
     fn keep(&mut self, identity: Identity) -> bool {
         let is_another = |known: Identity| {
             known.robot_id != identity.robot_id || known.token != self.identity.token
@@ -135,7 +136,7 @@ impl Rotation {
     }
 }
 
-/// Between half of it and all of it.
+/// Random duration between half of `time` and all of `time`.
 fn spread(time: Duration) -> Duration {
     time.mul_f64(0.5 + 0.5 * rand::random::<f64>())
 }

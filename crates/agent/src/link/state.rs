@@ -1,6 +1,6 @@
-//! The link to the server: reports out, desired states in, over MQTT while it is up and over HTTP
-//! otherwise. Polling never stops, it only gets slow, so that a broker that loses messages costs
-//! time and nothing else. It verifies nothing and decides nothing: the driver does.
+//! The link to the server: sends reports and receives desired states, over MQTT while a session is
+//! up and over HTTP otherwise. Polling never stops but becomes slow, so that a broker that loses
+//! messages only causes delay. The link verifies and decides nothing: the driver does.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,115 +21,120 @@ use crate::transfer::link_meter::LinkMeter;
 use crate::transfer::parts::Listening;
 use crate::transfer::server::{Sent, Server, ServerError};
 
-/// The longest wait before a report is posted again.
+/// Longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
-/// Within this time a robot whose session takes its reports also posts one, for the name and labels
-/// that only an answer brings. A fleet that starts at once spreads over it.
+/// Even if its session accepts reports, a robot also posts one within this time, because only an
+/// HTTP answer carries its name and labels. The robots of a fleet that starts at once spread over
+/// this time.
 const FIRST_POST: Duration = Duration::from_secs(15);
-/// The longest wait between polls while the server refuses the token.
+/// Longest wait between polls while the server refuses the token.
 pub(crate) const REFUSED_POLL: Duration = Duration::from_secs(300);
 
-/// What the link tells the driver.
+/// Messages from the link to the driver.
 #[derive(Debug)]
 pub enum Heard {
-    /// A desired state, not verified.
+    /// A desired state with an unverified signature.
     Desired {
-        /// As it was signed.
+        /// The signed envelope.
         envelope: Box<Envelope>,
-        /// Blobs that came along, only reached by the digests it names.
+        /// Blobs delivered with the state. They are accessible only by the digests that the state
+        /// names.
         inline: Inline,
-        /// Whether it is the server's answer to this robot; what a broker brings may be anybody's.
+        /// Whether this is the server's answer to this robot's request. A message from a broker may
+        /// come from any sender.
         was_asked_for: bool,
     },
-    /// The server has nothing newer.
+    /// The server has no newer state.
     Unchanged,
-    /// A report is stored.
+    /// The server has stored a report.
     Confirmed {
-        /// Which.
+        /// Sequence number of the report.
         seq: u64,
-        /// What the server said, if it was asked over HTTP.
+        /// The server's answer, if the report went over HTTP.
         reply: Option<ReportReply>,
     },
-    /// The server does not accept this robot's token, for the reason that it gives.
+    /// The server refuses this robot's token, for the given reason.
     TokenRefused(String),
-    /// The server knows the robot and sends it no state now.
+    /// The server knows the robot but sends no state now.
     Withheld {
-        /// The server's code.
+        /// The server's error code.
         code: String,
-        /// Its text.
+        /// The server's error text.
         text: String,
     },
 }
 
-/// What driver and link share. The driver writes reports and whether it keeps to its state, the
-/// link the rest.
+/// State shared by the driver and the link. The driver writes `reports` and `settled`; the link
+/// writes the rest.
 #[derive(Clone)]
 pub struct Shared {
     /// The newest report.
     pub reports: watch::Sender<Option<Arc<Report>>>,
-    /// The sequence number of the newest report that is stored.
+    /// Sequence number of the newest stored report.
     pub confirmed: watch::Sender<u64>,
-    /// Whether the robot keeps to the state it has for some time; otherwise the server is asked for
-    /// all of it again.
+    /// Whether the robot will keep its current state for some time. Otherwise the full state is
+    /// requested again.
     pub settled: watch::Sender<bool>,
-    /// Where the MQTT session goes; `None`: where whoever keeps it was told at first.
+    /// Endpoint of the MQTT session. `None` selects the session's initial address.
     pub endpoint: watch::Sender<Option<MqttEndpoint>>,
-    /// How often the server has answered where it goes, with something new or not.
+    /// Number of the server's answers about the endpoint, changed or not.
     pub endpoint_answers: watch::Sender<u64>,
-    /// Asks the server where it goes.
+    /// Requests the endpoint from the server.
     pub find: Arc<Notify>,
-    /// Whether a session is up.
+    /// Whether an MQTT session is up.
     pub mqtt_up: watch::Sender<bool>,
-    /// Whether the first try to get one is over.
+    /// Whether the first attempt to open a session has ended.
     pub mqtt_tried: watch::Sender<bool>,
-    /// Whether one is up whose acknowledgements come from the server itself: then it takes reports.
+    /// Whether a session is up whose acknowledgements come from the server itself. Such a session
+    /// accepts reports.
     pub mqtt_stores: watch::Sender<bool>,
-    /// Says that the server did not accept the token.
+    /// Signals that the server refused the token.
     pub token_refused: Arc<Notify>,
-    /// Asks for a poll now.
+    /// Requests a poll now.
     pub poll: Arc<Notify>,
-    /// Asks for a report over HTTP now, whether MQTT is up or not.
+    /// Requests a report over HTTP now, even while MQTT is up.
     pub post: Arc<Notify>,
-    /// Whose parts are wanted.
+    /// Contents with wanted parts.
     pub listening: Listening,
-    /// What is measured of the link.
+    /// Measurements of the link.
     pub meter: LinkMeter,
-    /// The agent ends.
+    /// Cancelled when the agent ends.
     pub shutdown: CancellationToken,
 }
 
-/// What goes between an MQTT session and those in the agent who answer and tell. Both ways are
-/// bounded and lossy: nothing in them outlives its moment.
+/// Channels between an MQTT session and the agent's tasks that answer requests and publish
+/// messages. Both directions are bounded and lossy, because their messages are useful only at the
+/// moment.
 pub struct Talk {
-    /// Where questions that came in go, each with when it came.
+    /// Incoming requests, each with its time of arrival.
     pub requests: mpsc::Sender<(Request, Instant)>,
-    /// What is to be published.
+    /// Messages to publish.
     pub messages: mpsc::Receiver<Message>,
-    /// Log lines to be published, a batch at a time: the next is taken when the one before has
-    /// arrived.
+    /// Batches of log lines to publish. The next batch is taken after the acknowledgement of the
+    /// last.
     pub lines: mpsc::Receiver<Vec<u8>>,
 }
 
-/// Something a robot says that is neither report nor status.
+/// A message from the robot other than a report or a status.
 #[derive(Debug)]
 pub struct Message {
-    /// On which of its topics.
+    /// Topic of the message.
     pub topic: RobotTopic,
-    /// The bytes.
+    /// Payload of the message.
     pub payload: Vec<u8>,
 }
 
-/// How often to poll.
+/// Intervals between polls.
 #[derive(Debug, Clone, Copy)]
 pub struct Intervals {
-    /// While MQTT is up.
+    /// Interval while MQTT is up.
     pub slow: Duration,
-    /// While it is not.
+    /// Interval while MQTT is down.
     pub fast: Duration,
 }
 
 impl Shared {
-    /// Nothing said yet.
+    /// Initial state, before any message.
     pub fn new(shutdown: CancellationToken) -> Self {
         Self {
             reports: watch::Sender::new(None),
@@ -151,8 +156,9 @@ impl Shared {
     }
 }
 
-/// The link's half over HTTP, until the agent ends. MQTT goes first, for as long as a try may take:
-/// a session brings the same with less, above all where a whole fleet starts at once.
+/// Runs the HTTP half of the link until the agent ends. It first waits for the end of the first
+/// MQTT attempt: a session delivers the same data at less cost, above all when a whole fleet starts
+/// at once.
 pub async fn over_http(
     server: Server,
     shared: Shared,
@@ -161,7 +167,7 @@ pub async fn over_http(
 ) {
     let mut tried = shared.mqtt_tried.subscribe();
     tokio::select! {
-        // Cancel-safe: a watch remembers what it holds, a token can be awaited again.
+        // Cancel-safe: a watch remembers its value, and a token can be awaited again.
         _ = tried.wait_for(|tried| *tried) => {}
         () = shared.shutdown.cancelled() => return,
     }
@@ -177,8 +183,8 @@ pub async fn over_http(
     tokio::join!(polling, post(server, shared.clone(), heard), asking);
 }
 
-/// Polls for the desired state, until the agent ends: at once, unless a session is up, which is
-/// told it without asking.
+/// Polls for the desired state until the agent ends. The first poll is immediate, unless a session
+/// is up, which receives the state without a request.
 pub async fn poll(
     server: Server,
     shared: Shared,
@@ -193,12 +199,13 @@ pub async fn poll(
         let known = tag.as_ref().filter(|_| *shared.settled.borrow());
         let begun = Instant::now();
         let outcome = server.desired(known).await;
-        // An MQTT session measures more often and without a connection to be made first.
+        // An MQTT session measures more often and without the cost of a new connection.
         if outcome.is_ok() && !*shared.mqtt_up.borrow() {
             shared.meter.round_trip(begun.elapsed());
         }
         let least = match &outcome {
-            // Spread like all else: whoever was put out together does not ask together.
+            // Spread like all other waits: robots that were refused together must not poll
+            // together.
             Err(ServerError::TokenRefused(_)) => REFUSED_POLL.min(intervals.slow).mul_f64(spread()),
             Err(ServerError::Busy { retry_after: Some(wait), .. }) => (*wait).min(intervals.slow),
             _ => Duration::ZERO,
@@ -217,7 +224,7 @@ pub async fn poll(
     }
 }
 
-/// Waits until it is time to poll, at least for `least`; false if the agent ends.
+/// Waits until the next poll is due, at least for `least`. Returns false if the agent ends.
 async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bool {
     let mut mqtt_up = shared.mqtt_up.subscribe();
     let (asked_at, spread) = (Instant::now(), spread());
@@ -226,17 +233,17 @@ async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bo
         let interval =
             (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
         tokio::select! {
-            // Cancel-safe: a timer that is made anew for the same time, so that a session that
-            // comes and goes does not put polling off for ever.
+            // Cancel-safe: the timer is recreated for the same time, so that a flapping session
+            // does not postpone polling forever.
             () = tokio::time::sleep_until(asked_at + interval) => {
-                // A report over HTTP brings the name and labels the server holds, which MQTT does
+                // A report over HTTP returns the name and labels that the server holds. MQTT does
                 // not.
                 shared.post.notify_one();
                 return true;
             }
             // Cancel-safe: a permit that was not taken stays.
             () = shared.poll.notified() => return true,
-            // Cancel-safe: a watch remembers that it changed. The other interval holds from now on.
+            // Cancel-safe: a watch remembers a change. The other interval applies from now on.
             Ok(()) = mqtt_up.changed() => {}
             // Cancel-safe: a token can be awaited again.
             () = shared.shutdown.cancelled() => return false,
@@ -261,8 +268,8 @@ fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
     }
 }
 
-/// Delivers reports over HTTP while no MQTT session stores them, and when it is asked to while one
-/// does, until the agent ends.
+/// Posts reports over HTTP while no MQTT session stores them, and on request while one does, until
+/// the agent ends.
 pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
     let (mut reports, mut mqtt_stores) =
         (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
@@ -281,7 +288,7 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                     shared
                         .confirmed
                         .send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
-                    // A broker that is not the server's may have lost the doorbell.
+                    // An external broker may have lost the doorbell.
                     if !stores
                         && *shared.mqtt_up.borrow()
                         && reply.generation > report.observed_generation
@@ -308,7 +315,7 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                             retry = retry.max(wait.min(REFUSED_POLL))
                         }
                         ServerError::TokenRefused(why) => {
-                            // What changes that is noticed by polling.
+                            // Polling detects when the token is accepted again.
                             retry = REFUSED_POLL.mul_f64(spread());
                             if heard.send(Heard::TokenRefused(why)).await.is_err() {
                                 return;
@@ -321,16 +328,16 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
         }
         let newer = async {
             if retry == Duration::MAX {
-                // Nothing failed: a new report goes out at once.
+                // No failure: a new report is sent at once.
                 let _ = reports.changed().await;
             } else {
                 tokio::time::sleep(retry).await;
             }
         };
         tokio::select! {
-            // Cancel-safe: a watch remembers that it changed, a timer is made anew.
+            // Cancel-safe: a watch remembers a change, and the timer is recreated.
             () = newer => {}
-            // Cancel-safe: a watch remembers that it changed.
+            // Cancel-safe: a watch remembers a change.
             Ok(()) = mqtt_stores.changed() => {}
             // Cancel-safe: a permit that was not taken stays.
             () = shared.post.notified() => asked = true,
@@ -340,7 +347,7 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
     }
 }
 
-/// Between half and one and a half, so that a fleet that began together does not poll together.
+/// Random factor from 0.5 to 1.5, so that robots that started together do not poll together.
 pub(crate) fn spread() -> f64 {
     0.5 + rand::random::<f64>()
 }

@@ -1,5 +1,5 @@
-//! Reads stored lines back, the newest first, from any number of files at once. However much is
-//! stored, only a chunk of each file is in memory, and only so much is read for one question.
+//! Reads stored lines back, the newest first, from any number of files at once. However large the
+//! logs are, only a chunk of each file is in memory, and the bytes read for one query are limited.
 
 use std::collections::VecDeque;
 use std::fs::File;
@@ -15,29 +15,29 @@ use super::rotated::aged;
 use crate::system::clock;
 
 const CHUNK_BYTES: usize = 64 * 1024;
-/// The longest line that is looked at whole; what the shim writes is shorter.
+/// Maximum length of a line that is examined as a whole; the shim writes shorter lines.
 const MAX_LINE_BYTES: usize = 64 * 1024;
-/// Bytes read for one question. What lies further back is not found by it.
+/// Maximum bytes read for one query. The query does not find lines further back.
 const MAX_SCAN_BYTES: u64 = 256 * 1024 * 1024;
-/// Older files looked for beside a log.
+/// Maximum number of older files that are searched beside a log.
 pub const MAX_AGED: u32 = 16;
-/// What a batch has beside its lines.
+/// Size of a batch without its lines.
 const BATCH_OVERHEAD_BYTES: usize = 1024;
 
-/// Which lines are wanted.
+/// Selection of log lines.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Wanted {
-    /// Of this task only.
+    /// Only lines of this task.
     pub task: Option<TaskName>,
-    /// Only these and more serious ones.
+    /// Only lines of this level and more serious ones.
     pub level: LogLevel,
-    /// Not older than this many milliseconds.
+    /// Maximum age of the lines in milliseconds.
     pub since_ms: Option<u64>,
-    /// At most so many.
+    /// Maximum number of lines.
     pub max_lines: u64,
 }
 
-/// The newest lines of `files` that are wanted and fit into an answer, the oldest first.
+/// The newest matching lines of `files` that fit into an answer, the oldest first.
 pub fn newest(files: &[LogFile], wanted: &Wanted, now_ms: u64) -> Vec<LogLine> {
     let cutoff_ms = wanted.since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms));
     let max_lines = usize::try_from(wanted.max_lines).unwrap_or(usize::MAX).min(MAX_KEPT_LINES);
@@ -87,13 +87,13 @@ impl<'a> Source<'a> {
             };
             let Ok(metadata) = opened.metadata() else { break };
             let id = (metadata.dev(), metadata.ino());
-            // It was rotated while it was opened: this one is there already.
+            // The log was rotated while it was opened: this file is already in the list.
             if !seen.contains(&id) {
                 seen.push(id);
                 files.push(opened);
             }
         }
-        // What has no time is at least not newer than its file.
+        // A line without a time is at most as new as its file.
         let written = files.first().and_then(|file| {
             file.metadata().ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()
         });
@@ -101,7 +101,7 @@ impl<'a> Source<'a> {
         Self { file, level, cutoff_ms, lines: Backwards::new(files.into()), at_ms, head: None }
     }
 
-    /// Finds the next line that is wanted.
+    /// Finds the next matching line.
     fn advance(&mut self, room: &mut u64) {
         self.head = None;
         while let Some(line) = self.lines.next_line(room) {
@@ -128,9 +128,9 @@ impl<'a> Source<'a> {
 /// The lines of files, the newest first.
 struct Backwards {
     files: VecDeque<File>,
-    /// The file that is read, and how much of its beginning is not.
+    /// The file that is read, and the length of its unread beginning.
     current: Option<(File, u64)>,
-    /// What was read and not taken; the last line's end was taken.
+    /// Bytes that were read and not taken yet, without the end of the last line.
     buffer: Vec<u8>,
     is_newest: bool,
 }
@@ -166,7 +166,7 @@ impl Backwards {
                     *unread -= count;
                     let mut chunk = vec![0; count as usize];
                     if file.read_exact_at(&mut chunk, *unread).is_err() {
-                        // It was written anew meanwhile, or the disk fails.
+                        // The file was rewritten meanwhile, or the disk fails.
                         self.current = None;
                         self.buffer.clear();
                         continue;
@@ -181,12 +181,12 @@ impl Backwards {
         }
     }
 
-    /// Goes to the next file; `None` after the last.
+    /// Opens the next file; `None` after the last.
     fn open_next(&mut self) -> Option<()> {
         let file = self.files.pop_front()?;
         let size = file.metadata().map_or(0, |metadata| metadata.len());
         let end = if std::mem::take(&mut self.is_newest) { whole_lines(&file, size) } else { size };
-        // The line's end that the first line begins behind.
+        // The line end before the first line.
         let mut last = [0];
         let ends_with_line =
             end > 0 && file.read_exact_at(&mut last, end - 1).is_ok() && last == *b"\n";
@@ -195,7 +195,8 @@ impl Backwards {
     }
 }
 
-/// How much of a file that is being written is whole lines; all of it if its end has none.
+/// Length of the whole lines in a file that is being written; the whole length if the last part has
+/// no line end.
 fn whole_lines(file: &File, size: u64) -> u64 {
     let begin = size.saturating_sub(MAX_LINE_BYTES as u64);
     let mut tail = vec![0; (size - begin) as usize];

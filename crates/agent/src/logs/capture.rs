@@ -1,6 +1,6 @@
-//! Takes a task's two output streams into its log: each line whole, in its stream's order, with the
-//! time it was read at. It never keeps the task waiting for long: where the disk does not keep up,
-//! output is dropped and counted.
+//! Copies a task's two output streams into its log: each line whole, in its stream's order, with
+//! the time at which it was read. The capture never blocks the task for long: where the disk can't
+//! keep up, output is dropped and counted.
 
 use std::io::{self, PipeReader, Read as _};
 use std::os::fd::AsFd as _;
@@ -17,14 +17,14 @@ use super::rotated::RotatedLog;
 use crate::logs::LogSpec;
 use crate::system::clock;
 
-/// How long the beginning of a line waits for the rest.
+/// Maximum time that the beginning of a line waits for the rest.
 const PARTIAL_TIMEOUT: Duration = Duration::from_secs(1);
-/// How long a full queue may keep the task's output waiting, before it is dropped until there is
-/// room.
+/// Maximum time that a full queue may block the task's output. After that, output is dropped until
+/// there is room.
 const QUEUE_PATIENCE: Duration = Duration::from_secs(1);
-/// Bytes that wait for the disk.
+/// Maximum number of bytes that wait for the disk.
 const QUEUE_BYTES: usize = 1024 * 1024;
-/// Bytes read at once; were each of them an empty line, the queue would just hold their records.
+/// Size of one read. Even if each byte were an empty line, the queue would just hold the records.
 const READ_BYTES: usize = 16 * 1024;
 
 /// Copies one run's output into its log until both streams end.
@@ -66,8 +66,8 @@ fn read(mut streams: [Stream; 2], queue: &Queue) {
     }
 }
 
-/// Waits until a stream can be read or the beginning of a line has waited long enough; which can be
-/// read.
+/// Waits until a stream can be read or the beginning of a line has waited long enough; returns
+/// which streams can be read.
 fn ready(streams: &[Stream; 2]) -> Result<[bool; 2], Errno> {
     let deadline = streams.iter().filter_map(Stream::deadline).min();
     let wait = deadline.map(|deadline| {
@@ -79,7 +79,7 @@ fn ready(streams: &[Stream; 2]) -> Result<[bool; 2], Errno> {
     let mut polled: Vec<PollFd> =
         open.map(|pipe| PollFd::new(pipe.as_fd(), PollFlags::POLLIN)).collect();
     poll(&mut polled, timeout)?;
-    // Also an end or an error is something to read.
+    // An end or an error also counts as readable.
     let mut polled = polled.iter().map(|polled| polled.any().unwrap_or(true));
     Ok([0, 1].map(|index: usize| streams[index].pipe.is_some() && polled.next().unwrap_or(false)))
 }
@@ -90,7 +90,7 @@ struct Stream {
     source: LogSource,
     partial: Vec<u8>,
     partial_since: Option<Instant>,
-    /// Whether the line has begun in an earlier record.
+    /// Whether an earlier record holds the beginning of the line.
     continues: bool,
 }
 
@@ -122,7 +122,7 @@ impl Stream {
         }
     }
 
-    /// Adds to `lines` what `bytes` completes.
+    /// Adds the lines to `lines` that `bytes` completes.
     fn take(&mut self, mut bytes: &[u8], stamp: &str, lines: &mut Vec<u8>) {
         while !bytes.is_empty() {
             let room = MAX_TEXT_BYTES - self.partial.len();
@@ -130,7 +130,7 @@ impl Stream {
             if let Some(end) = near.iter().position(|byte| *byte == b'\n') {
                 self.partial.extend_from_slice(&bytes[..end]);
                 bytes = &bytes[end + 1..];
-                // The end of a line that was flushed as a whole adds nothing.
+                // The end of a line that was flushed as a whole adds no record.
                 if !(self.continues && self.partial.is_empty()) {
                     self.put(self.partial.len(), stamp, lines);
                 }
@@ -167,7 +167,8 @@ impl Stream {
     }
 }
 
-/// Where a long line may be cut: all of `bytes`, or up to the character that goes on behind them.
+/// Position at which a long line may be cut: all of `bytes`, or before an incomplete last
+/// character.
 fn character_boundary(bytes: &[u8]) -> usize {
     let begins = |byte: &u8| !(0x80..0xc0).contains(byte);
     let tail = bytes.iter().rev().take(4).position(begins);
@@ -179,7 +180,7 @@ fn character_boundary(bytes: &[u8]) -> usize {
     }
 }
 
-/// What was read and is not written: whole lines, then perhaps a gap.
+/// Output that was read and not yet written: whole lines, then perhaps a gap.
 #[derive(Default)]
 struct Queue {
     waiting: Mutex<Waiting>,
@@ -200,7 +201,8 @@ impl Queue {
             return;
         }
         let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-        // After a gap nothing is added before the gap was noted, or it would be in the wrong place.
+        // After a gap no lines are added before the gap is recorded; otherwise the record of the
+        // gap would be in the wrong place.
         let is_full = |waiting: &mut Waiting| {
             waiting.lost_bytes == 0
                 && !waiting.lines.is_empty()
@@ -221,7 +223,7 @@ impl Queue {
         self.changed.notify_all();
     }
 
-    /// Writes what is added, until the end.
+    /// Writes the waiting output, until the end.
     fn write_to(&self, log: &mut RotatedLog) {
         loop {
             let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
@@ -300,7 +302,7 @@ mod tests {
         assert_eq!(format!("{}{}", &shown[0][2..], &shown[1][2..]), text);
         assert!(shown[1].starts_with("o é") && shown[2].starts_with("O yy"));
         assert_eq!((shown[2].len(), shown[3].as_str()), (MAX_TEXT_BYTES + 2, "O end"));
-        // Bytes that are no text at all are cut where they are.
+        // Bytes that are not valid text are cut at any position.
         assert_eq!(character_boundary(&[0x80; 10]), 10);
     }
 

@@ -1,36 +1,36 @@
-//! The lines that ROS nodes print, and how any bytes become a text that is safe to show. ROS 2
-//! prints `[INFO] [1700000000.123456789] [talker]: text`; ROS 1 pads the level, may add the
-//! simulated time and colours, and names no node; `ros2 launch` puts `[talker-1] ` before it all.
-//! It keeps no state.
+//! Parses the lines that ROS nodes print, and turns arbitrary bytes into text that is safe to show.
+//! ROS 2 prints `[INFO] [1700000000.123456789] [talker]: text`. ROS 1 pads the level, may add the
+//! simulated time and colours, and names no node. `ros2 launch` puts `[talker-1] ` before the line.
+//! The module keeps no state.
 
 use task_proto::id::GraphName;
 use task_proto::log::{LogLevel, MAX_LINE_BYTES};
 
-/// What stands for a byte or character that must not reach a terminal.
+/// Replaces a byte or character that must not reach a terminal.
 const REPLACEMENT: char = char::REPLACEMENT_CHARACTER;
-/// What a text that was cut ends with.
+/// Marks the end of a text that was cut.
 const ELLIPSIS: char = '…';
 
-/// What a line in console format says.
+/// A parsed line in console format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Said<'a> {
-    /// How serious it is.
+    /// Severity of the line.
     pub level: LogLevel,
-    /// When, as the node wrote it.
+    /// Time of the line, as the node wrote it.
     pub stamp: Option<&'a str>,
     /// The logger, where the line names one.
     pub logger: Option<&'a str>,
-    /// The rest.
+    /// The rest of the line.
     pub text: &'a str,
 }
 
-/// Reads a line in console format; `None` for any other. `line` is as [`printable`] leaves it.
+/// Parses a line in console format; `None` for any other. `line` is the output of [`printable`].
 pub fn parse(line: &str) -> Option<Said<'_>> {
     let line = line.trim_start();
     let (first, rest) = bracket(line)?;
     let (level, rest) = match level_of(first) {
         Some(level) => (level, rest),
-        // What a launch file started comes behind its name and number.
+        // Lines of processes that a launch file started have the process's name and number first.
         None => {
             bracket(rest.trim_start()).and_then(|(second, rest)| Some((level_of(second)?, rest)))?
         }
@@ -49,13 +49,13 @@ pub fn parse(line: &str) -> Option<Said<'_>> {
     Some(Said { level, stamp: Some(stamp), logger, text })
 }
 
-/// The node a logger belongs to, by its name: `robot.talker` is that of `/robot/talker`.
+/// The node of a logger, by its name: `robot.talker` belongs to `/robot/talker`.
 pub fn node_of(logger: &str) -> Option<GraphName> {
     format!("/{}", logger.replace('.', "/")).parse().ok()
 }
 
-/// `bytes` as one line of text for people: no colours, no control characters, nothing that turns
-/// the direction of writing, at most [`MAX_LINE_BYTES`].
+/// `bytes` as one line of readable text: no colours, no control characters, no characters that
+/// change the direction of writing, at most [`MAX_LINE_BYTES`].
 pub fn printable(bytes: &[u8]) -> String {
     let text = String::from_utf8_lossy(bytes);
     let mut shown = String::with_capacity(text.len().min(MAX_LINE_BYTES));
@@ -74,7 +74,7 @@ pub fn printable(bytes: &[u8]) -> String {
     cut(shown)
 }
 
-/// Skips what follows ESC: a colour or another order to the terminal.
+/// Skips the sequence after ESC: a colour or another terminal command.
 fn skip_escape(characters: &mut std::iter::Peekable<std::str::Chars<'_>>) {
     match characters.peek() {
         Some('[') => {
@@ -109,7 +109,7 @@ fn cut(mut text: String) -> String {
     text
 }
 
-/// What is in the bracket that `text` begins with, and what comes after it.
+/// The contents of the bracket that `text` begins with, and the text after it.
 fn bracket(text: &str) -> Option<(&str, &str)> {
     text.strip_prefix('[')?.split_once(']')
 }
@@ -125,8 +125,8 @@ fn level_of(word: &str) -> Option<LogLevel> {
     })
 }
 
-/// `1700000000.123456789`, in ROS 1 with the simulated time behind it, in its Python once with a
-/// word before it.
+/// Recognizes a time such as `1700000000.123456789`. ROS 1 adds the simulated time after it, and
+/// its Python version once puts a word before it.
 fn is_stamp(text: &str) -> bool {
     let text = text.strip_prefix("WallTime: ").unwrap_or(text);
     text.starts_with(|first: char| first.is_ascii_digit())

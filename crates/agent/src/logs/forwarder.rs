@@ -1,7 +1,7 @@
-//! Publishes lines as they come: those that matter, or more while somebody follows, never more than
-//! a link bears. What is too much is counted and stays where it is kept. The files are the queue:
-//! nothing waits in memory while the server can't be reached, and a batch is only made when the
-//! link has room for it.
+//! Publishes log lines as they are written: normally only the important ones, more while a client
+//! follows, and never more than the link can carry. Excess lines are counted and stay in the log
+//! files. The files are the queue: no lines wait in memory while the server can't be reached, and a
+//! batch is only made when the link has room for it.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -18,30 +18,30 @@ use super::{Following, files};
 use crate::system::clock;
 use crate::system::layout::DataDir;
 
-/// Which log lines go to the server while nobody follows.
+/// Selection of the log lines that go to the server while no client follows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ForwardSettings {
-    /// Only these and more serious ones.
+    /// Only lines of this level and more serious ones.
     pub level: LogLevel,
-    /// Lines a second and task.
+    /// Maximum lines a second for each task.
     pub lines_per_s: u32,
 }
 
-/// How often the files are looked at.
+/// Interval between two looks at the files.
 const PAUSE: Duration = Duration::from_millis(500);
-/// Likewise while somebody follows.
+/// Interval between two looks at the files while a client follows.
 const FOLLOWED_PAUSE: Duration = Duration::from_millis(200);
-/// Lines a second and task while somebody follows.
+/// Maximum lines a second for each task while a client follows.
 const FOLLOWED_LINES_PER_S: u32 = 200;
-/// So many seconds' lines may come at once.
+/// Burst limit: the lines of this many seconds may come at once.
 const BURST_S: u32 = 10;
-/// A batch is not much larger: what is behind it on a slow link is a report.
+/// Approximate maximum size of a batch, because a report may wait behind it on a slow link.
 const BATCH_BYTES: usize = 32 * 1024;
-/// Bytes of all files that are looked through at one go.
+/// Maximum bytes of all files that are examined in one pass.
 const ROOM_BYTES: usize = 4 * 1024 * 1024;
-/// How much of what was written to a log without a link is published afterwards.
+/// Maximum bytes of a log written without a link that are published afterwards.
 const MISSED_BYTES: u64 = 64 * 1024;
-/// How often a count is published when no line is.
+/// Interval at which a count is published when no line is.
 const COUNT_INTERVAL: Duration = Duration::from_secs(5);
 
 /// Publishes lines until the agent ends.
@@ -52,7 +52,7 @@ pub struct Forwarder {
 }
 
 impl Forwarder {
-    /// A forwarder of what is added to the logs of `data` from now on.
+    /// A forwarder of the lines that are added to the logs of `data` from now on.
     pub fn new(
         robot_id: RobotId,
         data: DataDir,
@@ -64,7 +64,7 @@ impl Forwarder {
         Self { settings, following, gatherer }
     }
 
-    /// Puts batches, as JSON, into `batches` while a session is up and takes them.
+    /// Puts batches, as JSON, into `batches` while a session is up and accepts them.
     pub async fn run(mut self, mut mqtt_up: watch::Receiver<bool>, batches: mpsc::Sender<Vec<u8>>) {
         loop {
             let was_up = *mqtt_up.borrow();
@@ -96,7 +96,7 @@ impl Forwarder {
             tokio::select! {
                 // Cancel-safe: a timer that is made anew each time.
                 () = tokio::time::sleep(pause) => {}
-                // Cancel-safe: a watch remembers that it changed. Without a sender nobody will
+                // Cancel-safe: a watch remembers that it changed. Without a sender no client will
                 // follow.
                 Ok(()) = self.following.changed() => {}
             }
@@ -104,12 +104,12 @@ impl Forwarder {
     }
 }
 
-/// What is published now.
+/// Selection of the lines that are published now.
 #[derive(Debug, Clone, Copy)]
 struct Wanted {
     level: LogLevel,
     lines_per_s: u32,
-    /// Also lines that are of none of our tasks.
+    /// Whether to include lines that belong to none of our tasks.
     others: bool,
     pause: Duration,
 }
@@ -129,7 +129,7 @@ impl Wanted {
     }
 }
 
-/// Where each log was read to, and what was left out.
+/// Read position of each log, and counts of the lines left out.
 struct Gatherer {
     robot_id: RobotId,
     data: DataDir,
@@ -139,11 +139,11 @@ struct Gatherer {
     suppressed: u64,
     counted_at: Option<Instant>,
     has_more: bool,
-    /// Which file comes first in the next batch.
+    /// Index of the file that comes first in the next batch.
     next: usize,
 }
 
-/// Lines a task may still say now.
+/// Remaining line budget of a task.
 #[derive(Debug)]
 struct Budget {
     lines: f64,
@@ -165,20 +165,20 @@ impl Gatherer {
         }
     }
 
-    /// Goes on at most `bytes` before the end of each log.
+    /// Moves each log's position to at most `bytes` before its end.
     fn skip(&mut self, bytes: u64) {
         for file in files(&self.data) {
             self.tails.entry(file.path.clone()).or_default().skip(&file.path, bytes);
         }
     }
 
-    /// The next batch, if there is something to say.
+    /// The next batch, if there are lines or counts to publish.
     fn gather(&mut self, wanted: &Wanted, now: Instant) -> Option<LogBatch> {
         let mut files = files(&self.data);
         self.tails.retain(|path, _| files.iter().any(|file| file.path == *path));
         self.budgets.retain(|task, _| files.iter().any(|file| file.task == *task));
         let (mut batch, mut room) = (Gathered::default(), ROOM_BYTES);
-        // One that has more to say than a batch takes leaves the next batch to those behind it.
+        // A file with more lines than fit into a batch leaves the next batch to the files after it.
         let first = std::mem::take(&mut self.next).checked_rem(files.len()).unwrap_or_default();
         files.rotate_left(first);
         self.has_more = false;
@@ -225,7 +225,7 @@ impl Gatherer {
                 return true;
             }
             if budget.lines < 1.0 {
-                // Whether it is the second of two is not worth finding out.
+                // Telling whether the line is the second of two is not worth the cost.
                 *suppressed += 1;
                 return true;
             }
@@ -252,7 +252,7 @@ impl Budget {
     }
 }
 
-/// A batch as it grows.
+/// A batch under construction.
 #[derive(Default)]
 struct Gathered {
     lines: Vec<LogLine>,
@@ -320,7 +320,7 @@ mod tests {
                 .unwrap();
         }
 
-        /// What is published `later` than the last time: the texts, and the number of those left
+        /// The batch published `later` than the last one: the texts, and the number of lines left
         /// out.
         fn gather(&mut self, later: Duration, following: Option<LogLevel>) -> (Vec<String>, u64) {
             self.now += later;

@@ -1,6 +1,6 @@
-//! What a stored line says: its level, its node, its text. Nodes say most things twice, on
-//! `/rosout` and on their standard error; the second is known by the node's own time. It reads no
-//! file.
+//! Determines the level, node and text of a stored line. Nodes send most messages twice, on
+//! `/rosout` and on their standard error; the second is recognized by the node's own time. This
+//! module reads no file.
 
 use std::path::PathBuf;
 
@@ -11,23 +11,24 @@ use super::console;
 use super::record::Record;
 use crate::system::recent_set::Recent;
 
-/// Lines among which the second of two is looked for.
+/// Number of lines among which the second of two is searched.
 const TWIN_WINDOW: usize = 4096;
-/// A node's time is believed if the robot's is not further away: it may be a simulated one.
+/// A node's time is accepted only within this distance of the robot's time: it may be a simulated
+/// one.
 const MAX_SKEW_MS: u64 = 5 * 60 * 1000;
 
-/// A file of stored lines; older ones of it may be beside it with `.1`, `.2`, … added.
+/// A file of stored lines; older ones may be beside it with `.1`, `.2`, … added.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogFile {
-    /// The newest.
+    /// Path of the newest file.
     pub path: PathBuf,
-    /// The task it belongs to; `None`: none of ours.
+    /// The task of the log; `None`: none of our tasks.
     pub task: Option<TaskName>,
-    /// Where lines are from that do not say it themselves.
+    /// Source of lines that name none.
     pub unmarked: LogSource,
 }
 
-/// A line as it is shown, and what its twin would have.
+/// A line as shown to users, with the key that its duplicate would have.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     /// The line.
@@ -35,7 +36,7 @@ pub struct Entry {
     mark: Option<Mark>,
 }
 
-/// What both forms of a node's message have: who said it, and in which millisecond by the node's
+/// Fields that both forms of a node's message share: the sender, and the millisecond by the node's
 /// clock.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 struct Mark {
@@ -43,13 +44,13 @@ struct Mark {
     stamp: String,
 }
 
-/// The messages of nodes that were seen lately.
+/// The recent messages of nodes.
 #[derive(Debug, Default)]
 pub struct Twins(Recent<(Mark, LogSource), TWIN_WINDOW>);
 
 impl Entry {
-    /// What `record` of `file` says; `None` if it says nothing. `at_ms` is for a record without a
-    /// time.
+    /// The entry for `record` of `file`; `None` if it has no text. `at_ms` is for a record without
+    /// a time.
     pub fn of(record: &Record, file: &LogFile, at_ms: u64) -> Option<Self> {
         let at_ms = record.at_ms.unwrap_or(at_ms);
         let source = record.source.unwrap_or(file.unmarked);
@@ -61,7 +62,7 @@ impl Entry {
         let stamp = said.and_then(|said| said.stamp);
         let mark = logger.zip(stamp).map(|(logger, stamp)| Mark::new(logger, stamp));
         let shown = match said {
-            // A logger whose name is no node's stays in the text.
+            // A logger name that belongs to no node stays in the text.
             Some(said) if logger.is_some() == node.is_some() => said.text,
             _ => &text,
         };
@@ -82,15 +83,15 @@ impl Entry {
 
 impl Mark {
     fn new(logger: &str, stamp: &str) -> Self {
-        // The console shows nanoseconds, what is kept of the topic milliseconds.
+        // The console shows nanoseconds; stored lines of the topic have milliseconds.
         let (seconds, fraction) = stamp.split_once('.').unwrap_or((stamp, ""));
         let stamp = format!("{seconds}.{:0<3.3}", fraction);
         Self { logger: logger.to_owned(), stamp }
     }
 }
 
-/// The milliseconds since the Unix epoch that a node wrote as `1700000000.123456789`, the first of
-/// several.
+/// The milliseconds since the Unix epoch that a node wrote as `1700000000.123456789`; of several
+/// times, the first.
 fn millis(stamp: &str) -> Option<u64> {
     let (seconds, fraction) = stamp.split(',').next()?.trim().split_once('.')?;
     let fraction: u64 = format!("{fraction:0<3.3}").parse().ok()?;
@@ -98,7 +99,7 @@ fn millis(stamp: &str) -> Option<u64> {
 }
 
 impl Twins {
-    /// Whether the same was said before by another way.
+    /// Whether the same message came before by another way.
     pub fn knows(&mut self, entry: &Entry) -> bool {
         let Some(mark) = &entry.mark else { return false };
         let others = [LogSource::Stdout, LogSource::Stderr, LogSource::Rosout].into_iter();

@@ -1,46 +1,46 @@
-//! A line as it lies on the disk, easy to read with `tail`:
+//! The format of a stored line, easy to read with `tail`:
 //!
 //! ```text
 //! 2026-11-21T10:00:00.123Z O hello
 //! 2026-11-21T10:00:00.124Z E Traceback (most recent call last):
 //! ```
 //!
-//! The letter says where the line is from: `O` standard output, `E` standard error, `R` `/rosout`,
-//! `D` `/diagnostics`, `B` the build, `T` the agent. A small letter goes on with the line before:
-//! it was too long, or its end took its time. Lines of earlier versions have no time and no letter.
-//! It never changes a text.
+//! The letter is the source of the line: `O` standard output, `E` standard error, `R` `/rosout`,
+//! `D` `/diagnostics`, `B` the build, `T` the agent. A small letter marks the continuation of the
+//! line before, which was too long, or whose end came late. Lines of earlier versions have no time
+//! and no letter. The module never changes a text.
 
 use task_proto::log::{LogLevel, LogSource};
 use task_proto::time::{parse_timestamp, timestamp};
 
 use super::console;
 
-/// The longest text of a stored line; a longer one goes on in the next.
+/// Maximum text length of a stored line; a longer line continues in the next record.
 pub const MAX_TEXT_BYTES: usize = 4000;
-/// Bytes of a time.
+/// Length of a time in bytes.
 const STAMP_BYTES: usize = 24;
-/// Bytes before the text: the time, the letter and a space behind each.
+/// Bytes before the text: the time, the letter and a space after each.
 pub const PREFIX_BYTES: usize = STAMP_BYTES + 3;
-/// Stands before each run's output.
+/// Marks the beginning of each run's output.
 const START: &[u8] = b"started";
-/// Likewise, as earlier versions wrote it.
+/// The same mark as written by earlier versions.
 const OLD_START: &[u8] = b"[taskd: started]";
 
 /// One stored line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Record<'a> {
-    /// When it was written, by the robot's clock.
+    /// Time of writing, by the robot's clock.
     pub at_ms: Option<u64>,
-    /// Where it is from.
+    /// Source of the line.
     pub source: Option<LogSource>,
-    /// Whether it goes on with the line before.
+    /// Whether the record continues the line before.
     pub continues: bool,
-    /// What was said, as it came.
+    /// The text as it arrived.
     pub text: &'a [u8],
 }
 
 impl<'a> Record<'a> {
-    /// Reads a line without its end; what has no time and letter is all text.
+    /// Parses a line without its end; a line without time and letter is all text.
     pub fn parse(line: &'a [u8]) -> Self {
         Self::stamped(line).unwrap_or(Self {
             at_ms: None,
@@ -60,7 +60,7 @@ impl<'a> Record<'a> {
         Some(Self { at_ms: Some(parse_timestamp(stamp)?), source: Some(source), continues, text })
     }
 
-    /// Whether a run begins here.
+    /// Whether a run begins at this record.
     pub fn is_start(&self) -> bool {
         match self.source {
             Some(source) => source == LogSource::Agent && self.text == START,
@@ -68,10 +68,10 @@ impl<'a> Record<'a> {
         }
     }
 
-    /// How serious it is: what it says itself, else what its source stands for. `unmarked` is the
-    /// source of a line that names none.
+    /// Severity of the line: from its own text, else from its source. `unmarked` is the source of a
+    /// line that names none.
     pub fn level(&self, unmarked: LogSource) -> LogLevel {
-        // Most lines have no bracket near their beginning, and this is asked of each.
+        // Most lines have no bracket near their beginning, and this check runs for each line.
         let may_say = self.text.iter().take(64).any(|byte| *byte == b'[');
         let said = may_say
             .then(|| console::parse(&console::printable(self.text)).map(|said| said.level))
@@ -79,7 +79,7 @@ impl<'a> Record<'a> {
         said.unwrap_or_else(|| Self::level_of_source(self.source.unwrap_or(unmarked)))
     }
 
-    /// How serious a line is that does not say it itself.
+    /// Severity of a line whose text names none.
     pub fn level_of_source(source: LogSource) -> LogLevel {
         if source == LogSource::Stderr { LogLevel::Warn } else { LogLevel::Info }
     }

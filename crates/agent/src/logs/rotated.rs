@@ -1,6 +1,6 @@
-//! A log on disk: one current file and a few older ones, never more. Writing never fails towards
-//! the task: when the disk is full the output is dropped and counted, because a task that blocks on
-//! its own log is worse.
+//! A log on disk: one current file and a limited number of older ones. A write never fails for the
+//! task: when the disk is full the output is dropped and counted, because a task that blocks on its
+//! own log is worse.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Write};
@@ -29,7 +29,7 @@ struct Current {
 }
 
 impl RotatedLog {
-    /// A log that goes on where an earlier one at the same path ended.
+    /// A log that continues after the output of an earlier one at the same path.
     pub fn new(spec: LogSpec) -> Self {
         Self { spec, current: None, dropped_bytes: 0 }
     }
@@ -48,7 +48,8 @@ impl RotatedLog {
         }
     }
 
-    /// Counts output that never came here; it is admitted before the next that does.
+    /// Counts output that was lost before it reached the log; the next write records the loss
+    /// first.
     pub fn drop_bytes(&mut self, count: u64) {
         self.dropped_bytes += count;
     }
@@ -63,8 +64,8 @@ impl RotatedLog {
         } else {
             bytes[..room].iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1)
         };
-        // A line that fits no file is cut; one that only does not fit the rest of this file goes to
-        // the next.
+        // A line that fits no file is cut; a line that only does not fit the rest of this file goes
+        // to the next.
         let count = if count == 0 && current.size == 0 { room.min(bytes.len()) } else { count };
         if count == 0 {
             self.rotate()?;
@@ -75,12 +76,12 @@ impl RotatedLog {
         Ok(count)
     }
 
-    /// Says, once writing works again, how much is missing.
+    /// Records the number of missing bytes, once writing works again.
     fn admit_dropped(&mut self) -> io::Result<()> {
         if self.dropped_bytes > 0 {
             let text =
                 format!("[WARN] {} bytes of output could not be written here", self.dropped_bytes);
-            // What could be written last may have been half a line.
+            // The last successful write may have ended in the middle of a line.
             let mut note = vec![b'\n'];
             record::write(
                 &mut note,

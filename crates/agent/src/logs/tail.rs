@@ -1,5 +1,5 @@
-//! Reads what is added to a log, across its rotation. It holds no file open, and remembers no line:
-//! what was not read yet waits on the disk, for as long as the log keeps it.
+//! Reads the lines that are added to a log, across its rotation. It holds no file open and stores
+//! no lines: unread lines stay on the disk for as long as the log keeps them.
 
 use std::fs::{File, Metadata};
 use std::io;
@@ -12,7 +12,7 @@ use super::rotated::aged;
 
 const CHUNK_BYTES: usize = 64 * 1024;
 
-/// Where in a log reading is to go on.
+/// Position in a log at which reading continues.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Tail {
     at: Option<Position>,
@@ -22,8 +22,8 @@ pub struct Tail {
 struct Position {
     device: u64,
     inode: u64,
-    /// The number of a file that is gone is soon given to another; most file systems also know when
-    /// a file was made.
+    /// The inode number of a deleted file is soon reused; most file systems also record a creation
+    /// time.
     created: Option<SystemTime>,
     offset: u64,
 }
@@ -39,7 +39,7 @@ impl Position {
 }
 
 impl Tail {
-    /// Goes on at most `bytes` before the end of what is there now.
+    /// Moves the position to at most `bytes` before the current end of the log.
     pub fn skip(&mut self, log: &Path, bytes: u64) {
         let Ok(newest) = std::fs::metadata(log) else { return };
         let begin = newest.len().saturating_sub(bytes);
@@ -49,7 +49,8 @@ impl Tail {
         }
     }
 
-    /// Hands out the next whole lines, of at most about `room` bytes, until `each` wants no more.
+    /// Passes the next whole lines, of at most about `room` bytes, to `each` until it returns
+    /// false.
     pub fn read(
         &mut self,
         log: &Path,
@@ -59,7 +60,7 @@ impl Tail {
         while *room > 0 {
             let Some((path, metadata)) = self.current(log)? else { return Ok(()) };
             let mut position = match &self.at {
-                // A file that is shorter than it was has been written anew.
+                // A file that became shorter was rewritten.
                 Some(at) if at.is_in(&metadata) && at.offset <= metadata.len() => at.clone(),
                 _ => Position::new(&metadata, 0),
             };
@@ -72,8 +73,8 @@ impl Tail {
                 return Ok(());
             }
             if is_read {
-                // Somebody has deleted the newest, while it is written: nothing more comes until it
-                // is rotated.
+                // The newest file was deleted while it was being written: no more lines come until
+                // the log is rotated.
                 let Some(newer) = next_newer(log, &path)? else { return Ok(()) };
                 self.at = Some(newer);
             }
@@ -81,7 +82,7 @@ impl Tail {
         Ok(())
     }
 
-    /// The file that is read now, if there is one; when it has been rotated away, the oldest.
+    /// The file that is being read, if there is one; when it has been rotated away, the oldest.
     fn current(&self, log: &Path) -> io::Result<Option<(PathBuf, Metadata)>> {
         let mut oldest = None;
         for age in 0..=MAX_AGED {
@@ -144,7 +145,7 @@ fn read_lines(
                 return Ok(false);
             }
         }
-        // A line that fills the buffer, or that nobody writes on, is as whole as it gets.
+        // A line that fills the buffer, or that is no longer being written, counts as whole.
         if begin == 0 && (count == buffer.len() || !is_newest) {
             each(&buffer[..count]);
             begin = count;
@@ -201,7 +202,7 @@ mod tests {
         let (mut tail, mut seen) = (Tail::default(), Vec::new());
         for number in 0..200 {
             written.write(format!("line {number}\n").as_bytes());
-            // Sometimes a file and more is added between two looks.
+            // Sometimes a whole file and more is added between two reads.
             if number % 23 == 0 {
                 seen.extend(read(&mut tail, &log));
             }
@@ -226,8 +227,8 @@ mod tests {
         let mut tail = Tail::default();
         assert_eq!(read(&mut tail, &log).len(), 30);
         std::fs::remove_file(&log).unwrap();
-        // What is left of it once more: nobody knows any longer how far that was read. Then no
-        // more.
+        // The rest of the file is read once more, because the read position is lost. Then no more
+        // lines come.
         read(&mut tail, &log);
         assert_eq!(read(&mut tail, &log), Vec::<String>::new());
         (0..30).for_each(|number| written.write(format!("later {number}\n").as_bytes()));

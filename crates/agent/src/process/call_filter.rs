@@ -1,11 +1,11 @@
-//! The system calls that a task may not make: a seccomp filter that takes from builds and tasks
-//! what only an administrator needs, or what mostly serves to attack a kernel. A list of what is
-//! denied, not of what is allowed: ROS nodes, compilers and interpreters use almost all the rest.
-//! It is made ready before the fork; installing it makes system calls only.
+//! The system calls that a task may not make: a seccomp filter that denies builds and tasks the
+//! calls that only an administrator needs, or that mostly serve to attack a kernel. The filter is a
+//! deny list, not an allow list: ROS nodes, compilers and interpreters use almost all other calls.
+//! The filter is prepared before the fork; installing it makes system calls only.
 //!
-//! A denied call fails with EPERM, `clone3` with ENOSYS, so that C libraries fall back to `clone`,
-//! whose flags a filter can read. All calls of another architecture are denied: they would be
-//! numbered otherwise.
+//! A denied call fails with EPERM. `clone3` fails with ENOSYS, so that C libraries fall back to
+//! `clone`, whose flags a filter can read. All calls of another architecture are denied, because
+//! their numbers differ.
 
 use std::io;
 
@@ -20,12 +20,11 @@ use serde::{Deserialize, Serialize};
 pub enum Seccomp {
     /// Builds and tasks are filtered.
     Default,
-    /// They are not.
+    /// Builds and tasks are not filtered.
     Off,
 }
 
-/// The architecture of this program, as the kernel names it to a filter; `None`: there is no filter
-/// for it.
+/// The architecture of this program in the kernel's numbering; `None`: there is no filter for it.
 const ARCHITECTURE: Option<u32> = if cfg!(target_arch = "x86_64") {
     Some(0xC000_003E)
 } else if cfg!(target_arch = "aarch64") {
@@ -36,7 +35,7 @@ const ARCHITECTURE: Option<u32> = if cfg!(target_arch = "x86_64") {
     None
 };
 
-/// `kexec_file_load`, which not all C libraries name.
+/// `kexec_file_load`, which some C libraries do not define.
 const KEXEC_FILE_LOAD: c_long = if cfg!(target_arch = "x86_64") {
     320
 } else if cfg!(target_arch = "aarch64") {
@@ -45,9 +44,10 @@ const KEXEC_FILE_LOAD: c_long = if cfg!(target_arch = "x86_64") {
     401
 };
 
-/// Denied whatever their arguments. Those by number are numbered alike on all architectures.
+/// Calls that are denied whatever their arguments. Calls that are listed by number have the same
+/// number on all architectures.
 const DENIED: [c_long; 43] = [
-    // Another kernel, or code in this one.
+    // Load another kernel, or code into this one.
     libc::SYS_kexec_load,
     KEXEC_FILE_LOAD,
     libc::SYS_init_module,
@@ -68,9 +68,9 @@ const DENIED: [c_long; 43] = [
     433,
     442,
     467,
-    // Others' namespaces; making some is judged by flags.
+    // Enter existing namespaces; the calls that make new ones are judged by their flags.
     libc::SYS_setns,
-    // The kernel's keys.
+    // The kernel's key rings.
     libc::SYS_keyctl,
     libc::SYS_add_key,
     libc::SYS_request_key,
@@ -79,7 +79,7 @@ const DENIED: [c_long; 43] = [
     426,
     427,
     libc::SYS_userfaultfd,
-    // The machine as a whole: its log, swap, clock, quotas (quotactl_fd), accounting, power.
+    // Machine-wide state: log, swap, clock, quotas (quotactl_fd), accounting, power.
     libc::SYS_syslog,
     libc::SYS_swapon,
     libc::SYS_swapoff,
@@ -92,9 +92,9 @@ const DENIED: [c_long; 43] = [
     443,
     libc::SYS_vhangup,
     libc::SYS_chroot,
-    // Files by handle, past all directories.
+    // Open files by handle, bypassing all directories.
     libc::SYS_open_by_handle_at,
-    // Names of the whole machine.
+    // Host and domain names of the machine.
     libc::SYS_sethostname,
     libc::SYS_setdomainname,
     // Ports of the processor.
@@ -102,10 +102,10 @@ const DENIED: [c_long; 43] = [
     IOPERM,
 ];
 
-/// `clock_settime` with 64 bits, where that is another call.
+/// `clock_settime` with 64-bit times, on architectures where that is a separate call.
 const CLOCK_SETTIME64: c_long =
     if cfg!(target_pointer_width = "32") { 404 } else { libc::SYS_clock_settime };
-/// Calls that only x86 has; elsewhere one that is denied anyway stands for them.
+/// Calls that only x86 has; on other architectures a call that is denied anyway takes their place.
 #[cfg(target_arch = "x86_64")]
 const IOPL: c_long = libc::SYS_iopl;
 #[cfg(not(target_arch = "x86_64"))]
@@ -114,12 +114,12 @@ const IOPL: c_long = libc::SYS_reboot;
 const IOPERM: c_long = libc::SYS_ioperm;
 #[cfg(not(target_arch = "x86_64"))]
 const IOPERM: c_long = libc::SYS_reboot;
-/// `clone3`, on all architectures.
+/// `clone3`, with the same number on all architectures.
 const CLONE3: c_long = 435;
 /// On x86_64 the calls of the x32 ABI have this bit.
 const X32_BIT: u32 = 0x4000_0000;
-/// Flags of `clone` and `unshare` that make namespaces. That of time namespaces is one of `unshare`
-/// only.
+/// Flags of `clone` and `unshare` that make namespaces. The flag for time namespaces applies to
+/// `unshare` only.
 const NEW_NAMESPACES: u32 = (libc::CLONE_NEWNS
     | libc::CLONE_NEWCGROUP
     | libc::CLONE_NEWUTS
@@ -128,10 +128,11 @@ const NEW_NAMESPACES: u32 = (libc::CLONE_NEWNS
     | libc::CLONE_NEWPID
     | libc::CLONE_NEWNET) as u32;
 const NEW_TIME_NAMESPACE: u32 = 0x80;
-/// Requests of `ioctl` that type into a terminal, which others may share.
+/// Requests of `ioctl` that type into a terminal, which other processes may share.
 const TYPING: [u32; 2] = [0x5412, 0x541C];
 
-/// Where `seccomp_data` has the call's number, the architecture and the low half of each argument.
+/// Offsets in `seccomp_data` of the call's number, the architecture and the low half of each
+/// argument.
 const NUMBER_AT: u32 = 0;
 const ARCHITECTURE_AT: u32 = 4;
 const FIRST_ARGUMENT_AT: u32 = 16;
@@ -151,12 +152,13 @@ impl CallFilter {
         ARCHITECTURE.filter(|_| kernel_filters()).map(|architecture| Self(program(architecture)))
     }
 
-    /// Installs it for the calling process and all that it starts, for good. Only system calls: it
-    /// is called between fork and exec. No program gains rights by being executed from then on, or
-    /// the kernel would take no filter.
+    /// Installs the filter permanently for the calling process and all its descendants. This runs
+    /// between fork and exec, so it makes system calls only. It also sets `no_new_privs`, without
+    /// which the kernel would refuse the filter: from then on no program gains rights by being
+    /// executed.
     pub fn install(&self) -> io::Result<()> {
         prctl::set_no_new_privs()?;
-        // SPEC_ALLOW: older kernels slow filtered processes down otherwise, as if they ran foreign
+        // SPEC_ALLOW: otherwise older kernels slow filtered processes down, as if they ran foreign
         // code in themselves.
         match self.set(libc::SECCOMP_FILTER_FLAG_SPEC_ALLOW) {
             Err(Errno::EINVAL) => Ok(self.set(0)?),
@@ -182,9 +184,9 @@ impl CallFilter {
     }
 }
 
-/// Whether builds and tasks are filtered, by the setting and by whether they run under an account
-/// of their own: where they run as the agent does, what is denied there may be what they are for,
-/// and so it has to be said.
+/// Whether builds and tasks are filtered: by the setting, or else by whether they run under an
+/// account of their own. Where they run under the agent's account, the denied calls may be their
+/// purpose, so the filter must be enabled explicitly.
 pub fn is_wanted(setting: Option<Seccomp>, has_account: bool) -> bool {
     setting.map_or(has_account, |setting| setting == Seccomp::Default)
 }
@@ -264,8 +266,8 @@ mod tests {
     use crate::process::confinement::Confinement;
     use crate::process::program;
 
-    /// Each class of denied calls, made with arguments that do no harm. Says for each whether it
-    /// was denied.
+    /// Each class of denied calls, made with harmless arguments. The script prints for each whether
+    /// it was denied.
     const CALLS: &str = r#"
 import ctypes, errno, mmap, os, platform, sys
 libc = ctypes.CDLL(None, use_errno=True)
@@ -305,7 +307,7 @@ said = {
 if platform.machine() == "x86_64": said["i386"] = in_child(old_call) or "EPERM"
 for name, outcome in said.items(): print(name, outcome)
 "#;
-    /// What a ROS task does all the time.
+    /// Operations that a ROS task uses all the time.
     const USES: &str = r#"
 import asyncio, ctypes, multiprocessing, socket, subprocess, threading, time
 thread = threading.Thread(target=lambda: time.sleep(0)); thread.start(); thread.join()
@@ -318,7 +320,7 @@ asyncio.run(asyncio.sleep(0))
 print("works")
 "#;
 
-    /// What `script` prints as a build that is filtered, or not.
+    /// Output of `script` when it runs as a build, with or without the filter.
     async fn said_by(script: &str, filter_calls: bool) -> String {
         let temp = tempfile::tempdir().expect("a directory");
         let path = temp.path().join("script");

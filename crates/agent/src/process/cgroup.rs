@@ -1,7 +1,7 @@
-//! Control groups, version 2: one for each run and each build, so that whatever it starts stays in
-//! it, shares its limits and can be ended at one stroke. It owns the choice of the place, the
-//! limits' files and the removal; it never decides what may run. Where a machine has no writable
-//! hierarchy nothing of this is there and the caller does without.
+//! Control groups, version 2: one for each run and each build. All processes of the run stay in its
+//! group, share its limits and can be killed together. This module owns the choice of the place,
+//! the limits' files and the removal; it never decides which processes may run. Where a machine has
+//! no writable hierarchy, no groups are made and the caller does without them.
 //!
 //! ```text
 //! <place>/taskd/            no processes of its own, so that its children can have limits
@@ -9,9 +9,9 @@
 //! <place>/taskd/<key>/      one run or build
 //! ```
 //!
-//! The place is the hierarchy's root, for an agent that runs as root on the machine itself: no
-//! service manager's restart of the agent touches it. Any other agent has only what was delegated
-//! to it: beside its own group, else below it.
+//! The place is the hierarchy's root for an agent that runs as root on the machine itself: there no
+//! service manager's restart of the agent touches the groups. Any other agent has only the part of
+//! the hierarchy that was delegated to it: the place is beside its own group, or else below it.
 
 use std::fs::{self, File};
 use std::io::{self, Write as _};
@@ -24,60 +24,60 @@ use nix::unistd::{AccessFlags, access};
 use serde::{Deserialize, Serialize};
 use task_proto::Digest;
 
-/// What all groups lie below.
+/// Directory that holds all groups.
 const BASE: &str = "taskd";
-/// Where the shims are.
+/// Group of the shims.
 const SHIMS: &str = "shims";
-/// Where an agent goes that must not be in the group that it divides.
+/// Group that an agent moves to when it must not be in the group that it divides.
 const AGENT: &str = "taskd-agent";
 /// The controllers that limits need.
 const CONTROLLERS: [&str; 3] = ["cpu", "memory", "pids"];
-/// How often a directory is made that someone else's removal takes away.
+/// Maximum attempts to make a directory that a concurrent removal keeps taking away.
 const MAKE_TRIES: usize = 10;
-/// The most groups below a run's that are looked at: a task may make some where it runs as the
-/// agent's own user.
+/// Maximum number of groups below a run's group that are visited: a task may make some where it
+/// runs as the agent's own user.
 const MAX_NESTED: usize = 1000;
-/// How long a removal waits for the last process to be gone.
+/// Maximum time for which a removal waits for the last process to be gone.
 const REMOVE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// What one run may use; `None` does not limit it.
+/// Resource limits of one run; `None` means unlimited.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunLimits {
-    /// Memory, without any swap, of all its processes together.
+    /// Memory of all processes of the run together, without any swap.
     #[serde(default)]
     pub memory_bytes: Option<u64>,
-    /// Its share of the processors where they are scarce; 100 is everyone's.
+    /// The run's share of the processors when they are scarce; 100 is the default of every group.
     #[serde(default)]
     pub cpu_weight: Option<u32>,
-    /// Processes and threads.
+    /// Maximum number of processes and threads.
     #[serde(default)]
     pub pids: Option<u64>,
-    /// Whether system calls are denied that only an administrator needs.
+    /// Whether the system calls are denied that only an administrator needs.
     #[serde(default)]
     pub filter_calls: bool,
 }
 
-/// The place where groups are made.
+/// The directory in which groups are made.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Cgroups {
     base: PathBuf,
     isolates: bool,
 }
 
-/// The group of one run or build. It need not exist any more.
+/// The group of one run or build. The group may have been removed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Cgroup(PathBuf);
 
 impl Cgroups {
-    /// The place this process may use, if there is one. It is tried out: a group is made and
-    /// removed.
+    /// The place that this process may use, if there is one. The place is tested by making and
+    /// removing a group.
     pub fn find() -> Option<Self> {
         let mount = Mount::find(&fs::read_to_string("/proc/self/mountinfo").ok()?)?;
         let own = own_path(&fs::read_to_string("/proc/self/cgroup").ok()?)?;
         let on_machine = mount.is_whole() && nix::unistd::geteuid().is_root();
         let found: Vec<_> =
             mount.places(&own, on_machine).iter().filter_map(|place| Self::at(place)).collect();
-        // A later place is better only if it can do what an earlier one can't.
+        // A later place is better only if it isolates and an earlier one does not.
         let best = found.iter().find(|cgroups| cgroups.isolates).or(found.first());
         best.cloned()
     }
@@ -99,25 +99,27 @@ impl Cgroups {
         Some(Self { base, isolates })
     }
 
-    /// Whether runs can be given memory and processes of their own. False where the hierarchy has
-    /// no such controllers: it can end a run for certain, but keeps none from starving its
-    /// neighbours.
+    /// Whether runs can be given memory and process limits of their own. False where the hierarchy
+    /// has no such controllers: such groups can end a run reliably, but keep no run from starving
+    /// its neighbours.
     pub fn isolates(&self) -> bool {
         self.isolates
     }
 
-    /// The group of the run or build whose directory is `dir`; no other directory has the same.
+    /// The group of the run or build with the directory `dir`; no other directory has the same
+    /// group.
     pub fn group(&self, dir: &Path) -> Cgroup {
         Cgroup(self.base.join(name(dir)))
     }
 
-    /// Makes that group, with these limits as far as there are controllers for them.
+    /// Makes that group. The limits apply as far as there are controllers for them.
     pub fn create(&self, dir: &Path, limits: &RunLimits) -> io::Result<Cgroup> {
         let group = make(&self.base, &name(dir))?;
         match group.limit(limits) {
             Ok(()) => Ok(group),
             Err(error) => {
-                // It is empty, and the error that matters is the one at hand.
+                // The group is empty, and the caller needs the earlier error, not one from this
+                // removal.
                 let _ = group.remove();
                 Err(error)
             }
@@ -136,24 +138,24 @@ impl Cgroup {
         &self.0
     }
 
-    /// The file by which a process comes into it: whoever writes `0` is in.
+    /// The file by which a process enters the group: a process that writes `0` is added.
     pub fn entrance(&self) -> io::Result<File> {
         File::options().write(true).open(self.0.join("cgroup.procs"))
     }
 
-    /// Brings the calling process out of reach of what ends runs and agents: beside the run's
-    /// group.
+    /// Moves the calling process to a group beside the run's group, so that ending runs or agents
+    /// does not end it.
     pub fn enter_shims(&self) -> io::Result<()> {
         let base = self.0.parent().ok_or(io::ErrorKind::NotFound)?;
         make(base, SHIMS)?.entrance()?.write_all(b"0")
     }
 
-    /// The processes in it and in groups below it; none if it is gone.
+    /// The processes in the group and in the groups below it; none if the group is gone.
     pub fn pids(&self) -> io::Result<Vec<u32>> {
         let mut pids = Vec::new();
         for dir in self.nested()? {
             match fs::read_to_string(dir.join("cgroup.procs")) {
-                // A process that this one may not see is listed as 0.
+                // A process that the caller may not see is listed as 0.
                 Ok(text) => {
                     pids.extend(
                         text.lines()
@@ -168,8 +170,8 @@ impl Cgroup {
         Ok(pids)
     }
 
-    /// Kills all processes in it, also those that are being forked right now. Kernels before 5.14
-    /// can't: nothing happens.
+    /// Kills all processes in the group, also those that are being forked right now. Kernels before
+    /// 5.14 can't: nothing happens.
     pub fn kill(&self) -> io::Result<()> {
         match write(&self.0.join("cgroup.kill"), "1") {
             Err(error) if is_gone(&error) => Ok(()),
@@ -177,17 +179,17 @@ impl Cgroup {
         }
     }
 
-    /// Whether its memory has a limit that the kernel keeps.
+    /// Whether the kernel enforces a memory limit on the group.
     pub fn limits_memory(&self) -> bool {
         self.0.join("memory.max").exists()
     }
 
-    /// Whether the number of its processes has one.
+    /// Whether the kernel enforces a limit on the number of processes in the group.
     pub fn limits_pids(&self) -> bool {
         self.0.join("pids.max").exists()
     }
 
-    /// Whether the kernel has killed processes of it for want of memory.
+    /// Whether the kernel has killed processes of the group because memory ran out.
     pub fn is_out_of_memory(&self) -> bool {
         let events = fs::read_to_string(self.0.join("memory.events")).unwrap_or_default();
         events
@@ -196,8 +198,8 @@ impl Cgroup {
             .any(|count| count.trim() != "0")
     }
 
-    /// Removes it once its last process is gone, and what it lay in, if nothing else does. Done if
-    /// it is not there.
+    /// Removes the group once its last process is gone, and its parent directories if they hold no
+    /// other group. Succeeds if the group does not exist.
     pub fn remove(&self) -> io::Result<()> {
         let deadline = Instant::now() + REMOVE_TIMEOUT;
         for dir in self.nested()?.iter().rev() {
@@ -215,7 +217,7 @@ impl Cgroup {
             }
         }
         if let Some(base) = self.0.parent() {
-            // Other runs are a reason to keep them.
+            // The directories stay while they hold other runs.
             let _ = fs::remove_dir(base.join(SHIMS)).and_then(|()| fs::remove_dir(base));
         }
         Ok(())
@@ -229,13 +231,13 @@ impl Cgroup {
         let or_max = |value: Option<u64>| value.map_or("max".to_owned(), |value| value.to_string());
         set("memory.max", or_max(limits.memory_bytes))?;
         set("memory.swap.max", limits.memory_bytes.map_or("max", |_| "0").to_owned())?;
-        // Half a task is of no use to anyone.
+        // A task with only some of its processes left is of no use.
         set("memory.oom.group", "1".to_owned())?;
         set("cpu.weight", limits.cpu_weight.unwrap_or(100).to_string())?;
         set("pids.max", or_max(limits.pids))
     }
 
-    /// The group and those below it, each after the one it lies in.
+    /// The group and the groups below it, each after its parent.
     fn nested(&self) -> io::Result<Vec<PathBuf>> {
         let mut dirs = vec![self.0.clone()];
         let mut next = 0;
@@ -259,18 +261,19 @@ impl Cgroup {
     }
 }
 
-/// What control groups could do here.
+/// Capability of control groups on this machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outlook {
-    /// End runs for certain, and keep them from starving their neighbours.
+    /// They end runs reliably and keep them from starving their neighbours.
     Isolates,
-    /// Only the former.
+    /// They end runs reliably, but do not isolate them.
     Counts,
-    /// Nothing: there are none.
+    /// There are no control groups.
     Nothing,
 }
 
-/// What an agent with the rights to use them would find. Nothing is tried out, so nothing changes.
+/// The capability that an agent with sufficient rights would find. This function tests nothing, so
+/// it changes nothing.
 pub fn outlook() -> Outlook {
     let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
     let Some(mount) = Mount::find(&table) else { return Outlook::Nothing };
@@ -280,7 +283,7 @@ pub fn outlook() -> Outlook {
     if has("memory") && has("pids") { Outlook::Isolates } else { Outlook::Counts }
 }
 
-/// Where the hierarchy is mounted and which part of it.
+/// Mount point of the hierarchy and the mounted part of it.
 struct Mount {
     point: PathBuf,
     root: PathBuf,
@@ -296,13 +299,13 @@ impl Mount {
         })
     }
 
-    /// Whether it begins at the root of the machine's hierarchy, which is the one group that has no
-    /// type.
+    /// Whether the mount begins at the root of the machine's hierarchy, which is the one group that
+    /// has no type.
     fn is_whole(&self) -> bool {
         self.root == Path::new("/") && !self.point.join("cgroup.type").exists()
     }
 
-    /// Where groups may be made by a process in the group `own`, the best first.
+    /// Directories where a process in the group `own` may make groups, the best first.
     fn places(&self, own: &Path, on_machine: bool) -> Vec<PathBuf> {
         if on_machine {
             return vec![self.point.clone()];
@@ -315,8 +318,8 @@ impl Mount {
     }
 }
 
-/// The group of a process, from its `/proc/<pid>/cgroup`; `None` where it lies outside of what the
-/// process sees.
+/// The group of a process, from its `/proc/<pid>/cgroup`; `None` where the group lies outside the
+/// process's view of the hierarchy.
 fn own_path(text: &str) -> Option<PathBuf> {
     let path = text.lines().find_map(|line| line.strip_prefix("0::"))?;
     (!path.split('/').any(|part| part == "..")).then(|| PathBuf::from(path))
@@ -327,8 +330,8 @@ fn name(dir: &Path) -> String {
     format!("run-{}", &digest.hex()[..16])
 }
 
-/// Makes a group below `base`, which someone else's removal may take away at any moment until it is
-/// there.
+/// Makes a group below `base`. A concurrent removal may take `base` away at any moment until the
+/// group exists.
 fn make(base: &Path, name: &str) -> io::Result<Cgroup> {
     let group = base.join(name);
     for _ in 0..MAKE_TRIES {
@@ -354,17 +357,18 @@ fn make_dir(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Lets the groups in `dir` have limits, as far as `dir` may itself. What is refused shows in what
-/// they have.
+/// Enables the controllers for the groups in `dir`, as far as `dir` has them itself. A refused
+/// controller shows later in the files that the groups have.
 fn enable_controllers(dir: &Path) {
     for controller in CONTROLLERS {
         let _ = write(&dir.join("cgroup.subtree_control"), &format!("+{controller}"));
     }
 }
 
-/// Takes this process out of the group that it is to divide, if it is a container's outermost one
-/// and holds nothing else: a group with limits for those below it must have no processes. Under a
-/// service manager the group is not left: there the agent could not be started a second time.
+/// Moves this process out of the group that it is to divide, if that group is a container's
+/// outermost one and holds no other process: a group with limits for its children must have no
+/// processes. Under a service manager the agent does not leave its group: otherwise it could not be
+/// started a second time.
 fn leave(group: &Path) -> bool {
     let alone = Cgroup(group.to_owned()).pids().is_ok_and(|pids| pids == [std::process::id()]);
     let outermost = !group.parent().is_some_and(|parent| parent.join("cgroup.procs").exists());
@@ -375,7 +379,7 @@ fn leave(group: &Path) -> bool {
     alone && outermost && left().is_ok()
 }
 
-/// Waits, but not long, until something changes in the group at `dir`.
+/// Waits briefly until something changes in the group at `dir`.
 fn wait_for_event(dir: &Path) -> io::Result<()> {
     let events = match File::open(dir.join("cgroup.events")) {
         Err(error) if is_gone(&error) => return Ok(()),
@@ -389,7 +393,7 @@ fn wait_for_event(dir: &Path) -> io::Result<()> {
     }
 }
 
-/// In one piece, and without creating anything: these files belong to the kernel.
+/// Writes the text with one call and creates no file: these files belong to the kernel.
 fn write(path: &Path, text: &str) -> io::Result<()> {
     File::options().write(true).open(path)?.write_all(text.as_bytes())
 }

@@ -1,6 +1,6 @@
-//! What a build or a task is put into between fork and exec: its control group, its limits, its
-//! account, its filter of system calls. [`Confinement`] is made ready before the fork, by whoever
-//! may look things up; entering it makes system calls only. It never starts anything.
+//! The confinement that a build or a task enters between fork and exec: control group, limits,
+//! account, and system-call filter. A [`Confinement`] is prepared before the fork, where look-ups
+//! are allowed; entering it makes system calls only. This module never starts a process.
 
 use std::ffi::CString;
 use std::fs::{self, File};
@@ -20,14 +20,16 @@ use crate::process::call_filter::CallFilter;
 use crate::process::cgroup::{Cgroup, RunLimits};
 use crate::system::task_user::TaskUser;
 
-/// How much sooner than others a task is killed when the whole machine is out of memory.
+/// OOM score adjustment of tasks: when the machine runs out of memory, tasks are killed before
+/// other processes.
 const TASK_OOM_SCORE: &std::ffi::CStr = c"300";
-/// How much later an agent that is root is, and its shims.
+/// OOM score adjustment of an agent that is root, and of its shims: they are killed after other
+/// processes.
 const AGENT_OOM_SCORE: i32 = -900;
-/// The highest capability a kernel could know.
+/// Upper bound for capability numbers of any kernel.
 const LAST_CAPABILITY: libc::c_ulong = 63;
 
-/// What a process enters before it becomes a build or a task.
+/// The confinement that a process enters before it becomes a build or a task.
 #[derive(Debug)]
 pub struct Confinement {
     cgroup: Option<File>,
@@ -46,9 +48,9 @@ struct Account {
 }
 
 impl Confinement {
-    /// The confinement of what runs `script`. Limits that `cgroup` can't keep are kept as well as
-    /// can be otherwise: the memory for each process by itself, the processes by a limit on all of
-    /// the account's.
+    /// The confinement of the process that runs `script`. Limits that `cgroup` can't enforce are
+    /// approximated: memory by a limit on each process, the number of processes by a limit on all
+    /// processes of the account.
     pub fn new(
         script: &Path,
         cgroup: Option<&Cgroup>,
@@ -58,7 +60,7 @@ impl Confinement {
         let keeps_memory = cgroup.is_some_and(Cgroup::limits_memory);
         let keeps_pids = cgroup.is_some_and(Cgroup::limits_pids);
         let user_processes = match limits.pids.filter(|_| !keeps_pids) {
-            // The kernel counts all that runs under the account, so what runs now is added.
+            // The kernel counts all threads of the account, so the current threads are added.
             Some(pids) => Some(pids.saturating_add(threads_of(
                 user.map_or(nix::unistd::getuid().as_raw(), |user| user.uid),
             )?)),
@@ -79,20 +81,21 @@ impl Confinement {
         })
     }
 
-    /// Puts the calling process into it. Only system calls: it is called between fork and exec.
+    /// Puts the calling process into the confinement. This runs between fork and exec, so it makes
+    /// system calls only.
     pub fn enter(&self) -> io::Result<()> {
         if let Some(cgroup) = &self.cgroup {
             nix::unistd::write(cgroup, b"0")?;
         }
-        // It only says who goes first; where it can't be said all are equal.
+        // The score only sets the order of killing; without it all processes are equal.
         if let Ok(file) =
             open(c"/proc/self/oom_score_adj", OFlag::O_WRONLY | OFlag::O_CLOEXEC, Mode::empty())
         {
             let _ = nix::unistd::write(&file, TASK_OOM_SCORE.to_bytes());
         }
         if let Some(bytes) = self.data_bytes {
-            // Not the address space, of which programs with many threads or large files mapped have
-            // far more than memory.
+            // The address space is not limited: programs with many threads or large mapped files
+            // use far more of it than of memory.
             setrlimit(Resource::RLIMIT_DATA, bytes, bytes)?;
         }
         if let Some(count) = self.user_processes {
@@ -107,7 +110,7 @@ impl Confinement {
 }
 
 impl Account {
-    /// Gives up root for good: no capability is left or can be had, whatever is executed.
+    /// Gives up root permanently: no capability is left, and no executed program can regain one.
     fn become_it(&self) -> io::Result<()> {
         prctl::set_no_new_privs()?;
         for capability in 0..=LAST_CAPABILITY {
@@ -115,8 +118,8 @@ impl Account {
             match Errno::result(unsafe { libc::prctl(libc::PR_CAPBSET_DROP, capability, 0, 0, 0) })
             {
                 Ok(_) => {}
-                // Beyond the last one that this kernel knows; or the agent lacks the power to give
-                // up powers, and then what is set above keeps any from being had again.
+                // EINVAL: past the last capability that this kernel knows. EPERM: the agent may not
+                // drop capabilities, and then the settings above keep any from being regained.
                 Err(Errno::EINVAL | Errno::EPERM) => break,
                 Err(errno) => return Err(errno.into()),
             }
@@ -128,13 +131,13 @@ impl Account {
     }
 }
 
-/// Lets no other process of this account look into this one.
+/// Prevents other processes of this account from inspecting this process.
 pub fn hide_this_process() {
     let _ = prctl::set_dumpable(false);
 }
 
-/// Keeps what an agent that is root knows to itself, and lets it be the last to go when memory runs
-/// out. The shims inherit the second and call this for the first.
+/// Protects the data of an agent that is root from other processes, and makes the agent the last
+/// candidate when memory runs out. Shims inherit the OOM score and call this function for the data.
 pub fn protect_this_process() {
     if !nix::unistd::geteuid().is_root() {
         // Tasks run as the same user: they could read the identity's file as well.

@@ -1,10 +1,10 @@
-//! Everything a run has started, whatever it did to get away: all in its control group (which
-//! nothing leaves that is not root), all that carry the run directory in their environment (it
-//! survives `fork`, `setsid` and the shim's death) and all that descend from the shim, which is
-//! their subreaper (that survives a cleared environment). It signals them and proves that none is
-//! left; it never signals the shim. Out of reach, where there are no control groups, is only a
-//! process that clears its environment, locks it or makes it endless, leaves its parent and then
-//! sees its shim killed.
+//! Finds all processes that a run has started, including those that tried to escape. Members are
+//! all processes in the run's control group (only root can leave it), all processes with the run
+//! directory in their environment (this survives `fork`, `setsid` and the shim's death), and all
+//! descendants of the shim, which is their subreaper (this survives a cleared environment). The
+//! module signals them and proves that none is left; it never signals the shim. Without control
+//! groups, one kind of process is out of reach: one that clears its environment, locks it or makes
+//! it endless, leaves its parent and then sees its shim killed.
 
 use std::collections::HashSet;
 use std::io;
@@ -18,12 +18,13 @@ use crate::process::cgroup::Cgroup;
 use crate::process::program::{ProcessEntry, ProcessIdentity, environments};
 use crate::system::clock::boot_id;
 
-/// The variable by which a run's processes are found: the path of its run directory, which no other
-/// run shares, not even one of the same deployment by a second agent on this machine.
+/// The variable that identifies a run's processes: the path of its run directory. No other run
+/// shares this path, not even a run of the same deployment by a second agent on this machine.
 pub const RUN_DIR_VARIABLE: &str = "TASKD_RUN_DIR";
 /// The variable that names the deployment in every process of a task.
 pub const ASSIGNMENT_VARIABLE: &str = "TASKD_ASSIGNMENT";
-/// How often a set of processes that goes on forking is hunted before it counts as not killable.
+/// Maximum rounds of killing a set of processes that goes on forking, before the set counts as not
+/// killable.
 const MAX_ROUNDS: usize = 100;
 
 /// The processes of one run.
@@ -34,13 +35,13 @@ pub struct Containment {
     cgroup: Option<Cgroup>,
 }
 
-/// Processes that SIGKILL did not end in time: they hang in the kernel.
+/// Errors of killing a run's processes.
 #[derive(Debug, thiserror::Error)]
 pub enum ContainmentError {
-    /// The process table could not be read, or a process not be signalled.
+    /// The process table could not be read, or a process could not be signalled.
     #[error("cannot look through the process table")]
     Io(#[from] io::Error),
-    /// These are still there.
+    /// Processes that SIGKILL did not end in time: they hang in the kernel.
     #[error("processes {pids:?} do not end, not even by SIGKILL")]
     Survivors {
         /// Their pids.
@@ -48,7 +49,8 @@ pub enum ContainmentError {
     },
 }
 
-/// Kills all members when it is dropped, for what must not outlive the one who waits for it.
+/// Kills all members when it is dropped. Use it for processes that must not outlive the code that
+/// waits for them.
 #[derive(Debug)]
 pub struct KillOnDrop(Containment);
 
@@ -60,7 +62,7 @@ impl Containment {
         Self { marker, shim, cgroup: cgroup.map(Cgroup::at) }
     }
 
-    /// Those that live now.
+    /// The members that are alive now.
     pub fn members(&self) -> io::Result<Vec<ProcessIdentity>> {
         Ok(self.entries()?.1)
     }
@@ -83,14 +85,14 @@ impl Containment {
         self.cgroup.as_ref().is_some_and(Cgroup::is_out_of_memory)
     }
 
-    /// Removes the control group. Only once no member is left.
+    /// Removes the control group. Call this only once no member is left.
     pub fn remove(&self) -> io::Result<()> {
         self.cgroup.as_ref().map_or(Ok(()), Cgroup::remove)
     }
 
-    /// Kills all members: at one stroke those in the control group, then those found otherwise.
-    /// They are stopped first, until a look finds no new one, so that none forks away between the
-    /// look and the kill. Returns those that were killed; they may take a moment to be gone.
+    /// Kills all members: first those in the control group, together, then the others. The others
+    /// are stopped first, until a look finds no new one, so that none forks between the look and
+    /// the kill. Returns the killed processes; they may take a moment to be gone.
     pub fn kill(&self) -> io::Result<Vec<ProcessIdentity>> {
         if let Some(cgroup) = &self.cgroup {
             cgroup.kill()?;
@@ -102,7 +104,8 @@ impl Containment {
             if new.is_empty() {
                 break;
             }
-            // Refused or not: the SIGKILL below goes to all of them and gives the error.
+            // The result does not matter: the SIGKILL below goes to all of them and gives the
+            // error.
             let _ = signal_each(&new, Signal::SIGSTOP);
             stopped.extend(new);
         }
@@ -111,8 +114,8 @@ impl Containment {
         Ok(killed)
     }
 
-    /// Kills all members and waits until they are gone. Afterwards none is left, nor is the control
-    /// group.
+    /// Kills all members and waits until they are gone. Afterwards no member is left, and the
+    /// control group is removed.
     pub async fn end(&self, timeout: Duration) -> Result<(), ContainmentError> {
         let ended = tokio::time::timeout(timeout, async {
             loop {
@@ -142,7 +145,7 @@ impl Containment {
         }
     }
 
-    /// Does what goes through the whole process table where nobody waits for it.
+    /// Runs work that scans the whole process table on a thread that may block.
     pub async fn in_background<T: Send + 'static>(
         &self,
         work: impl FnOnce(&Self) -> io::Result<T> + Send + 'static,
@@ -160,7 +163,7 @@ impl Containment {
         };
         let grouped = self.cgroup.as_ref().map_or(Ok(Vec::new()), grouped)?;
         let mut known: HashSet<u32> = grouped.iter().map(|entry| entry.pid).chain(below).collect();
-        // Only of the others it takes a look into their environment to tell.
+        // Only the other processes need a look into their environment.
         let others = table
             .iter()
             .filter(|entry| !known.contains(&entry.pid) && !entry.is_zombie)
@@ -170,7 +173,7 @@ impl Containment {
         let marked = environments::look(others, move |entry| entry.was_started_with(&marker));
         known
             .extend(marked.into_iter().filter(|(_, is_ours)| *is_ours).map(|(entry, _)| entry.pid));
-        // Later than the table, they know better who has a pid.
+        // The group's entries were read later than the table, so their pids are more current.
         table.retain(|entry| grouped.iter().all(|later| later.pid != entry.pid));
         table.extend(grouped);
         let is_member = |entry: &&ProcessEntry| !entry.is_zombie && known.contains(&entry.pid);
@@ -181,7 +184,7 @@ impl Containment {
 }
 
 impl KillOnDrop {
-    /// Kills what is in `containment` when it is dropped.
+    /// Kills all processes of `containment` when it is dropped.
     pub fn new(containment: Containment) -> Self {
         Self(containment)
     }
@@ -197,15 +200,15 @@ impl Deref for KillOnDrop {
 
 impl Drop for KillOnDrop {
     fn drop(&mut self) {
-        // Who starts the same again looks again.
+        // A later start of the same run checks again.
         let _ = self.0.kill();
         let killed = self.0.clone();
         std::thread::spawn(move || killed.remove());
     }
 }
 
-/// The processes in a control group, none of them mistaken for a later one with its pid: a pid
-/// counts that is in the group before and after its entry is read.
+/// The processes in a control group. A pid counts only if it is in the group both before and after
+/// its entry is read, so a later process with the same pid is not mistaken for a member.
 fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
     for _ in 0..MAX_ROUNDS {
         let before = cgroup.pids()?;
@@ -220,9 +223,10 @@ fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
     Err(io::Error::other(format!("the processes in {} change too fast", cgroup.path().display())))
 }
 
-/// Signals all of them, also when one can't be, and then gives the last error. What this process
-/// may not signal, such as what a task runs by sudo, is no error: the others get theirs, a control
-/// group ends it all the same, and [`Containment::end`] names it where it lives on.
+/// Signals all processes, even if one of them can't be signalled, and then returns the last error.
+/// A process that this one may not signal, such as a program that a task runs by sudo, is no error:
+/// the others get the signal, a control group ends that process all the same, and
+/// [`Containment::end`] names it if it lives on.
 pub fn signal_each<'a>(
     members: impl IntoIterator<Item = &'a ProcessIdentity>,
     signal: Signal,

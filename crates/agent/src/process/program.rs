@@ -1,9 +1,10 @@
-//! Starts processes, signals them and knows them again. The only module that calls `fork`, `exec`,
-//! `kill` or `waitpid` and the only one that reads `/proc/<pid>`. It never decides which process
-//! should live.
+//! Starts processes, signals them and identifies them again. This is the only module that calls
+//! `fork`, `exec`, `kill` or `waitpid`, and the only one that reads `/proc/<pid>`. It never decides
+//! which process should live.
 //!
-//! A pid alone names nothing: the kernel uses it again. A [`ProcessIdentity`] is the pid with the
-//! process's start time and the boot, and signals go through a pidfd that was checked against it.
+//! A pid alone identifies no process, because the kernel reuses pids. A [`ProcessIdentity`] is the
+//! pid with the process's start time and the boot. Signals go through a pidfd that was checked
+//! against this identity.
 
 use std::collections::BTreeMap;
 use std::ffi::CString;
@@ -35,11 +36,11 @@ pub mod environments;
 /// Kernel ticks per second in `/proc/<pid>/stat`: USER_HZ, 100 on every architecture that Linux
 /// runs ROS on.
 const TICKS_PER_SECOND: u64 = 100;
-/// The most that is read of an environment. Linux starts nothing with more than 6 MiB of it: a
-/// larger one was made up later.
+/// Maximum number of bytes read of an environment. Linux starts no process with more than 6 MiB of
+/// environment: a larger one was made up later.
 const MAX_ENVIRONMENT_BYTES: u64 = 6 << 20;
 
-/// What process 1 passes on to the agent.
+/// Signals that process 1 forwards to the agent.
 const PASSED_ON: [Signal; 6] = [
     Signal::SIGTERM,
     Signal::SIGINT,
@@ -49,14 +50,14 @@ const PASSED_ON: [Signal; 6] = [
     Signal::SIGUSR2,
 ];
 
-/// A process that can be told from every other, also from a later one with the same pid.
+/// A process, distinguishable from every other process, also from a later one with the same pid.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ProcessIdentity {
     /// The pid.
     pub pid: u32,
-    /// When it started: clock ticks since boot.
+    /// Start time of the process: clock ticks since boot.
     pub start_ticks: u64,
-    /// The boot it lives in.
+    /// The boot that the process belongs to.
     pub boot_id: String,
 }
 
@@ -69,13 +70,13 @@ pub struct ProcessEntry {
     pub parent: u32,
     /// Its process group.
     pub group: u32,
-    /// When it started: clock ticks since boot.
+    /// Start time of the process: clock ticks since boot.
     pub start_ticks: u64,
-    /// Whether it has ended and only waits to be collected.
+    /// Whether the process has ended and only waits to be collected.
     pub is_zombie: bool,
 }
 
-/// A handle on one living process: it cannot come to mean another.
+/// A handle on one living process. The handle can never refer to another process.
 #[derive(Debug)]
 pub struct PidFd(OwnedFd);
 
@@ -83,20 +84,20 @@ pub struct PidFd(OwnedFd);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ExitStatus {
-    /// It exited with this code.
+    /// The process exited with this code.
     Code(i32),
-    /// This signal killed it.
+    /// This signal killed the process.
     Signal(i32),
 }
 
-/// What became of the caller's children.
+/// Result of waiting for a child of the caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ChildEvent {
     /// This child ended and has been collected.
     Ended(u32, ExitStatus),
     /// The caller has no children.
     NoChildren,
-    /// None ended in time.
+    /// No child ended in time.
     TimedOut,
 }
 
@@ -107,32 +108,32 @@ impl ProcessIdentity {
         Ok(Some(Self { pid, start_ticks: entry.start_ticks, boot_id: clock::boot_id()? }))
     }
 
-    /// Whether it still runs. A zombie does not.
+    /// Whether the process still runs. A zombie does not.
     pub fn is_alive(&self) -> bool {
         let same = |entry: ProcessEntry| entry.start_ticks == self.start_ticks && !entry.is_zombie;
         self.is_of_this_boot() && ProcessEntry::of(self.pid).ok().flatten().is_some_and(same)
     }
 
-    /// Whether it was started since the machine booted.
+    /// Whether the process was started since the machine booted.
     pub fn is_of_this_boot(&self) -> bool {
         clock::boot_id().is_ok_and(|boot_id| boot_id == self.boot_id)
     }
 
-    /// How long ago it was started.
+    /// Time since the process was started.
     pub fn age(&self) -> io::Result<Duration> {
         let started =
             Duration::from_millis(self.start_ticks.saturating_mul(1000 / TICKS_PER_SECOND));
         Ok(clock::uptime()?.saturating_sub(started))
     }
 
-    /// A handle on it; `None` when it is gone. The identity is checked after the handle is taken,
-    /// so the handle cannot belong to a later process.
+    /// A pidfd for the process; `None` when the process is gone. The identity is checked after the
+    /// pidfd is taken, so the pidfd cannot belong to a later process.
     pub fn open(&self) -> io::Result<Option<PidFd>> {
         let Some(handle) = PidFd::open(self.pid)? else { return Ok(None) };
         Ok(self.is_alive().then_some(handle))
     }
 
-    /// Sends `signal` to it, if it is still there.
+    /// Sends `signal` to the process, if the process still exists.
     pub fn signal(&self, signal: Signal) -> io::Result<()> {
         self.open()?.map_or(Ok(()), |handle| handle.signal(signal))
     }
@@ -154,14 +155,14 @@ impl ProcessEntry {
         for item in std::fs::read_dir("/proc")? {
             let name = item?.file_name();
             if let Some(pid) = name.to_str().and_then(|name| name.parse().ok()) {
-                // One that another user hides is not of our making.
+                // A process that another user hides is not one of ours.
                 entries.extend(Self::of(pid).ok().flatten());
             }
         }
         Ok(entries)
     }
 
-    /// Its command name may hold spaces and parentheses, so the fields are counted from the last
+    /// The command name may hold spaces and parentheses, so the fields are counted from the last
     /// `)`.
     fn parse(pid: u32, line: &[u8]) -> Option<Self> {
         let end = line.iter().rposition(|byte| *byte == b')')?;
@@ -176,7 +177,7 @@ impl ProcessEntry {
         })
     }
 
-    /// Its identity in the boot `boot_id`.
+    /// The identity of the process in the boot `boot_id`.
     pub fn identity(&self, boot_id: &str) -> ProcessIdentity {
         ProcessIdentity {
             pid: self.pid,
@@ -185,8 +186,8 @@ impl ProcessEntry {
         }
     }
 
-    /// What it was started with as the variable `name`. `None` also where that can't be read. May
-    /// take for ever, as [`environments`] says.
+    /// Value of the variable `name` in the environment that the process was started with. Also
+    /// `None` where the environment can't be read. The call may never return, see [`environments`].
     pub fn variable(&self, name: &str) -> Option<String> {
         let environment = self.environment().ok()?;
         let mut entries = environment.split(|byte| *byte == 0);
@@ -195,15 +196,14 @@ impl ProcessEntry {
         String::from_utf8(value.to_vec()).ok()
     }
 
-    /// Whether it was started with `variable` (`NAME=value`) in its environment. False where that
-    /// can't be read. May take for ever likewise.
+    /// Whether the process was started with `variable` (`NAME=value`) in its environment. False
+    /// where the environment can't be read. The call may never return, see [`environments`].
     pub fn was_started_with(&self, variable: &str) -> bool {
         let environment = self.environment().unwrap_or_default();
         environment.split(|byte| *byte == 0).any(|entry| entry == variable.as_bytes())
     }
 
-    /// Where its environment lies in its memory, and how much of that it is, is what the process
-    /// itself says last.
+    /// The process itself can change the recorded address and size of its environment.
     fn environment(&self) -> io::Result<Vec<u8>> {
         untrusted_file::read(
             Path::new(&format!("/proc/{}/environ", self.pid)),
@@ -217,10 +217,10 @@ impl PidFd {
         // SAFETY: pidfd_open takes two integers and touches no memory of ours.
         let fd = unsafe { libc::syscall(libc::SYS_pidfd_open, pid as libc::pid_t, 0) };
         match Errno::result(fd) {
-            // SAFETY: the kernel just returned this descriptor to us, nobody else owns it.
+            // SAFETY: the kernel just returned this descriptor to us, and it has no other owner.
             // Descriptors fit an int.
             Ok(fd) => Ok(Some(Self(unsafe { OwnedFd::from_raw_fd(fd as RawFd) }))),
-            // EINVAL is what kernels say for a pid that is a thread and leads no process.
+            // Kernels report EINVAL for a pid that belongs to a thread and leads no process.
             Err(Errno::ESRCH | Errno::EINVAL) => Ok(None),
             Err(errno) => Err(errno.into()),
         }
@@ -242,14 +242,14 @@ impl PidFd {
 
     /// Resolves when the process has ended. Cancel-safe.
     pub async fn ended(self) -> io::Result<()> {
-        // SAFETY: the owned descriptor stays open, and is the same one, until the registration is
-        // dropped with it.
+        // SAFETY: the owned descriptor stays open and unchanged until the registration is dropped
+        // with it.
         let registered = unsafe { AsyncFd::register_with_interest(self.0, Interest::READABLE)? };
         registered.readable().await.map(|_| ())
     }
 }
 
-/// The memory this machine has.
+/// Total memory of this machine, in bytes.
 pub fn total_memory_bytes() -> io::Result<u64> {
     let text = std::fs::read_to_string("/proc/meminfo")?;
     let kibibytes = text
@@ -261,9 +261,9 @@ pub fn total_memory_bytes() -> io::Result<u64> {
 }
 
 /// Starts `program shim --dir DIR` detached: in its own session and not as a child of the caller,
-/// so that neither the caller's death nor a signal to its process group reaches it. `lock` becomes
-/// its standard input and so stays locked until the shim lets go of it. What it answers can be read
-/// from the returned pipe.
+/// so that neither the caller's death nor a signal to the caller's process group reaches the shim.
+/// `lock` becomes the shim's standard input and so stays locked until the shim releases it. The
+/// shim's answer can be read from the returned pipe.
 pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeReader> {
     let (reader, writer) = io::pipe()?;
     let mut command = command(program, &BTreeMap::new());
@@ -271,8 +271,7 @@ pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeRead
     command.stdin(lock).stdout(writer).stderr(Stdio::null());
     let detach = || {
         nix::unistd::setsid()?;
-        // SAFETY: between fork and exec there is one thread; the parent's branch does nothing but
-        // end.
+        // SAFETY: between fork and exec there is one thread; the parent's branch only exits.
         match unsafe { nix::unistd::fork()? } {
             nix::unistd::ForkResult::Child => reset_for_exec(),
             // SAFETY: _exit is async-signal-safe and runs nothing of this process's clean-up.
@@ -281,14 +280,14 @@ pub fn spawn_shim(program: &Path, dir: &Path, lock: File) -> io::Result<PipeRead
     };
     // SAFETY: `detach` only makes async-signal-safe system calls and allocates nothing.
     unsafe { command.pre_exec(detach) };
-    // The child in between has ended already; collecting it does not block.
+    // The intermediate child has ended already; collecting it does not block.
     command.spawn()?.wait()?;
     Ok(reader)
 }
 
 /// Starts a task's script under bash, confined, in its own process group, with exactly
 /// `environment`. When the calling thread dies, and with it the reader of the task's output, the
-/// task gets the signal that stops a ROS node in good order.
+/// task gets the signal that stops a ROS node cleanly.
 pub fn spawn_task(
     script: &Path,
     directory: &Path,
@@ -305,12 +304,12 @@ pub fn spawn_task(
     let prepare = move || {
         reset_for_exec()?;
         confinement.enter()?;
-        // Entered with the task's rights: it may have put a link to what only root may enter in its
-        // place.
+        // The directory is entered with the task's rights: the task may have replaced it by a link
+        // to a directory that only root may enter.
         nix::unistd::chdir(directory.as_c_str())?;
-        // A change of user takes the wish back, so it comes after.
+        // A change of user resets the parent-death signal, so the signal is set after the change.
         prctl::set_pdeathsig(Signal::SIGINT)?;
-        // It died before the line above: nobody would send the signal any more.
+        // The parent died before the line above, so the signal would never be sent.
         if nix::unistd::getppid() == parent { Ok(()) } else { Err(Errno::ESRCH.into()) }
     };
     // SAFETY: `prepare` only makes async-signal-safe system calls and allocates nothing.
@@ -318,8 +317,8 @@ pub fn spawn_task(
     Ok(command.spawn()?.id())
 }
 
-/// Starts a build script under bash, confined, in its own session, `nice`, out of the way of
-/// everything that matters more.
+/// Starts a build script under bash, confined, in its own session, at a low priority (`nice`), so
+/// that builds yield to more important processes.
 pub fn spawn_build(
     script: &Path,
     directory: &Path,
@@ -333,8 +332,8 @@ pub fn spawn_build(
     command.stdin(Stdio::null()).stdout(output.try_clone()?).stderr(output);
     let prepare = move || {
         enter_session()?;
-        // Being nice is a courtesy: where it is refused the build still runs. SAFETY: both calls
-        // take integers only. The second is ioprio_set(this process, best effort, last).
+        // Niceness is optional: where the kernel refuses it, the build still runs. SAFETY: both
+        // calls take integers only. The second is ioprio_set(this process, best effort, last).
         let _ = unsafe {
             libc::setpriority(libc::PRIO_PROCESS, 0, nice)
                 | libc::syscall(libc::SYS_ioprio_set, 1, 0, (2 << 13) | 7) as libc::c_int
@@ -363,8 +362,8 @@ pub fn spawn_gate(
 }
 
 /// Starts `program graph`, confined, in its own session, `nice`, with at most `data_bytes` of
-/// memory whatever control group it is in. It is spoken with over its standard input and output,
-/// and ends with the former.
+/// memory whatever its control group. The agent communicates with the program over its standard
+/// input and output. The program ends when its standard input is closed.
 pub fn spawn_graph(
     program: &Path,
     environment: &BTreeMap<String, String>,
@@ -377,8 +376,8 @@ pub fn spawn_graph(
     command.stdin(Stdio::piped()).stdout(Stdio::piped());
     let prepare = move || {
         enter_session()?;
-        // A courtesy to others: where it is refused it runs all the same.
-        // SAFETY: takes integers only.
+        // Niceness is optional: where the kernel refuses it, the program still runs. SAFETY: takes
+        // integers only.
         let _ = unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, nice) };
         setrlimit(Resource::RLIMIT_DATA, data_bytes, data_bytes)?;
         setrlimit(Resource::RLIMIT_CORE, 0, 0)?;
@@ -391,10 +390,11 @@ pub fn spawn_graph(
     command.kill_on_drop(true).spawn()
 }
 
-/// Makes the caller the shim of what it starts: orphans below it become its children, signals meant
-/// for others do not end it, and the end of a child can be waited for with [`next_child`].
+/// Makes the caller the shim of the processes that it starts: orphans below the shim become its
+/// children, signals meant for others do not end the shim, and [`next_child`] can wait for the end
+/// of a child.
 pub fn become_shim() -> io::Result<()> {
-    // Already a session leader when it was started by `spawn_shim`.
+    // The process is already a session leader when `spawn_shim` started it.
     let _ = nix::unistd::setsid();
     let _ = prctl::set_name(c"taskd-shim");
     prctl::set_child_subreaper(true)?;
@@ -407,11 +407,12 @@ pub fn become_shim() -> io::Result<()> {
     Ok(nix::sys::signal::sigprocmask(SigmaskHow::SIG_BLOCK, Some(&blocked), None)?)
 }
 
-/// Where the calling process is process 1, as in a container, orphans of its namespace become its
-/// children, and nobody else collects them. It then goes on as a child of its own (`None`), and
-/// what was called is left with that: it collects whatever ends, passes signals on to the child,
-/// and returns with it how that ended. So no wait of the agent's for what it has started can be
-/// taken from it. Call it before any other thread exists.
+/// Collects orphans where the calling process is process 1, as in a container: orphans of its
+/// namespace become its children, and no other process collects them. The program goes on in a
+/// forked child (`None`). The original process stays behind: it collects every process that ends,
+/// forwards signals to the child, and returns with the child's exit status. So the collection never
+/// takes a wait away from the agent for a process that the agent has started. Call this function
+/// before any other thread exists.
 pub fn collect_orphans_as_init() -> io::Result<Option<ExitStatus>> {
     if std::process::id() != 1 {
         return Ok(None);
@@ -420,7 +421,7 @@ pub fn collect_orphans_as_init() -> io::Result<Option<ExitStatus>> {
     for signal in PASSED_ON.into_iter().chain([Signal::SIGCHLD]) {
         signals.add(signal);
     }
-    // Process 1 gets no signal that it neither handles nor blocks.
+    // Process 1 receives no signal that it neither handles nor blocks.
     let before = signals.thread_swap_mask(SigmaskHow::SIG_BLOCK)?;
     // SAFETY: there is one thread, so the child may do whatever its parent might.
     match unsafe { nix::unistd::fork()? } {
@@ -446,7 +447,7 @@ fn collect_until_end_of(child: Pid, signals: &SigSet) -> io::Result<ExitStatus> 
                 let mut told: libc::siginfo_t = unsafe { std::mem::zeroed() };
                 // SAFETY: the set and the answer outlive the call.
                 let number = unsafe { libc::sigwaitinfo(signals.as_ref(), &raw mut told) };
-                // What a terminal sends goes to the child as well.
+                // Signals from a terminal also reach the child directly.
                 if let Ok(signal) = Signal::try_from(number)
                     && signal != Signal::SIGCHLD
                     && told.si_code != libc::SI_KERNEL
@@ -460,7 +461,7 @@ fn collect_until_end_of(child: Pid, signals: &SigSet) -> io::Result<ExitStatus> 
     }
 }
 
-/// Puts `/dev/null` in the place of standard input and output, which lets go of what they were.
+/// Replaces standard input and output by `/dev/null`, which releases the previous descriptors.
 pub fn close_standard_streams() -> io::Result<()> {
     let null = File::options().read(true).write(true).open("/dev/null")?;
     nix::unistd::dup2_stdin(&null)?;
@@ -488,7 +489,7 @@ pub fn next_child(timeout: Option<Duration>) -> io::Result<ChildEvent> {
     }
 }
 
-/// Waits until SIGCHLD is pending; false when it was not within `timeout`.
+/// Waits until SIGCHLD is pending; false when `timeout` passed without one.
 fn wait_for_sigchld(timeout: Option<Duration>) -> io::Result<bool> {
     let mut signals = SigSet::empty();
     signals.add(Signal::SIGCHLD);
@@ -513,16 +514,16 @@ fn command(program: &Path, environment: &BTreeMap<String, String>) -> std::proce
     command
 }
 
-/// Makes a child the leader of a session and process group of its own. An agent that was started by
-/// hand has a terminal, and whoever shares it could type there in the name of root.
+/// Makes a child the leader of its own session and process group. An agent that was started by hand
+/// has a terminal, and any process that shares the terminal could type there in the name of root.
 fn enter_session() -> io::Result<()> {
     nix::unistd::setsid()?;
     reset_for_exec()
 }
 
-/// Gives a child what a login shell would give it: default signal dispositions, nothing blocked, no
-/// stray descriptors. SIGINT in particular is inherited as ignored from a shell's `&`, and then a
-/// ROS node could not be stopped with it.
+/// Gives a child the state that a login shell would give: default signal dispositions, no blocked
+/// signals, no stray descriptors. SIGINT in particular is inherited as ignored from a shell's `&`,
+/// and then a ROS node could not be stopped with SIGINT.
 fn reset_for_exec() -> io::Result<()> {
     for signal in Signal::iterator() {
         if !matches!(signal, Signal::SIGKILL | Signal::SIGSTOP) {
@@ -554,7 +555,7 @@ impl AsFd for PidFd {
 }
 
 impl ExitStatus {
-    /// As a shell gives it: of a signal 128 and its number.
+    /// The exit code as a shell reports it: 128 plus the signal's number for a signal.
     pub fn as_shell_code(self) -> u8 {
         let code = match self {
             Self::Code(code) => code,
@@ -566,7 +567,7 @@ impl ExitStatus {
 
 impl From<std::process::ExitStatus> for ExitStatus {
     fn from(status: std::process::ExitStatus) -> Self {
-        // A process that was waited for has one or the other.
+        // A process that was waited for has either a code or a signal.
         status.code().map_or_else(|| Self::Signal(status.signal().unwrap_or_default()), Self::Code)
     }
 }
@@ -643,7 +644,7 @@ mod tests {
         }
     }
 
-    /// What the kernel calls `prctl_mm_map`: where a process says that its parts lie.
+    /// The kernel's `prctl_mm_map`: the address ranges that a process claims for its memory areas.
     #[repr(C)]
     struct Claim {
         code_data_and_heap: [u64; 6],

@@ -1,7 +1,8 @@
-//! The run directory: where one start of a task is written down, by the supervisor before it and by
-//! the shim during it. One directory is one start; it is never used again. It holds `spec.json`
-//! (what to run), `begun` (it may run from now on), `pid.json` (who runs it), `exit.json` (how it
-//! ended) and `lock` (held while the start is in progress). It never starts or signals a process.
+//! The run directory: the record of one start of a task, written by the supervisor before the start
+//! and by the shim during the run. One directory is one start and is never reused. The directory
+//! holds `spec.json` (the program to run), `begun` (the task may run from now on), `pid.json` (the
+//! run's processes), `exit.json` (the exit status) and `lock` (held while the start is in
+//! progress). This module never starts or signals a process.
 
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -20,11 +21,11 @@ use crate::setup::launch::Interrupt;
 use crate::system::durable;
 use crate::system::task_user::TaskUser;
 
-/// One start of a task, by its directory.
+/// The run directory of one start of a task.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RunDir(PathBuf);
 
-/// What a shim runs.
+/// The specification of a run, for the shim.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunSpec {
     /// The deployment this run belongs to; every process of the task carries it as
@@ -32,26 +33,27 @@ pub struct RunSpec {
     pub assignment: DeploymentId,
     /// The generated script, run by bash.
     pub script: PathBuf,
-    /// The directory it runs in.
+    /// The working directory of the script.
     pub directory: PathBuf,
     /// The whole environment; nothing is inherited. The supervisor adds `TASKD_ASSIGNMENT` and
     /// `TASKD_RUN_DIR`.
     pub environment: BTreeMap<String, String>,
-    /// Who gets the SIGINT of a stop.
+    /// The processes that get the SIGINT of a stop.
     #[serde(default)]
     pub interrupt: Interrupt,
-    /// Where the task's output goes.
+    /// Log of the task's output.
     pub log: LogSpec,
-    /// What it may use.
+    /// The run's resource limits.
     #[serde(default)]
     pub limits: RunLimits,
-    /// Whom it runs as; absent: whoever the agent is.
+    /// The account of the run; absent: the agent's own account.
     #[serde(default)]
     pub user: Option<TaskUser>,
-    /// Whether files in `directory` are to be brought back after the run.
+    /// Whether files in `directory` are to be uploaded after the run.
     #[serde(default)]
     pub has_outputs: bool,
-    /// The directory of its control group, if it has one. The supervisor makes it.
+    /// The directory of the run's control group, if the run has one. The supervisor makes the
+    /// group.
     #[serde(default)]
     pub cgroup: Option<PathBuf>,
 }
@@ -65,16 +67,17 @@ pub struct Started {
     pub task: ProcessIdentity,
 }
 
-/// The end of a run. When this is on disk, none of the run's processes is left that the shim could
-/// see and end, and what the run wrote for bringing back is on the disk as well.
+/// The end of a run. When this record is on disk, none of the run's processes is left that the shim
+/// could see and end, and the run's output files for upload are on the disk as well.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Ended {
-    /// How the first process ended.
+    /// Exit status of the first process.
     #[serde(flatten)]
     pub status: ExitStatus,
-    /// When: milliseconds since the machine booted, because a robot's clock may lie.
+    /// Time of the end: milliseconds since the machine booted, because a robot's clock may be
+    /// wrong.
     pub at_uptime_ms: u64,
-    /// The memory it was limited to, if it was killed for using more.
+    /// The memory limit, if the run was killed for exceeding the limit.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub out_of_memory_bytes: Option<u64>,
 }
@@ -85,23 +88,23 @@ pub enum RunDirError {
     /// Reading or writing it failed.
     #[error("cannot use {}", path.display())]
     Io {
-        /// Which file.
+        /// The file's path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// It is not what this version writes.
+    /// The file is not in the format that this version writes.
     #[error("{} is not readable as what it should be", path.display())]
     Malformed {
-        /// Which file.
+        /// The file's path.
         path: PathBuf,
-        /// What the parser said.
+        /// The parser's error.
         source: serde_json::Error,
     },
 }
 
 impl RunDirError {
-    /// Whether all that is missing is room.
+    /// Whether the error is a lack of disk space.
     pub fn is_full(&self) -> bool {
         use io::ErrorKind::{QuotaExceeded, StorageFull};
         matches!(self, Self::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
@@ -110,14 +113,14 @@ impl RunDirError {
 
 impl RunDir {
     /// The run directory at `path`, created if absent. The path becomes absolute and free of links,
-    /// because it is also the key by which the run's processes are found.
+    /// because the path is also the key by which the run's processes are found.
     pub fn create(path: &Path) -> Result<Self, RunDirError> {
         let failed = |source| RunDirError::Io { path: path.to_owned(), source };
         durable::create_dir_all(path).map_err(failed)?;
         Ok(Self(path.canonicalize().map_err(failed)?))
     }
 
-    /// The run directory at `path`, as it is.
+    /// The run directory at `path`, without creating or changing it.
     pub fn at(path: &Path) -> Self {
         Self(path.to_owned())
     }
@@ -127,63 +130,63 @@ impl RunDir {
         &self.0
     }
 
-    /// What was to be run.
+    /// The specification of the run.
     pub fn spec(&self) -> Result<Option<RunSpec>, RunDirError> {
         self.read("spec.json")
     }
 
-    /// Who runs it.
+    /// The run's processes.
     pub fn started(&self) -> Result<Option<Started>, RunDirError> {
         self.read("pid.json")
     }
 
-    /// How it ended.
+    /// The record of the run's end.
     pub fn ended(&self) -> Result<Option<Ended>, RunDirError> {
         self.read("exit.json")
     }
 
-    /// Writes down what to run.
+    /// Writes the specification of the run.
     pub fn write_spec(&self, spec: &RunSpec) -> Result<(), RunDirError> {
         self.write("spec.json", spec)
     }
 
-    /// Writes down that it is about to be run: until it is known by whom, nobody can tell whether
-    /// it was.
+    /// Records that the run is about to begin: until its processes are recorded, it is uncertain
+    /// whether the task ran.
     pub fn write_begun(&self) -> Result<(), RunDirError> {
         let path = self.0.join("begun");
         durable::write(&path, b"", 0o600).map_err(|source| RunDirError::Io { path, source })
     }
 
-    /// Takes that back, because nothing was run after all.
+    /// Removes that record, because nothing ran after all.
     pub fn forget_begun(&self) -> Result<(), RunDirError> {
         let path = self.0.join("begun");
         durable::remove_file(&path).map_err(|source| RunDirError::Io { path, source })
     }
 
-    /// Whether it may have been run.
+    /// Whether the task may have run.
     pub fn has_begun(&self) -> bool {
         self.0.join("begun").exists()
     }
 
-    /// Writes down who runs it.
+    /// Records the run's processes.
     pub fn write_started(&self, started: &Started) -> Result<(), RunDirError> {
         self.write("pid.json", started)
     }
 
-    /// Writes down how it ended.
+    /// Records the end of the run.
     pub fn write_ended(&self, ended: &Ended) -> Result<(), RunDirError> {
         self.write("exit.json", ended)
     }
 
-    /// Takes the start lock; `None` while a start is in progress. Nobody waits for it in here: a
-    /// start may hang, and takes who waits with it. The lock goes with the file, also into a child
-    /// that inherits it, so there is no moment at which a start is under way and the lock is free.
-    /// Where nothing can be written any more, what runs can still be looked at and stopped.
+    /// Takes the start lock; `None` while a start is in progress. This call never waits: a start
+    /// may hang and would block the waiting thread. The lock goes with the file, also into a child
+    /// that inherits the file, so there is no moment at which a start is under way and the lock is
+    /// free. Where files can no longer be written, running tasks can still be observed and stopped.
     pub fn try_lock(&self) -> Result<Option<File>, RunDirError> {
         self.locked(File::try_lock)
     }
 
-    /// The same for who only reads, beside others who do.
+    /// Takes the start lock for reading only, shared with other readers.
     pub fn try_lock_shared(&self) -> Result<Option<File>, RunDirError> {
         self.locked(File::try_lock_shared)
     }

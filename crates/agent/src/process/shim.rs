@@ -1,9 +1,7 @@
-//! The process between agent and task: `task-agent shim --dir RUNDIR`. It starts the task, owns its
-//! output, collects every orphan below it and writes down how it all ended. It lives exactly as
-//! long as its task, needs nothing of the agent after the start and never decides anything: no
-//! restart, no stop.
-//!
-//! It has no async runtime: two threads copy the output, the main thread waits for children.
+//! The process between agent and task: `task-agent shim --dir RUNDIR`. The shim starts the task,
+//! owns its output, collects every orphan below itself and records how the task ended. It lives
+//! exactly as long as its task, needs nothing from the agent after the start and never decides
+//! anything: no restart, no stop.
 
 use std::io::{self, PipeWriter, Write};
 use std::path::Path;
@@ -23,28 +21,28 @@ use crate::process::run_dir::{Ended, RunDir, RunDirError, RunSpec, Started};
 use crate::system::clock;
 use crate::system::durable;
 
-/// How long what a task leaves behind may take to end after SIGTERM.
+/// Time that leftover processes of a task have to end after SIGTERM.
 const LEFTOVER_GRACE: Duration = Duration::from_secs(2);
-/// How long it may take after SIGKILL; what is still there then hangs in the kernel.
+/// Maximum time after SIGKILL; a process that still exists then hangs in the kernel.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
-/// How often the end is tried to be written to a full disk, and how long it rests in between: an
-/// hour in all.
+/// Number of attempts to write the exit record to a full disk, and the pause between two attempts:
+/// an hour in all.
 const MAX_WRITES: u32 = 720;
 const ROOM_PAUSE: Duration = Duration::from_secs(5);
-/// How long the rest of the output may take once nobody is left to write any.
+/// Maximum time for the rest of the output once no process is left to write any.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// What the shim tells the supervisor, one JSON line on its standard output.
+/// The shim's answer to the supervisor: one JSON line on the shim's standard output.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Answer {
     /// The task was started; `pid.json` is on disk.
     Started(Started),
-    /// It was not, and nothing is left of the try.
+    /// The task was not started, and nothing is left of the attempt.
     Failed(String),
 }
 
-/// Why a shim could not do its work.
+/// Errors of a shim.
 #[derive(Debug, thiserror::Error)]
 pub enum ShimError {
     /// A file of the run directory failed.
@@ -56,14 +54,14 @@ pub enum ShimError {
     /// The task's process could not be started.
     #[error("cannot start {script} in {directory}")]
     Start {
-        /// The script.
+        /// Path of the script.
         script: String,
-        /// Where it was to run.
+        /// Intended working directory of the script.
         directory: String,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// Something that every process may do was refused.
+    /// The system refused an operation that every process may do.
     #[error("cannot watch the task's processes")]
     Io(#[from] io::Error),
 }
@@ -73,7 +71,7 @@ struct Task {
     started: Started,
     containment: Containment,
     memory_bytes: Option<u64>,
-    /// Whether it wrote files that will be brought back.
+    /// Whether the task wrote files that will be uploaded after the run.
     has_outputs: bool,
     drained: mpsc::Receiver<()>,
 }
@@ -91,26 +89,27 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     program::close_standard_streams()?;
     let task = begun?;
     let status = wait_for_task(task.started.task.pid)?;
-    // How it ended is known whatever becomes of what it left, and so it is said.
+    // The exit status is known whatever happens to the leftover processes, so it is recorded in any
+    // case.
     let _ = end_leftovers(&task.containment);
-    // What is still unread after this is in the hands of a process that hangs in the kernel.
+    // Output that is still unread after this belongs to a process that hangs in the kernel.
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
     let at_uptime_ms = u64::try_from(clock::uptime()?.as_millis()).unwrap_or(u64::MAX);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
     if task.has_outputs {
-        // The agent brings the files back once it reads that the run ended, also after a power cut.
-        // The run directory lies on the same file system, and no task can put anything else in its
-        // place.
+        // The agent uploads the files once it reads that the run ended, also after a power cut. The
+        // run directory lies on the same file system, and no task can replace it.
         let _ = durable::sync_file_system(dir.path());
     }
     let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
     once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
-    // The next stop of this run or the next boot removes what is left here.
+    // The next stop of this run or the next boot removes a group that stays here.
     let _ = task.containment.remove();
     Ok(())
 }
 
-/// The task may have filled the disk itself, and how it ended must not be lost for that.
+/// Retries while the disk is full: the task may have filled the disk itself, and its exit status
+/// must not be lost for that reason.
 fn once_there_is_room(
     pause: Duration,
     mut write: impl FnMut() -> Result<(), RunDirError>,
@@ -130,12 +129,13 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     let containment = Containment::new(dir.path(), Some(own.clone()), spec.cgroup.clone());
     let (output, writer) = io::pipe()?;
     let (errors, error_writer) = io::pipe()?;
-    // A power cut may come before it is on the disk who runs it, and a job must not run twice.
+    // A power cut may come before the run's processes are recorded on the disk, and a job must not
+    // run twice.
     dir.write_begun()?;
     let pid = match start(&spec, writer, error_writer) {
         Ok(pid) => pid,
         Err(source) => {
-            // Where it stays, the run counts as one that was lost: that of a job is not made again.
+            // If the file stays, the run counts as lost: a lost job is not run again.
             let _ = dir.forget_begun();
             let (script, directory) =
                 (spec.script.display().to_string(), spec.directory.display().to_string());
@@ -158,7 +158,7 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
             Ok(Task { started, containment, memory_bytes, has_outputs, drained })
         }
         Err(error) => {
-            // A task that nobody could find again must not run.
+            // A task that could not be found again must not run.
             let _ = end_leftovers(&containment);
             Err(error)
         }
@@ -168,8 +168,8 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
 fn start(spec: &RunSpec, output: PipeWriter, errors: PipeWriter) -> io::Result<u32> {
     let cgroup = spec.cgroup.clone().map(Cgroup::at);
     if let Some(cgroup) = &cgroup {
-        // Where it can't be, the shim stays with the agent and ends with all of its group, should
-        // that be ended.
+        // If the move fails, the shim stays in the agent's group and ends together with the agent's
+        // group.
         let _ = cgroup.enter_shims();
     }
     let confinement =
@@ -193,7 +193,7 @@ fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {
     ProcessIdentity::of(pid)?.ok_or_else(|| io::Error::from(io::ErrorKind::NotFound).into())
 }
 
-/// The supervisor may be gone; the task runs on all the same.
+/// Ignores errors: the supervisor may be gone, and the task runs on all the same.
 fn tell(answer: &Answer) {
     if let Ok(mut line) = serde_json::to_vec(answer) {
         line.push(b'\n');
@@ -214,7 +214,7 @@ fn wait_for_task(task: u32) -> io::Result<ExitStatus> {
     }
 }
 
-/// Ends what the task left behind: first asked, then killed.
+/// Ends the leftover processes of the task: SIGTERM first, then SIGKILL.
 fn end_leftovers(containment: &Containment) -> io::Result<()> {
     if containment.members()?.is_empty() {
         return Ok(());
@@ -229,7 +229,7 @@ fn end_leftovers(containment: &Containment) -> io::Result<()> {
     collect_until_empty(containment, KILL_TIMEOUT).map(|_| ())
 }
 
-/// Collects children until the containment is empty; false when it is not within `timeout`.
+/// Collects children until the containment is empty; false when processes remain after `timeout`.
 fn collect_until_empty(containment: &Containment, timeout: Duration) -> io::Result<bool> {
     let deadline = Instant::now() + timeout;
     loop {

@@ -1,5 +1,6 @@
-//! Starts runs, finds them again and ends them. The run directory is all it knows: a new agent sees
-//! what the last one saw. It never restarts anything by itself and never decides what should run.
+//! Starts runs, finds them again and ends them. All of its knowledge comes from the run directory:
+//! a new agent sees the same state as the last one. The supervisor never restarts anything by
+//! itself and never decides which tasks should run.
 //!
 //! ```text
 //!   NeverStarted ── start ──▶ Running ── task ends ──▶ Exited
@@ -27,55 +28,55 @@ use crate::process::run_dir::{RunDir, RunDirError, RunSpec, Started};
 use crate::process::shim::Answer;
 use crate::setup::launch::Interrupt;
 
-/// How long a start may take; it is a fork, an exec and two small files.
+/// Maximum time for a start, which consists of a fork, an exec and two small files.
 const START_TIMEOUT: Duration = Duration::from_secs(20);
-/// When to try again to take the lock of a run whose start is in progress.
+/// Interval between attempts to take a run's lock while its start is in progress.
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
-/// How long killed processes may take to be gone.
+/// Maximum time for killed processes to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
 /// The longest answer a shim gives.
 const MAX_ANSWER_BYTES: u64 = 64 * 1024;
 
-/// Starts shims and talks to what they leave on disk.
+/// Starts shims and reads the files that they leave on disk.
 #[derive(Debug, Clone)]
 pub struct Supervisor {
     program: PathBuf,
     cgroups: Option<Cgroups>,
 }
 
-/// What a run directory and the process table say together.
+/// State of a run, from its run directory and the process table.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Observed {
-    /// Nothing was ever started in it.
+    /// No run was ever started in the directory.
     NeverStarted,
-    /// Its shim lives.
+    /// The run's shim lives.
     Running {
         /// The task's first process.
         pid: u32,
-        /// How long ago it was started.
+        /// Time since the first process was started.
         age: Duration,
     },
-    /// The task ended and the shim wrote down how.
+    /// The task ended and the shim recorded the exit status.
     Exited(ExitStatus),
-    /// The kernel killed it because it used more memory than its limit.
+    /// The kernel killed the task because it used more memory than its limit.
     OutOfMemory {
         /// The limit.
         limit_bytes: u64,
     },
-    /// It was started, but how it ended is not known: its shim was killed, or the machine went
-    /// down. None of its processes is left.
+    /// The run was started, but its exit status is unknown: its shim was killed, or the machine
+    /// went down. None of its processes is left.
     Gone,
 }
 
-/// How far a start has come.
+/// Progress of a start.
 enum Begun {
-    /// It was made before.
+    /// The run was started before.
     Runs(Started),
-    /// The shim says on this pipe what comes of it.
+    /// The shim writes the result of the start to this pipe.
     Asked(PipeReader),
 }
 
-/// Why a run could not be started, looked at or ended.
+/// Errors of starting, observing or ending a run.
 #[derive(Debug, thiserror::Error)]
 pub enum SupervisorError {
     /// A file of the run directory failed.
@@ -84,13 +85,13 @@ pub enum SupervisorError {
     /// The run directory holds an earlier run that has ended.
     #[error("{} belongs to a run that has ended; a start needs a directory of its own", .0.display())]
     Used(PathBuf),
-    /// The shim said why not.
+    /// The shim refused, for this reason.
     #[error("the task was not started: {0}")]
     Refused(String),
-    /// The shim said nothing within its time.
+    /// The shim gave no answer within its time.
     #[error("the task's shim did not answer within {} s", START_TIMEOUT.as_secs())]
     NoAnswer,
-    /// Nobody can tell yet what comes of it.
+    /// The result of the start is not known yet.
     #[error("a start of the task is in progress, or hangs")]
     Starting,
     /// Processes could not be found or ended.
@@ -99,37 +100,37 @@ pub enum SupervisorError {
     /// The system refused something.
     #[error("cannot {what}")]
     Io {
-        /// What was tried.
+        /// The operation that failed.
         what: &'static str,
-        /// What it said.
+        /// The system's error.
         source: io::Error,
     },
 }
 
 impl SupervisorError {
-    /// Whether a file of the run directory is there and can't be understood.
+    /// Whether a file of the run directory exists and can't be parsed.
     pub fn is_malformed(&self) -> bool {
         matches!(self, Self::RunDir(RunDirError::Malformed { .. }))
     }
 }
 
 impl Supervisor {
-    /// A supervisor whose shims are `program shim`, and whose runs get their control groups from
-    /// `cgroups`.
+    /// A supervisor that starts its shims as `program shim` and makes the control groups of its
+    /// runs in `cgroups`.
     pub fn new(program: impl Into<PathBuf>, cgroups: Option<Cgroups>) -> Self {
         Self { program: program.into(), cgroups }
     }
 
-    /// A supervisor whose shims are this very program, also after its file was replaced by a newer
-    /// version.
+    /// A supervisor that starts its shims from the running program, also after a newer version has
+    /// replaced the program's file.
     pub fn of_this_program(cgroups: Option<Cgroups>) -> Self {
         Self::new("/proc/self/exe", cgroups)
     }
 
-    /// Starts `spec` in the run directory at `path`; a run that already runs there is left as it
-    /// is. The run survives the caller from the moment the shim exists: dropping this future takes
-    /// it back only before that. After [`SupervisorError::NoAnswer`] it may be one or the other,
-    /// and [`Self::observe`] tells which.
+    /// Starts `spec` in the run directory at `path`. A run that already runs there stays as it is.
+    /// From the moment the shim exists the run survives the caller: dropping this future cancels
+    /// the start only before that moment. After [`SupervisorError::NoAnswer`] the run may or may
+    /// not have started, and [`Self::observe`] tells which.
     pub async fn start(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
         let started = tokio::time::timeout(START_TIMEOUT, self.start_shim(path, spec));
         started.await.unwrap_or(Err(SupervisorError::NoAnswer))
@@ -158,7 +159,8 @@ impl Supervisor {
                     .create(dir.path(), &spec.limits)
                     .map_err(failed("make the task's control group"))?;
             }
-            // Whoever gave up and looks meanwhile finds the spec, and waits for the lock.
+            // A caller that gave up and observes the run meanwhile finds the spec, and waits for
+            // the lock.
             if given_up.is_cancelled() {
                 return Err(SupervisorError::NoAnswer);
             }
@@ -181,14 +183,14 @@ impl Supervisor {
         }
     }
 
-    /// What has become of the run at `path`. Waits for a start in progress. When the shim was
-    /// killed, what it left behind is ended here: nobody reads its output any more or could tell
-    /// how it ends.
+    /// The state of the run at `path`. Waits for a start in progress. When the shim was killed,
+    /// this call ends the processes that are left: their output is no longer read and their exit
+    /// status could not be determined.
     pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
         self.observe_within(path, START_TIMEOUT).await
     }
 
-    /// The same, but waits for a start in progress no longer than that.
+    /// Like `observe`, but waits at most that long for a start in progress.
     pub async fn observe_within(
         &self,
         path: &Path,
@@ -199,11 +201,12 @@ impl Supervisor {
         }
         let (dir, started, cgroup) = read_within(path, patience).await?;
         let Some(started) = started else {
-            // The shim died, or the machine went down, before it was written who runs it.
+            // The shim died, or the machine went down, before the processes of the run were
+            // recorded.
             Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
             return Ok(if dir.has_begun() { Observed::Gone } else { Observed::NeverStarted });
         };
-        // The order matters: a shim that is gone has written `exit.json` before, if it could.
+        // The order matters: before it ends, a shim writes `exit.json` if it can.
         let shim_lives = started.shim.is_alive();
         if let Some(ended) = dir.ended()? {
             let killed =
@@ -218,8 +221,8 @@ impl Supervisor {
         Ok(Observed::Gone)
     }
 
-    /// Resolves when the run at `path` does not run any more, at once if it doesn't now. Nothing is
-    /// polled. Cancel-safe.
+    /// Resolves when the run at `path` does not run any more, at once if it does not run now. This
+    /// call does not poll. Cancel-safe.
     pub async fn wait(&self, path: &Path) -> Result<Observed, SupervisorError> {
         loop {
             let observed = self.observe(path).await?;
@@ -233,7 +236,7 @@ impl Supervisor {
         }
     }
 
-    /// The processes that the run at `path` has now.
+    /// The current processes of the run at `path`.
     pub async fn pids(&self, path: &Path) -> Result<Vec<u32>, SupervisorError> {
         let (dir, started, cgroup) = read(path).await?;
         let containment = Containment::new(dir.path(), started.map(|started| started.shim), cgroup);
@@ -243,10 +246,10 @@ impl Supervisor {
     }
 
     /// Ends the run at `path`: SIGINT to the task's process group, or to its first process alone
-    /// where its launcher wants that; `grace`; SIGTERM to all of it; `grace`; SIGKILL. Afterwards
-    /// none of its processes is left, wherever they had hidden. Dropping the future leaves a run
-    /// that may still be ending; calling again begins with SIGINT again, and on a run that has
-    /// ended only makes sure.
+    /// where its launcher wants that; `grace`; SIGTERM to all processes; `grace`; SIGKILL.
+    /// Afterwards none of the run's processes is left, wherever they had hidden. Dropping the
+    /// future leaves a run that may still be ending. Another call begins with SIGINT again; on a
+    /// run that has ended, it only verifies that no process is left.
     pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
         let mut observed = match self.observe(path).await {
             Err(SupervisorError::Starting) => {
@@ -271,9 +274,9 @@ impl Supervisor {
         Ok(observed)
     }
 
-    /// Kills what is in the control group of a run whose start does not end: it hangs before the
-    /// task's own program, as on a file system that does not answer. Its shim then takes it for a
-    /// task that has ended, and lets go of the lock.
+    /// Kills all processes in the control group of a run whose start does not end: the start hangs
+    /// before the task's own program, for example on a file system that does not answer. The shim
+    /// then sees a task that has ended, and releases the lock.
     async fn end_start(&self, path: &Path) -> Result<(), SupervisorError> {
         let Some(cgroups) = self.cgroups.clone() else { return Err(SupervisorError::Starting) };
         let path = path.to_owned();
@@ -312,14 +315,14 @@ impl Supervisor {
             return ended;
         }
         containment.end(KILL_TIMEOUT).await?;
-        // The shim needs a moment to write the end down; should it hang, the run is over all the
+        // The shim needs a moment to record the end. If the shim hangs, the run is over all the
         // same.
         tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(Observed::Gone))
     }
 }
 
-/// The run directory, who runs it and in which control group, once no start is in progress; an
-/// error where one never ends.
+/// The run directory, its processes and its control group, once no start is in progress; an error
+/// if a start never ends.
 async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
     read_within(path, START_TIMEOUT).await
 }
@@ -336,8 +339,8 @@ async fn read_within(
     Ok((dir, started, spec.and_then(|spec| spec.cgroup)))
 }
 
-/// What `attempt` gives for the run directory once it has its lock. It is made again and again,
-/// since a thread that waited for the lock of a start that hangs would be gone for good.
+/// Runs `attempt` on the run directory once its lock is held. The lock is tried repeatedly, because
+/// a thread that blocked on the lock of a hanging start would be lost forever.
 async fn once_locked<T: Send + 'static>(
     path: &Path,
     patience: Duration,

@@ -1,5 +1,6 @@
-//! Which desired states this robot obeys: signed by the pinned key, for this robot, not older than
-//! what it has, still in force. Pure; a refusal says why, and the state before it stays.
+//! Decides which desired states this robot obeys: signed by the pinned key, for this robot, not
+//! older than its current state, still in force. Pure. A refusal gives the reason, and the previous
+//! state stays.
 
 use std::collections::BTreeSet;
 
@@ -10,22 +11,22 @@ use task_proto::{Generation, TaskName};
 
 use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
 
-/// The most tasks one robot is sent.
+/// The maximum number of tasks in one robot's desired state.
 const MAX_TASKS: usize = 1024;
 
-/// Why a desired state is not obeyed.
+/// Why a desired state is refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
-    /// Not signed by the server this robot registered at.
+    /// The state is not signed by the server at which this robot registered.
     #[error("it is not signed by the server this robot registered at")]
     Signature(#[source] EnvelopeError),
-    /// Signed, but not a desired state.
+    /// The payload is signed but is not a desired state.
     #[error("it is signed, but no desired state")]
     Malformed(#[source] serde_json::Error),
-    /// For another robot.
+    /// The state is for another robot.
     #[error("it is for robot {0}")]
     OtherRobot(RobotId),
-    /// Older than what the robot has.
+    /// The state is older than the robot's current one.
     #[error("its generation {offered} is older than {accepted}, which this robot has")]
     Stale {
         /// The generation offered.
@@ -33,21 +34,21 @@ pub enum Refused {
         /// The generation accepted before.
         accepted: Generation,
     },
-    /// Same number, other content.
+    /// The generation is the same, but the content differs.
     #[error("its generation {0} was accepted before with other content")]
     Contradicts(Generation),
-    /// Its time is over.
+    /// The state has expired.
     #[error("it expired at {0} ms since 1970")]
     Expired(u64),
-    /// It names a task twice, or too many.
+    /// The state names a task twice, a package of another name, or too many tasks.
     #[error(
         "it names task {0} twice, or a package of another name for it, or more than {MAX_TASKS} tasks"
     )]
     Tasks(TaskName),
 }
 
-/// The desired state in `envelope`, if this robot may obey it. `accepted` is the state it obeys
-/// now.
+/// Returns the desired state in `envelope` if this robot may obey that state. `accepted` is the
+/// current state.
 pub fn admit(
     envelope: &Envelope,
     key: &PublicKey,
@@ -75,7 +76,7 @@ pub fn admit(
     Ok(state)
 }
 
-/// The desired state in `envelope`, signature, robot and shape verified, its age not.
+/// Opens the desired state in `envelope`. Signature, robot and shape are verified; the age is not.
 pub fn open(
     envelope: &Envelope,
     key: &PublicKey,
@@ -95,8 +96,8 @@ pub fn open(
     Ok(state)
 }
 
-/// Whether the state's time is over. A clock that shows a time before this program existed is
-/// wrong, as on a robot without a battery clock, and must not lock it out.
+/// Whether the state has expired. A clock that shows a time before this program existed is wrong,
+/// as on a robot without a battery clock, and must not lock the robot out.
 pub fn is_expired(state: &DesiredState, wall_ms: u64) -> bool {
     wall_ms >= PROGRAM_EXISTS_SINCE_MS && wall_ms >= state.expires_at_ms
 }

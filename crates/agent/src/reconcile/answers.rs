@@ -1,6 +1,6 @@
-//! Answers to the server's questions: each is answered by itself, within the time it has, and a few
-//! at a time. It looks and passes on; what lasts comes with the desired state and goes through the
-//! driver.
+//! Answers the server's questions. Each question is answered independently, within its time limit,
+//! and a few run concurrently. Answers only read and forward; lasting changes come with the desired
+//! state and go through the driver.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -23,26 +23,26 @@ use crate::reconcile::orders::{Orders, refusal};
 use crate::system::clock;
 use crate::telemetry::vitals;
 
-/// Questions answered at the same time; a lifecycle transition may take seconds and should not hold
-/// up a list.
+/// The maximum number of questions answered concurrently. A lifecycle transition may take seconds
+/// and should not hold up a list.
 const AT_A_TIME: usize = 8;
 
-/// Who answers.
+/// Answers the server's questions.
 pub struct Answers {
-    /// The robot.
+    /// The robot's id.
     pub robot_id: RobotId,
-    /// From whom it takes what changes something.
+    /// Verifies the requests that change something.
     pub orders: Orders,
-    /// What its tasks said.
+    /// The log lines of the robot's tasks.
     pub logs: Logs,
-    /// Its ROS graph.
+    /// Answers questions about the ROS graph.
     pub graph: GraphAnswers,
-    /// How its machine does.
+    /// The machine's vital signs.
     pub vitals: vitals::Asked,
 }
 
 impl Answers {
-    /// Answers until nobody can ask any more.
+    /// Answers questions until the channel closes.
     pub async fn run(
         self,
         mut requests: mpsc::Receiver<(Request, Instant)>,
@@ -58,19 +58,19 @@ impl Answers {
                     let (answers, messages) = (answers.clone(), messages.clone());
                     under_way.spawn(async move { answers.reply(request, came, &messages).await });
                 }
-                // Cancel-safe: what has ended stays in the set until it is taken.
+                // Cancel-safe: an ended task stays in the set until it is taken.
                 Some(_) = under_way.join_next() => {}
             }
         }
     }
 
-    /// Answers what came at `came`, as long as somebody waits for it.
+    /// Answers a request that arrived at `came`, before its time limit.
     async fn reply(&self, request: Request, came: Instant, messages: &mpsc::Sender<Message>) {
         let meant = self.orders.meant(&request);
         let Request { id, ttl_ms, .. } = request;
         let until = came + Duration::from_millis(ttl_ms.min(MAX_TTL_MS));
         let late = || Err(refusal("timeout", "the robot had no answer in time"));
-        // Nothing is begun for who does not wait any more.
+        // We begin no work for a request that has timed out.
         let answer = match meant {
             Ok(ask) if Instant::now() < until => {
                 tokio::time::timeout_at(until, self.answer(ask)).await.unwrap_or_else(|_| late())
@@ -91,7 +91,7 @@ impl Answers {
             written => written,
         };
         match payload {
-            // Without a session, or with one that is too slow, the answer is of no use any more.
+            // Without a session, or with one that is too slow, the answer has no further use.
             Ok(payload) => drop(messages.try_send(Message { topic: RobotTopic::Reply, payload })),
             Err(error) => tracing::error!(%error, "an answer can't be written as JSON"),
         }

@@ -1,9 +1,10 @@
-//! The driver: the one task that owns the ledger. It asks the plan for each task's next step,
-//! writes the ledger, lets the step run, and reports what changed. It decides nothing about tasks
-//! and does nothing to the robot itself: that is the plan's and the effects' work.
+//! The driver is the single tokio task that owns the ledger. The driver asks the plan for each
+//! task's next step, writes the ledger, runs the step, and reports changes. Decisions about tasks
+//! belong to the plan, and actions on the robot belong to the effects.
 //!
-//! Steps run as tasks of their own and send back only that they ended, so nothing here is ever
-//! waited for long; a step that is no longer wanted is told so and, if it does not end, dropped.
+//! Steps run as tokio tasks of their own and send back only that they ended, so the driver never
+//! waits for long. A step that is no longer wanted is cancelled and, if the step does not end,
+//! dropped.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -33,18 +34,18 @@ mod reporting;
 mod steps;
 mod watching;
 
-/// How often the hold flag is looked at, were there nothing else to do, and progress is reported.
+/// Interval between polls of the hold flag while idle, and between progress reports.
 const TICK: Duration = Duration::from_secs(1);
-/// When to try again after the ledger could not be written.
+/// Delay before the next attempt after the ledger could not be written.
 const LEDGER_RETRY: Duration = Duration::from_secs(5);
-/// When to look again at a process of which nothing could be told.
+/// Interval between observations of a process while its state cannot be determined.
 const LOOK_AGAIN: Duration = Duration::from_millis(plan::LOOK_AGAIN_MS);
-/// More turns than this for one task mean that the plan goes in circles.
+/// More planning rounds than this for one task mean that the plan is in a cycle.
 const MAX_TURNS: u32 = 64;
-/// What watchers have seen and the driver has not taken yet; beyond it they wait.
+/// The maximum number of watcher observations waiting for the driver; beyond it the watchers wait.
 const MAX_SIGHTS: usize = 16;
 
-/// What is known of a disk that nobody has looked at.
+/// The assumed contents of a disk that has not been inspected.
 static NOTHING_PREPARED: Prepared = Prepared {
     manifest: None,
     content: false,
@@ -53,68 +54,68 @@ static NOTHING_PREPARED: Prepared = Prepared {
     vouched: Vouched::No,
 };
 
-/// Who the driver speaks for.
+/// The robot and the agent that the driver reports for.
 #[derive(Debug, Clone)]
 pub struct Speaker {
-    /// The robot.
+    /// The robot's id.
     pub robot_id: RobotId,
-    /// The key its desired states are signed with.
+    /// The server's public key, which verifies the desired states.
     pub server_key: PublicKey,
-    /// This start of the agent.
+    /// Identifies this start of the agent.
     pub instance: InstanceId,
-    /// Where it runs.
+    /// The place of this start: one data directory, during one boot of one machine.
     pub place: Option<Digest>,
     /// The kernel's boot id.
     pub boot_id: String,
-    /// The name the robot gives itself.
+    /// The robot's name in its own settings.
     pub name: Option<RobotName>,
-    /// The labels it gives itself.
+    /// The robot's labels in its own settings.
     pub labels: Option<Labels>,
 }
 
-/// What the driver has seen of one task; lost at a restart.
+/// The driver's observations of one task; lost at a restart.
 #[derive(Default)]
 struct View {
-    /// What is on the disk of the ordered version; `None` when that must be looked at.
+    /// The files of the ordered version on the disk; `None` when the disk must be inspected.
     prepared: Option<Prepared>,
-    /// What became of the active run's process; `None` likewise.
+    /// The state of the active run's process; `None` when the process must be observed.
     process: Option<ProcessState>,
-    /// When to look at it again, should nothing have been told of it: a look may take long, and all
-    /// tasks wait for it.
+    /// When to observe the process again if its state could not be determined. An observation may
+    /// take long, and all tasks wait for it.
     look_again: Option<Instant>,
-    /// Who looks at that process.
+    /// The watchers of the process.
     watched: Option<Watched>,
-    /// What ROS says of it.
+    /// The health of the process on the ROS graph.
     health: Health,
-    /// How far the transfers under way have come, by lane.
+    /// The progress of the transfers under way, by lane.
     transfers: BTreeMap<Lane, watch::Receiver<Progress>>,
-    /// The same, as it is reported.
+    /// The progress as reported, by lane.
     progress: BTreeMap<Lane, Progress>,
-    /// What the step that gathers parts says of those that are lacking.
+    /// The missing parts, as announced by the step that gathers parts.
     asked: Option<watch::Receiver<Asks>>,
-    /// What was last not stopped or deleted, and why. It is tried again.
+    /// The last stop or deletion that failed, and the reason. The step is tried again.
     undone: Option<String>,
 }
 
-/// The watchers of one process. Dropping it ends the one that asks ROS.
+/// The watchers of one process. Dropping this ends the watcher of the ROS graph.
 struct Watched {
     /// The run directory's name.
     dir: String,
     _until_dropped: DropGuard,
 }
 
-/// What a watcher has seen of the process of a run directory.
+/// A watcher's observation of the process of a run directory.
 struct Seen {
     task: TaskName,
     dir: String,
     what: Sight,
 }
 
-/// What can be seen of a process.
+/// An observation of a process.
 enum Sight {
-    /// It has ended, or is not watched any more.
+    /// The process has ended, or is no longer watched.
     Over,
-    /// What ROS says of it now.
+    /// The current health on the ROS graph.
     Health(Health),
 }
 
@@ -123,7 +124,7 @@ struct UnderWay {
     step: Step,
     handle: AbortHandle,
     cancel: CancellationToken,
-    /// When it is dropped, once it was told to end.
+    /// When a cancelled step is dropped.
     drop_at: Option<Instant>,
 }
 
@@ -135,40 +136,39 @@ pub struct Driver<E> {
     speaker: Speaker,
     shared: Shared,
     ledger: Ledger,
-    /// The ledger has changes that are not on the disk.
+    /// Whether the ledger has changes that are not on the disk.
     dirty: bool,
-    /// Of the accepted state that is on the disk: what was accepted and is forgotten by a power cut
-    /// must be sent again.
+    /// The generation of the accepted state that is on the disk. A state that was accepted and is
+    /// lost in a power cut must be sent again.
     observed: Generation,
     desired: Option<DesiredState>,
     views: BTreeMap<TaskName, View>,
     under_way: HashMap<(TaskName, Lane), UnderWay>,
     steps: JoinSet<(TaskName, Lane, Outcome)>,
-    /// Where watchers put what they see.
+    /// The channel on which watchers send their observations.
     sights: mpsc::Sender<Seen>,
     seen: mpsc::Receiver<Seen>,
     robot: RobotFacts,
-    /// What was last gone by when it was looked who has signed the packages.
+    /// The trust facts at the last check of the packages' signers.
     trust: TrustFacts,
     held: bool,
-    /// Conditions by code; those that follow from other fields are not in it.
+    /// Conditions by code, except those that follow from other fields.
     conditions: BTreeMap<&'static str, String>,
-    /// What the server withholds, in its words.
+    /// Why the server withholds a desired state, in the server's words.
     withheld: Option<Condition>,
-    /// The contents whose gathered bytes were kept when they were last gone through; `None`: they
-    /// are to be.
+    /// The contents whose gathered bytes were kept at the last cleanup; `None`: a cleanup is due.
     kept_parts: Option<Vec<Digest>>,
-    /// Notified when parts that are lacking are to be asked for.
+    /// Notified when missing parts are to be requested.
     asks: Arc<Notify>,
-    /// Whether they are to be, although the last report may have said the same.
+    /// Whether missing parts are to be requested, even if the last report may have said the same.
     asks_again: bool,
     seq: u64,
     started: Instant,
 }
 
 impl<E: Effects> Driver<E> {
-    /// The driver that goes on from `ledger`, which the caller has not counted this start in.
-    /// `lost` says that and where an earlier ledger was moved.
+    /// A driver that continues from `ledger`. The caller has not counted this start in the ledger.
+    /// `lost` says that an earlier ledger was moved aside, and where.
     pub async fn new(
         effects: Arc<E>,
         speaker: Speaker,
@@ -190,15 +190,15 @@ impl<E: Effects> Driver<E> {
         if let Some(accepted) = &ledger.accepted {
             match admission::open(&accepted.envelope, &speaker.server_key, &speaker.robot_id) {
                 Ok(state) => desired = Some(state),
-                // The robot was registered anew: the tasks go on as they are until the new server
-                // has spoken.
+                // The robot was registered anew. The tasks continue unchanged until the new server
+                // has sent a state.
                 Err(error) => {
                     tracing::warn!(error = %chain(&error), "the state in the ledger is not this server's");
                     ledger.accepted = None;
                 }
             }
         }
-        // Which ROS there is is looked at when it is needed.
+        // The ROS installations are inspected when they are needed.
         let robot = RobotFacts { installations: None, ..effects.robot_facts() };
         let (sights, seen) = mpsc::channel(MAX_SIGHTS);
         let held = effects.is_held();
@@ -230,7 +230,8 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Drives until the agent ends. Steps under way are dropped then, tasks go on running.
+    /// Drives the tasks until the agent ends. Steps under way are dropped then; the tasks keep
+    /// running.
     pub async fn run(mut self, mut heard: mpsc::Receiver<Heard>) {
         let mut tick = tokio::time::interval(TICK);
         loop {
@@ -240,13 +241,13 @@ impl<E: Effects> Driver<E> {
                 Some(ended) = self.steps.join_next_with_id() => self.step_ended(ended),
                 // Cancel-safe: a message stays in its channel until it is received.
                 Some(seen) = self.seen.recv() => self.see(seen),
-                // Cancel-safe: likewise.
+                // Cancel-safe: a message stays in its channel until it is received.
                 Some(message) = heard.recv() => self.hear(message),
                 // Cancel-safe: a permit that was not taken stays.
                 () = self.asks.notified() => self.asks_again = true,
                 // Cancel-safe: an interval keeps its own time.
                 _ = tick.tick() => self.tick(),
-                // Cancel-safe: a timer that is made anew each time.
+                // Cancel-safe: the timer is created anew in each turn.
                 () = tokio::time::sleep_until(wake) => {}
                 // Cancel-safe: a token can be awaited again.
                 () = self.shared.shutdown.cancelled() => break,
@@ -255,10 +256,10 @@ impl<E: Effects> Driver<E> {
         self.save();
     }
 
-    /// Plans every task until all rest, begins what is to be done, reports. Gives the time of the
+    /// Plans every task until all rest, begins the planned steps, reports. Returns the time of the
     /// next turn.
     async fn turn(&mut self) -> Instant {
-        // Looked at before each turn: after `hold` nothing may be started any more.
+        // Polled before each turn: after `hold` nothing may be started any more.
         self.held = self.effects.is_held();
         self.interrupt_unwanted();
         let mut wake = Instant::now() + Duration::from_secs(3600);
@@ -270,7 +271,7 @@ impl<E: Effects> Driver<E> {
                 wake = wake.min(Instant::now() + Duration::from_millis(wait_ms));
             }
         }
-        // Written before anything is done: if that fails the plan sees steps that never began.
+        // Written before any step begins. If the write fails, the plan sees steps that never began.
         let saved = self.save();
         if saved {
             self.keep_ordered_parts();
@@ -290,16 +291,16 @@ impl<E: Effects> Driver<E> {
         wake
     }
 
-    /// Whether the step ends something and nothing is to come in its place. It is done also where
-    /// nothing can be written: it may be what makes room, and an agent that has forgotten it does
-    /// it again.
+    /// Whether the step ends something without a replacement. Such a step runs even when the ledger
+    /// cannot be written: it may free the disk space, and an agent that has forgotten the step
+    /// repeats it.
     fn only_takes_away(&self, task: &TaskName, step: &Step) -> bool {
         let is_wanted =
             self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
         matches!(step, Step::Stop(_) | Step::Remove) && !is_wanted
     }
 
-    /// All tasks, in the order in which they get what not all can have at once.
+    /// All tasks, in the order in which they get scarce resources.
     fn task_names(&self) -> Vec<TaskName> {
         let desired = self.desired.iter().flat_map(|state| &state.tasks);
         let desired = desired.map(|task| (task.task.clone(), task.priority));
@@ -309,8 +310,8 @@ impl<E: Effects> Driver<E> {
         plan::in_turn(known.filter(|(task, _)| !is_desired(task)).chain(desired.clone()).collect())
     }
 
-    /// What is desired of a task. Before any desired state is known, what its record was ordered to
-    /// be.
+    /// The desired state of a task. Before any desired state is known, this is the order in the
+    /// task's record.
     fn desired_task(&self, task: &TaskName) -> Option<DesiredTask> {
         match &self.desired {
             Some(state) => state.tasks.iter().find(|desired| desired.task == *task).cloned(),
@@ -366,7 +367,7 @@ impl<E: Effects> Driver<E> {
                         let (boot_id, start) = (&self.speaker.boot_id, self.ledger.start);
                         let record =
                             plan::begun(record, &step, boot_id, start, self.effects.now().boot_ms);
-                        // A start does what the record written before it says.
+                        // A start follows the record that was written before it.
                         let step = match (step, &record.active) {
                             (Step::Start(_), Some(active)) => Step::Start(Box::new(active.clone())),
                             (step, _) => step,
@@ -410,7 +411,7 @@ impl<E: Effects> Driver<E> {
         })
     }
 
-    /// All that the plan is to know of `task`, while `steps` are under way.
+    /// The plan's inputs for `task`, while `steps` are under way.
     fn situation<'a>(
         &'a self,
         task: &TaskName,
@@ -439,7 +440,7 @@ impl<E: Effects> Driver<E> {
         })
     }
 
-    /// Looks at whatever is not known to be as it was.
+    /// Observes the disk and the process again where the last observation may be stale.
     async fn observe(&mut self, task: &TaskName) {
         let Some(record) = self.ledger.tasks.get(task) else { return };
         let view = self.views.entry(task.clone()).or_default();
@@ -464,7 +465,7 @@ impl<E: Effects> Driver<E> {
             view.look_again = Some(Instant::now() + LOOK_AGAIN);
         }
         if let Some(ProcessState::Alive { pid }) = view.process {
-            // An agent that died during the start did not write it down.
+            // An agent that died during the start did not record the process id.
             let record = self
                 .ledger
                 .tasks
@@ -477,8 +478,8 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Deletes what was gathered of contents that are no longer ordered, or that are in their
-    /// place: a power cut may have brought it back.
+    /// Deletes the gathered parts of contents that are no longer ordered or are already unpacked. A
+    /// power cut may have brought such parts back.
     fn keep_ordered_parts(&mut self) {
         let is_there = |task| {
             self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content)
@@ -501,7 +502,7 @@ impl<E: Effects> Driver<E> {
         under_way + planned < self.effects.parallel_tasks()
     }
 
-    /// Takes a changed record; what was seen under another order or process is forgotten.
+    /// Stores a changed record, and drops observations that belong to an earlier order or process.
     fn put(&mut self, task: &TaskName, record: TaskRecord) {
         let view = self.views.entry(task.clone()).or_default();
         let before = self.ledger.tasks.get(task);
@@ -531,7 +532,7 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Writes the ledger if it changed; whether what it says is on the disk.
+    /// Writes the ledger if it changed. Returns whether the disk is up to date.
     fn save(&mut self) -> bool {
         if !self.dirty {
             return true;
@@ -560,8 +561,8 @@ impl<E: Effects> Driver<E> {
     }
 }
 
-/// Whether the robot's labels, which the server's answer to a posted report says, decide if it can
-/// run this.
+/// Whether the decision to run this version depends on the robot's labels. The labels come in the
+/// server's answer to a posted report.
 fn requires_labels(prepared: &Prepared) -> bool {
     prepared.manifest.as_ref().is_some_and(|manifest| !manifest.requires.labels.is_empty())
 }

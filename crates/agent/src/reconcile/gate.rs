@@ -1,7 +1,8 @@
-//! The robot's gate: a program of the robot's owner that is asked before a task is started, stopped
-//! or switched, and may say not now. Exit code 0 is yes, every other is no, and the first lines it
-//! wrote are why. It is run with a time limit, its output is bounded, and nothing of it is left
-//! afterwards. When it is asked, and what its answer means, is the plan's to say.
+//! The robot's gate is a program of the robot's owner. The agent asks the gate before a task is
+//! started, stopped or switched, and the gate may answer "not now". Exit code 0 allows the step,
+//! every other code refuses it, and the first lines of output are the reason. The gate runs with a
+//! time limit, its output is bounded, and none of its processes is left afterwards. The plan
+//! decides when to ask and interprets the answer.
 
 use std::collections::BTreeMap;
 use std::io::{self, PipeReader, Read as _};
@@ -16,16 +17,16 @@ use crate::process::containment::{Containment, ContainmentError, KillOnDrop, RUN
 use crate::process::program::{self, ExitStatus};
 use crate::task::ledger::{GateQuestion, GateStep};
 
-/// How much of what it writes is read as its reason.
+/// The maximum bytes of the gate's output that are read as its reason.
 const MAX_REASON_BYTES: u64 = 1024;
-/// How many lines of that.
+/// The maximum lines of the reason.
 const MAX_REASON_LINES: usize = 3;
-/// How long its processes may take to be gone once they are killed.
+/// Time limit for the gate's processes to disappear after they are killed.
 const KILL_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long the rest of the output may take then.
+/// Time limit for the rest of the output after that.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The program, and what it is run with.
+/// The gate program, with its environment.
 #[derive(Debug, Clone)]
 pub struct Gate {
     config: GateConfig,
@@ -33,46 +34,46 @@ pub struct Gate {
     directory: PathBuf,
 }
 
-/// Why there is no answer.
+/// Why the gate gave no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum GateError {
-    /// It could not be run.
+    /// The gate could not be run.
     #[error("cannot run the gate {}", .program.display())]
     Run {
         /// The program.
         program: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// It did not answer.
+    /// The gate did not answer in time.
     #[error("the gate {} did not answer within {} s", .program.display(), .timeout.as_secs())]
     Hung {
         /// The program.
         program: PathBuf,
-        /// Its limit.
+        /// The time limit.
         timeout: Duration,
     },
-    /// A signal ended it.
+    /// A signal ended the gate.
     #[error("the gate {} crashed: {status}", .program.display())]
     Crashed {
         /// The program.
         program: PathBuf,
-        /// How it ended.
+        /// The signal that ended the program.
         status: ExitStatus,
     },
-    /// Its processes could not be found or ended.
+    /// The gate's processes could not be found or ended.
     #[error(transparent)]
     Containment(#[from] ContainmentError),
 }
 
 impl Gate {
-    /// The gate of `robot`, which is run in `directory`.
+    /// The gate of `robot`, run in `directory`.
     pub fn new(config: GateConfig, robot: RobotId, directory: &Path) -> Self {
         Self { config, robot, directory: directory.to_owned() }
     }
 
-    /// Asks it, run with `environment`. A failure is the reason of a no; what it is when there is
-    /// no answer is a setting.
+    /// Asks the gate, run with `environment`. An error is the reason of the refusal. A setting
+    /// decides how a missing answer counts.
     pub async fn ask(
         &self,
         task: &TaskName,
@@ -103,10 +104,10 @@ impl Gate {
     ) -> Result<Result<(), String>, GateError> {
         let program = || PathBuf::from(self.config.command.first().cloned().unwrap_or_default());
         let failed = |source| GateError::Run { program: program(), source };
-        // The path need not exist: by it the gate's processes are found again.
+        // The path need not exist: it only marks the gate's processes, so that we find them again.
         let mark = self.directory.join("gate").join(task.as_str());
         let processes = KillOnDrop::new(Containment::new(&mark, None, None));
-        // An agent that was killed may have left one that hangs.
+        // An agent that was killed may have left a hanging gate.
         processes.end(KILL_TIMEOUT).await?;
         let (reader, writer) = io::pipe().map_err(failed)?;
         let mut environment = environment.clone();
@@ -116,7 +117,7 @@ impl Gate {
                 .map_err(failed)?;
         let reading = tokio::task::spawn_blocking(move || reason(reader));
         let ended = tokio::time::timeout(self.config.timeout, child.wait()).await;
-        // The output ends when the last process that could write any has.
+        // The output ends when the last process that could write to it has ended.
         processes.end(KILL_TIMEOUT).await?;
         let status = match ended {
             Ok(status) => ExitStatus::from(status.map_err(failed)?),
@@ -126,7 +127,7 @@ impl Gate {
         };
         let reason = match tokio::time::timeout(DRAIN_TIMEOUT, reading).await {
             Ok(Ok(reason)) => reason,
-            // A process of it got away and still writes, or nothing could be read.
+            // A process of the gate escaped and still writes, or the output could not be read.
             _ => String::new(),
         };
         match status {
@@ -139,7 +140,7 @@ impl Gate {
         }
     }
 
-    /// The question, as variables.
+    /// The question, as environment variables.
     fn asked(
         &self,
         task: &TaskName,
@@ -160,7 +161,7 @@ impl Gate {
 }
 
 impl GateStep {
-    /// The step as the gate reads it.
+    /// The step's name in the gate's environment.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Start => "start",
@@ -170,10 +171,11 @@ impl GateStep {
     }
 }
 
-/// The first lines of what a gate writes; the rest is read, so that it need not wait, and dropped.
+/// The first lines of a gate's output. The rest is read and dropped, so that the gate is not
+/// blocked.
 fn reason(mut output: PipeReader) -> String {
     let mut bytes = Vec::new();
-    // What can't be read is no reason; the exit code is the answer.
+    // Unreadable output gives no reason; the exit code is the answer.
     let _ = output.by_ref().take(MAX_REASON_BYTES).read_to_end(&mut bytes);
     let _ = io::copy(&mut output, &mut io::sink());
     let text = String::from_utf8_lossy(&bytes);

@@ -1,5 +1,5 @@
-//! Answers about the robot's ROS graph: what it shows, and calls to its nodes that people asked
-//! for. It looks through the agent's own node and decides nothing.
+//! Answers about the robot's ROS graph: its contents, and calls to its nodes on request. The
+//! agent's own node reads the graph; this module decides nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -16,21 +16,21 @@ use tokio::task::JoinSet;
 use crate::reconcile::robot::Robot;
 use crate::ros::graph::{Graph, GraphError, Node, ParameterValue, ParticipantId, Snapshot};
 
-/// How long a node may take to answer a question.
+/// Time limit for a node's answer to a question.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
-/// How long a transition, or setting a parameter, may take: a node may open a device in it.
+/// Time limit for a transition or for setting a parameter: a node may open a device meanwhile.
 const WORK_TIMEOUT: Duration = Duration::from_secs(15);
-/// The most lifecycle nodes whose state a list shows.
+/// The maximum number of lifecycle nodes with a state in a list.
 const MAX_STATES: usize = 64;
 
-/// Who answers.
+/// Answers questions about the ROS graph.
 #[derive(Clone)]
 pub struct GraphAnswers {
     /// The robot.
     pub robot: Arc<Robot>,
 }
 
-/// The graph at one moment, and which task each participant is of.
+/// A snapshot of the graph, with the task of each participant.
 struct Picture {
     graph: Graph,
     snapshot: Arc<Snapshot>,
@@ -38,7 +38,7 @@ struct Picture {
 }
 
 impl GraphAnswers {
-    /// The nodes, lifecycle nodes with their states.
+    /// The nodes; lifecycle nodes include their states.
     pub async fn nodes(&self) -> Result<Answer, Refusal> {
         let picture = self.picture().await?;
         let states = picture.states(picture.snapshot.nodes.iter()).await;
@@ -47,7 +47,7 @@ impl GraphAnswers {
         Ok(Answer::Nodes { age_ms: picture.age_ms(), nodes })
     }
 
-    /// One node with its endpoints; several, if several have the name.
+    /// One node with its endpoints; several nodes if the name is not unique.
     pub async fn node(&self, name: &GraphName) -> Result<Answer, Refusal> {
         let picture = self.picture().await?;
         let found: Vec<&Node> =
@@ -66,7 +66,7 @@ impl GraphAnswers {
         Ok(Answer::Node { age_ms: picture.age_ms(), nodes: found.iter().map(detail).collect() })
     }
 
-    /// The topics, with who is at their ends.
+    /// The topics, with the nodes at their ends.
     pub async fn topics(&self) -> Result<Answer, Refusal> {
         let picture = self.picture().await?;
         let topics = topics(&picture.snapshot.nodes);
@@ -97,7 +97,7 @@ impl GraphAnswers {
         }
     }
 
-    /// Sets a parameter, and gives the value it has then.
+    /// Sets a parameter and returns its value afterwards.
     pub async fn set_parameter(
         &self,
         node: &GraphName,
@@ -127,7 +127,7 @@ impl GraphAnswers {
         })
     }
 
-    /// Asks for a transition, and gives the state after it.
+    /// Requests a transition and returns the state afterwards.
     pub async fn lifecycle(
         &self,
         node: &GraphName,
@@ -143,7 +143,7 @@ impl GraphAnswers {
         }
         match graph.lifecycle_state(node, ANSWER_TIMEOUT).await {
             Ok(state) => Ok(Answer::Lifecycle { state }),
-            // A node that was shut down may be gone before it can say so.
+            // A node that was shut down may be gone before it can answer.
             Err(_) if transition == Transition::Shutdown => {
                 Ok(Answer::Lifecycle { state: LifecycleState::Finalized })
             }
@@ -162,7 +162,7 @@ impl GraphAnswers {
         Ok(Picture { graph, snapshot, tasks })
     }
 
-    /// The graph, if it has such a node.
+    /// The graph, if it contains this node.
     async fn graph_with(&self, node: &GraphName) -> Result<Graph, Refusal> {
         let picture = self.picture().await?;
         let is_there = picture.snapshot.nodes.iter().any(|known| known.name == *node);
@@ -183,7 +183,8 @@ impl Picture {
         refusal("no_such_node", format!("there is no node {name}; on the graph: {there}"))
     }
 
-    /// The states of those nodes that have one and say it in time, all asked at once.
+    /// The lifecycle states of the nodes that have one and answer in time. All nodes are asked at
+    /// once.
     async fn states(
         &self,
         nodes: impl Iterator<Item = &Node>,

@@ -1,6 +1,6 @@
-//! Questions that change something are believed only if the server signed them, for this robot and
-//! this start of its agent, and once: whoever passes messages on may repeat what was said, or say
-//! something itself. It never does what is asked.
+//! Authenticates requests that change something. Such a request is accepted only if the server
+//! signed it for this robot and this start of its agent, and only once: a broker could replay or
+//! forge messages. This module never executes a request.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -11,10 +11,10 @@ use task_proto::request::{ACTION_TYPE, Action, Ask, Refusal, Request};
 
 use crate::system::recent_set::Recent;
 
-/// How many of those that were done are known; people ask them one by one.
+/// The number of executed request ids that are remembered; people send such requests one by one.
 const KNOWN: usize = 10_000;
 
-/// From whom this robot takes what changes something.
+/// Verifies the requests that change something.
 pub struct Orders {
     robot_id: RobotId,
     instance: InstanceId,
@@ -28,12 +28,12 @@ pub(crate) fn refusal(code: &str, text: impl Into<String>) -> Refusal {
 }
 
 impl Orders {
-    /// Those that the holder of `server_key` signs for this start of the agent.
+    /// Accepts requests signed with the key of `server_key`, for this start of the agent.
     pub fn new(robot_id: RobotId, instance: InstanceId, server_key: PublicKey) -> Self {
         Self { robot_id, instance, server_key, done: Mutex::default() }
     }
 
-    /// What is to be answered; of what changes something, as it was signed.
+    /// The question to answer. For a request that changes something, this is the signed question.
     pub fn meant(&self, request: &Request) -> Result<Ask, Refusal> {
         if !request.ask.changes_something() {
             return Ok(request.ask.clone());

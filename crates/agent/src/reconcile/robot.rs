@@ -1,5 +1,5 @@
-//! The real robot: each effect is a call to the module that owns it, and its error becomes a
-//! failure's code and text. It holds no state beside its settings.
+//! The real robot. Each effect is a call to the module that owns the work; the module's error
+//! becomes a failure code and text. The robot holds no state beside its settings.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -71,19 +71,19 @@ mod runs;
 mod signers;
 mod trees;
 
-/// Written into a version's directory once it is built.
+/// The marker file in a version's directory after its build.
 const BUILT_MARKER: &str = "built";
-/// Written into a run's directory before its start: what the ledger says of the run, should the
-/// ledger be lost.
+/// The copy of the ledger's run record in a run's directory, written before the start in case the
+/// ledger is lost.
 const RUN_RECORD: &str = "run.json";
-/// How much of a log's end goes, without its times, into a failure's text.
+/// How much of the end of a log goes into a failure's text, without its times.
 const TAIL_BYTES: u64 = 3072;
 
 /// This robot.
 pub struct Robot {
     data: DataDir,
     fetcher: Arc<Fetcher>,
-    /// Who vouches for packages, where the robot asks for more than its server's word.
+    /// The signature policy of a robot that requires more than its server's word.
     vouching: Option<Arc<Vouching>>,
     listening: Listening,
     gate: Option<Gate>,
@@ -92,11 +92,11 @@ pub struct Robot {
     supervisor: Supervisor,
     watcher: Watcher,
     graph: GraphAccess,
-    /// The ROS that was last seen.
+    /// The last known ROS installations.
     ros: RwLock<Vec<Installation>>,
-    /// Its own settings.
+    /// The robot's own settings.
     own: Config,
-    /// What holds of them and of what the server says.
+    /// The effective settings: the robot's own combined with the server's.
     held: RwLock<Arc<Held>>,
     forward: watch::Sender<ForwardSettings>,
     cgroups: Option<Cgroups>,
@@ -108,7 +108,7 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// The robot whose data is in `data`.
+    /// The robot with its data in `data`.
     pub fn new(
         data: DataDir,
         (fetcher, listening): (Fetcher, Listening),
@@ -163,7 +163,7 @@ impl Robot {
         self.data.task(&package.name).version(&package.manifest.digest)
     }
 
-    /// The manifest that lies on the disk, verified as if it came from the server.
+    /// The manifest on the disk, verified as if it came from the server.
     async fn manifest(&self, package: &PackageRef) -> Result<TaskManifest, StepFailure> {
         self.fetcher.manifest(package, &CancellationToken::new()).await.map_err(fetch_failure)
     }
@@ -178,14 +178,14 @@ impl Robot {
         log
     }
 
-    /// What this version promises about the ROS graph; nothing, where its manifest is gone.
+    /// The version's promises about the ROS graph; none if its manifest is gone.
     fn promise(&self, package: &PackageRef) -> Promise {
         fetch::stored_manifest(&self.data, package)
             .map_or_else(Promise::default, |manifest| Promise::of(&manifest))
     }
 
-    /// What processes have that run as `user` with the home directory `home`, once the way to the
-    /// task's directories is open.
+    /// The environment of processes that run as `user` with the home directory `home`. Also makes
+    /// the task's directories reachable for `user`.
     fn environment_of(
         &self,
         task: &TaskName,
@@ -204,7 +204,7 @@ impl Robot {
         Ok(environment)
     }
 
-    /// What the task may use: what its package says, else what this robot's settings say.
+    /// The resource limits of the task: from its package, else from this robot's settings.
     fn limits(&self, manifest: &TaskManifest) -> RunLimits {
         let (limits, settings) = (&manifest.limits, self.held().task_limits);
         RunLimits {
@@ -326,7 +326,7 @@ impl Effects for Robot {
             let last_lines = logs::last_lines(&self.log(task).path, TAIL_BYTES);
             ProcessState::Ended(Exit { status, out_of_memory_bytes, last_lines })
         };
-        // Whoever asks is not kept waiting by a start that may hang: it asks again.
+        // A start that hangs must not keep the caller waiting: the caller asks again.
         match self.supervisor.observe_within(&self.run_dir(task, process), Duration::ZERO).await {
             Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
             Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
@@ -481,8 +481,8 @@ impl Effects for Robot {
         let Some(process) = &run.process else {
             return Err(failed(&std::io::Error::other("the ledger names no process to start")));
         };
-        // What was staged long ago may have waited for a person or the gate until its publishers'
-        // list was over.
+        // A version that was staged long ago may have waited for a person or the gate until its
+        // publishers' list expired.
         let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
         self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
@@ -490,7 +490,7 @@ impl Effects for Robot {
         let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
         let task_dir = self.data.task(task);
         let run_dir = self.run_dir(task, process);
-        // What still ran of it could change what is looked at below.
+        // Leftover processes of the run could change the files that are verified below.
         self.end_other_runs(&task_dir.run(), Some(&run_dir))
             .await
             .map_err(|error| failed(&error))?;
@@ -530,8 +530,8 @@ impl Effects for Robot {
             return Err(StepFailure { failure, retry_after_ms: None });
         }
         self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
-            // Whoever has the name may go away: a run that was ready before waits for that. So may
-            // what is in the graph's way.
+            // The owner of a conflicting name may go away, so a run that was ready before waits for
+            // that. An obstacle to the graph may also pass.
             let may_pass = run.ever_ready
                 || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
             StepFailure { failure, retry_after_ms: may_pass.then_some(0) }
@@ -540,12 +540,12 @@ impl Effects for Robot {
         if matches!(started, Err(SupervisorError::NoAnswer))
             && let Err(error) = self.supervisor.stop(&run_dir, Duration::ZERO).await
         {
-            // It stays in the ledger until it is seen to be gone.
+            // The process stays in the ledger until it is seen to be gone.
             tracing::warn!(%task, error = %chain(&error), "cannot end what may have been started");
         }
         let pid = started.map_err(|error| failed(&error))?.task.pid;
-        // What earlier runs left is of no more use; that it can't be deleted is no reason not to
-        // run.
+        // Leftovers of earlier runs have no further use. If they cannot be deleted, the task still
+        // runs.
         if let Err(error) = self.forget_runs(&task_dir.run(), Some(&run_dir)).await {
             tracing::warn!(%task, failure = %error.failure, "cannot delete what ended runs left");
         }
@@ -626,7 +626,7 @@ mod tests {
     use crate::process::run_dir::RunDir;
     use crate::setup::launch::Interrupt;
 
-    /// A robot whose data is in `dir` and whose own settings are `file`. Nobody is its server.
+    /// A robot with its data in `dir` and its own settings from `file`, without a server.
     pub(super) fn robot(dir: &Path, file: &str) -> Robot {
         std::fs::write(dir.join(crate::config::FILE_NAME), file).expect("written");
         let config = Config::load(dir, std::iter::empty()).expect("loads");
@@ -653,7 +653,7 @@ mod tests {
         )
     }
 
-    /// The directory of a run in that environment, of which nothing but what it is was written yet.
+    /// The directory of a run in that environment. Only the run's specification has been written.
     pub(super) fn run_dir(path: &Path, environment: BTreeMap<String, String>) -> RunDir {
         let run = RunDir::create(path).expect("made");
         let spec = RunSpec {

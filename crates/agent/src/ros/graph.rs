@@ -1,20 +1,20 @@
-//! The robot's ROS 2 graph: what it shows, calls to nodes, what nodes say. It decides nothing about
-//! tasks.
+//! The robot's ROS 2 graph: its nodes and endpoints, calls to nodes, and messages from nodes. This
+//! module decides nothing about tasks.
 //!
-//! Everybody on the network may send to whatever takes part in a ROS graph, and the bytes are read
-//! by a large library. So the agent, which may be root, does not take part itself: it starts a
-//! program for it ([`program`]) that has no rights and little memory, and speaks with it over pipes
-//! ([`protocol`], [`connection`]). This program is the agent itself ([`serve`]) with a DDS
+//! Every host on the network may send to a participant of a ROS graph, and a large library reads
+//! the bytes. So the agent, which may be root, does not take part itself. It starts a program that
+//! has no rights and little memory ([`program`]), and communicates with this program over pipes
+//! ([`protocol`], [`connection`]). The program is the agent's own executable ([`serve`]) with a DDS
 //! participant ([`participant`]).
 //!
-//! These modules are the only place that names `ros2-client`. Of it the graph uses the message
-//! types and the DDS library below it (RustDDS), not its `Node`, `Spinner` and `Client`: those fix
-//! the length of a gid when they are compiled, so one agent could not serve Humble and newer
-//! robots, keep 8 events and lose the rest, never take back an endpoint they announced, and take
-//! whatever a stranger says about its nodes.
+//! Only these modules name `ros2-client`. The graph uses its message types and the DDS library
+//! below it (RustDDS), but not its `Node`, `Spinner` and `Client`. Those fix the length of a gid at
+//! compile time, so one agent could not serve Humble and newer robots; they keep 8 events and lose
+//! the rest, never withdraw an announced endpoint, and accept any claim of an untrusted sender
+//! about its nodes.
 //!
-//! It costs no C library. What it cannot do: see participants that speak neither UDP nor RTPS
-//! (Zenoh), or DDS Security.
+//! No C library is needed. Two kinds of participants stay invisible: those that speak neither UDP
+//! nor RTPS (Zenoh), and those that use DDS Security.
 
 pub mod entities;
 pub mod feeds;
@@ -55,56 +55,57 @@ use self::protocol::{Answer, Call, Feed, Request};
 pub use self::rate::{Rate, RateMeter};
 pub use self::snapshot::{EndpointId, Node, Participant, ParticipantId, Snapshot};
 
-/// The highest domain id whose ports exist.
+/// The highest domain id with valid ports.
 pub const MAX_DOMAIN_ID: u16 = 232;
 
-/// How the agent takes part in the graph. It reads no environment: whoever opens the graph has.
+/// Settings for taking part in the graph. The program reads no environment variables: the caller
+/// that opens the graph has read them.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GraphSettings {
     /// `ROS_DOMAIN_ID`, at most [`MAX_DOMAIN_ID`].
     pub domain_id: u16,
-    /// Whether only this host's nodes are met. Then nothing from another host is read.
+    /// Whether only this host's nodes are met. Then no data from another host is read.
     pub localhost_only: bool,
     /// The agent's node. Two agents on one host, or in one domain, need two names.
     pub node_name: GraphName,
-    /// The distribution of the robot's nodes, which decides the form in which the agent's node is
+    /// The distribution of the robot's nodes. It decides the form in which the agent's node is
     /// announced; nodes of all distributions are understood.
     pub distro: Option<String>,
 }
 
-/// What can go wrong with the graph.
+/// Errors of the graph.
 #[derive(Debug, Clone, PartialEq, thiserror::Error, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GraphError {
-    /// No such domain.
+    /// The domain id is out of range.
     #[error("ros_domain_id: {0} is not from 0 to {MAX_DOMAIN_ID}")]
     DomainId(u16),
     /// The program that takes part could not be started.
     #[error("cannot start the program that takes part in the ROS graph: {reason}")]
     Start {
-        /// Why.
+        /// The system's error.
         reason: String,
     },
-    /// The agent could not take part.
+    /// The agent could not take part in the domain.
     #[error("cannot take part in ROS domain {domain_id}: {reason}")]
     Join {
         /// The domain.
         domain_id: u16,
-        /// Why.
+        /// The DDS library's error.
         reason: String,
     },
-    /// A reader or writer could not be made.
+    /// A reader or writer could not be created.
     #[error("cannot make a reader or writer for {topic}: {reason}")]
     Endpoint {
         /// The DDS topic.
         topic: String,
-        /// Why.
+        /// The DDS library's error.
         reason: String,
     },
-    /// Not a type's name.
+    /// The text is not the name of a type.
     #[error("{0:?} is not a type like std_srvs/srv/Trigger")]
     Kind(String),
-    /// A node's name to which nothing can be added.
+    /// The service's full name would exceed the limit for ROS names.
     #[error("{node}/{service} is longer than a ROS name may be")]
     Name {
         /// The node.
@@ -112,53 +113,53 @@ pub enum GraphError {
         /// The service.
         service: String,
     },
-    /// A message could not be put into bytes.
+    /// A message could not be serialized.
     #[error("cannot encode the request: {reason}")]
     Encode {
-        /// Why.
+        /// The serializer's error.
         reason: String,
     },
     /// A message could not be sent.
     #[error("cannot send the request: {reason}")]
     Write {
-        /// Why, in the DDS library's words.
+        /// The DDS library's error.
         reason: String,
     },
-    /// Nobody offers the service.
+    /// No node offers the service.
     #[error("{service}: no server within {within:?}")]
     NoServer {
         /// The service.
         service: GraphName,
-        /// How long was waited.
+        /// Time spent waiting.
         #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
-    /// There is a server, but no answer.
+    /// There is a server, but no answer arrived.
     #[error("{service}: no answer within {within:?}")]
     NoAnswer {
         /// The service.
         service: GraphName,
-        /// How long was waited.
+        /// Time spent waiting.
         #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
-    /// An answer that is none.
+    /// The answer does not decode as the service's type.
     #[error("{service}: the answer is not of the service's type")]
     Malformed {
         /// The service.
         service: GraphName,
     },
-    /// Beyond a limit.
+    /// The node exceeds a limit.
     #[error("{node}: {found} {what} are too many")]
     TooMany {
-        /// Of what.
+        /// The kind of the counted objects.
         what: String,
         /// The node.
         node: GraphName,
-        /// How many.
+        /// The number found.
         found: usize,
     },
-    /// More calls than can be under way at a time.
+    /// The limit of concurrent calls is reached.
     #[error("too many calls to nodes are under way")]
     Busy,
     /// The graph was closed, or the program that takes part in it has ended.
@@ -166,7 +167,7 @@ pub enum GraphError {
     Closed,
 }
 
-/// A handle on the graph; when the last one is dropped the agent's node leaves.
+/// A handle on the graph. When the last handle is dropped, the agent's node leaves.
 #[derive(Clone)]
 pub struct Graph {
     shared: Arc<Shared>,
@@ -197,7 +198,7 @@ impl GraphError {
 }
 
 impl Graph {
-    /// Takes part in the domain, by a program that is started for it.
+    /// Takes part in the domain through a program that is started for it.
     pub async fn open(
         settings: &GraphSettings,
         program: &GraphProgram,
@@ -213,12 +214,13 @@ impl Graph {
         Ok(Self { shared: Arc::new(shared) })
     }
 
-    /// What the graph shows. [`Snapshot::at`] is at most a few seconds ago while the graph is open.
+    /// The current state of the graph. [`Snapshot::at`] is at most a few seconds old while the
+    /// graph is open.
     pub fn snapshot(&self) -> Arc<Snapshot> {
         self.shared.snapshot.borrow().clone()
     }
 
-    /// Wakes when the graph shows something else, many changes at once as one. It ends when the
+    /// Wakes when the graph changes; several changes may arrive as one. The channel ends when the
     /// graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
@@ -229,8 +231,8 @@ impl Graph {
         self.shared.connection.pid()
     }
 
-    /// Which of the participants in this snapshot live in these processes: only what a task started
-    /// is its own.
+    /// Determines which participants in this snapshot live in these processes: a task owns only the
+    /// nodes that it started.
     pub async fn owners(snapshot: Arc<Snapshot>, pids: Vec<u32>) -> Owners {
         let unknown = Owners {
             unknown: snapshot.participants.keys().copied().collect(),
@@ -241,13 +243,14 @@ impl Graph {
         asked.unwrap_or(unknown)
     }
 
-    /// The process on this host that a participant lives in, where it can be told.
+    /// The process on this host that contains the participant, if it can be determined.
     pub async fn process_of(participant: Participant) -> Option<u32> {
         tokio::task::spawn_blocking(move || Owners::process_of(&participant)).await.ok().flatten()
     }
 
-    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need
-    /// for this node. A node that starts later finds it there, and answers the sooner.
+    /// Creates the client endpoints that [`Self::lifecycle_state`], [`Self::change_state`] and the
+    /// parameter calls need for this node. A node that starts later finds them there and answers
+    /// sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
         match self.call(Call::Prepare { node: node.clone() }, Duration::ZERO).await? {
             Answer::Done => Ok(()),
@@ -255,9 +258,9 @@ impl Graph {
         }
     }
 
-    /// Waits until a server of this service would hear a request, and its answer would be heard;
-    /// says which participants have one. Without `kind` the service's type is taken from what the
-    /// graph shows.
+    /// Waits until a server of this service would receive a request and its answer would be
+    /// received. Returns the participants that have such a server. Without `kind` the service's
+    /// type is taken from the graph.
     pub async fn service_answers(
         &self,
         service: &GraphName,
@@ -271,7 +274,7 @@ impl Graph {
         }
     }
 
-    /// The state this lifecycle node is in.
+    /// The state of this lifecycle node.
     pub async fn lifecycle_state(
         &self,
         node: &GraphName,
@@ -283,9 +286,9 @@ impl Graph {
         }
     }
 
-    /// Asks this lifecycle node for a transition, once; says whether it made it. After
-    /// [`GraphError::NoAnswer`] it may have, and so after [`GraphError::Closed`]: ask for its
-    /// state.
+    /// Requests a transition of this lifecycle node, once; returns whether the node made the
+    /// transition. After [`GraphError::NoAnswer`] or [`GraphError::Closed`] the node may have made
+    /// the transition: ask for its state.
     pub async fn change_state(
         &self,
         node: &GraphName,
@@ -298,7 +301,7 @@ impl Graph {
         }
     }
 
-    /// All parameters of this node. `within` is for each of the calls that takes.
+    /// All parameters of this node. `within` applies to each of the calls that this takes.
     pub async fn parameters(
         &self,
         node: &GraphName,
@@ -310,7 +313,7 @@ impl Graph {
         }
     }
 
-    /// One parameter of this node; [`ParameterValue::NotSet`] where it has none of that name.
+    /// One parameter of this node; [`ParameterValue::NotSet`] where the node has none of that name.
     pub async fn parameter(
         &self,
         node: &GraphName,
@@ -326,7 +329,7 @@ impl Graph {
         }
     }
 
-    /// Sets these parameters, each for itself; says what became of each, in their order.
+    /// Sets these parameters, each independently; returns the result of each, in their order.
     pub async fn set_parameters(
         &self,
         node: &GraphName,
@@ -339,34 +342,34 @@ impl Graph {
         }
     }
 
-    /// What nodes log, from now on; the first who asks also gets the last lines from before, for
-    /// nodes keep them. A listener that is too slow is told how many lines it missed.
+    /// Log lines of nodes, from now on. The first subscriber also gets the last lines from before,
+    /// because nodes keep them. A receiver that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let listener = self.shared.connection.rosout()?;
         self.shared.connection.say(Request::Listen(Feed::Rosout))?;
         Ok(listener)
     }
 
-    /// What nodes say about the robot's parts, from now on.
+    /// Diagnostics that nodes publish about the robot's parts, from now on.
     pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
         let listener = self.shared.connection.diagnostics()?;
         self.shared.connection.say(Request::Listen(Feed::Diagnostics))?;
         Ok(listener)
     }
 
-    /// How many messages of nodes came too fast to reach this handle's listeners at all.
+    /// Number of messages of nodes that came too fast to reach any listener of this handle.
     pub fn missed_messages(&self) -> u64 {
         self.shared.connection.missed_messages()
     }
 
-    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings
-    /// are.
+    /// Counts the messages of this topic with the type `kind`, whatever the QoS settings of its
+    /// publishers.
     pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<RateMeter, GraphError> {
         names::type_to_dds(Role::Topic, kind).ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
         Connection::meter(&self.shared.connection, topic, kind)
     }
 
-    /// Whether it shows nothing new any more.
+    /// Whether the graph is closed and shows no more changes.
     pub fn is_closed(&self) -> bool {
         self.shared.closing.is_cancelled()
     }
@@ -375,7 +378,7 @@ impl Graph {
         self.shared.connection.call(call, within).await
     }
 
-    /// Leaves the graph. Other handles see nothing any more.
+    /// Leaves the graph. Other handles receive no more changes.
     pub async fn close(self) {
         self.shared.closing.cancel();
         self.shared.tracker.close();

@@ -1,7 +1,8 @@
-//! When the agent takes part in the ROS graph: from the first time that a task or a question needs
-//! it, on a robot that has ROS 2, until the agent ends, or until somebody needs another domain and
-//! nobody this one any more; anew, should it have been thrown out. A robot without ROS 2 never
-//! opens a socket for it. It looks at nothing itself.
+//! Decides when the agent takes part in the ROS graph. On a robot with ROS 2 the agent joins when a
+//! task or a question first needs the graph, and stays until the agent ends, or until another
+//! domain is needed and the current one is not in use. It joins again if the connection is lost. On
+//! a robot without ROS 2 the agent never opens a socket for the graph. This module does not inspect
+//! the graph itself.
 
 use std::sync::{Arc, Weak};
 use std::time::Duration;
@@ -20,16 +21,17 @@ use crate::ros::graph::{Graph, GraphProgram, GraphSettings, Snapshot};
 use crate::ros::node_logs;
 use crate::system::layout::DataDir;
 
-/// How long discovery may take until the graph shows who was there before: nodes announce
+/// Time that discovery may take until the graph shows the nodes that existed before: nodes announce
 /// themselves every 3 s.
 const DISCOVERY: Duration = Duration::from_millis(3500);
-/// When to try again after the graph was lost, or could not be opened: at first, and at most.
+/// Pause before the next attempt after the graph was lost, or could not be opened: the first pause,
+/// and the maximum.
 const FIRST_RETRY: Duration = Duration::from_millis(500);
 const LAST_RETRY: Duration = Duration::from_secs(30);
-/// A graph that was open for so long was well.
+/// A graph that was open for this long resets the failure count.
 const WELL: Duration = Duration::from_secs(60);
 
-/// The way to the robot's graph; clones share it.
+/// Access to the robot's graph; clones share it.
 #[derive(Clone)]
 pub struct GraphAccess {
     inner: Arc<Inner>,
@@ -46,7 +48,7 @@ struct Inner {
 #[derive(Default)]
 struct State {
     graph: GraphState,
-    /// How often the graph was lost, or could not be opened, since it was well.
+    /// Number of times that the graph was lost, or could not be opened, since it last stayed open.
     failures: u32,
 }
 
@@ -58,8 +60,8 @@ enum GraphState {
         graph: Graph,
         since: Instant,
         domain_id: u16,
-        /// What nodes say is kept as long: nobody else may write it, and the graph is not held open
-        /// for it.
+        /// Messages of nodes are recorded while the graph is open. Only this recorder may write the
+        /// files, and it does not hold the graph open.
         _keeping: DropGuard,
     },
     Failed {
@@ -69,27 +71,25 @@ enum GraphState {
 }
 
 impl GraphAccess {
-    /// Closed at first; `program` takes part. The node is named for the robot, because two agents
-    /// on one host, or in one domain, need two names. What nodes say is kept in `data` while it is
-    /// open.
+    /// The graph is closed at first; `program` takes part in it. The node's name comes from the
+    /// robot, because two agents on one host, or in one domain, need two names. Messages of nodes
+    /// are recorded in `data` while the graph is open.
     pub fn of_robot(mac: MacAddress, data: DataDir, program: GraphProgram) -> Self {
         let (log_bytes, state) = (watch::Sender::new(None), Mutex::default());
         Self { inner: Arc::new(Inner { mac, data, program, log_bytes, state }) }
     }
 
-    /// Lets a file of what nodes say have no more than `log_bytes`, from the next time that the
-    /// graph is opened.
+    /// Limits a file of node messages to `log_bytes`, from the next time that the graph is opened.
     pub fn limit(&self, log_bytes: Option<u64>) {
         self.inner.log_bytes.send_replace(log_bytes);
     }
 
-    /// The graph, opened now if it was not yet. `facts` say what the robot has, as it was seen
-    /// last.
+    /// The graph, opened now if it was not open yet. `facts` describe the robot as last seen.
     pub async fn open(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
         self.inner.opened(facts).await.map(|(graph, _)| graph)
     }
 
-    /// Likewise, but not before it can show who was there when it was opened.
+    /// Like `open`, but waits until the graph can show the nodes that existed when it was opened.
     pub async fn settled(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
         let (graph, since) = self.inner.opened(facts).await?;
         tokio::time::sleep_until(since + DISCOVERY).await;
@@ -105,7 +105,7 @@ impl Inner {
         let mut state = self.state.lock().await;
         state.notice_loss();
         match &state.graph {
-            // Whoever watches a task in the domain that was left goes on with the graph they have.
+            // Watches of tasks in the domain that was left go on with the graph that they have.
             GraphState::Open { graph, since, domain_id, .. }
                 if facts.is_none_or(|facts| facts.domain_id == Some(*domain_id)) =>
             {
@@ -167,8 +167,8 @@ impl Inner {
 }
 
 impl State {
-    /// Takes in that the graph has closed by itself, if it has: because its program was killed, or
-    /// its listening ended.
+    /// Notices that the graph has closed by itself, because its program was killed or its listening
+    /// ended.
     fn notice_loss(&mut self) {
         let GraphState::Open { graph, since, .. } = &self.graph else { return };
         if graph.is_closed() {
@@ -188,14 +188,14 @@ impl State {
     }
 }
 
-/// How long to wait before the next attempt, after as many that failed.
+/// The pause before the next attempt, after this number of failed attempts.
 fn backoff(failures: u32) -> Duration {
     let most = FIRST_RETRY.saturating_mul(2_u32.saturating_pow(failures.min(16))).min(LAST_RETRY);
     rand::rng().random_range(most / 2..=most)
 }
 
-/// Opens the graph again once it is lost, whether anybody asks for it or not: what nodes say is to
-/// be kept. It holds neither the graph nor the access to it.
+/// Opens the graph again once it is lost, whether a caller needs it or not: messages of nodes are
+/// to be recorded. This task holds neither the graph nor the access to it.
 fn reopen_when_lost(
     access: Weak<Inner>,
     mut changes: watch::Receiver<Arc<Snapshot>>,
@@ -209,7 +209,7 @@ fn reopen_when_lost(
                 let mut state = access.state.lock().await;
                 state.notice_loss();
                 match &state.graph {
-                    // Another is open by now, or nobody wants one.
+                    // Another graph is open by now, or the graph is no longer needed.
                     GraphState::Open { .. } | GraphState::Closed => return,
                     GraphState::Failed { retry_at, .. } => *retry_at,
                 }

@@ -1,6 +1,6 @@
-//! What nodes say on `/rosout` and `/diagnostics`, kept beside the task whose process said it, in
-//! the form that consoles show. What is of no task is kept apart. It decides nothing by what is
-//! said.
+//! Records the messages of nodes on `/rosout` and `/diagnostics`, in console format, in the logs of
+//! the task whose process sent them. Messages that belong to no task go to a separate log. The
+//! contents of messages influence no decision.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::PathBuf;
@@ -22,27 +22,27 @@ use crate::ros::graph::{DiagnosticLevel, DiagnosticStatus, Graph, ParticipantId,
 use crate::system::clock;
 use crate::system::layout::DataDir;
 
-/// Messages that wait for the disk.
+/// Maximum number of messages that wait for the disk.
 const QUEUED_MESSAGES: usize = 1024;
-/// Statuses whose last value is remembered.
+/// Maximum number of statuses of which the last value is remembered.
 const MAX_STATUSES: usize = 4096;
-/// How soon a participant that was no task's is looked for again.
+/// Interval until the owner of a participant without a task is looked up again.
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
-/// How soon after a look another participant is looked for.
+/// Minimum interval between two look-ups of participants.
 const LOOK_PAUSE: Duration = Duration::from_millis(200);
-/// How long a participant whose words have come may take to show itself.
+/// Maximum time for discovery to show a participant after its first message.
 const DISCOVERY: Duration = Duration::from_secs(1);
-/// Files of each log.
+/// Number of files of each log.
 const FILES: u32 = 2;
 
-/// What is to be written.
+/// Messages to be written.
 enum Message {
     Line(Arc<RosoutLine>, Option<TaskName>),
     Status(Arc<DiagnosticStatus>, Option<TaskName>),
     Missed(u64),
 }
 
-/// Keeps what is said on `graph` until it is closed.
+/// Records the messages on `graph` until it is closed.
 pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
     let (mut rosout, mut diagnostics) = match (graph.rosout(), graph.diagnostics()) {
         (Ok(rosout), Ok(diagnostics)) => (rosout, diagnostics),
@@ -68,7 +68,7 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
                 Err(RecvError::Lagged(count)) => Message::Missed(count),
                 Err(RecvError::Closed) => return,
             },
-            // Cancel-safe, likewise.
+            // Cancel-safe, for the same reason.
             status = diagnostics.recv() => match status {
                 Ok(status) => {
                     let task = owners.task_of(&graph, status.participant).await;
@@ -90,12 +90,12 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
         if missed > 0 && messages.try_send(Message::Missed(missed)).is_ok() {
             missed = 0;
         }
-        // The disk does not keep up: what is said is dropped and counted.
+        // The disk can't keep up: messages are dropped and counted.
         missed += u64::from(messages.try_send(message).is_err());
     }
 }
 
-/// Which task's processes take part in the graph.
+/// The tasks whose processes take part in the graph.
 struct Owners {
     data: DataDir,
     known: HashMap<ParticipantId, Option<TaskName>>,
@@ -114,7 +114,7 @@ impl Owners {
         }
         let mut changes = graph.changes();
         let shown = changes.wait_for(|snapshot| snapshot.participants.contains_key(&participant));
-        // What does not show itself is nobody's, as far as can be told.
+        // A participant that discovery does not show has no known owner.
         let _ = tokio::time::timeout(DISCOVERY, shown).await;
         let snapshot = graph.snapshot();
         self.looked_at = Some(Instant::now());
@@ -151,12 +151,12 @@ fn pids_by_task(data: &DataDir) -> Vec<(TaskName, Vec<u32>)> {
     found.into_iter().collect()
 }
 
-/// Writes what is said into the logs.
+/// Writes messages into the logs.
 struct Recorder {
     data: DataDir,
     log_bytes: Option<u64>,
     logs: BTreeMap<Option<TaskName>, RotatedLog>,
-    /// How each part was said to be last: only a change is worth a line.
+    /// Last level and message of each part: only a change is logged.
     statuses: HashMap<(String, String), (DiagnosticLevel, String)>,
 }
 
@@ -213,15 +213,15 @@ impl Recorder {
 
     fn write(&mut self, task: Option<TaskName>, source: LogSource, text: &str) {
         let path = path_in(&self.data, task.as_ref());
-        // A task that was removed has no directory any more, and gets none by this.
+        // A task that was removed has no directory any more, and this must not create one.
         let parent = path.parent().filter(|_| task.is_none());
         if let Some(Err(error)) = parent.map(std::fs::create_dir_all) {
             tracing::debug!(%error, "what nodes say can't be kept");
         }
         if !path.exists() {
-            // It was never begun, or its task was removed with it: what was open then is no file of
-            // the next one. Nor is that of any other that was removed, which would keep its bytes
-            // on the disk.
+            // The file was never created, or was removed with its task: a file that was open then
+            // does not belong to the next task. Other removed files are closed too, because they
+            // would keep their bytes on the disk.
             let data = &self.data;
             self.logs.retain(|task, _| path_in(data, task.as_ref()).exists());
         }
@@ -239,7 +239,7 @@ impl Recorder {
     }
 }
 
-/// Where what a task's nodes say is kept, or what others say.
+/// Path of the log for the messages of a task's nodes, or of nodes without a task.
 fn path_in(data: &DataDir, task: Option<&TaskName>) -> PathBuf {
     task.map_or_else(|| data.ros_log(), |task| data.task(task).ros_log())
 }

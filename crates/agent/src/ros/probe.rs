@@ -1,6 +1,6 @@
-//! Looks into ROS installations: sources the setup files as a task would, under the same account,
-//! and lists the packages that can be found then. Bounded in time and in what is listed; what can't
-//! be seen stays unknown. It chooses nothing.
+//! Examines ROS installations: sources the setup files as a task would, under the same account, and
+//! lists the packages that can be found then. Time and list sizes are limited; data that can't be
+//! read stays unknown. This module chooses no installation.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
@@ -19,20 +19,20 @@ use crate::system::task_user::{self, TaskUser};
 
 /// Added to the agent's niceness.
 const NICE: i32 = 10;
-/// How long setup files may take; those of a large workspace on a slow card take seconds.
+/// Maximum time for setup files; those of a large workspace on a slow card take seconds.
 const SOURCING_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long their processes may take to be gone.
+/// Maximum time for the survey's processes to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(5);
-/// Installations that are looked into.
+/// Maximum number of installations that are examined.
 const MAX_INSTALLATIONS: usize = 16;
-/// What setup files may say.
+/// Maximum output of setup files.
 const MAX_ANSWER_BYTES: u64 = 4 << 20;
-/// Directories that are looked into, and names that are kept.
+/// Maximum number of directories that are visited, and of names that are kept.
 const MAX_DIRECTORIES: usize = 10_000;
 const MAX_PACKAGES: usize = 100_000;
-/// How deep a source workspace in `ROS_PACKAGE_PATH` is gone through.
+/// Maximum depth of the search in a source workspace in `ROS_PACKAGE_PATH`.
 const MAX_DEPTH: usize = 4;
-/// What is asked for, in the order of [`Answer`]'s fields.
+/// The queried variables, in the order of [`Answer`]'s fields.
 const VARIABLES: [&str; 7] = [
     "AMENT_PREFIX_PATH",
     "CMAKE_PREFIX_PATH",
@@ -43,7 +43,7 @@ const VARIABLES: [&str; 7] = [
     "RMW_IMPLEMENTATION",
 ];
 
-/// `installations` with what `user` has seen in them. `dir` is for the survey alone.
+/// `installations` with the packages that `user` can see in them. `dir` is for the survey alone.
 pub async fn survey(
     installations: Vec<Installation>,
     environment: &BTreeMap<String, String>,
@@ -65,7 +65,7 @@ pub async fn survey(
     seen
 }
 
-/// What the variables are after sourcing `setups`.
+/// The values of the variables after sourcing `setups`.
 async fn source(
     setups: &[PathBuf],
     environment: &BTreeMap<String, String>,
@@ -86,7 +86,7 @@ async fn source(
         environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
     }
     let containment = Containment::new(&dir, None, None);
-    // An agent that was killed leaves its survey running.
+    // An agent that was killed may have left a survey running.
     containment.end(KILL_TIMEOUT).await.map_err(io::Error::other)?;
     let (reader, writer) = io::pipe()?;
     let confinement = Confinement::new(&path, None, &RunLimits::default(), user)?;
@@ -98,7 +98,7 @@ async fn source(
     if status != ExitStatus::Code(0) {
         return Err(io::Error::other(status.to_string()));
     }
-    // A process that got away may hold its end open.
+    // A process that escaped may hold its end of the pipe open.
     tokio::time::timeout(KILL_TIMEOUT, reading)
         .await
         .map_err(|_| io::Error::from(io::ErrorKind::TimedOut))??
@@ -109,7 +109,7 @@ fn read_answer(answer: PipeReader) -> io::Result<Vec<String>> {
     answer.take(MAX_ANSWER_BYTES).read_to_end(&mut bytes)?;
     let values: Vec<String> =
         bytes.split(|byte| *byte == 0).map(|value| String::from_utf8_lossy(value).into()).collect();
-    // The last value is ended too, which gives an empty text after it.
+    // The last value is terminated too, which gives an empty text after it.
     if values.len() == VARIABLES.len() + 1 {
         Ok(values)
     } else {
@@ -145,15 +145,15 @@ async fn look_into(installation: &mut Installation, answer: Vec<String>, user: O
         places.prefixes.push(venv);
     }
     if installation.versions.contains(&RosVersion::Ros1) {
-        // ROS 1 of the operating system, also below another one.
+        // ROS 1 of the operating system, also below another installation.
         places.prefixes.push("/usr".into());
         places.pythons.push("/usr/lib/python3/dist-packages".into());
     }
-    // A thread that panicked has seen nothing.
+    // A thread that panicked returns no packages.
     installation.packages = task_user::do_as(user, move || places.packages()).await.ok();
 }
 
-/// Where packages lie.
+/// Directories that contain packages.
 #[derive(Default)]
 struct Places {
     prefixes: Vec<PathBuf>,
@@ -162,8 +162,8 @@ struct Places {
 }
 
 impl Places {
-    /// Everything that could be meant by a package's name. Rather too much than too little: what is
-    /// missing is refused.
+    /// All names that could refer to a package. The list is rather too long than too short: a
+    /// missing name causes a refusal.
     fn packages(&self) -> BTreeSet<String> {
         let mut found = BTreeSet::new();
         for prefix in self.prefixes.iter().take(MAX_DIRECTORIES) {

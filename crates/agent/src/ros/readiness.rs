@@ -1,6 +1,7 @@
-//! What "running" means for one run of a task: what `[ready]` and `[parameters]` promise, held
-//! against what the robot's ROS graph shows of the run's own processes. Pure: looks and answers
-//! come in, what to ask next and the run's health go out. It touches neither ROS nor clocks.
+//! Decides when a run of a task counts as running. It compares the promises in `[ready]` and
+//! `[parameters]` with the part of the robot's ROS graph that belongs to the run's own processes.
+//! Pure: its inputs are observations and answers, its outputs are the next questions and the run's
+//! health. It touches neither ROS nor clocks.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -21,47 +22,47 @@ use bring_up::BringUp;
 pub use bring_up::{Answer, Ask, Question};
 use rate::Rate;
 
-/// How long something may be missing from a graph that was complete before it counts: discovery has
-/// its hiccups.
+/// Grace period for an entity that goes missing from a graph that was complete: discovery has short
+/// gaps.
 const GRACE_MS: u64 = 2000;
-/// How long somebody else's node must be there to count: it takes a moment to tell whose a new
-/// participant is.
+/// Time for which a node of another owner must exist before it counts: determining the owner of a
+/// new participant takes a moment.
 const FOREIGN_MS: u64 = 1000;
-/// How long a node that is up may answer nothing before it counts as inactive.
+/// Time without any answer after which a node that is up counts as inactive.
 const SILENCE_MS: u64 = 10_000;
-/// How many names of the graph a text lists.
+/// Maximum number of graph names that a text lists.
 const MAX_LISTED: usize = 20;
 
-/// What a package promises about the ROS graph.
+/// A package's promises about the ROS graph.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Promise {
-    /// Every node that must be there: also those with lifecycle and parameters.
+    /// All nodes that must exist, including those with lifecycle and parameters.
     pub nodes: BTreeSet<GraphName>,
-    /// Those that are brought to active.
+    /// Lifecycle nodes that are brought to active.
     pub lifecycle: BTreeSet<GraphName>,
-    /// Services that answer.
+    /// Services that must answer.
     pub services: BTreeSet<GraphName>,
-    /// Topics with a publisher, some with a least rate.
+    /// Topics with a publisher, some with a minimum rate.
     pub topics: BTreeMap<GraphName, Option<f64>>,
     /// Parameters by node.
     pub parameters: BTreeMap<GraphName, BTreeMap<String, Value>>,
-    /// Seconds it must all hold.
+    /// Seconds for which all promises must hold.
     pub hold_s: u32,
 }
 
-/// What the graph shows, and whose it is. A participant that is in none of the three sets does not
-/// count: what discovery still knows of it may be long past.
+/// The graph and the ownership of its participants. A participant that is in none of the three sets
+/// does not count: discovery's data about it may be long outdated.
 #[derive(Debug, Clone, Copy)]
 pub struct Look<'a> {
     /// The graph.
     pub snapshot: &'a Snapshot,
     /// The participants of the run's processes.
     pub ours: &'a BTreeSet<ParticipantId>,
-    /// Others that live, each in words.
+    /// Living participants of other owners, each with a description.
     pub others: &'a BTreeMap<ParticipantId, String>,
-    /// Those whose process is known to be gone.
+    /// Participants of processes that are known to be gone.
     pub gone: &'a BTreeSet<ParticipantId>,
-    /// Messages that have come on each topic with a least rate.
+    /// Number of messages received on each topic with a minimum rate.
     pub counts: &'a BTreeMap<GraphName, u64>,
 }
 
@@ -80,21 +81,21 @@ enum Item {
 #[derive(Debug, Clone, PartialEq)]
 struct Shortfall {
     item: Item,
-    /// What it is called in a task that ran before.
+    /// The failure code for a task that ran before.
     code: FailureCode,
-    /// In words to which "within 30 s" can be added.
+    /// A description to which "within 30 s" can be appended.
     what: String,
-    /// What is there instead, or nothing.
+    /// The state found instead, or empty.
     seen: String,
-    /// It needs no second look.
+    /// The shortfall needs no confirmation by a second look.
     certain: bool,
 }
 
-/// How long a shortfall has lasted.
+/// Duration of a shortfall.
 #[derive(Debug, Clone)]
 struct Lasting {
     since_ms: u64,
-    /// In the words in which it was first said, so that a text does not change with every figure.
+    /// The shortfall in its first wording, so that a text does not change with every figure.
     said: Option<Shortfall>,
 }
 
@@ -102,9 +103,9 @@ struct Lasting {
 #[derive(Debug, Clone)]
 pub struct Readiness {
     promise: Promise,
-    /// Brought up by an earlier agent.
+    /// An earlier agent brought the run up.
     adopted: bool,
-    /// It has held for `hold_s` once.
+    /// All promises have held for `hold_s` once.
     was_ready: bool,
     nodes: BTreeMap<GraphName, BringUp>,
     rates: BTreeMap<GraphName, Rate>,
@@ -113,7 +114,7 @@ pub struct Readiness {
 }
 
 impl Promise {
-    /// What this manifest promises; its names were checked when it was made.
+    /// The promises of this manifest; its names were checked when the manifest was made.
     pub fn of(manifest: &TaskManifest) -> Self {
         let ready = &manifest.ready;
         let names = |texts: &[String]| {
@@ -141,12 +142,12 @@ impl Promise {
         }
     }
 
-    /// Whether nothing is promised, so that a process that lives is all there is to running.
+    /// Whether nothing is promised, so that a living process is enough to count as running.
     pub fn is_empty(&self) -> bool {
         self.nodes.is_empty() && self.services.is_empty() && self.topics.is_empty()
     }
 
-    /// Why the run can't be started: a living process has one of its names already.
+    /// The reason why the run can't be started: a living process already has one of its names.
     pub fn taken(
         &self,
         snapshot: &Snapshot,
@@ -157,7 +158,7 @@ impl Promise {
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
-    /// Those of the others that have a promised name.
+    /// The participants of other owners that have a promised name.
     pub fn takers(
         &self,
         snapshot: &Snapshot,
@@ -172,7 +173,7 @@ impl Promise {
             .collect()
     }
 
-    /// Promised names that somebody else has, and who that is.
+    /// Promised names that other owners have, with those owners.
     fn foreign<'a>(
         &'a self,
         snapshot: &'a Snapshot,
@@ -192,7 +193,7 @@ impl Promise {
 }
 
 impl Readiness {
-    /// Of a run that has just been started, or of one that an earlier agent saw ready.
+    /// A run that has just been started, or one that an earlier agent saw ready.
     pub fn new(promise: Promise, was_ready: bool) -> Self {
         let rates = promise
             .topics
@@ -209,29 +210,29 @@ impl Readiness {
         }
     }
 
-    /// What it holds the run against.
+    /// The promises that the run is compared with.
     pub fn promise(&self) -> &Promise {
         &self.promise
     }
 
-    /// How the run stands, as of the last look.
+    /// The run's health, as of the last look.
     pub fn health(&self) -> &Health {
         &self.health
     }
 
-    /// What to ask now; each is asked once, until its answer has come.
+    /// The questions to ask now; each is asked once, until its answer has come.
     pub fn questions(&mut self, now_ms: u64) -> Vec<Question> {
         self.nodes.values_mut().filter_map(|node| node.question(now_ms)).collect()
     }
 
-    /// Takes an answer in; it counts at the next look.
+    /// Records an answer; the next look takes it into account.
     pub fn answered(&mut self, question: &Question, answer: Answer, now_ms: u64) {
         if let Some(node) = self.nodes.get_mut(&question.node) {
             node.answered(question, answer, now_ms);
         }
     }
 
-    /// Takes a look in.
+    /// Records an observation of the graph.
     pub fn see(&mut self, look: &Look<'_>, now_ms: u64) {
         // Until this look all that was promised has held.
         self.was_ready |= self.has_held(now_ms);
@@ -245,7 +246,7 @@ impl Readiness {
         self.judge(shortfalls, now_ms);
     }
 
-    /// Notices nodes that are new, or back in another process.
+    /// Notices nodes that are new, or that have returned in another process.
     fn meet(&mut self, look: &Look<'_>) {
         let offer =
             self.promise.services.iter().flat_map(|service| look.snapshot.servers_of(service));
@@ -320,11 +321,11 @@ impl Readiness {
         }
     }
 
-    /// What a node that is there still lacks.
+    /// The shortfall of a node that exists.
     fn unprepared(&self, name: &GraphName, now_ms: u64) -> Option<Shortfall> {
         let node = self.nodes.get(name)?;
         let silent_ms = node.silent_since_ms().map(|since_ms| now_ms.saturating_sub(since_ms));
-        // What came back in a new process is as good as gone until it is up.
+        // A node that returned in a new process counts as gone until it is up.
         let certain = !node.is_up();
         let shortfall = |item, code, what, seen: &str| {
             Some(Shortfall { item, code, what, seen: seen.to_owned(), certain })
@@ -332,7 +333,8 @@ impl Readiness {
         if self.promise.lifecycle.contains(name) {
             let too_silent = silent_ms.is_some_and(|ms| ms >= SILENCE_MS);
             let active = node.state() == Some(LifecycleState::Active) && !too_silent;
-            // Right after a restart of the agent nothing is known yet; that is no reason to doubt.
+            // Right after a restart of the agent nothing is known yet; that is no reason to doubt
+            // the node.
             let unknown = self.was_ready && node.is_up() && node.state().is_none() && !too_silent;
             if !active && !unknown {
                 let seen = match (node.state(), silent_ms) {
@@ -391,7 +393,7 @@ impl Readiness {
             (true, Some(rate)) => match rate.suffices() {
                 Some(true) => return None,
                 // Right after a restart of the agent nothing was counted yet; that is no reason to
-                // doubt.
+                // doubt the topic.
                 None if self.was_ready => return None,
                 None => (format!("`{name}` was not heard for long enough"), String::new()),
                 Some(false) => {
@@ -440,7 +442,7 @@ impl Readiness {
                 self.health = Health::Refused(refused);
                 return;
             }
-            // What one node that came back refuses is no reason to take down the others.
+            // A refusal by one node that returned is no reason to take down the others.
             Some(refused) => Some((refused.code, refused.text, String::new())),
             None => in_words(&counted),
         };
@@ -458,13 +460,13 @@ impl Readiness {
         self.was_ready |= self.has_held(now_ms);
     }
 
-    /// Whether all that was promised holds, and for long enough.
+    /// Whether all promises hold, and for long enough.
     fn has_held(&self, now_ms: u64) -> bool {
         let enough_ms = u64::from(self.promise.hold_s) * 1000;
         matches!(self.health, Health::Holds { since_ms } if now_ms.saturating_sub(since_ms) >= enough_ms)
     }
 
-    /// A name that somebody else has had for long enough.
+    /// A name that another owner has had for long enough.
     fn taken(&self, now_ms: u64) -> Option<Failure> {
         self.lasting.iter().find_map(|(item, lasting)| match (item, &lasting.said) {
             (Item::Alone(name), Some(said))
@@ -477,7 +479,7 @@ impl Readiness {
     }
 }
 
-/// What lacks, by the code of the first, and what is there instead; each said once.
+/// The shortfalls in words, with the code of the first and the state found instead; each text once.
 fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
     let code = counted.first()?.code.clone();
     let what =
@@ -491,7 +493,7 @@ fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
     Some((code, what, seen.join("; ")))
 }
 
-/// That somebody else has a name, in words that stand alone.
+/// States that another owner has a name, in words that stand alone.
 fn taken(name: &GraphName, whose: &str) -> String {
     format!("`{name}` is already on the graph: {whose}")
 }

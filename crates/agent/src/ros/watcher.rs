@@ -1,6 +1,6 @@
-//! Watches runs on the ROS graph: looks, asks and measures what [`crate::ros::readiness`] wants to
-//! know, and tells what came of it. Each watched run has one task, which ends with its receiver.
-//! What running means is not decided here.
+//! Watches runs on the ROS graph: observes, asks and measures everything that
+//! [`crate::ros::readiness`] needs, and reports the results. Each watched run has one tokio task,
+//! which ends with its receiver. This module does not decide when a run counts as running.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
@@ -25,18 +25,18 @@ mod whose;
 
 use whose::Whose;
 
-/// How often a run is looked at that is not ready, were the graph silent.
+/// Interval between looks at a run that is not ready, when the graph reports no change.
 const LOOK_STARTING: Duration = Duration::from_millis(250);
-/// And one that is: to see that a process has gone without a word.
+/// Interval between looks at a run that is ready: this detects a process that ended without notice.
 const LOOK_RUNNING: Duration = Duration::from_secs(1);
-/// How long a node may take to answer a question that costs it nothing.
+/// Maximum time for a node to answer a cheap question.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
-/// How long it may take to set parameters or make a transition before it is asked how far it came.
+/// Maximum time for a node to set parameters or make a transition, before its state is queried.
 const WORK_TIMEOUT: Duration = Duration::from_secs(15);
-/// How long the names of what was just stopped may take to leave the graph.
+/// Maximum time for the names of a stopped run to leave the graph.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
-/// When to ask again for a graph that could not be opened. How often it is tried is not decided
-/// here.
+/// Pause before the next request for a graph that could not be opened. [`GraphAccess`] decides how
+/// often opening is attempted.
 const RETRY: Duration = Duration::from_secs(2);
 /// A parameter that every node has.
 const EVERYWHERE: &str = "use_sim_time";
@@ -46,9 +46,9 @@ const EVERYWHERE: &str = "use_sim_time";
 pub struct Watched {
     /// Its run directory.
     pub dir: PathBuf,
-    /// When its process was started, in milliseconds since boot.
+    /// Start time of the run's process, in milliseconds since boot.
     pub started_ms: u64,
-    /// Whether it was ready once.
+    /// Whether the run was ready once.
     pub was_ready: bool,
 }
 
@@ -56,18 +56,18 @@ pub struct Watched {
 pub struct Watcher {
     access: GraphAccess,
     supervisor: Supervisor,
-    /// What ends the watch of each run directory.
+    /// The cancellation token for the watch of each run directory.
     watches: Arc<Mutex<HashMap<PathBuf, Arc<CancellationToken>>>>,
 }
 
 impl Watcher {
-    /// Sees through `access`, and tells by `supervisor` whose a process is.
+    /// Observes the graph through `access` and finds the owner of a process through `supervisor`.
     pub fn new(access: GraphAccess, supervisor: Supervisor) -> Self {
         Self { access, supervisor, watches: Arc::default() }
     }
 
-    /// Makes sure, before anything of a run is started, that its graph can be watched and that none
-    /// of its names is taken.
+    /// Checks, before any process of a run is started, that the graph can be watched and that none
+    /// of the run's names is taken.
     pub async fn before_start(
         &self,
         promise: &Promise,
@@ -78,7 +78,7 @@ impl Watcher {
         }
         let graph = self.access.settled(facts).await?;
         for node in promise.lifecycle.iter().chain(promise.parameters.keys()) {
-            // A node that finds the agent's clients answers the sooner; that is all that is lost.
+            // A node that finds the agent's clients answers sooner; a failure costs only that.
             if let Err(error) = graph.prepare(node).await {
                 tracing::warn!(%node, %error, "the calls to a node can't be prepared");
             }
@@ -89,7 +89,7 @@ impl Watcher {
             let snapshot = changes.borrow_and_update().clone();
             let whose = Whose::look(snapshot.clone(), Vec::new(), &BTreeSet::new(), None).await;
             let Some(failure) = promise.taken(&snapshot, &whose.others) else { return Ok(()) };
-            // What was stopped a moment ago may still be on its way out.
+            // Nodes of a run that was just stopped may still be leaving.
             let changed = tokio::time::timeout_at(deadline, changes.changed()).await;
             if !matches!(changed, Ok(Ok(()))) {
                 let named = whose.naming_takers(promise, &snapshot).await;
@@ -119,19 +119,19 @@ impl Watcher {
             let watching = watch_run(run, promise, facts, &access, supervisor, &health);
             tokio::select! {
                 () = watching => {}
-                // Cancel-safe: both can be awaited again, and the watch changes nothing that it
-                // would have to undo.
+                // Cancel-safe: both can be awaited again, and the watch makes no change that would
+                // need to be undone.
                 () = health.closed() => {}
                 () = over.cancelled() => health.closed().await,
             }
-            // The same run may be watched anew by now.
+            // The same run may have a new watch by now.
             lock(&watches).retain(|_, known| !Arc::ptr_eq(known, &over));
         });
         seen
     }
 
-    /// Ends the watch of a run and, within `time`, takes its lifecycle nodes down in good order.
-    /// What fails is logged: the signals that follow end it anyway.
+    /// Ends the watch of a run and, within `time`, shuts its lifecycle nodes down cleanly. Failures
+    /// are logged: the signals that follow end the nodes anyway.
     pub async fn wind_down(
         &self,
         dir: &Path,
@@ -173,7 +173,7 @@ impl Watcher {
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
-    // A map of tokens is sound whatever a panic left.
+    // A map of tokens stays valid after a panic.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -227,19 +227,19 @@ async fn watch_run(
     eyes.watch(readiness, health).await;
 }
 
-/// What it means for a run that the graph can't be seen.
+/// The consequence for a run when the graph can't be observed.
 fn blind(failure: Failure) -> Missing {
     let what = "the ROS graph could not be watched".to_owned();
     let (since_ms, code) = (clock::boot_ms(), FailureCode::GRAPH_UNAVAILABLE);
     Missing { since_ms, code, what, seen: failure.text, is_its_own: false }
 }
 
-/// What one run is seen with.
+/// The data for observing one run.
 struct Eyes {
     graph: Graph,
     supervisor: Supervisor,
     dir: PathBuf,
-    /// When its process was started; `None`: before this machine's clock began.
+    /// Start time of the run's process; `None`: before this machine's clock began.
     started: Option<std::time::Instant>,
     pids: Vec<u32>,
     pids_at: Option<Instant>,
@@ -248,7 +248,7 @@ struct Eyes {
     meters: BTreeMap<GraphName, RateMeter>,
 }
 
-/// How old the list of a run's processes may be.
+/// Maximum age of the list of a run's processes.
 const PIDS_AGE: Duration = Duration::from_secs(10);
 
 impl Eyes {
@@ -274,7 +274,7 @@ impl Eyes {
             let holds = matches!(seen, Health::Holds { .. });
             let look_again = if holds { LOOK_RUNNING } else { LOOK_STARTING };
             tokio::select! {
-                // Cancel-safe: what has been answered stays in the set until it is taken.
+                // Cancel-safe: an answer stays in the set until it is taken.
                 Some(answered) = asking.join_next() => {
                     if let Ok((question, answer)) = answered {
                         readiness.answered(&question, answer, clock::boot_ms());
@@ -315,7 +315,7 @@ impl Eyes {
         readiness.see(&Look { snapshot, ours, others, gone, counts: &counts }, clock::boot_ms());
     }
 
-    /// Counts the messages of topics with a least rate, once their type is known.
+    /// Counts the messages of topics with a minimum rate, once their type is known.
     fn meter(&mut self, snapshot: &Snapshot) {
         for (topic, _) in self.topics.iter().filter(|(_, min_hz)| min_hz.is_some()) {
             if self.meters.contains_key(topic) {
@@ -359,7 +359,7 @@ async fn ask(graph: &Graph, question: &Question) -> Answer {
     })
 }
 
-/// Sets parameters, each in the type that the node has given it.
+/// Sets parameters, each in the type that the node has declared.
 async fn set(
     graph: &Graph,
     node: &GraphName,

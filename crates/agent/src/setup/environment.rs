@@ -1,6 +1,6 @@
-//! The environment that builds and tasks start with: a short explicit list, nothing else of the
-//! agent's own. What the agent was started with (tokens, a virtual environment,
-//! `_ROS_WHEELS_BOOTSTRAP_COMPLETE`) never reaches a task.
+//! The environment that builds and tasks start with: a short explicit list, and no other variables
+//! of the agent's own. Variables that the agent was started with (tokens, a virtual environment,
+//! `_ROS_WHEELS_BOOTSTRAP_COMPLETE`) never reach a task.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use task_proto::report::RosFacts;
 
 use crate::setup::installation::{Installation, RosVersion};
 
-/// Passed on from the agent, with what to use where the agent has none.
+/// Variables passed on from the agent, with a default where the agent has none.
 const PASSED_ON: [(&str, Option<&str>); 6] = [
     ("PATH", Some("/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin")),
     ("HOME", Some("/")),
@@ -18,9 +18,9 @@ const PASSED_ON: [(&str, Option<&str>); 6] = [
     ("TZ", None),
 ];
 
-/// Variables that say how a robot's nodes find each other and what carries them; tasks get the
-/// agent's, where it has them. `ROS_DOMAIN_ID` is not among them: it is a setting, whose default is
-/// the agent's variable.
+/// Variables that control discovery and transport of the robot's nodes; tasks get the agent's
+/// values, where it has them. `ROS_DOMAIN_ID` is not among them: it is a setting, with the agent's
+/// variable as the default.
 pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_AUTOMATIC_DISCOVERY_RANGE",
     "ROS_STATIC_PEERS",
@@ -44,7 +44,7 @@ pub const ROS_VARIABLES: [&str; 20] = [
     "ROS_HOSTNAME",
 ];
 
-/// By what nodes with this environment meet, where the agent can't hear them.
+/// The discovery method of nodes with this environment, if the agent can't take part in it.
 pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str> {
     let value = |name| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
     match (value("RMW_IMPLEMENTATION"), value("ROS_DISCOVERY_SERVER")) {
@@ -54,8 +54,8 @@ pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str
     }
 }
 
-/// The environment made of the robot's settings (`ROS_DOMAIN_ID` and the like, which win) and of
-/// what `inherited` says about the few variables every program expects.
+/// The environment from the robot's settings (`ROS_DOMAIN_ID` and the like, which take precedence)
+/// and from the values in `inherited` of the few variables that every program expects.
 pub fn explicit(
     settings: &BTreeMap<String, String>,
     inherited: impl Fn(&str) -> Option<String>,
@@ -66,7 +66,7 @@ pub fn explicit(
         Some((name.to_owned(), value))
     });
     let mut environment: BTreeMap<_, _> = passed_on.collect();
-    // Without it Python holds a task's lines back until a buffer is full, and the log of a killed
+    // Otherwise Python holds a task's lines back until a buffer is full, and the log of a killed
     // task misses its end.
     environment.insert("PYTHONUNBUFFERED".to_owned(), "1".to_owned());
     environment.extend(settings.clone());
@@ -78,7 +78,7 @@ pub fn of_this_robot(settings: &BTreeMap<String, String>) -> BTreeMap<String, St
     explicit(settings, |name| std::env::var(name).ok())
 }
 
-/// How tasks that ask for nothing special meet ROS: the best of `installations` under their
+/// The ROS setup of tasks without special needs: the best of `installations` under their
 /// `environment`. `None` where there is no ROS.
 pub fn ros_facts(
     installations: &[Installation],

@@ -1,47 +1,49 @@
-//! A ROS installation as tasks use it: the setup files to source and what is in it. Pure: which one
-//! a task gets, and what a task would miss. Finding installations is `underlay`'s work, looking
-//! into them `ros::probe`'s.
+//! A ROS installation as tasks use it: the setup files to source and the contents of the
+//! installation. Pure: the choice of an installation for a task, and the packages that a task would
+//! miss. `underlay` finds installations, and `ros::probe` examines them.
 
 use std::collections::BTreeSet;
 use std::fmt;
 use std::path::PathBuf;
 
-/// Which of the two systems called ROS.
+/// The two systems called ROS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RosVersion {
-    /// With a master, `catkin` and `roslaunch`.
+    /// ROS with a master, `catkin` and `roslaunch`.
     Ros1,
-    /// With DDS, `colcon` and `ros2 launch`.
+    /// ROS with DDS, `colcon` and `ros2 launch`.
     Ros2,
 }
 
-/// Setup files that are sourced together, and what a task has then.
+/// Setup files that are sourced together, and the environment that they give a task.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Installation {
-    /// What bash sources, in this order; empty where everything is in the system's own directories.
+    /// The files that bash sources, in this order; empty where the whole installation is in the
+    /// system's own directories.
     pub setups: Vec<PathBuf>,
-    /// The distributions, for example `jazzy`, where they can be told.
+    /// The distributions, for example `jazzy`, where they are known.
     pub distros: Vec<String>,
-    /// Their versions of ROS; empty where that can't be told.
+    /// The ROS versions of the distributions; empty where unknown.
     pub versions: Vec<RosVersion>,
-    /// The packages that are there; `None` where nobody has looked, or nothing could be seen.
+    /// The installed packages; `None` where the installation was not examined, or the examination
+    /// failed.
     pub packages: Option<BTreeSet<String>>,
-    /// What its setup files choose as middleware.
+    /// The middleware that the setup files choose.
     pub rmw: Option<String>,
 }
 
 /// A robot without the ROS that a task needs.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NoInstallation {
-    /// There is none of this version.
+    /// There is no installation of this version.
     #[error("{0} (no {0} found{found})", found = also(.1))]
     Version(RosVersion, Vec<String>),
     /// None of the distributions the task accepts is installed.
     #[error("ros_distro {} (it has {})", wanted.join(" or "), if found.is_empty() { "none".to_owned() } else { found.join(", ") })]
     Distro {
-        /// What the task accepts.
+        /// The distributions that the task accepts.
         wanted: Vec<String>,
-        /// What the robot has.
+        /// The distributions of the robot.
         found: Vec<String>,
     },
 }
@@ -52,14 +54,14 @@ const PLAIN_NAMES: [&str; 6] = ["rclcpp", "rclpy", "ros2launch", "roscpp", "rosl
 const SYSTEM_NAMES: [&str; 1] = ["onvif_zeep"];
 
 impl Installation {
-    /// Whether it is of `version`, or may be.
+    /// Whether the installation is of `version`, or may be.
     fn may_be(&self, version: RosVersion) -> bool {
         self.versions.is_empty() || self.versions.contains(&version)
     }
 
-    /// Those of `needed` that are certainly not in it. Only names that can't be anything but ROS
-    /// packages are judged: others are keys of `rosdep` for what the operating system or pip
-    /// provides, which no index of ROS lists.
+    /// The packages of `needed` that are certainly missing. Only names that must be ROS packages
+    /// are judged: other names are keys of `rosdep` for packages of the operating system or pip,
+    /// which no index of ROS lists.
     pub fn lacks<'a>(&self, needed: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
         let Some(packages) = &self.packages else { return BTreeSet::new() };
         needed
@@ -70,15 +72,15 @@ impl Installation {
 }
 
 /// Whether only a ROS package can be called `name`. Of 4,210 released ROS packages nine in ten have
-/// an underscore, of 2,414 names of system packages one.
+/// an underscore; of 2,414 names of system packages one has.
 pub fn is_ros_package(name: &str) -> bool {
     let plain =
         name.bytes().all(|byte| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_');
     (plain && name.contains('_') && !SYSTEM_NAMES.contains(&name)) || PLAIN_NAMES.contains(&name)
 }
 
-/// The installation for a task that needs `version` (`None`: any will do, also none) of one of
-/// `distros` (none: any). The best one is the last of `installations`.
+/// The installation for a task that needs `version` (`None`: any version, or no ROS at all) of one
+/// of `distros` (none: any). The best one is the last of `installations`.
 pub fn choose<'a>(
     installations: &'a [Installation],
     version: Option<RosVersion>,

@@ -1,6 +1,5 @@
-//! What starts a task: `ros2 launch`, ROS 1's `roslaunch`, or a command of the package's own. One
-//! launcher each; all of them give a [`Launch`], which is everything that scripts and stops need to
-//! know about them. Pure.
+//! Launchers of tasks: `ros2 launch`, ROS 1's `roslaunch`, or a command from the package. Each
+//! launcher gives a [`Launch`] with all data that scripts and stops need. Pure.
 
 use std::collections::BTreeMap;
 
@@ -9,28 +8,28 @@ use task_proto::manifest::{BuildTool, TaskManifest};
 
 use crate::setup::installation::RosVersion;
 
-/// How a task is started, and what a stop must respect.
+/// The way a task is started, and the constraints for a stop.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Launch {
     /// The command and its arguments, as they reach the program: nothing in them is shell.
     pub command: Vec<String>,
-    /// Who gets the SIGINT with which a stop begins.
+    /// The processes that get the SIGINT with which a stop begins.
     pub interrupt: Interrupt,
-    /// The ROS it can't do without.
+    /// The ROS version that the launcher requires.
     pub ros: Option<RosVersion>,
-    /// The ROS package that brings the launcher.
+    /// The ROS package that contains the launcher.
     pub package: Option<&'static str>,
 }
 
-/// Who gets the SIGINT with which a stop begins.
+/// The processes that get the SIGINT with which a stop begins.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Interrupt {
-    /// The whole process group, as Ctrl-C in a terminal does it: a shell script passes nothing on.
+    /// The whole process group, like Ctrl-C in a terminal: a shell script does not forward signals.
     #[default]
     Group,
     /// The first process alone, which ends its children in its own order. Without a terminal
-    /// `ros2 launch` sends each node a SIGINT of its own; a second one would break into the node's
+    /// `ros2 launch` sends each node a SIGINT of its own; a second one would interrupt the node's
     /// clean-up.
     Leader,
 }
@@ -43,7 +42,7 @@ pub fn of(manifest: &TaskManifest) -> Launch {
         (Some(file), _) => ros2_launch(file, &run.args),
         (None, command) => exec(command.as_deref().unwrap_or_default()),
     };
-    // The build tool comes with its ROS, whatever is run then.
+    // The build tool comes with its ROS, whatever the launcher.
     launch.ros = launch.ros.or(match tool {
         BuildTool::Colcon => Some(RosVersion::Ros2),
         BuildTool::Catkin => Some(RosVersion::Ros1),
@@ -62,8 +61,8 @@ fn ros2_launch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Laun
     }
 }
 
-/// It puts the master and each node in a session of its own and ends them in that order; a group
-/// would miss them.
+/// `roslaunch` puts the master and each node in a session of its own and ends them in that order; a
+/// signal to the group would miss them.
 fn roslaunch(file: &[String; 2], arguments: &BTreeMap<String, String>) -> Launch {
     let command = words(&["roslaunch"], file, arguments);
     Launch {

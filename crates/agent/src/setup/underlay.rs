@@ -1,6 +1,6 @@
-//! The ROS installations that a task builds and runs on: the ones a person configured, else what is
-//! in `/opt/ros` and the ROS 1 of the operating system. It finds and names them; sourcing them is
-//! the generated scripts' work. Nothing is ever written into an underlay.
+//! The ROS installations that a task builds and runs on: the configured ones, or else those in
+//! `/opt/ros` and the ROS 1 of the operating system. This module finds and names them; the
+//! generated scripts source them. It never writes into an underlay.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -8,40 +8,40 @@ use std::path::{Path, PathBuf};
 
 use crate::setup::installation::{Installation, NoInstallation, RosVersion, choose};
 
-/// The distribution's name where ROS 1 comes with the operating system (Debian and Ubuntu have
-/// `catkin` and `roslaunch` in `/usr`, without a setup file): what it calls itself, in lower case.
+/// Name of the distribution where ROS 1 comes with the operating system: the system's own name, in
+/// lower case. Debian and Ubuntu have `catkin` and `roslaunch` in `/usr`, without a setup file.
 const SYSTEM_DISTRO: &str = "debian";
 
-/// Where to look.
+/// Directories that are searched for installations.
 #[derive(Debug, Clone)]
 pub struct Places {
-    /// Where ROS installs itself, a directory for each distribution.
+    /// Installation directory of ROS, with a subdirectory for each distribution.
     pub distros: PathBuf,
-    /// Where the operating system has its programs.
+    /// Directory of the operating system's programs.
     pub system: PathBuf,
 }
 
-/// No setup files for a task.
+/// Reasons why a task has no setup files.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UnderlayError {
-    /// A configured file is not there.
+    /// A configured file does not exist.
     #[error("underlays, workspace: {} is not there", .0.display())]
     Missing(PathBuf),
-    /// The robot does not have it.
+    /// The robot lacks the required ROS.
     #[error("this robot lacks what the task needs: {0}")]
     NotInstalled(NoInstallation),
 }
 
 impl Places {
-    /// Those of this machine.
+    /// The directories of this machine.
     pub fn of_this_machine() -> Self {
         Self { distros: "/opt/ros".into(), system: "/usr".into() }
     }
 }
 
-/// What tasks can use, the best last: the `configured` setup files, which are sourced all together,
-/// or everything there is, ROS 2 after ROS 1 and newer after older (the names of distributions rise
-/// with the alphabet).
+/// The installations that tasks can use, the best last: the `configured` setup files, which are
+/// sourced all together, or else every installation found, ROS 2 after ROS 1 and newer after older
+/// (the names of distributions rise with the alphabet).
 pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
     let mut found: Vec<Installation> = Vec::new();
     if ["catkin", "roslaunch"]
@@ -61,12 +61,12 @@ pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
     }
     let setups = children(&places.distros).into_iter().map(|dir| dir.join("setup.bash"));
     found.extend(setups.filter(|setup| setup.is_file()).map(|setup| together(&[setup])));
-    // Stable: of one version they stay in the order of their names, the system's first.
+    // Stable: installations of one version stay in the order of their names, the system's first.
     found.sort_by(|one, other| one.versions.cmp(&other.versions));
     found
 }
 
-/// What tasks can use on this machine, by the settings that hold.
+/// The installations that tasks can use on this machine, by the effective settings.
 pub fn by_settings(underlays: &[PathBuf], workspace: Option<&Path>) -> Vec<Installation> {
     let found = find(underlays, &Places::of_this_machine());
     match workspace {
@@ -75,8 +75,8 @@ pub fn by_settings(underlays: &[PathBuf], workspace: Option<&Path>) -> Vec<Insta
     }
 }
 
-/// What was `found` with a person's own `workspace` on top of each installation of the same ROS, or
-/// alone where there is none.
+/// The `found` installations with the configured `workspace` on top of each installation of the
+/// same ROS, or alone where there is none.
 pub fn with_workspace(mut found: Vec<Installation>, workspace: &Path) -> Vec<Installation> {
     let devel = workspace.join("devel/setup.bash");
     let setup = if devel.is_file() { devel } else { workspace.join("install/setup.bash") };
@@ -126,19 +126,20 @@ fn together(setups: &[PathBuf]) -> Installation {
     }
 }
 
-/// Which ROS a setup file belongs to; a workspace on top of another does not say.
+/// The ROS version of a setup file; `None` for a workspace on top of another, which does not state
+/// its version.
 fn version_of(setup: &Path) -> Option<RosVersion> {
     let dir = setup.parent()?;
     if dir.join(".catkin").exists() {
         return Some(RosVersion::Ros1);
     }
     let holds_ros_2 = dir.join("share/ament_index").is_dir() || wheels_of(dir).is_some();
-    // Every distribution in the place of distributions that catkin did not make is of ROS 2.
+    // In the directory of distributions, every distribution that catkin did not make is ROS 2.
     (holds_ros_2 || is_below_ros(dir)).then_some(RosVersion::Ros2)
 }
 
-/// The distribution a setup file belongs to: what its installation says, else the ROS wheels in its
-/// virtual environment (which may well be called `ros`), else the directory's name below `ros`.
+/// The distribution of a setup file: from its installation, else from the ROS wheels in its virtual
+/// environment (which may well be called `ros`), else the directory's name below `ros`.
 fn distro_of(setup: &Path) -> Option<String> {
     let dir = setup.parent()?;
     let said =
@@ -153,7 +154,7 @@ fn distro_of(setup: &Path) -> Option<String> {
     })
 }
 
-/// The distribution of the ROS wheels in the virtual environment whose programs are in `bin`.
+/// The distribution of the ROS wheels in the virtual environment with its programs in `bin`.
 fn wheels_of(bin: &Path) -> Option<String> {
     let pythons = children(&bin.parent()?.join("lib"));
     let mut installed = pythons.iter().flat_map(|python| children(&python.join("site-packages")));
@@ -198,7 +199,7 @@ mod tests {
         let places = places(temp.path());
         let [humble, jazzy] =
             ["humble", "jazzy"].map(|distro| touch(places.distros.join(distro).join("setup.bash")));
-        // Its name comes last, but it is of ROS 1.
+        // This name comes last in the alphabet, but the distribution is ROS 1.
         let noetic = touch(places.distros.join("noetic/setup.bash"));
         touch(places.distros.join("noetic/.catkin"));
         fs::create_dir(places.distros.join("removed")).unwrap();
@@ -215,7 +216,7 @@ mod tests {
     #[test]
     fn a_virtual_environment_is_an_underlay_and_a_missing_file_is_named() {
         let temp = tempfile::tempdir().unwrap();
-        // Its name must not be taken for the place where distributions are installed.
+        // This name must not be mistaken for the directory where distributions are installed.
         let venv = temp.path().join("ros");
         let activate = touch(venv.join("bin/activate"));
         touch(venv.join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
@@ -239,7 +240,7 @@ mod tests {
         let found = find(&[], &places);
         assert_eq!((all_distros(&found), found.len()), (vec!["debian".to_owned()], 1));
         assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &["debian".to_owned()]), Ok(vec![]));
-        // It stays usable beside a ROS 2 that a person configured.
+        // It stays usable beside a configured ROS 2.
         let jazzy = touch(places.distros.join("jazzy/setup.bash"));
         let found = find(std::slice::from_ref(&jazzy), &places);
         assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &[]), Ok(vec![]));

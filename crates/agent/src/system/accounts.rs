@@ -1,8 +1,8 @@
-//! Which account each task runs under, where the agent is root: two user ids of the range in the
-//! settings, one for its processes and one for its builds, so that neither a neighbour nor an older
-//! version that still runs has rights over either. The ids stay the task's own for as long as its
-//! directory is there, and are the last to be given to another task afterwards. The groups are
-//! those of `task_user`. Nothing is entered in the system's list of accounts.
+//! The account of each task, where the agent is root: two user ids of the range in the settings,
+//! one for the task's processes and one for its builds. So neither a neighbour nor an older version
+//! that still runs has rights over either. The ids belong to the task as long as its directory
+//! exists; afterwards they are the last to be given to another task. The groups are those of
+//! `task_user`. The module writes no entry in the system's list of accounts.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -19,35 +19,35 @@ use crate::system::durable;
 use crate::system::layout::DataDir;
 use crate::system::task_user::TaskUser;
 
-/// Where every account may leave files that outlive its task.
+/// Directories where every account may leave files that outlive its task.
 const PUBLIC_DIRECTORIES: [&str; 4] = ["/tmp", "/var/tmp", "/dev/shm", "/dev/mqueue"];
-/// Ids of one task.
+/// Number of user ids per task.
 const PER_TASK: u32 = 2;
 
 /// The accounts of a robot's tasks.
 #[derive(Debug)]
 pub struct Accounts {
     data: DataDir,
-    /// The user ids there are; `None`: all tasks share one account.
+    /// The available user ids; `None`: all tasks share one account.
     range: Option<RangeInclusive<u32>>,
-    /// Read when the first task asks.
+    /// Loaded when the first task asks for its accounts.
     book: Mutex<Option<Book>>,
 }
 
-/// Whom a task and its builds run as.
+/// The accounts of a task and its builds.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AccountPair {
-    /// Its processes.
+    /// Account of the task's processes.
     pub run: TaskUser,
-    /// Its builds.
+    /// Account of the task's builds.
     pub build: TaskUser,
 }
 
-/// What is on the disk: the first of each task's ids.
+/// Content of the file on disk: the first of each task's ids.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 struct Book {
     tasks: BTreeMap<TaskName, u32>,
-    /// Of tasks that were removed, the longest gone first.
+    /// First ids of tasks that were removed, the earliest removal first.
     #[serde(default)]
     former: Vec<(TaskName, u32)>,
 }
@@ -58,13 +58,13 @@ impl Accounts {
         Self { data, range, book: Mutex::new(None) }
     }
 
-    /// Whether each task has its own.
+    /// Whether each task has its own accounts.
     pub fn are_per_task(&self) -> bool {
         self.range.is_some()
     }
 
-    /// The accounts of `task`, which are its own from now on, also after a power cut. They have the
-    /// groups of `base`.
+    /// The accounts of `task`, which belong to it from now on, also after a power cut. They have
+    /// the groups of `base`.
     pub fn of(&self, task: &TaskName, base: &TaskUser) -> io::Result<AccountPair> {
         let Some(range) = &self.range else {
             return Ok(AccountPair { run: base.clone(), build: base.clone() });
@@ -92,7 +92,7 @@ impl Accounts {
         Ok(AccountPair { run: base.with_id(id), build: base.with_id(id + 1) })
     }
 
-    /// Notes that nothing of `task` is left in the agent's directory.
+    /// Records that `task` has no files left in the agent's directory.
     pub fn release(&self, task: &TaskName) -> io::Result<()> {
         let mut book = self.book.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(range) = &self.range else { return Ok(()) };
@@ -108,7 +108,8 @@ impl Accounts {
         Ok(())
     }
 
-    /// What was noted, and what the owners of home directories say where that is lost.
+    /// The recorded ids. If the record is lost, they are recovered from the owners of home
+    /// directories.
     fn read(&self, range: &RangeInclusive<u32>) -> io::Result<Book> {
         let path = self.data.accounts();
         let mut book = match fs::read(&path) {
@@ -134,8 +135,8 @@ impl Accounts {
         durable::write(&self.data.accounts(), &serde_json::to_vec_pretty(book)?, 0o600)
     }
 
-    /// Whether nobody has this id: no account of the system, and no file where everybody may leave
-    /// one.
+    /// Whether this id is unused: it has no account on the system, and owns no file in a public
+    /// directory.
     fn is_free(&self, id: u32) -> bool {
         let text =
             |path: &str| String::from_utf8_lossy(&fs::read(path).unwrap_or_default()).into_owned();
@@ -148,8 +149,8 @@ impl Accounts {
 }
 
 impl Book {
-    /// Gives `task` the first id of a pair: the one that it had, else one that nobody had, else the
-    /// one that was given back first.
+    /// Gives `task` the first id of a pair: the id that the task had before, else one that no task
+    /// had, else the one that was released first.
     fn assign(
         &mut self,
         task: &TaskName,
@@ -188,7 +189,7 @@ fn has_pair(range: &RangeInclusive<u32>, id: u32) -> bool {
     range.contains(&id) && range.contains(&id.saturating_add(1))
 }
 
-/// Whether something lies in the directories that are open to all which belongs to this id.
+/// Whether this id owns a file in the public directories.
 fn owns_public_files(id: u32) -> bool {
     let owns_in = |dir: &str| {
         let entries = fs::read_dir(Path::new(dir)).into_iter().flatten().flatten();
@@ -235,7 +236,7 @@ mod tests {
         assert_eq!(again.of(&name("b"), &base()).expect("assigned").run.uid, 3_000_002);
         assert_eq!(again.of(&name("a"), &base()).expect("known"), first);
         assert_eq!(accounts(temp.path(), RANGE).of(&name("a"), &base()).expect("known"), first);
-        // Another range: those outside of it are given up.
+        // Another range: ids outside of it are given up.
         assert_eq!(
             accounts(temp.path(), 3_000_010..=3_000_011)
                 .of(&name("a"), &base())

@@ -1,19 +1,20 @@
-//! What is left of the robot's battery, as the kernel says. It decides nothing by it.
+//! The charge of the robot's battery, as reported by the kernel. This module decides nothing.
 
 use std::fs;
 use std::path::Path;
 
-/// Where the kernel lists what gives the machine its power.
+/// The kernel's directory of power supplies.
 pub const SUPPLIES: &str = "/sys/class/power_supply";
 
-/// How full the first battery in `supplies` is; `None` where there is none that says so.
+/// Charge of the first battery in `supplies`, in percent; `None` where no battery reports its
+/// charge.
 pub fn percent(supplies: &Path) -> Option<u8> {
     let mut names: Vec<_> =
         fs::read_dir(supplies).ok()?.flatten().map(|entry| entry.path()).collect();
     names.sort();
     names.iter().find_map(|supply| {
         let says = |file: &str| Some(fs::read_to_string(supply.join(file)).ok()?.trim().to_owned());
-        // The battery of a mouse is one too, of another scope.
+        // The battery of a mouse is listed too, with another scope.
         let is_of_robot =
             says("type")? == "Battery" && says("scope").is_none_or(|scope| scope != "Device");
         says("capacity").filter(|_| is_of_robot)?.parse().ok().filter(|percent| *percent <= 100)

@@ -1,5 +1,5 @@
-//! Whether a package fits on the disk: blob, unpacked tree, build and a reserve, checked before
-//! anything travels. It never frees anything.
+//! Checks whether a package fits on the disk: blob, unpacked tree, build and a reserve, before any
+//! transfer. This module never frees any space.
 
 use std::io;
 use std::path::Path;
@@ -8,30 +8,30 @@ use std::time::Duration;
 use task_proto::desired::PackageRef;
 use task_proto::manifest::{BuildTool, TaskManifest};
 
-/// What a file costs beyond its bytes: a block that is only partly used, and an inode.
+/// Disk cost of a file beyond its bytes: a block that is only partly used, and an inode.
 const BYTES_PER_ENTRY: u64 = 4096 + 256;
 /// A build and its install tree together take about this many times the sources.
 const BUILD_FACTOR: u64 = 2;
 
-/// How long to wait before a full disk is looked at again: somebody has to make room.
+/// Pause before a full disk is checked again: a person has to make room.
 pub const FULL_PAUSE: Duration = Duration::from_secs(5 * 60);
-/// With less than this free, whatever failed may have failed for want of room.
+/// With less than this free, a failure may be due to lack of room.
 const NO_ROOM_BYTES: u64 = 16 * 1024 * 1024;
 
-/// The bytes that one package needs, by what they are for.
+/// The bytes that one package needs, by purpose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Need {
-    /// The compressed content, as far as it is not there yet.
+    /// The missing part of the compressed content.
     pub blob: u64,
     /// The unpacked tree.
     pub tree: u64,
     /// Build and install trees.
     pub build: u64,
-    /// What must stay free for everything else on the machine.
+    /// Bytes that must stay free for everything else on the machine.
     pub reserve: u64,
 }
 
-/// There is not enough room. Its text is the failure's text and has all the figures.
+/// There is not enough room. The error's text is the failure's text and has all the figures.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{free} of {total} bytes are free, {} are needed: {} for the package, {} for its tree, {} for the build, {} in reserve",
@@ -40,9 +40,9 @@ pub struct Need {
 pub struct DiskFull {
     /// Free bytes on the data directory's file system.
     pub free: u64,
-    /// Its size.
+    /// Size of the file system in bytes.
     pub total: u64,
-    /// What it would have taken.
+    /// The room that the package would have needed.
     pub need: Need,
 }
 
@@ -56,7 +56,7 @@ pub struct Room {
 }
 
 impl Need {
-    /// What `package` needs when `present` bytes of its content are there already.
+    /// The room that `package` needs when `present` bytes of its content are on the disk already.
     pub fn of(package: &PackageRef, manifest: &TaskManifest, present: u64, reserve: u64) -> Self {
         let facts = &manifest.content;
         let tree = facts.tar_size.saturating_add(facts.entries.saturating_mul(BYTES_PER_ENTRY));
@@ -67,17 +67,17 @@ impl Need {
         Self { blob: package.content.size.saturating_sub(present), tree, build, reserve }
     }
 
-    /// What one more small file needs.
+    /// The room that one more small file needs.
     pub fn of_file(bytes: u64) -> Self {
         Self { blob: bytes.saturating_add(BYTES_PER_ENTRY), tree: 0, build: 0, reserve: 0 }
     }
 
-    /// All of it.
+    /// Sum of all needs.
     pub fn total(&self) -> u64 {
         [self.tree, self.build, self.reserve].into_iter().fold(self.blob, u64::saturating_add)
     }
 
-    /// Whether it fits into `room`.
+    /// Checks whether the need fits into `room`.
     pub fn check(self, room: Room) -> Result<(), DiskFull> {
         if self.total() <= room.free {
             return Ok(());
@@ -87,7 +87,7 @@ impl Need {
 }
 
 impl Room {
-    /// Whether hardly anything can be written any more.
+    /// Whether the disk is nearly full, so that hardly anything can be written.
     pub fn is_used_up(self) -> bool {
         self.free < NO_ROOM_BYTES
     }

@@ -1,6 +1,6 @@
-//! Changes to the file system that survive a power cut: once a function here returns, a reader
-//! finds the new state, and until then the old one, never half of it. It knows nothing of what the
-//! files mean.
+//! Changes to the file system that survive a power cut: once a function of this module returns, a
+//! reader finds the new state, and until then the old one, never a mixture. The module does not
+//! interpret the files.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -15,12 +15,12 @@ mod removal;
 
 pub use removal::remove_dir_all;
 
-/// Replaces the file at `path` by one that holds `bytes` and has `mode`. One writer per path at a
-/// time.
+/// Replaces the file at `path` by one that contains `bytes` and has `mode`. One writer per path at
+/// a time.
 pub fn write(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     let temporary = beside(path, ".tmp");
-    // What a crash left behind must not lend the new file its mode, nor be followed if it is a
-    // link.
+    // A file left by a crash must not pass its mode on to the new file, and must not be followed if
+    // it is a link.
     remove_file(&temporary)?;
     let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&temporary)?;
     file.set_permissions(fs::Permissions::from_mode(mode))?;
@@ -29,7 +29,7 @@ pub fn write(path: &Path, bytes: &[u8], mode: u32) -> io::Result<()> {
     rename(&temporary, path)
 }
 
-/// Makes `path` a symbolic link to `target`, replacing a link or file that is there.
+/// Makes `path` a symbolic link to `target`, replacing an existing link or file.
 pub fn write_link(path: &Path, target: &Path) -> io::Result<()> {
     let temporary = beside(path, ".tmp");
     remove_file(&temporary)?;
@@ -37,7 +37,7 @@ pub fn write_link(path: &Path, target: &Path) -> io::Result<()> {
     rename(&temporary, path)
 }
 
-/// Renames. What `from` holds must have been synced before.
+/// Renames `from` to `to`. The contents of `from` must have been synced before.
 pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
     fs::rename(from, to)?;
     sync_dir(parent(to))?;
@@ -47,7 +47,8 @@ pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
     Ok(())
 }
 
-/// Creates a directory and those above it, only for their owner: what lies in them is the agent's.
+/// Creates a directory and its parents, accessible to their owner only: the contents belong to the
+/// agent.
 pub fn create_dir_all(path: &Path) -> io::Result<()> {
     if path.is_dir() {
         return Ok(());
@@ -62,25 +63,25 @@ pub fn create_dir_all(path: &Path) -> io::Result<()> {
     }
 }
 
-/// Removes a file or link, if it is there.
+/// Removes a file or link, if it exists.
 pub fn remove_file(path: &Path) -> io::Result<()> {
     absent_is_fine(fs::remove_file(path))
 }
 
-/// Brings everything written on the file system that holds the directory `path` to the disk. One
-/// call for a whole tree: syncing its files one by one takes many times as long. A link, pipe or
-/// device in its place is refused unopened.
+/// Flushes all data of the file system that holds the directory `path` to the disk. One call covers
+/// a whole tree: syncing its files one by one takes many times as long. A link, pipe or device at
+/// `path` is refused unopened.
 pub fn sync_file_system(path: &Path) -> io::Result<()> {
     Ok(nix::unistd::syncfs(open_dir(path, OFlag::O_NOFOLLOW)?)?)
 }
 
-/// Brings a directory's entries to the disk.
+/// Flushes a directory's entries to the disk.
 pub fn sync_dir(path: &Path) -> io::Result<()> {
     open_dir(path, OFlag::empty())?.sync_all()
 }
 
-/// Opens a directory. Anything else is refused without being opened: a pipe would keep the caller
-/// waiting, and opening a device may already change something.
+/// Opens a directory. Other file types are refused without being opened: a pipe would block the
+/// caller, and opening a device may already have an effect.
 fn open_dir(path: &Path, flags: OFlag) -> io::Result<File> {
     let flags = OFlag::O_DIRECTORY | flags;
     OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)

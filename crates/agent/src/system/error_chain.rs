@@ -1,4 +1,4 @@
-//! An error's text with those of its causes. It decides nothing.
+//! The text of an error with the texts of its causes. This module decides nothing.
 
 use std::error::Error;
 

@@ -1,6 +1,6 @@
-//! Who this robot is: `identity.json` (0600), written by `enroll` and when the token
-//! changes, and the MAC it was registered by. Finding the MAC
-//! reads `/sys/class/net`; nothing here talks to the server.
+//! The robot's identity: `identity.json` (0600), written by `enroll` and when the token changes,
+//! and the MAC address that the robot was registered by. Finding the MAC reads `/sys/class/net`;
+//! this module does not talk to the server.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,40 +14,40 @@ use task_transport::ClientKey;
 use crate::system::durable;
 use crate::system::permanent_address;
 
-/// Where the kernel lists network interfaces.
+/// The kernel's directory of network interfaces.
 const INTERFACES: &str = "/sys/class/net";
-/// The kernel's "the address is the hardware's own" in `addr_assign_type`.
+/// Value of `addr_assign_type` for the hardware's own address.
 const PERMANENT: &str = "0";
 
 /// A registered robot.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Identity {
-    /// What the server calls it, for ever.
+    /// The robot's permanent id at the server.
     pub robot_id: RobotId,
-    /// Its bearer token and MQTT password.
+    /// The robot's bearer token and MQTT password.
     pub token: String,
-    /// The token after it, from before its first use until that is seen to have worked.
+    /// The next token, from before its first use until the agent has seen it work.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_token: Option<String>,
-    /// Since when `token` is the one, by this robot's clock.
+    /// Time from which `token` has been in use, by this robot's clock.
     #[serde(default)]
     pub token_since_ms: u64,
-    /// The server it registered at.
+    /// The server that the robot registered at.
     pub server: String,
-    /// The key that signs its desired states.
+    /// The key that signs the robot's desired states.
     pub server_key: PublicKey,
-    /// The certificate authority that made the server's certificate; absent: the system's roots
-    /// vouch for it, if it has one.
+    /// The certificate authority of the server's certificate; absent: the system's roots verify the
+    /// server's certificate, if it has one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
-    /// The key that it shows where clients are asked for a certificate.
+    /// The robot's key for TLS client authentication.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub client_key: Option<ClientKey>,
-    /// How to reach MQTT.
+    /// Address of the MQTT broker.
     pub mqtt: MqttEndpoint,
-    /// The MAC it was registered by.
+    /// The MAC address that the robot was registered by.
     pub mac: MacAddress,
-    /// Whether it had to wait to be approved when `enroll` was last heard of.
+    /// Whether the robot was waiting for approval at the last answer to `enroll`.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub awaits_approval: bool,
 }
@@ -55,28 +55,28 @@ pub struct Identity {
 /// The identity can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum IdentityError {
-    /// There is none.
+    /// The robot has no identity.
     #[error("this robot is not registered: run task-agent enroll (no {0})")]
     Missing(PathBuf),
-    /// The file fails.
+    /// Reading or writing the file failed.
     #[error("cannot use {path}")]
     Io {
-        /// Which.
+        /// The file's path.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The file is not an identity.
     #[error("{path} is not an identity")]
     Malformed {
-        /// Which.
+        /// The file's path.
         path: PathBuf,
-        /// What the parser said.
+        /// The parser's error.
         source: serde_json::Error,
     },
 }
 
-/// Why no MAC was chosen.
+/// Reasons why no MAC address was chosen.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum MacError {
     /// There is no physical network interface.
@@ -84,7 +84,7 @@ pub enum MacError {
         "no physical network interface with an address was found: give the robot's MAC with --mac"
     )]
     NoneFound,
-    /// All there are have addresses that were made up.
+    /// All interfaces have made-up addresses.
     #[error(
         "the addresses of this robot's network interfaces are made up, not the hardware's own ({0}): \
          give the MAC it shall be known by with --mac"
@@ -105,7 +105,7 @@ impl Identity {
         }
     }
 
-    /// Writes it, readable by its owner only.
+    /// Writes the identity, readable by its owner only.
     pub fn write(&self, path: &Path) -> Result<(), IdentityError> {
         let bytes = serde_json::to_vec_pretty(self)
             .map_err(|source| IdentityError::Malformed { path: path.to_owned(), source })?;
@@ -114,15 +114,15 @@ impl Identity {
     }
 }
 
-/// [`find_mac`] on this machine.
+/// Runs [`find_mac`] on this machine.
 pub fn find_own_mac() -> Result<MacAddress, MacError> {
-    // An interface that can't be asked is as one that has no answer.
+    // An interface that can't be queried counts as one without an answer.
     find_mac(Path::new(INTERFACES), |name| permanent_address::of(name).ok().flatten())
 }
 
-/// The MAC to register by: the permanent address of the first physical interface below
-/// `interfaces`, by name, so that `eth0` comes before `wlan0`. For one that uses another address
-/// `permanent` tells the hardware's own, if it can.
+/// The MAC address to register by: the permanent address of the first physical interface below
+/// `interfaces`, by name, so that `eth0` comes before `wlan0`. For an interface that uses another
+/// address, `permanent` returns the hardware's own, if possible.
 pub fn find_mac(
     interfaces: &Path,
     permanent: impl Fn(&str) -> Option<MacAddress>,
@@ -195,7 +195,7 @@ mod tests {
                 && error.contains("usb0")
                 && error.contains("--mac")
         );
-        // The Wi-Fi made one up, but its hardware has one.
+        // The Wi-Fi interface uses a made-up address, but its hardware has a permanent one.
         let burned_in =
             |name: &str| (name == "usb0").then(|| "00:11:22:33:44:99".parse().expect("valid"));
         assert_eq!(

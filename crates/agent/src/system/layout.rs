@@ -1,4 +1,4 @@
-//! Where everything lies in the agent's data directory:
+//! Paths in the agent's data directory:
 //!
 //! ```text
 //! identity.json                     who this robot is (0600)
@@ -26,7 +26,8 @@
 //!   node_logs/                      what its nodes write into logs of their own
 //! ```
 //!
-//! It owns names, and what may be cleaned away; what is in the files is their owners' affair.
+//! This module owns the names and the rules for cleaning up. The contents of the files belong to
+//! the modules that write them.
 
 use std::fs;
 use std::io;
@@ -36,15 +37,16 @@ use task_proto::{Digest, TaskName};
 
 use crate::system::durable;
 
-/// The flag file by which `hold` and `release` speak to the agent.
+/// The flag file by which `hold` and `release` communicate with the agent.
 pub const HOLD_FILE: &str = "hold";
 
-/// What a directory is called while it is being removed; no task or version can have such a name.
-/// Were it removed in place, a power cut would leave half a tree where a whole one is expected.
+/// Name prefix of a directory while it is being removed; no task or version can have such a name.
+/// If a directory were removed in place, a power cut would leave a partial tree where a whole one
+/// is expected.
 const REMOVED: &str = ".removed-";
-/// What follows a version's name in that of the file with its signatures.
+/// Suffix of the file with a version's signatures, after the version's name.
 const SIGNATURES: &str = ".signatures";
-/// And in that of the file that says what was unpacked and built.
+/// Suffix of the file with the digests of a version's unpacked and built files.
 const SEAL: &str = ".seal";
 
 /// The agent's data directory.
@@ -53,13 +55,13 @@ pub struct DataDir {
     root: PathBuf,
 }
 
-/// What belongs to one task.
+/// Files and directories of one task.
 #[derive(Debug, Clone)]
 pub struct TaskDir {
     root: PathBuf,
 }
 
-/// What belongs to one version of a task.
+/// Files and directories of one version of a task.
 #[derive(Debug, Clone)]
 pub struct VersionDir {
     root: PathBuf,
@@ -76,47 +78,47 @@ impl DataDir {
         &self.root
     }
 
-    /// Who this robot is.
+    /// File with the robot's identity.
     pub fn identity(&self) -> PathBuf {
         self.root.join("identity.json")
     }
 
-    /// What the agent was doing.
+    /// File with the agent's state of its tasks.
     pub fn ledger(&self) -> PathBuf {
         self.root.join("ledger.json")
     }
 
-    /// The list of publishers the agent goes by.
+    /// File with the list of publishers that the agent obeys.
     pub fn publishers(&self) -> PathBuf {
         self.root.join("publishers.json")
     }
 
-    /// Which account each task runs under.
+    /// File with the account of each task.
     pub fn accounts(&self) -> PathBuf {
         self.root.join("accounts.json")
     }
 
-    /// Where a blob's bytes gather while they are being pulled.
+    /// File that collects a blob's bytes while they are being pulled.
     pub fn blob_part(&self, digest: &Digest) -> PathBuf {
         self.blobs().join(format!("{}.part", digest.hex()))
     }
 
-    /// Where a blob's bytes gather while they are pushed in parts.
+    /// File that collects a blob's bytes while they are pushed in parts.
     pub fn blob_parts(&self, digest: &Digest) -> PathBuf {
         self.blobs().join(format!("{}.parts", digest.hex()))
     }
 
-    /// Which of those parts are there.
+    /// File that records which of those parts are on the disk.
     pub fn blob_parts_note(&self, digest: &Digest) -> PathBuf {
         self.blobs().join(format!("{}.parts-note", digest.hex()))
     }
 
-    /// Where trees are unpacked before they get their place.
+    /// Directory where trees are unpacked before they are renamed into place.
     pub fn staging(&self) -> PathBuf {
         self.root.join("staging")
     }
 
-    /// What nodes say on ROS topics that are of no task.
+    /// Log of the messages on ROS topics from nodes that belong to no task.
     pub fn ros_log(&self) -> PathBuf {
         self.root.join("logs").join("ros.log")
     }
@@ -126,14 +128,14 @@ impl DataDir {
         TaskDir { root: self.tasks().join(name.as_str()) }
     }
 
-    /// The directories on the way to what belongs to a task.
+    /// The directories that lead to a task's files.
     pub fn way_to(&self, name: &TaskName) -> [PathBuf; 3] {
         [self.root.clone(), self.tasks(), self.task(name).root]
     }
 
-    /// Removes what an agent that died left half done: trees half unpacked or half removed. Only at
-    /// start: a pull in progress would lose its tree. What can't be removed keeps nothing else from
-    /// it.
+    /// Removes partial work of an agent that died: partly unpacked or partly removed trees. Call it
+    /// only at start: a pull in progress would lose its tree. An entry that can't be removed does
+    /// not stop the removal of the others.
     pub fn clean_leftovers(&self) -> io::Result<()> {
         let tasks = entries(&self.tasks())?;
         let mut outcomes = vec![durable::remove_dir_all(&self.staging()), remove_marked(&tasks)];
@@ -143,7 +145,7 @@ impl DataDir {
         outcomes.into_iter().collect()
     }
 
-    /// Removes all gathered bytes except those of the blobs in `wanted`.
+    /// Removes all partial blobs except those of the blobs in `wanted`.
     pub fn clean_parts(&self, wanted: &[Digest]) -> io::Result<()> {
         let of_blob = |digest| {
             [self.blob_part(digest), self.blob_parts(digest), self.blob_parts_note(digest)]
@@ -185,22 +187,22 @@ impl TaskDir {
         self.root.join("run")
     }
 
-    /// Where all its logs are.
+    /// Directory of all logs of the task.
     pub fn logs(&self) -> PathBuf {
         self.root.join("logs")
     }
 
-    /// The task's output.
+    /// Log of the task's output.
     pub fn output_log(&self) -> PathBuf {
         self.logs().join("task.log")
     }
 
-    /// What its nodes say on ROS topics.
+    /// Log of the messages of the task's nodes on ROS topics.
     pub fn ros_log(&self) -> PathBuf {
         self.logs().join("ros.log")
     }
 
-    /// The output of its last build.
+    /// Log of the last build's output.
     pub fn build_log(&self) -> PathBuf {
         self.logs().join("build.log")
     }
@@ -215,8 +217,8 @@ impl TaskDir {
         self.root.join("build_home")
     }
 
-    /// Which uploads of its files are under way: out of the task's reach, because it says where the
-    /// robot's token goes.
+    /// File with the output uploads that are under way. The task has no access, because the file
+    /// names the destination of the robot's token.
     pub fn uploads(&self) -> PathBuf {
         self.root.join("uploads.json")
     }
@@ -226,12 +228,12 @@ impl TaskDir {
         VersionDir { root: self.root.join(manifest.hex()) }
     }
 
-    /// What publishers have signed about that version.
+    /// File with the publishers' signatures of that version.
     pub fn signatures(&self, manifest: &Digest) -> PathBuf {
         self.root.join(format!("{}{SIGNATURES}", manifest.hex()))
     }
 
-    /// What was unpacked and built of that version, by digests: out of the task's reach.
+    /// File with the digests of the version's unpacked and built files. The task has no access.
     pub fn seal(&self, manifest: &Digest) -> PathBuf {
         self.root.join(format!("{}{SEAL}", manifest.hex()))
     }
@@ -251,8 +253,8 @@ impl TaskDir {
         Ok(entries(&self.root)?.iter().filter_map(|path| digest_of(path)).collect())
     }
 
-    /// Removes every version except those in `kept` and the current one, and what is left of
-    /// earlier ones.
+    /// Removes every version except those in `kept` and the current one, and the remains of earlier
+    /// removals.
     pub fn prune(&self, kept: &[Digest]) -> io::Result<()> {
         remove_marked(&entries(&self.root)?)?;
         let current = self.current();
@@ -275,7 +277,7 @@ impl TaskDir {
         Ok(())
     }
 
-    /// Removes the task with all it left.
+    /// Removes the task's directory with all its contents.
     pub fn remove(&self) -> io::Result<()> {
         remove_whole(&self.root)
     }
@@ -296,8 +298,8 @@ impl VersionDir {
         self.root.join("task.json")
     }
 
-    /// The unpacked package. It exists only whole: it is renamed here when all of it is on the
-    /// disk.
+    /// The unpacked package. This directory only exists complete: a tree is renamed to this path
+    /// when all of it is on the disk.
     pub fn src(&self) -> PathBuf {
         self.root.join("src")
     }
@@ -307,17 +309,18 @@ impl VersionDir {
         self.root.join("build")
     }
 
-    /// What was built.
+    /// The built files.
     pub fn install(&self) -> PathBuf {
         self.root.join("install")
     }
 
-    /// The directory that the task runs in: what it writes there stays until the version goes.
+    /// The working directory of the task. Files that the task writes here stay until the version is
+    /// removed.
     pub fn work(&self) -> PathBuf {
         self.root.join("work")
     }
 
-    /// Where the nodes of a run write logs of their own.
+    /// Directory where the nodes of a run write their own log files.
     pub fn node_logs(&self) -> PathBuf {
         self.root().join("node_logs")
     }
@@ -328,8 +331,8 @@ impl VersionDir {
     }
 }
 
-/// Removes a directory so that it is there whole or not at all, at any moment. It is not done while
-/// anything is left of it, also of an earlier try.
+/// Removes a directory atomically: at any moment it is either complete or absent. The call fails
+/// while any part of it is left, also from an earlier attempt.
 fn remove_whole(dir: &Path) -> io::Result<()> {
     let Some(name) = file_name(dir) else { return Ok(()) };
     let removed = dir.with_file_name(format!("{REMOVED}{name}"));
@@ -341,7 +344,7 @@ fn remove_whole(dir: &Path) -> io::Result<()> {
     durable::remove_dir_all(&removed)
 }
 
-/// Removes what is marked as being removed, all that can be.
+/// Removes all directories that are marked as being removed, as far as possible.
 fn remove_marked(paths: &[PathBuf]) -> io::Result<()> {
     let is_marked = |path: &&PathBuf| file_name(path).is_some_and(|name| name.starts_with(REMOVED));
     let outcomes: Vec<_> =
@@ -349,7 +352,7 @@ fn remove_marked(paths: &[PathBuf]) -> io::Result<()> {
     outcomes.into_iter().collect()
 }
 
-/// A directory's entries, sorted; none if it is not there.
+/// A directory's entries, sorted; none if the directory does not exist.
 fn entries(dir: &Path) -> io::Result<Vec<PathBuf>> {
     let listing = match fs::read_dir(dir) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
@@ -414,14 +417,14 @@ mod tests {
         let task = data.task(&"talker".parse().unwrap());
         let [kept, half] = [b"1", b"2"].map(|bytes| Digest::of(bytes));
         durable::create_dir_all(&task.version(&kept).src()).unwrap();
-        // As a power cut in the middle of removing leaves it.
+        // A power cut in the middle of a removal leaves this state.
         let marked = task.root().join(format!("{REMOVED}{}", half.hex()));
         durable::create_dir_all(&marked.join("src")).unwrap();
         durable::create_dir_all(&data.tasks().join(".removed-gone/run")).unwrap();
         durable::create_dir_all(&data.staging().join("x")).unwrap();
         assert_eq!((task.versions().unwrap(), data.task_names().unwrap().len()), (vec![kept], 1));
-        // The version comes back and is removed again while the rest of the first removal is still
-        // there.
+        // The version is installed again and removed again while the rest of the first removal
+        // still exists.
         durable::create_dir_all(&task.version(&half).src()).unwrap();
         task.prune(&[kept]).unwrap();
         assert!(!marked.exists() && !task.version(&half).root().exists());
@@ -441,7 +444,7 @@ mod tests {
         durable::create_dir_all(&task.root().join("busy")).unwrap();
         durable::create_dir_all(&other).unwrap();
         with_own_mounts(|| {
-            // Nobody can remove it while something is mounted there.
+            // A directory cannot be removed while something is mounted there.
             let busy = task.root().join("busy");
             mount(Some("tmpfs"), &busy, Some("tmpfs"), MsFlags::empty(), None::<&str>).unwrap();
             task.remove().unwrap_err();

@@ -1,6 +1,6 @@
-//! The address a network interface was made with, whatever it uses now: a robot's Wi-Fi may make up
-//! a new one for each network. It asks the kernel by the ioctl that `ethtool -P` uses, and nothing
-//! else.
+//! The permanent hardware address of a network interface, whatever address it uses now: a robot's
+//! Wi-Fi may make up a new one for each network. This module asks the kernel by the ioctl that
+//! `ethtool -P` uses, and does nothing else.
 
 use std::io;
 use std::net::{Ipv4Addr, UdpSocket};
@@ -11,9 +11,9 @@ use task_proto::MacAddress;
 
 const SIOCETHTOOL: libc::c_ulong = 0x8946;
 const ETHTOOL_GPERMADDR: u32 = 0x20;
-/// The kernel's longest address.
+/// Maximum length of an address in the kernel.
 const MAX_ADDRESS: usize = 32;
-/// An Ethernet address.
+/// Length of an Ethernet address.
 const MAC: usize = 6;
 
 /// `struct ethtool_perm_addr`.
@@ -44,7 +44,7 @@ pub fn of(interface: &str) -> io::Result<Option<MacAddress>> {
     let mut answer =
         Answer { command: ETHTOOL_GPERMADDR, size: MAX_ADDRESS as u32, address: [0; MAX_ADDRESS] };
     question.answer = &raw mut answer;
-    // Any socket leads to the network's interfaces; nothing is sent over it.
+    // Any socket gives access to the network's interfaces; no data is sent over this one.
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     // SAFETY: both structures are laid out as the kernel's, outlive the call, and `size` is the
     // room in `answer`.
@@ -58,7 +58,7 @@ pub fn of(interface: &str) -> io::Result<Option<MacAddress>> {
 
 fn parse(answer: &Answer) -> Option<MacAddress> {
     let address = &answer.address[..MAC];
-    // Zeros mean that there is none.
+    // Zeros mean that there is no permanent address.
     if answer.size as usize != MAC || address.iter().all(|byte| *byte == 0) {
         return None;
     }
@@ -81,7 +81,7 @@ mod tests {
         assert_eq!(parse(&answer), None, "InfiniBand's");
     }
 
-    /// What the kernel says in /sys of this machine's own interfaces, it says here too.
+    /// The ioctl returns the same address as /sys for this machine's own interfaces.
     #[test]
     fn hardware_that_uses_its_own_address_has_it_as_the_permanent_one() {
         let read =
@@ -104,7 +104,7 @@ mod tests {
         assert!(of("no-such-if").is_err() && of("a-name-that-is-too-long").is_err());
     }
 
-    /// In a network namespace of its own, which lasts as long as this thread.
+    /// Runs in a network namespace of its own, which lasts as long as this thread.
     #[test]
     #[expect(clippy::disallowed_methods, reason = "ip makes the interface that the test looks at")]
     fn an_interface_without_hardware_has_none() {

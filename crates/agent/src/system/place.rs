@@ -1,8 +1,8 @@
-//! Where an agent runs: the lock file that it holds, during one boot of one machine. A copy of the
-//! data directory has another lock file, and a machine that was started again another boot. An
-//! agent that comes with the same place has had to wait for the lock, and so for the end of the
-//! agent before it: by that a server tells a restart from a copy. It is found out at each start and
-//! written down nowhere.
+//! The place of an agent: the lock file that it holds, during one boot of one machine. A copy of
+//! the data directory has another lock file, and a machine that was started again has another boot.
+//! An agent with the same place as an earlier one has had to wait for the lock, and so for the end
+//! of that agent. This lets a server distinguish a restart from a copy. The place is determined at
+//! each start and never stored.
 
 use std::fs::File;
 use std::io;
@@ -13,11 +13,11 @@ use task_proto::Digest;
 
 use super::clock;
 
-/// The place of whatever holds this lock file.
+/// The place of the agent that holds this lock file.
 pub fn of(lock: &File) -> io::Result<Digest> {
     let about = lock.metadata()?;
-    // Not all file systems know it. It tells files apart that got the number of one that was
-    // removed.
+    // Not all file systems record a creation time. It distinguishes a new file from a removed one
+    // with the same inode number.
     let born = about
         .created()
         .ok()

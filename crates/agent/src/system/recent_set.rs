@@ -1,13 +1,13 @@
-//! What was seen lately: a set that holds so many and forgets the oldest. It decides nothing.
+//! A set of recently seen values: it has a maximum size and forgets the oldest. It decides nothing.
 
 use std::collections::{HashSet, VecDeque};
 use std::hash::Hash;
 
-/// The last `MAX` different ones that were seen.
+/// The last `MAX` different values that were seen.
 #[derive(Debug)]
 pub struct Recent<T, const MAX: usize> {
     known: HashSet<T>,
-    /// The oldest first.
+    /// The values, the oldest first.
     order: VecDeque<T>,
 }
 
@@ -18,12 +18,12 @@ impl<T, const MAX: usize> Default for Recent<T, MAX> {
 }
 
 impl<T: Clone + Eq + Hash, const MAX: usize> Recent<T, MAX> {
-    /// Whether it was seen lately.
+    /// Whether the value was seen recently.
     pub fn contains(&self, one: &T) -> bool {
         self.known.contains(one)
     }
 
-    /// It was seen. Whether that is new.
+    /// Records a value; returns whether it is new.
     pub fn see(&mut self, one: T) -> bool {
         let is_new = self.known.insert(one.clone());
         if is_new {

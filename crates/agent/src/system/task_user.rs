@@ -1,7 +1,8 @@
-//! The account that tasks take their groups from where the agent is root, found by name or number,
-//! and what accounts are given of the agent's directories: their own files, the way to them, and to
-//! read what they run. It reads `/etc/passwd` and `/etc/group` itself, because a static program
-//! can't load the system's name services. It never creates an account.
+//! The account that tasks take their groups from where the agent is root, found by name or number.
+//! This module also gives accounts access to the agent's directories: to their own files, to the
+//! path that leads there, and read access to the files that they run. It reads `/etc/passwd` and
+//! `/etc/group` itself, because a static program can't load the system's name services. It never
+//! creates an account.
 
 use std::fs;
 use std::io;
@@ -17,7 +18,7 @@ use serde::{Deserialize, Serialize};
 
 /// The account that is used when the settings name none.
 pub const DEFAULT_NAME: &str = "taskd-task";
-/// How deep a tree may be that changes hands.
+/// Maximum depth of a tree that changes owner.
 pub const MAX_DEPTH: usize = 256;
 /// The call that sets the groups of one thread, with ids of 32 bits.
 #[cfg(target_pointer_width = "64")]
@@ -25,20 +26,20 @@ const SETGROUPS: libc::c_long = libc::SYS_setgroups;
 #[cfg(target_pointer_width = "32")]
 const SETGROUPS: libc::c_long = libc::SYS_setgroups32;
 
-/// An account.
+/// A user account.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TaskUser {
-    /// Its name, or its number where it has no name.
+    /// The account's name, or its number where it has no name.
     pub name: String,
     /// Its user id.
     pub uid: u32,
     /// Its group.
     pub gid: u32,
-    /// The other groups it is in: `dialout`, `video`, …
+    /// The supplementary groups: `dialout`, `video`, …
     pub groups: Vec<u32>,
 }
 
-/// Why tasks can't run on this robot.
+/// Reasons why tasks can't run on this robot.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum TaskUserError {
     /// There is no such account.
@@ -51,7 +52,7 @@ pub enum TaskUserError {
         /// The name.
         name: String,
     },
-    /// A directory above the agent's lets it not pass.
+    /// The account can't enter a directory above the agent's data directory.
     #[error(
         "tasks run as {user:?}, which may not enter {}, where the data directory {} lies: let it pass \
          (`chmod o+x {}`) or move the data directory, and restart the agent", dir.display(), data.display(), dir.display()
@@ -59,12 +60,12 @@ pub enum TaskUserError {
     ShutOut {
         /// The account's name.
         user: String,
-        /// The first directory that it can't enter.
+        /// The first directory that the account can't enter.
         dir: PathBuf,
         /// The agent's data directory.
         data: PathBuf,
     },
-    /// Only root may run things as somebody else.
+    /// Only root may run tasks under another account.
     #[error(
         "task_user is {name:?}, but the agent does not run as root and can't start anything as another user"
     )]
@@ -75,7 +76,8 @@ pub enum TaskUserError {
 }
 
 impl TaskUser {
-    /// The account that `setting` means; `None`: builds and tasks run as whoever the agent is.
+    /// The account that `setting` names; `None`: builds and tasks run under the agent's own
+    /// account.
     pub fn find(setting: Option<&str>) -> Result<Option<Self>, TaskUserError> {
         let text =
             |path: &str| fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
@@ -126,11 +128,12 @@ impl TaskUser {
         Some(Self { name, uid, gid, groups })
     }
 
-    /// The account, if it can get to the data directory `data`: the agent opens that and what is in
-    /// it to its tasks, but not what lies above it, which is its administrator's.
+    /// The account, if it can reach the data directory `data`. The agent opens that directory and
+    /// its contents to its tasks. The directories above belong to the machine's administrator, so
+    /// the agent does not open them.
     pub fn admitted_to(self, data: &Path) -> Result<Self, TaskUserError> {
         let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
-        // What can't be told here is seen at the first start.
+        // An error that does not show here shows at the first start.
         let shut = self.with_its_rights(|| {
             data.ancestors().skip(1).filter(|dir| is_shut(dir)).last().map(Path::to_owned)
         });
@@ -140,14 +143,15 @@ impl TaskUser {
         }
     }
 
-    /// An account for one task, which has this one's groups, its own included: what they open of
-    /// the hardware.
+    /// An account for one task, with the groups of this account, its own group included: the groups
+    /// give access to hardware.
     pub fn with_id(&self, id: u32) -> Self {
         let groups = std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         Self { name: id.to_string(), uid: id, gid: id, groups }
     }
 
-    /// Lets the account, and of all that are not root it alone, into a directory that stays root's.
+    /// Lets the account into a directory that stays root's. Apart from root, no other account may
+    /// enter.
     pub fn admit(&self, dir: &Path) -> io::Result<()> {
         let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
@@ -155,7 +159,7 @@ impl TaskUser {
         Ok(nix::sys::stat::fchmod(&opened, Mode::S_IRWXU | Mode::S_IRGRP | Mode::S_IXGRP)?)
     }
 
-    /// Lets the account pass through `dirs`, without seeing what is in them.
+    /// Lets the account pass through `dirs` without listing them.
     pub fn let_through(&self, dirs: &[PathBuf]) -> io::Result<()> {
         for dir in dirs {
             let mode = fs::metadata(dir)?.permissions().mode();
@@ -166,21 +170,21 @@ impl TaskUser {
         Ok(())
     }
 
-    /// Makes an open file the account's.
+    /// Makes the account the owner of an open file.
     pub fn own(&self, file: impl AsFd) -> io::Result<()> {
         Ok(fchown(file, Some(self.user()), Some(self.group()))?)
     }
 
-    /// Makes a directory of the account's own, for nobody else.
+    /// Makes a home directory that only the account may enter.
     pub fn make_home(&self, dir: &Path) -> io::Result<()> {
         crate::system::durable::create_dir_all(dir)?;
         self.hand_over(dir)
     }
 
-    /// Makes the tree at `dir` the account's, for nobody else. `dir` itself comes last, so that a
-    /// tree that was handed over in part is done again, and a tree that is the account's is not
-    /// touched: what a task made of it is its own affair, and nothing that it put there is
-    /// followed.
+    /// Makes the account the owner of the tree at `dir`, with no access for others. `dir` itself
+    /// comes last: a tree that was handed over in part is done again, and a tree that belongs to
+    /// the account is not touched. Changes that a task made in its tree are the task's own affair,
+    /// and no link in the tree is followed.
     pub fn hand_over(&self, dir: &Path) -> io::Result<()> {
         let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
@@ -188,7 +192,7 @@ impl TaskUser {
             return Ok(());
         }
         each_below(&opened, 0, &mut |entry, stat| {
-            // A file with a second name may be anybody's; packages have none.
+            // A file with a second name may belong to another account; packages have no such files.
             let is_sure = !is_kind(stat, SFlag::S_IFREG) || stat.st_nlink == 1;
             if is_sure { self.own_entry(entry) } else { Ok(()) }
         })?;
@@ -196,26 +200,26 @@ impl TaskUser {
         Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
     }
 
-    /// Does `work`, which must not touch what is the agent's alone, with the account's rights to
-    /// files and no others: where a task may exchange any file or directory for a link, what it
-    /// can't read itself can't be read for it.
+    /// Runs `work` with the account's rights to files and no others. `work` must not touch data
+    /// that only the agent may see. A task may replace any file or directory by a link, so the
+    /// agent must not read anything for the task that the task itself can't read.
     pub fn with_its_rights<T: Send>(&self, work: impl FnOnce() -> T + Send) -> io::Result<T> {
-        // The thread ends with the work, so there are no rights to be taken back.
+        // The thread ends with the work, so no rights need to be restored.
         std::thread::scope(|scope| {
             let working = scope.spawn(|| self.take_file_rights().map(|()| work()));
             working.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
         })
     }
 
-    /// Leaves the calling thread, and it alone, the account's rights to files and no capability.
-    /// Its user id stays root's, or every process of the account could end the agent by a signal to
-    /// this thread.
+    /// Reduces the calling thread, and no other, to the account's rights to files and no
+    /// capability. The thread's user id stays root's: otherwise every process of the account could
+    /// end the agent by a signal to this thread.
     fn take_file_rights(&self) -> io::Result<()> {
         let groups: Vec<libc::gid_t> =
             std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         // SAFETY: the list outlives the call. The C library's own call would change all threads.
         Errno::result(unsafe { libc::syscall(SETGROUPS, groups.len(), groups.as_ptr()) })?;
-        // They tell what was before, and nothing of a failure; an id that is none changes nothing.
+        // These calls return the previous id and report no failure; an invalid id changes nothing.
         setfsgid(self.group());
         setfsuid(self.user());
         let (none, now) = (u32::MAX, (self.user(), self.group()));
@@ -243,9 +247,9 @@ fn is_shut(dir: &Path) -> bool {
     fs::metadata(dir.join(".")).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
 }
 
-/// Makes what the account `uid` owns in the tree at `dir` root's: for everybody to read, as the
-/// account could, and for nobody to change. What is somebody else's stays as it is, and no link is
-/// followed. No process of the account may be left.
+/// Returns the files that the account `uid` owns in the tree at `dir` to root: readable for
+/// everybody, as they were for the account, and writable for none. Files of other accounts stay as
+/// they are, and no link is followed. No process of the account may be left.
 pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
     let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     let opened = match nix::fcntl::open(dir, flags, Mode::empty()) {
@@ -257,7 +261,7 @@ pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
             return Ok(());
         }
         if !is_kind(stat, SFlag::S_IFLNK) {
-            // Nobody else had rights to it that its owner had not; set-id bits go.
+            // No other account had rights that the owner lacked; set-id bits go.
             let own = stat.st_mode & 0o700;
             let mode = own | (own & 0o500) >> 3 | (own & 0o500) >> 6;
             fs::set_permissions(by_descriptor(entry), fs::Permissions::from_mode(mode))?;
@@ -269,8 +273,8 @@ pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
     take(&opened, &fstat(&opened)?)
 }
 
-/// Does `work` with each entry below `dir`, the directories after what is in them. What is looked
-/// at is what is worked on, whatever takes its name in between.
+/// Runs `work` on each entry below `dir`, directories after their contents. `work` acts on the
+/// examined file itself, even if another file takes its name in between.
 fn each_below(
     dir: &OwnedFd,
     depth: usize,
@@ -298,8 +302,8 @@ fn by_descriptor(descriptor: &OwnedFd) -> PathBuf {
     format!("/proc/self/fd/{}", descriptor.as_raw_fd()).into()
 }
 
-/// Does blocking `work` with the rights to files that `user` has, or with the agent's where tasks
-/// run as whoever it is.
+/// Runs blocking `work` with the rights to files that `user` has, or with the agent's rights where
+/// tasks run under the agent's account.
 pub async fn do_as<T: Send + 'static>(
     user: Option<&TaskUser>,
     work: impl FnOnce() -> T + Send + 'static,
@@ -312,11 +316,11 @@ pub async fn do_as<T: Send + 'static>(
     working.await.map_err(io::Error::other).flatten()
 }
 
-/// Leaves the calling thread, and it alone, without capabilities. Another user id for files takes
-/// away only those that are about the modes of files: the rest would still open what `/proc` says
-/// of other processes.
+/// Drops all capabilities of the calling thread, and of no other. Another user id for files removes
+/// only the capabilities for file modes: the rest would still allow reading the `/proc` entries of
+/// other processes.
 fn give_up_capabilities() -> io::Result<()> {
-    /// What the kernel calls `_LINUX_CAPABILITY_VERSION_3`: two words for each set.
+    /// The kernel's `_LINUX_CAPABILITY_VERSION_3`: two words for each set.
     const VERSION: u32 = 0x2008_0522;
     let header: [u32; 2] = [VERSION, 0];
     let none = [0_u32; 6];

@@ -1,7 +1,7 @@
-//! Reading files that lie where a task may write. A link, pipe, device or endless file that a task
-//! puts in the place of a file neither leads elsewhere nor is opened nor keeps the reader waiting.
-//! A [`Directory`] is entered one component at a time, so that no link on the way is followed
-//! either; [`open`] does not look at the directories above its file.
+//! Reads files in directories where a task may write. A task may replace a file by a link, pipe,
+//! device or endless file. Such a replacement is not followed or opened, and never blocks the
+//! reader. A [`Directory`] is entered one component at a time, so that no link on the path is
+//! followed either; [`open`] does not check the directories above its file.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -14,34 +14,34 @@ use nix::errno::Errno;
 use nix::fcntl::{AT_FDCWD, OFlag, openat};
 use nix::sys::stat::{FileStat, Mode, SFlag, fstat};
 
-/// A directory that a task may change while it is looked at.
+/// A directory that a task may change while it is being read.
 #[derive(Debug)]
 pub struct Directory(OwnedFd);
 
-/// What a name stands for, without following it.
+/// The type of a directory entry; links are not followed.
 #[derive(Debug)]
 pub enum Entry {
     /// A directory.
     Directory(Directory),
-    /// A regular file of so many bytes.
+    /// A regular file, with its size in bytes.
     File(u64),
     /// A link, a pipe, a socket or a device.
     Other,
 }
 
 impl Directory {
-    /// The directory at `path`. Its last component may be a task's, those above are not.
+    /// The directory at `path`. A task may own the last component, but not those above.
     pub fn open(path: &Path) -> io::Result<Self> {
         let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         Ok(Self(openat(AT_FDCWD, path, flags, Mode::empty())?))
     }
 
-    /// The names in it, in no order.
+    /// The names in the directory, in no order.
     pub fn names(&self) -> io::Result<impl Iterator<Item = io::Result<OsString>> + use<>> {
         Ok(fs::read_dir(by_descriptor(&self.0))?.map(|entry| entry.map(|entry| entry.file_name())))
     }
 
-    /// What `name` is; `None` where there is nothing of that name any more.
+    /// The entry `name`; `None` where it no longer exists.
     pub fn entry(&self, name: &str) -> io::Result<Option<Entry>> {
         let found = match find(&self.0, name) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -55,7 +55,7 @@ impl Directory {
         }))
     }
 
-    /// Opens the regular file at `path`, which leads downward from here.
+    /// Opens the regular file at `path`, which leads downward from this directory.
     pub fn file(&self, path: &Path) -> io::Result<File> {
         let mut names = path.components().collect::<Vec<_>>();
         let last = names.pop().ok_or(io::ErrorKind::InvalidInput)?;
@@ -77,7 +77,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     open_found(&find(AT_FDCWD, path)?)
 }
 
-/// The bytes of a regular file, which may be `max_bytes` at most.
+/// The bytes of a regular file, which may have `max_bytes` at most.
 pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
@@ -87,13 +87,14 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A descriptor that only names what is there: nothing is opened by it.
+/// A descriptor that only names the entry (`O_PATH`): nothing is opened by it.
 fn find(at: impl AsFd, name: &(impl NixPath + ?Sized)) -> io::Result<OwnedFd> {
     let flags = OFlag::O_PATH | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     Ok(openat(at, name, flags, Mode::empty())?)
 }
 
-/// Opens what was found, if it is a regular file: the very one, whatever has its name by now.
+/// Opens the found entry, if it is a regular file. This opens the same file even if its name has
+/// another file by now.
 fn open_found(found: &OwnedFd) -> io::Result<File> {
     match kind(&fstat(found)?) {
         SFlag::S_IFREG => File::open(by_descriptor(found)),
@@ -136,7 +137,7 @@ mod tests {
         let temp = tempfile::tempdir().expect("temp dir");
         let pipe = temp.path().join("pipe");
         nix::unistd::mkfifo(&pipe, Mode::S_IRWXU).expect("a pipe");
-        // A reader, were there one for a moment only, would let the writer in.
+        // If there were a reader, even for a moment, the writer could open the pipe.
         let writer = std::thread::spawn({
             let pipe = pipe.clone();
             move || File::options().write(true).open(pipe).expect("opened")

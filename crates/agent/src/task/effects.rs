@@ -1,6 +1,6 @@
-//! What the driver may do to the robot, behind one trait, so that its logic is tested against a
-//! fake without disk, processes or time. [`crate::reconcile::robot::Robot`] is the real one.
-//! Effects decide nothing.
+//! The effects that the driver may have on the robot, behind one trait. The driver's logic is
+//! tested against a fake without disk, processes or time. [`crate::reconcile::robot::Robot`] is the
+//! real implementation. Effects decide nothing.
 
 use std::future::Future;
 
@@ -18,85 +18,87 @@ use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFac
 use crate::task::plan::{Done, StepFailure};
 use crate::transfer::parts::Asks;
 
-/// Milliseconds by the clocks an agent looks at.
+/// Readings of the agent's two clocks, in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Now {
     /// Since boot.
     pub boot_ms: u64,
-    /// Since the Unix epoch, as far as the robot knows.
+    /// Since the Unix epoch, by the robot's clock, which may be wrong.
     pub wall_ms: u64,
 }
 
-/// Everything the driver does to the robot. Each method may be called again after a crash: doing it
-/// twice is harmless.
+/// All effects of the driver on the robot. Each method may be called again after a crash: a second
+/// call is harmless.
 pub trait Effects: Send + Sync + 'static {
-    /// What the clocks show.
+    /// The current clock readings.
     fn now(&self) -> Now;
 
-    /// Writes the ledger. Once this returns it survives a power cut.
+    /// Writes the ledger. Once this returns, the ledger survives a power cut.
     fn write_ledger(&self, ledger: &Ledger) -> Result<(), LedgerError>;
 
     /// Whether a person at the robot said `hold`.
     fn is_held(&self) -> bool;
 
-    /// Whether the robot has a gate that is to be asked.
+    /// Whether the robot has a gate to ask.
     fn is_gated(&self) -> bool;
 
-    /// What packages may require of this robot, apart from the labels the server knows better, with
-    /// the ROS that was last seen.
+    /// Facts about this robot that packages may require, with the last known ROS installations. The
+    /// labels are not included: the server holds them.
     fn robot_facts(&self) -> RobotFacts;
 
-    /// Looks at what ROS there is now: a person may have installed what a task lacked.
+    /// Inspects the installed ROS distributions again: a person may have installed a missing
+    /// dependency.
     fn look_for_ros(&self) -> impl Future<Output = ()> + Send;
 
-    /// What the reports say of the machine.
+    /// The facts about the machine that reports contain.
     fn host_facts(&self) -> HostFacts;
 
-    /// Each task's last run, found without the ledger: one that lives, else one that has ended, so
-    /// that a job that was done is not done again.
+    /// Each task's last run, found without the ledger: a live run, else an ended run, so that a
+    /// completed job does not run again.
     fn survivors(&self) -> impl Future<Output = Vec<(TaskName, ActiveRun)>> + Send;
 
-    /// What is on the disk of this version.
+    /// The files of this version on the disk.
     fn prepared(&self, package: &PackageRef) -> impl Future<Output = Prepared> + Send;
 
-    /// What became of a process.
+    /// The observed state of a process.
     fn process(
         &self,
         task: &TaskName,
         process: &ProcessRecord,
     ) -> impl Future<Output = ProcessState> + Send;
 
-    /// Resolves when a process that lived has ended. Dropping it does nothing to the process.
+    /// Resolves when a live process has ended. Dropping the future does not affect the process.
     fn process_ended(
         &self,
         task: &TaskName,
         process: &ProcessRecord,
     ) -> impl Future<Output = ()> + Send;
 
-    /// Begins to compare what ROS says of this run, whose process lives, with what its package
-    /// promises, bringing its lifecycle nodes to active and setting its parameters unless
-    /// `process.ready` says that this was done. It goes on until the receiver is dropped. A package
-    /// that promises nothing holds since its process was started.
+    /// Begins to compare the ROS graph with the promises of the package of this run. The run's
+    /// process must be alive. Also brings the run's lifecycle nodes to active and sets its
+    /// parameters, unless `process.ready` says that this was done. Watching continues until the
+    /// receiver is dropped. A package without promises is healthy from the start of its process.
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
 
-    /// How many versions may be prepared at the same time.
+    /// The maximum number of versions that are prepared concurrently.
     fn parallel_tasks(&self) -> usize;
 
-    /// Notes what a desired state says of who has signed what, and begins to get it; and takes on
-    /// the settings in it.
+    /// Records the signature evidence of a desired state, begins to fetch the evidence, and adopts
+    /// the settings in the state.
     fn heed(&self, state: &DesiredState);
 
-    /// What the robot goes by when it asks who has signed a package.
+    /// The facts by which the robot decides whether a package is trusted.
     fn trust_facts(&self) -> TrustFacts;
 
-    /// Finds out whether enough of the trusted publishers have signed it, so that it may be begun.
+    /// Checks that enough of the trusted publishers have signed the package, so that work on the
+    /// package may begin.
     fn check_signers(
         &self,
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Deletes the gathered bytes of all contents but these.
+    /// Deletes the gathered bytes of all contents that are not in `wanted`.
     fn keep_parts(&self, wanted: &[Digest]);
 
     /// Pulls the manifest, unless the server tells this robot to come back later.
@@ -106,11 +108,11 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Takes blobs that came with an order and are what their digests say; those that came before
-    /// are of no more use.
+    /// Takes blobs that came with an order, their digests verified. Blobs of earlier orders are
+    /// discarded.
     fn offer(&self, blobs: Vec<(BlobRef, Bytes)>);
 
-    /// Pulls and unpacks the content, likewise.
+    /// Pulls and unpacks the content, unless the server tells this robot to come back later.
     fn pull_content(
         &self,
         package: &PackageRef,
@@ -118,8 +120,8 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Gathers the parts of the content that the server pushes, pulls what does not come, and
-    /// unpacks it.
+    /// Gathers the parts of the content that the server pushes, pulls the missing parts, and
+    /// unpacks the content.
     fn gather_content(
         &self,
         package: &PackageRef,
@@ -128,37 +130,37 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Builds it.
+    /// Builds the package.
     fn build(
         &self,
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Asks the robot's gate; a failure is the reason of its no.
+    /// Asks the robot's gate; a failure holds the reason of the refusal.
     fn ask_gate(
         &self,
         task: &TaskName,
         question: &GateQuestion,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Makes the run's version the current one and starts the process that its record names; gives
-    /// the process id.
+    /// Makes the run's version the current one and starts the process named in the run's record.
+    /// Returns the process id.
     fn start(
         &self,
         task: &TaskName,
         run: &ActiveRun,
     ) -> impl Future<Output = Result<u32, StepFailure>> + Send;
 
-    /// Stops the run's process and all it started, in good order: its lifecycle nodes first.
-    /// Afterwards none of it is left on the graph.
+    /// Stops the run's process and all its descendants in order: lifecycle nodes first. Afterwards
+    /// none of the run's nodes is left on the graph.
     fn stop(
         &self,
         task: &TaskName,
         run: &ActiveRun,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Brings the files of an ended run to the server.
+    /// Uploads the output files of an ended run to the server.
     fn collect(
         &self,
         task: &TaskName,
@@ -167,7 +169,7 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Deletes the versions that are not in `kept`, and what ended runs left.
+    /// Deletes the versions that are not in `kept`, and the leftovers of ended runs.
     fn prune(
         &self,
         task: &TaskName,
@@ -175,6 +177,6 @@ pub trait Effects: Send + Sync + 'static {
         running: Option<&ProcessRecord>,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
-    /// Deletes a task with all that belongs to it.
+    /// Deletes a task with all its files.
     fn remove(&self, task: &TaskName) -> impl Future<Output = Result<(), StepFailure>> + Send;
 }

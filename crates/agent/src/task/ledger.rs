@@ -1,8 +1,8 @@
-//! The ledger: what the agent accepted, what it was doing and what it started. Written before each
-//! step, so that after kill -9 or a power cut the next agent goes on where this one was. Ledger
-//! types are neither wire types nor what is observed; times are [`crate::system::clock`]'s
-//! milliseconds since boot and mean something only in the boot they name. It decides nothing: that
-//! is the plan's work.
+//! The ledger holds the accepted desired state, the steps under way and the started processes. The
+//! agent writes the ledger before each step, so that after kill -9 or a power cut the next agent
+//! continues from there. Ledger types are neither wire types nor observations. Times are
+//! [`crate::system::clock`]'s milliseconds since boot and are valid only in the boot that they
+//! name. The ledger decides nothing: decisions are the plan's work.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -24,112 +24,113 @@ pub use asked::{GateAnswer, GateQuestion, GateRecord, GateStep};
 pub use rules::RunRules;
 
 /// A run that is restarted more often than this without a calm stretch has failed. At the longest
-/// backoff that is over an hour: enough for a sensor to be plugged in again.
+/// backoff that takes over an hour: enough time to plug a sensor in again.
 pub const MAX_RESTARTS_IN_A_ROW: u32 = 100;
 
 /// The version of the file's format that this agent reads and writes.
 pub const FORMAT: u32 = 1;
 /// The largest file that is read as a ledger.
 const MAX_BYTES: u64 = 64 * 1024 * 1024;
-/// The most finished runs remembered of one task.
+/// The maximum number of finished runs remembered per task.
 const MAX_FINISHED: usize = 32;
 
-/// Everything the agent must not forget.
+/// The agent's persistent state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ledger {
     /// See [`FORMAT`].
     pub format: u32,
     /// How many times the agent has been started.
     pub start: u64,
-    /// The boot in which the times below were taken.
+    /// The boot that all times in the ledger refer to.
     pub boot_id: String,
     /// The last desired state that was accepted.
     pub accepted: Option<Accepted>,
     /// The server does not accept this robot's token: it was removed or revoked there.
     pub removed: bool,
-    /// The server's reason for that; empty if it is not known.
+    /// The server's reason for the removal; empty if unknown.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub removed_because: String,
     /// The tasks on this robot.
     pub tasks: BTreeMap<TaskName, TaskRecord>,
 }
 
-/// A desired state that was verified and accepted. It is kept as it was signed and verified again
+/// A desired state that was verified and accepted. The signed envelope is kept and verified again
 /// at each start.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Accepted {
-    /// Its generation.
+    /// The generation of the state.
     pub generation: Generation,
     /// The signed bytes.
     pub envelope: Envelope,
 }
 
-/// One task.
+/// The state of one task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TaskRecord {
-    /// What the desired state last asked for.
+    /// The task as last requested by the desired state.
     pub order: DesiredTask,
-    /// How far the ordered version has come before its start.
+    /// The progress of the ordered version up to its start.
     pub preparation: Preparation,
-    /// The run that is kept alive, of the ordered version or, until that is staged, of the one
-    /// before.
+    /// The run that is kept alive: of the ordered version or, until that is staged, of the previous
+    /// version.
     pub active: Option<ActiveRun>,
-    /// The run that comes back should the active one, which took its place, not get ready.
+    /// The run that comes back if the active run, which replaced it, does not become ready.
     #[serde(default)]
     pub fallback: Option<ActiveRun>,
     /// The version that was active before.
     pub previous: Option<PackageRef>,
-    /// Runs that have ended for good, the oldest first. An order that comes back is not done twice.
+    /// Runs that have ended for good, the oldest first. They keep an order that comes back from
+    /// running twice.
     pub finished: Vec<FinishedRun>,
-    /// Ended runs whose files are still to be brought back, the oldest first.
+    /// Ended runs with output files to upload, the oldest first.
     #[serde(default)]
     pub collections: Vec<Collection>,
-    /// The last run whose files did not come back.
+    /// The last run with lost output files.
     #[serde(default)]
     pub lost: Option<LostFiles>,
-    /// What the robot's gate was asked about this task, while that matters.
+    /// The current question to the robot's gate about this task, and its answer.
     #[serde(default)]
     pub gate: Option<GateRecord>,
-    /// Starts of a process of this task.
+    /// The number of process starts of this task.
     #[serde(default)]
     pub starts: u64,
-    /// The phase as it was last reported.
+    /// The phase as last reported.
     pub phase: Phase,
-    /// Since when.
+    /// The time at which the task entered `phase`.
     pub phase_since_ms: u64,
 }
 
-/// How far a version has come on its way to be started.
+/// The progress of a version on its way to be started.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Preparation {
     /// `assigned` to `staged`, `deferred`, or one of the ends `failed` and `unmet`.
     pub phase: Phase,
-    /// Tries of that phase.
+    /// The number of attempts in that phase.
     pub attempts: u32,
-    /// Not before this time.
+    /// No attempt before this time.
     pub retry_at_ms: u64,
-    /// Why it failed, is unmet or waits.
+    /// Why the preparation failed, is unmet or waits.
     pub failure: Option<Failure>,
-    /// Known once the manifest is there.
+    /// Service or job; known once the manifest is there.
     pub kind: Option<TaskKind>,
 }
 
 /// A run of one version, alive or meant to be.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ActiveRun {
-    /// The order that asked for it.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of the order's runs.
+    /// The run number within the deployment.
     pub run: u64,
-    /// What runs.
+    /// The package that runs.
     pub package: PackageRef,
-    /// How it is to be run.
+    /// The rules of the run, from its manifest.
     pub rules: RunRules,
-    /// The process that was started last and is not known to have ended.
+    /// The last started process that is not known to have ended.
     pub process: Option<ProcessRecord>,
-    /// Starts of a process that the restart policy made.
+    /// The number of starts by the restart policy.
     pub restarts: u32,
-    /// Those of them since it last ran calmly.
+    /// The number of restarts since the last calm stretch.
     pub restarts_in_a_row: u32,
     /// No start before this time.
     pub retry_at_ms: u64,
@@ -137,92 +138,93 @@ pub struct ActiveRun {
     pub first_start_ms: u64,
     /// Whether a process of this run was ever ready.
     pub ever_ready: bool,
-    /// Whether one was started in this boot, so that the robot's gate need not be asked again.
+    /// Whether a process was started in this boot, so that the robot's gate need not be asked
+    /// again.
     #[serde(default)]
     pub admitted: bool,
-    /// Whether one was ever started, so that it goes on and is not begun.
+    /// Whether a process was ever started, so that a start continues the run rather than begins it.
     #[serde(default)]
     pub ever_started: bool,
     /// Set once the run is over for good.
     pub end: Option<End>,
 }
 
-/// A process that was, or was about to be, started.
+/// A process that was started or was about to be started.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ProcessRecord {
-    /// Its run directory's name; one directory is one start.
+    /// The name of the run directory; each start has its own directory.
     pub dir: String,
-    /// The boot it was started in.
+    /// The boot in which the process was started.
     pub boot_id: String,
-    /// When.
+    /// Milliseconds since boot at the start.
     pub started_ms: u64,
-    /// Its id, once it is known.
+    /// The process id, once known.
     pub pid: Option<u32>,
-    /// Whether it counted as running.
+    /// Whether the process has become ready.
     pub ready: bool,
-    /// Set once it is to be stopped for a reason of its own.
+    /// Set once the process is to be stopped because of a failure.
     #[serde(default)]
     pub condemned: Option<Condemned>,
 }
 
-/// Why a process is stopped that the order would have go on.
+/// Why a process is stopped although the order wants the run to continue.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Condemned {
-    /// What it failed in.
+    /// The failure of the process.
     pub failure: Failure,
-    /// Whether the restart policy may start another.
+    /// Whether the restart policy may start another process.
     pub again: bool,
 }
 
 /// A run that is over.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FinishedRun {
-    /// The order.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Its run.
+    /// The run number within the deployment.
     pub run: u64,
-    /// What came of it.
+    /// The outcome of the run.
     pub end: End,
 }
 
-/// What came of a run.
+/// The outcome of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct End {
     /// A final phase.
     pub phase: Phase,
-    /// Why, where it is no success.
+    /// The reason, if the run did not succeed.
     pub failure: Option<Failure>,
 }
 
-/// An ended run whose files are to be brought back.
+/// An ended run with output files to upload.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Collection {
-    /// The order.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of its runs.
+    /// The run number within the deployment.
     pub run: u64,
-    /// What ran.
+    /// The package that ran.
     pub package: PackageRef,
     /// Service or job.
     pub kind: TaskKind,
-    /// When it ended, or when this boot began.
+    /// When the run ended, or when this boot began.
     pub since_ms: u64,
-    /// Tries that failed.
+    /// The number of failed attempts.
     pub attempts: u32,
-    /// Not before this time.
+    /// No attempt before this time.
     pub retry_at_ms: u64,
-    /// Why the last try failed.
+    /// Why the last attempt failed.
     pub failure: Option<Failure>,
 }
 
-/// A run whose files did not come back.
+/// A run with lost output files.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct LostFiles {
-    /// The order.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of its runs.
+    /// The run number within the deployment.
     pub run: u64,
-    /// Why.
+    /// Why the files were lost.
     pub failure: Failure,
 }
 
@@ -234,21 +236,22 @@ pub struct LedgerError {
     source: io::Error,
 }
 
-/// What was found where the ledger should be.
+/// The result of reading the ledger file.
 #[derive(Debug)]
 pub enum Found {
-    /// A ledger.
+    /// A valid ledger.
     Ledger(Box<Ledger>),
     /// No file: a first start.
     Nothing,
-    /// A file that is no ledger of this format; it was moved to this path and lost nothing.
+    /// A file that is not a ledger of this format. The file was moved to this path, with all its
+    /// content.
     Unreadable(PathBuf),
 }
 
 impl Ledger {
-    /// The ledger of a robot that was never started, or whose ledger was lost. A start counter
-    /// above all earlier ones makes the server take this agent's reports for newer than those
-    /// before the loss.
+    /// A new ledger, for a robot that was never started or after the loss of its ledger. A start
+    /// counter above all earlier counters makes the server treat this agent's reports as newer than
+    /// those before the loss.
     pub fn new(start: u64) -> Self {
         Self {
             format: FORMAT,
@@ -261,7 +264,7 @@ impl Ledger {
         }
     }
 
-    /// What a person is told while the server does not accept the robot's token.
+    /// The message for people while the server does not accept the robot's token.
     pub fn removal(&self) -> Option<String> {
         let because = match self.removed_because.as_str() {
             "" => String::new(),
@@ -273,7 +276,7 @@ impl Ledger {
         self.removed.then(text)
     }
 
-    /// Reads the ledger at `path`; one that can't be understood is moved aside, not deleted.
+    /// Reads the ledger at `path`. An unreadable ledger is moved aside, not deleted.
     pub fn read(path: &Path) -> Result<Found, LedgerError> {
         let failed = |source| LedgerError { path: path.to_owned(), source };
         let bytes = match read_limited(path) {
@@ -310,11 +313,11 @@ impl Ledger {
         durable::write(path, &bytes, 0o600).map_err(failed)
     }
 
-    /// Takes out of the records what means nothing to a new agent, and in a new boot the times of
-    /// the one before.
+    /// Clears the parts of the records that are meaningless to a new agent and, in a new boot, the
+    /// times of the previous boot.
     pub fn enter_boot(&mut self, boot_id: &str, now_ms: u64) {
         for record in self.tasks.values_mut() {
-            // The robot may have been given a load since it said yes.
+            // The robot may have taken on a load since its gate allowed the step.
             record.gate.take_if(|gate| gate.answer == Some(GateAnswer::Allowed));
         }
         if self.boot_id == boot_id {
@@ -330,7 +333,7 @@ impl Ledger {
             for collection in &mut record.collections {
                 (collection.since_ms, collection.retry_at_ms) = (now_ms, 0);
             }
-            // What it lacked when it was given up may be there again.
+            // A resource that was missing when the run was given up may be there again.
             if let Some(active) = record.active.as_mut().filter(|active| active.is_worn_out()) {
                 active.end = None;
             }
@@ -356,14 +359,15 @@ fn free_name_beside(path: &Path) -> PathBuf {
 }
 
 impl Preparation {
-    /// Whether the version is on its way. For one that has run before: it is prepared anew.
+    /// Whether the version is still being prepared. A version that has run before may be prepared
+    /// anew.
     pub fn is_under_way(&self) -> bool {
         matches!(self.phase, Phase::Fetching | Phase::Building)
     }
 }
 
 impl TaskRecord {
-    /// The record of an order that has just come in.
+    /// The record of a new order.
     pub fn new(order: DesiredTask, now_ms: u64) -> Self {
         let mut record = Self {
             order,
@@ -383,8 +387,8 @@ impl TaskRecord {
         record
     }
 
-    /// The record of a run that was found alive when the ledger was lost: as if it were ordered,
-    /// until the server has said what is.
+    /// The record of a run that was found after the ledger was lost. The run counts as ordered
+    /// until the server has sent the desired state.
     pub fn of_survivor(task: TaskName, run: ActiveRun, now_ms: u64) -> Self {
         let order = DesiredTask {
             task,
@@ -401,7 +405,7 @@ impl TaskRecord {
         record
     }
 
-    /// How the ordered run ended, if it has: now, or before the order came back.
+    /// How the ordered run ended, if it has ended: either now, or before the order came back.
     pub fn end_of_order(&self) -> Option<&End> {
         if let Some(active) = self.active.as_ref().filter(|active| active.is_for(&self.order)) {
             return active.end.as_ref();
@@ -412,7 +416,7 @@ impl TaskRecord {
         self.finished.iter().rev().find(same).map(|run| &run.end)
     }
 
-    /// Where the order stands.
+    /// The phase of the order, and the failure behind it.
     pub fn standing(&self) -> (Phase, Option<&Failure>) {
         let active = self.active.as_ref().filter(|active| active.is_for(&self.order));
         if self.order.wanted == Wanted::Stopped
@@ -447,7 +451,7 @@ impl TaskRecord {
         }
     }
 
-    /// What the robot's gate forbids, and why.
+    /// The question that the robot's gate refused, and the reason.
     pub fn refusal(&self) -> Option<(&GateQuestion, &Failure)> {
         match &self.gate {
             Some(GateRecord { question, answer: Some(GateAnswer::Refused(failure)), .. }) => {
@@ -457,8 +461,8 @@ impl TaskRecord {
         }
     }
 
-    /// Whether what the gate is asked decides where the order stands, and not only whether an older
-    /// run goes on.
+    /// Whether the gate's answer to `question` affects the phase of the order, and not only the
+    /// restart of an older run.
     pub fn concerns_order(&self, question: &GateQuestion) -> bool {
         let same = question.deployment == self.order.deployment && question.run == self.order.run;
         question.step == GateStep::Stop || same
@@ -473,7 +477,7 @@ impl TaskRecord {
         }
     }
 
-    /// Makes place for `successor`: remembers how the active run ended, its version and, if it was
+    /// Makes room for `successor`. Remembers the active run's end and version and, if the run was
     /// good and does not come back anyway, the run itself.
     pub fn retire_active(&mut self, successor: &ActiveRun) {
         let is_good = |run: &&mut ActiveRun| {
@@ -484,8 +488,7 @@ impl TaskRecord {
             self.fallback.clone_from(&self.active);
         }
         self.lay_down_active(&successor.package);
-        // A job that failed has failed: what it has done can't be undone by starting something
-        // else.
+        // A failed job stays failed: starting another version cannot undo its effects.
         let is_job = successor.rules.kind == TaskKind::Job;
         self.fallback.take_if(|fallback| is_job || fallback.package == successor.package);
         if let Some(fallback) = &self.fallback {
@@ -493,7 +496,7 @@ impl TaskRecord {
         }
     }
 
-    /// What the operator had stopped neither starts nor comes back in place of what is ordered now.
+    /// A run that the operator had stopped neither starts nor comes back in place of the new order.
     pub fn forget_stopped(&mut self, next: &DesiredTask, now_ms: u64) {
         self.fallback = None;
         match &mut self.active {
@@ -504,8 +507,8 @@ impl TaskRecord {
         }
     }
 
-    /// Takes the active run away and remembers how it ended and, unless that is the next one's, its
-    /// version.
+    /// Removes the active run and remembers its end. Its version is remembered as well, unless
+    /// `next` is the same version.
     fn lay_down_active(&mut self, next: &PackageRef) {
         let Some(active) = self.active.take() else { return };
         if active.package != *next {
@@ -516,7 +519,7 @@ impl TaskRecord {
         }
     }
 
-    /// Remembers what came of a run.
+    /// Remembers the outcome of a run.
     pub fn finish(&mut self, deployment: DeploymentId, run: u64, end: End) {
         self.finished.retain(|other| other.deployment != deployment || other.run != run);
         self.finished.push(FinishedRun { deployment, run, end });
@@ -524,9 +527,9 @@ impl TaskRecord {
         self.finished.drain(..surplus);
     }
 
-    /// The versions that must stay on disk: ordered, active, the one that may come back, and the
-    /// one before while there is room for what is ordered: it lies there only so that a later
-    /// rollback need not fetch it.
+    /// The versions that must stay on disk: the ordered, the active and the fallback version. The
+    /// previous version stays only while there is room for the ordered one: it merely spares a
+    /// later rollback the fetch.
     pub fn kept_versions(&self) -> Vec<Digest> {
         let lacks_room = self
             .preparation
@@ -556,7 +559,7 @@ impl ActiveRun {
             && self.package == order.package
     }
 
-    /// Whether it was good, and was given up only for being started again too often in one boot.
+    /// Whether the run was good and was given up only because of too many restarts in one boot.
     fn is_worn_out(&self) -> bool {
         let is_up_at_boot =
             self.rules.kind == TaskKind::Service && self.rules.on_boot == OnBoot::Start;
@@ -571,15 +574,14 @@ impl ActiveRun {
         self.deployment == other.deployment && self.run == other.run
     }
 
-    /// Whether a process of it was started before. An earlier agent wrote down only that one was
-    /// ready.
+    /// Whether a process of the run was started before. Earlier agents recorded only readiness.
     pub fn has_started(&self) -> bool {
         self.ever_started || self.ever_ready
     }
 }
 
 impl Collection {
-    /// Whether it is of the run that `order` asks for.
+    /// Whether these are files of the run that `order` asks for.
     pub fn is_for(&self, order: &DesiredTask) -> bool {
         self.deployment == order.deployment && self.run == order.run
     }
@@ -622,7 +624,7 @@ mod tests {
         let order = order();
         ledger.tasks.insert(order.task.clone(), TaskRecord::new(order, 5));
         ledger.write(&path).expect("written");
-        // What a crash half way through the next write leaves behind.
+        // The leftover of a crash half way through the next write.
         std::fs::write(dir.path().join("ledger.json.tmp"), "{\"format\":1,").expect("written");
         let Ok(Found::Ledger(read)) = Ledger::read(&path) else { panic!("the ledger is there") };
         assert_eq!(*read, ledger);

@@ -1,6 +1,6 @@
-//! What is true on the robot, whatever the ledger says: processes, what ROS sees of them, and what
-//! lies on the disk. Plain values, filled by the effects and read by the plan. Times are
-//! milliseconds since boot.
+//! The observed state of the robot, independent of the ledger: processes, their health on the ROS
+//! graph, and the files on the disk. Plain values, filled by the effects and read by the plan.
+//! Times are milliseconds since boot.
 
 use std::collections::BTreeSet;
 
@@ -13,131 +13,132 @@ use crate::process::program::ExitStatus;
 use crate::setup::installation::{self, Installation};
 use crate::setup::launch;
 
-/// What is on the disk of one version, and which versions there are.
+/// The files of one version on the disk, and the list of the task's versions.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Prepared {
-    /// The version's manifest, once it was pulled and verified.
+    /// The version's manifest, once pulled and verified.
     pub manifest: Option<TaskManifest>,
-    /// Its content is unpacked.
+    /// Whether the content is unpacked.
     pub content: bool,
-    /// It is built, or needs no build.
+    /// Whether the version is built or needs no build.
     pub built: bool,
     /// Every version of the task that has a directory.
     pub versions: Vec<Digest>,
-    /// Whether this robot may run it, as far as is known of who has signed it.
+    /// Whether this robot may run the version, by the signatures known so far.
     pub vouched: Vouched,
 }
 
-/// What the signatures that are on the disk say.
+/// The verdict on the signatures on the disk.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Vouched {
-    /// Nothing, or not enough.
+    /// There are no signatures, or not enough.
     #[default]
     No,
-    /// It may go on running; new work needs a newer list of publishers.
+    /// The version may keep running; new work needs a newer list of publishers.
     Stale,
-    /// It may run. So may everything on a robot that trusts its server alone.
+    /// The version may run. On a robot that trusts its server alone, every version may.
     Yes,
 }
 
-/// What a robot goes by when it asks who has signed a package.
+/// The facts by which a robot decides whether a package is trusted.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TrustFacts {
-    /// Another number whenever a package may be judged otherwise than before.
+    /// Changes whenever the verdict on a package may have changed.
     pub epoch: u64,
-    /// Whether the lifetime of the list of publishers is over, so that nothing new begins.
+    /// Whether the list of publishers has expired, so that no new work begins.
     pub list_is_over: bool,
-    /// Why the newest list of publishers that it was shown does not count, if it does not.
+    /// Why the newest list of publishers was rejected, if it was.
     pub refused_list: Option<String>,
 }
 
-/// What became of a process that the ledger knows.
+/// The observed state of a process in the ledger.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum ProcessState {
-    /// The ledger knows none.
+    /// The ledger has no process.
     None,
-    /// It lives.
+    /// The process lives.
     Alive {
-        /// Its id.
+        /// The process id.
         pid: u32,
     },
-    /// It can't be told now.
+    /// The state cannot be determined now.
     Unknown,
-    /// It was about to be started, and was not.
+    /// The process was about to be started and was not.
     NeverStarted,
-    /// It ended.
+    /// The process ended.
     Ended(Exit),
 }
 
 /// How a process ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Exit {
-    /// With which code or signal; `None` when the process and its shim were gone without a word.
+    /// The exit code or signal; `None` when the process and its shim disappeared without a status.
     pub status: Option<ExitStatus>,
-    /// The memory it was limited to, if it was killed for using more.
+    /// The memory limit, if the process was killed for exceeding it.
     pub out_of_memory_bytes: Option<u64>,
-    /// The last lines of its output.
+    /// The last lines of the process's output.
     pub last_lines: String,
 }
 
-/// What ROS says of a run whose process lives, against what its package promises in `[ready]`.
+/// The health of a run with a live process: the ROS graph compared with the promises in `[ready]`
+/// of its package.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Health {
-    /// Nobody has looked yet.
+    /// No observation yet.
     #[default]
     Unknown,
-    /// All that was promised holds.
+    /// All promises hold.
     Holds {
-        /// Since when, without a break.
+        /// The time since which all promises have held without a break.
         since_ms: u64,
     },
-    /// Something is missing, and may yet come.
+    /// Something is missing and may still appear.
     Missing(Missing),
-    /// What no waiting mends: `node_name_taken`, `parameter_rejected`, `lifecycle_failed`. Only
-    /// before it was ready.
+    /// A failure that waiting does not mend: `node_name_taken`, `parameter_rejected`,
+    /// `lifecycle_failed`. Occurs only before the run was ready.
     Refused(Failure),
 }
 
-/// Something that was promised and is not there.
+/// Something promised that is absent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Missing {
-    /// Since when anything has been missing, without a break.
+    /// The time since which something has been missing without a break.
     pub since_ms: u64,
-    /// What it means once the task was ready: `node_vanished`, `node_inactive`, `topic_silent`,
-    /// `service_lost`, `graph_unavailable`.
+    /// The failure code for a task that was ready before: `node_vanished`, `node_inactive`,
+    /// `topic_silent`, `service_lost`, `graph_unavailable`.
     pub code: FailureCode,
-    /// What is missing, a sentence without its end: "`/mapper` did not appear".
+    /// The absence, as a sentence without its end: "`/mapper` did not appear".
     pub what: String,
-    /// What is there instead: "on the graph: `/lidar`, `/odom`". May be empty.
+    /// What is present instead: "on the graph: `/lidar`, `/odom`". May be empty.
     pub seen: String,
-    /// Whether the run itself lacks something, so that another start may mend it: what a stranger
-    /// does is not, nor that the agent sees nothing.
+    /// Whether the run itself lacks something, so that a restart may help. False if a stranger on
+    /// the graph is the cause, or if the agent sees nothing.
     pub is_its_own: bool,
 }
 
-/// What a package may require of the robot.
+/// Facts about the robot that a package may require.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RobotFacts {
     /// The processor architecture.
     pub arch: String,
-    /// The labels the server holds; `None` until it has said.
+    /// The labels that the server holds; `None` until the server has sent them.
     pub labels: Option<Labels>,
-    /// The ROS installations, the best last; `None` while they have to be looked at.
+    /// The ROS installations, the best last; `None` while they still have to be inspected.
     pub installations: Option<Vec<Installation>>,
     /// Why there is no user to run tasks as, if there is none.
     pub no_task_user: Option<String>,
 }
 
 impl RobotFacts {
-    /// Whether this robot's ROS has to be known to tell if `manifest` can run here.
+    /// Whether we must know this robot's ROS to decide if `manifest` can run here.
     pub fn must_know_ros(manifest: &TaskManifest) -> bool {
         launch::of(manifest).ros.is_some()
             || !manifest.requires.ros_distro.is_empty()
             || !manifest.exec_depends.is_empty()
     }
 
-    /// What `manifest` needs and this robot lacks, each as a sentence part; empty when it has all
-    /// that can be told.
+    /// The unmet requirements of `manifest`, each as a sentence part. Empty if the robot meets all
+    /// requirements that can be checked.
     pub fn lacks(&self, manifest: &TaskManifest) -> Vec<String> {
         let requires = &manifest.requires;
         let mut lacks = Vec::new();
@@ -172,12 +173,12 @@ impl RobotFacts {
 }
 
 impl Missing {
-    /// Why a task that was ready is not as it should be.
+    /// The failure of a task that was ready before.
     pub fn failure(&self) -> Failure {
         Failure::new(self.code.clone(), self.sentence(""))
     }
 
-    /// Why a task was not ready within its time.
+    /// The failure of a task that was not ready within its timeout.
     pub fn not_within(&self, timeout_s: u32) -> Failure {
         Failure::new(FailureCode::NOT_READY, self.sentence(&format!(" within {timeout_s} s")))
     }
@@ -189,12 +190,12 @@ impl Missing {
 }
 
 impl Exit {
-    /// Whether it ended as a program does that is content.
+    /// Whether the process exited with code 0.
     pub fn is_success(&self) -> bool {
         self.status == Some(ExitStatus::Code(0))
     }
 
-    /// The failure that this end is, in words and with the last lines of output.
+    /// The failure that describes this exit, with the last lines of output.
     pub fn failure(&self) -> Failure {
         let (code, end) = match (self.out_of_memory_bytes, self.status) {
             (Some(limit), _) => {

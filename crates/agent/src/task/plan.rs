@@ -1,8 +1,9 @@
-//! The plan: what to do next about one task. Pure: desired state, ledger record and observation in,
-//! next step out; time and randomness are arguments. It never touches disk, network or processes.
+//! The plan decides the next step for one task. The plan is pure: desired state, ledger record and
+//! observation go in, the next step comes out. Time and randomness are arguments. The plan never
+//! touches disk, network or processes.
 //!
-//! Two things go on side by side. A version that was ordered is prepared while the one before it
-//! keeps running:
+//! Two state machines run side by side. The first prepares an ordered version while the previous
+//! version keeps running:
 //!
 //! ```text
 //! assigned ─► fetching ─► unpacking ─► building ─► staged ──► (handed to the active run)
@@ -10,7 +11,7 @@
 //!     └► unmet    a retry waits in its phase                      or its gate says not now
 //! ```
 //!
-//! and one run of one version is kept alive:
+//! The second keeps one run of one version alive:
 //!
 //! ```text
 //! starting ─► running ─► succeeded | failed | stopped
@@ -20,11 +21,11 @@
 //!     └── restart policy, reboot: after a backoff
 //! ```
 //!
-//! A staged version takes over: the old process is stopped, `current` is swapped, the new one is
-//! started. The old run stays in the record until the new one is ready; if that never comes, the
-//! old one becomes the active run again and the order has ended as `rolled_back`. Each half has at
-//! most one step under way ([`Lane`]); a process is only ever started by the second, so there are
-//! never two of a task.
+//! A staged version takes over in three steps: the old process is stopped, `current` is swapped,
+//! the new process is started. The old run stays in the record until the new run is ready. If the
+//! new run never becomes ready, the old run becomes the active run again and the order ends as
+//! `rolled_back`. Each state machine has at most one step under way ([`Lane`]). Only the second one
+//! starts processes, so a task never has two.
 
 use std::time::Duration;
 
@@ -50,18 +51,18 @@ pub use collect::collect;
 pub use gate::consult;
 pub use transition::{Done, StepFailure, adopted, backoff_ms, begun, finished};
 
-/// All that the next step depends on.
+/// All inputs of the decision about the next step.
 #[derive(Debug, Clone, Copy)]
 pub struct Situation<'a> {
-    /// What the accepted desired state says of this task; `None`: it should be absent.
+    /// The task in the accepted desired state; `None`: the task should be absent.
     pub desired: Option<&'a DesiredTask>,
-    /// What the ledger says.
+    /// The task's record in the ledger.
     pub record: &'a TaskRecord,
-    /// What is on the disk of the ordered version.
+    /// The files of the ordered version on the disk.
     pub prepared: &'a Prepared,
-    /// What became of the active run's process.
+    /// The observed state of the active run's process.
     pub process: &'a ProcessState,
-    /// What ROS says of it while it lives.
+    /// The health of the active run on the ROS graph while its process lives.
     pub health: &'a Health,
     /// Whether a step of [`Lane::Prepare`] is under way.
     pub preparing: bool,
@@ -71,93 +72,92 @@ pub struct Situation<'a> {
     pub collecting: bool,
     /// Whether a step that deletes versions is under way.
     pub deleting: bool,
-    /// What packages may require.
+    /// Facts about the robot that packages may require.
     pub robot: &'a RobotFacts,
-    /// Whether new work may be begun: the desired state is in force and the server knows the robot.
+    /// Whether new work may begin: the desired state is in force and the server knows the robot.
     pub may_begin: bool,
     /// A person at the robot said `hold`.
     pub held: bool,
-    /// The robot has a gate that is to be asked.
+    /// Whether the robot has a gate to ask.
     pub gated: bool,
     /// The kernel's boot id.
     pub boot_id: &'a str,
     /// Milliseconds since boot.
     pub now_ms: u64,
-    /// Evenly from 0 to 1: spreads the retries.
+    /// Uniform from 0 to 1; spreads the retries.
     pub jitter: f64,
 }
 
-/// What to do next.
+/// The decision of the plan.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "it is taken apart where it is made")]
 pub enum Next {
-    /// Nothing before this time, or before something changes.
+    /// Do nothing before this time, or before something changes.
     Rest {
         /// Milliseconds since boot.
         until_ms: Option<u64>,
     },
-    /// Write this record, then ask again.
+    /// Write this record, then plan again.
     Record(Box<TaskRecord>),
-    /// Write [`begun`], do this, write [`finished`], then ask again.
+    /// Write [`begun`], do this step, write [`finished`], then plan again.
     Act(Step),
 }
 
-/// One thing to be done about a task.
+/// One unit of work on a task.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Step {
-    /// Find out whether enough of the trusted publishers have signed it.
+    /// Check that enough of the trusted publishers have signed the package.
     CheckSigners(PackageRef),
     /// Pull the manifest.
     PullManifest(PackageRef),
-    /// Look at what ROS there is, to tell whether the version can run here.
+    /// Inspect the installed ROS distributions, to decide whether the version can run here.
     LookForRos(PackageRef),
-    /// Get and unpack the content: as parts that the server pushes, and what does not come so by a
-    /// pull.
+    /// Fetch and unpack the content. Parts that the server pushes are gathered; the rest is pulled.
     PullContent {
-        /// Of which package.
+        /// The package to fetch.
         package: PackageRef,
-        /// Whether the server pushes it.
+        /// Whether the server pushes the content.
         is_pushed: bool,
     },
-    /// Build it.
+    /// Build the package.
     Build(PackageRef),
     /// Ask the robot's gate.
     Ask(GateQuestion),
-    /// Make this run the active one and start a process of it.
+    /// Make this run the active run and start a process of the run.
     Start(Box<ActiveRun>),
-    /// Stop this run's process; it is the active one.
+    /// Stop the process of this run, which is the active run.
     Stop(Box<ActiveRun>),
-    /// Bring the files of an ended run to the server.
+    /// Upload the output files of an ended run to the server.
     Collect(Box<Collection>),
     /// Delete the versions that are not in `kept`.
     Prune {
         /// The versions that stay.
         kept: Vec<Digest>,
     },
-    /// Delete the task with all that belongs to it, its record too.
+    /// Delete the task with all its files and its record.
     Remove,
 }
 
-/// Which half of the plan a step belongs to.
+/// The lane of a step. A lane has at most one step of a task under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Lane {
-    /// Brings the ordered version to `staged`. May take long, may be interrupted at any point.
+    /// Brings the ordered version to `staged`. May take long and may be interrupted at any point.
     Prepare,
-    /// Starts, stops, removes.
+    /// Starts and stops processes, deletes versions and tasks.
     Run,
-    /// Asks the robot's gate. Meanwhile the run that lives is looked after.
+    /// Asks the robot's gate. The live run is supervised meanwhile.
     Gate,
-    /// Brings the files of ended runs to the server.
+    /// Uploads the output files of ended runs to the server.
     Collect,
 }
 
 impl Lane {
-    /// All of them.
+    /// All lanes, in planning order.
     pub const ALL: [Self; 4] = [Self::Run, Self::Prepare, Self::Gate, Self::Collect];
 }
 
 impl Step {
-    /// The lane it runs in.
+    /// The lane that this step runs in.
     pub fn lane(&self) -> Lane {
         match self {
             Self::CheckSigners(_)
@@ -171,14 +171,14 @@ impl Step {
         }
     }
 
-    /// How long it may take. What moves many bytes watches over their flow instead, since a large
-    /// package on a bad link takes its time, and a build over its own limits.
+    /// The time limit of the step. Transfers have none, because a large package on a bad link takes
+    /// its time: they watch for stalls instead. Builds have limits of their own.
     pub fn deadline(&self) -> Option<Duration> {
         let seconds = match self {
             Self::PullContent { .. } | Self::Build(_) | Self::Collect(_) => return None,
             Self::CheckSigners(_) | Self::PullManifest(_) | Self::LookForRos(_) => STEP_DEADLINE_S,
             Self::Start(_) => STEP_DEADLINE_S + VERIFY_DEADLINE_S,
-            // Its own, shorter limit is a setting.
+            // The gate's own, shorter limit is a setting.
             Self::Ask(_) => STEP_DEADLINE_S + crate::config::MAX_GATE_TIMEOUT_S,
             Self::Stop(run) => STEP_DEADLINE_S + 2 * u64::from(run.rules.stop_timeout_s),
             Self::Prune { .. } | Self::Remove => DELETE_DEADLINE_S,
@@ -186,13 +186,13 @@ impl Step {
         Some(Duration::from_secs(seconds))
     }
 
-    /// Whether it deletes versions, so that none may be prepared meanwhile.
+    /// Whether the step deletes versions, so that no version may be prepared meanwhile.
     pub fn deletes(&self) -> bool {
         matches!(self, Self::Prune { .. } | Self::Remove)
     }
 
-    /// Whether this step, already under way, still serves what is desired. If not it is
-    /// interrupted; steps of [`Lane::Run`] are short and are finished.
+    /// Whether this step, already under way, still serves the desired state. If not, the step is
+    /// interrupted. Steps of [`Lane::Run`] are short and always finish.
     pub fn is_wanted(&self, desired: Option<&DesiredTask>, record: Option<&TaskRecord>) -> bool {
         match self {
             Self::Ask(question) => record
@@ -213,20 +213,19 @@ impl Step {
     }
 }
 
-/// How long a step may take whose parts all have shorter limits of their own.
+/// Time limit of a step in which each part has a shorter limit of its own.
 const STEP_DEADLINE_S: u64 = 120;
-/// How long it may take to read all of a version: the largest there may be, on a slow card.
+/// Time limit for reading a whole version: the largest permitted version on a slow card.
 const VERIFY_DEADLINE_S: u64 = 900;
-/// How long deleting may take: many small files on a slow card.
+/// Time limit for deletion: many small files on a slow card.
 const DELETE_DEADLINE_S: u64 = 600;
-/// A run that went on this long without ending is calm: its restarts are forgiven.
+/// After this time without an end, a run is calm and its restart count is reset.
 pub const CALM_MS: u64 = 10 * 60 * 1000;
 
-/// When to look again at a process of which nothing could be told.
+/// Interval between observations of a process while its state cannot be determined.
 pub const LOOK_AGAIN_MS: u64 = 5000;
 
-/// Tasks in the order in which they get what not all can have at once: those of higher priority
-/// first, then by name.
+/// Orders the tasks for scarce resources: by descending priority, then by name.
 pub fn in_turn(mut tasks: Vec<(TaskName, i32)>) -> Vec<TaskName> {
     tasks.sort_by(|(name, priority), (other, other_priority)| {
         other_priority.cmp(priority).then(name.cmp(other))
@@ -235,7 +234,7 @@ pub fn in_turn(mut tasks: Vec<(TaskName, i32)>) -> Vec<TaskName> {
     tasks.into_iter().map(|(name, _)| name).collect()
 }
 
-/// The next step about the active run: start, restart, stop, replace, remove.
+/// The next step for the active run: start, restart, stop, replace, remove.
 pub fn supervise(s: &Situation<'_>) -> Next {
     if let Some(order) = s.desired
         && *order != s.record.order
@@ -246,14 +245,14 @@ pub fn supervise(s: &Situation<'_>) -> Next {
     let Some(process) = &active.process else { return without_process(s, Some(active)) };
     match s.process {
         ProcessState::Alive { .. } => with_process(s, active, process),
-        // Another process must not be started while this one may live.
+        // This process may still live, so we must not start another.
         ProcessState::Unknown => Next::Rest { until_ms: Some(s.now_ms + LOOK_AGAIN_MS) },
         ProcessState::Ended(exit) => record(transition::ended(s, exit)),
         ProcessState::NeverStarted | ProcessState::None => record(transition::never_started(s)),
     }
 }
 
-/// The next step towards the ordered version being staged.
+/// The next step towards `staged` for the ordered version.
 pub fn prepare(s: &Situation<'_>) -> Next {
     const NOTHING: Next = Next::Rest { until_ms: None };
     let order = &s.record.order;
@@ -274,8 +273,8 @@ pub fn prepare(s: &Situation<'_>) -> Next {
     if s.now_ms < preparation.retry_at_ms {
         return Next::Rest { until_ms: Some(preparation.retry_at_ms) };
     }
-    // Before anything of it is fetched, and again whenever it turns out that the signatures are not
-    // enough any more.
+    // Checked before any of the package is fetched, and again whenever the signatures turn out to
+    // be no longer sufficient.
     if s.prepared.vouched != Vouched::Yes {
         return Next::Act(Step::CheckSigners(order.package.clone()));
     }
@@ -366,7 +365,7 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
         && active.is_none_or(|active| !active.is_for(order))
         && let Some(manifest) = &s.prepared.manifest
     {
-        // A run that was replaced and is ordered again goes on as the good one it was.
+        // A run that was replaced and is ordered again continues with its previous record.
         let before = s.record.fallback.as_ref().filter(|run| run.is_for(order)).cloned();
         let run =
             before.unwrap_or_else(|| ActiveRun::of(order, RunRules::from(manifest), s.now_ms));
@@ -388,14 +387,15 @@ fn without_process(s: &Situation<'_>, active: Option<&ActiveRun>) -> Next {
     start(s, active)
 }
 
-/// Whether what `active` is to run is not on the disk any more: it was deleted because it had been
-/// changed, and is prepared anew.
+/// Whether the files that `active` needs are no longer on the disk: they had been changed, so they
+/// were deleted and are prepared anew.
 fn is_lost(s: &Situation<'_>, active: &ActiveRun) -> bool {
     let is_whole = s.prepared.content && s.prepared.built;
     active.is_for(&s.record.order) && active.process.is_none() && active.end.is_none() && !is_whole
 }
 
-/// Starts a process of `run`, unless it would write over files that are still to be brought back.
+/// Starts a process of `run`, unless the process would overwrite output files that are not yet
+/// uploaded.
 fn start(s: &Situation<'_>, run: &ActiveRun) -> Next {
     if collect::occupies(s.record, run) {
         return Next::Rest { until_ms: None };
@@ -403,7 +403,7 @@ fn start(s: &Situation<'_>, run: &ActiveRun) -> Next {
     Next::Act(Step::Start(Box::new(run.clone())))
 }
 
-/// Deletes versions that nothing needs any more, once nothing else is to be done.
+/// Deletes unneeded versions once no other work is left.
 fn tidy(s: &Situation<'_>, until_ms: Option<u64>) -> Next {
     let kept = s.record.kept_versions();
     let surplus = s.prepared.versions.iter().any(|version| !kept.contains(version));
@@ -414,13 +414,13 @@ fn record(record: TaskRecord) -> Next {
     Next::Record(Box::new(record))
 }
 
-/// The name of a run's directory: one for each start, never used twice. `start` counts the agent's
-/// starts, `starts` the task's.
+/// The name of a run's directory. Each start has its own directory, and a name is never used twice.
+/// `start` counts the agent's starts, `starts` the task's.
 pub fn run_dir_name(run: &ActiveRun, start: u64, starts: u64) -> String {
     format!("{}.{}.{start}.{starts}", run.deployment, run.run)
 }
 
-/// The line that names a step in the log.
+/// The log line that names a step.
 pub fn describe(task: &TaskName, step: &Step) -> String {
     match step {
         Step::CheckSigners(package) => format!("look who has signed {task} {}", package.version),

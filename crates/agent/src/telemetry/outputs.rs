@@ -1,7 +1,7 @@
-//! Brings files of an ended run to the server: finds them, pushes each as a blob, then says which
-//! run they are of. The order of things is the registry's: nothing is listed before all of it is
-//! there. Doing it again after a crash is harmless and sends only what the server lacks. It decides
-//! nothing about the run.
+//! Uploads output files of an ended run to the server: finds them, pushes each as a blob, then
+//! registers them with the run. The registry dictates the order: an output is listed only after all
+//! its files are stored. A repetition after a crash is harmless and sends only the files that the
+//! server lacks. This module decides nothing about the run.
 
 mod find;
 mod push;
@@ -20,73 +20,74 @@ use crate::system::task_user::{self, TaskUser};
 
 pub use push::Registry;
 
-/// Which files to bring back, and of what.
+/// The files to upload, and the run that they belong to.
 #[derive(Debug, Clone)]
 pub struct OutputOrder {
     /// The robot.
     pub robot_id: RobotId,
     /// The task.
     pub task: TaskName,
-    /// Its version.
+    /// Version of the task.
     pub version: Version,
-    /// The order.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of its runs.
+    /// Number of the run.
     pub run: u64,
-    /// The directory the task ran in.
+    /// Working directory of the task.
     pub directory: PathBuf,
-    /// Whom it ran as; `None`: whoever the agent is. The files are read with its rights.
+    /// Account of the task. The files are read with its rights; `None` is the agent's own
+    /// account.
     pub user: Option<TaskUser>,
     /// The patterns of `outputs.paths`.
     pub patterns: Vec<String>,
-    /// Where to note uploads under way, so that the next try goes on with them.
+    /// File that records uploads in progress, so that the next attempt resumes them.
     pub notes: PathBuf,
-    /// The most bytes that are brought back.
+    /// Most bytes to upload.
     pub max_bytes: u64,
 }
 
-/// Why files did not come back.
+/// Reasons why files were not uploaded.
 #[derive(Debug, thiserror::Error)]
 pub enum OutputError {
-    /// A pattern is none.
+    /// A pattern is invalid.
     #[error("outputs.paths: {pattern:?} is not a pattern: {reason}")]
     Pattern {
         /// The pattern.
         pattern: String,
-        /// Why.
+        /// Reason.
         reason: &'static str,
     },
-    /// Beyond a limit.
+    /// The files exceed a limit.
     #[error("outputs.paths: {0}")]
     TooMuch(String),
-    /// The files can't be looked at as the task's user.
+    /// The agent can't take the rights of the task's user.
     #[error("cannot take the rights of the user that tasks run as")]
     User(#[source] io::Error),
     /// A file can't be read.
     #[error("cannot read {path}")]
     Read {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// The note of uploads under way can't be written.
+    /// The record of uploads in progress can't be written.
     #[error("cannot write {path}")]
     Note {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// No connection, or it broke.
+    /// The connection failed or broke.
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
-    /// Something answered that is no registry: a captive portal, a proxy.
+    /// The answer does not come from a registry, but from a captive portal or a proxy.
     #[error("something else answers in the server's place: {status} {text}")]
     NotTheServer {
         /// The HTTP status.
         status: u16,
-        /// What it said.
+        /// Text of the answer.
         text: String,
     },
     /// The server is overloaded, restarting or broken.
@@ -94,45 +95,45 @@ pub enum OutputError {
     Busy {
         /// The HTTP status.
         status: u16,
-        /// What it said.
+        /// Text of the answer.
         text: String,
-        /// When it wants to be asked again.
+        /// Wait that the server requests.
         retry_after: Option<Duration>,
     },
-    /// It said no.
+    /// The server refused the request.
     #[error("the server refuses {what}: {status} {text}")]
     Refused {
-        /// What was asked.
+        /// Subject of the request.
         what: String,
         /// The HTTP status.
         status: u16,
-        /// The registry's code of the error, if it gave one.
+        /// The registry's error code, if the answer has one.
         code: String,
-        /// What it said.
+        /// Text of the answer.
         text: String,
     },
-    /// The server keeps receiving other bytes than were sent.
+    /// The server repeatedly receives other bytes than we send.
     #[error("the server receives other bytes than are sent: {text}")]
     Garbled {
-        /// What it said.
+        /// Text of the answer.
         text: String,
     },
-    /// The order was taken back.
+    /// The upload was cancelled.
     #[error("it was interrupted")]
     Cancelled,
 }
 
 impl OutputError {
-    /// Whether trying again may help, and how long to wait at least.
+    /// The shortest wait before the next attempt; `None` if another attempt can't help.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Unreachable(_) | Self::Note { .. } | Self::Cancelled => Some(Duration::ZERO),
-            // What can't be read now may be readable once a file system is back.
+            // An unreadable file may become readable once its file system is back.
             Self::Read { .. } | Self::User(_) | Self::Garbled { .. } => {
                 Some(Duration::from_secs(30))
             }
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
-            // A robot that is enrolled anew, or replaces its token, is known again.
+            // The server knows a robot again after a new enrollment or a new token.
             Self::NotTheServer { .. } | Self::Refused { status: 401, .. } => {
                 Some(Duration::from_secs(30))
             }
@@ -141,7 +142,8 @@ impl OutputError {
     }
 }
 
-/// Brings the files back; gives how many. None is no error: the run may have had nothing to say.
+/// Uploads the files and returns their number. Zero is not an error: the run may have produced no
+/// output.
 pub async fn bring_back(
     registry: &Registry,
     order: &OutputOrder,
@@ -174,7 +176,7 @@ pub async fn bring_back(
     }
 }
 
-/// One more file than may be.
+/// Error for a file beyond [`MAX_FILES`].
 fn too_many() -> OutputError {
     OutputError::TooMuch(format!("more than {MAX_FILES} files match"))
 }

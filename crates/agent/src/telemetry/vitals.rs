@@ -1,6 +1,6 @@
-//! How the machine does, from what the kernel shows in /proc and /sys. A [`Gauge`] looks;
-//! [`Sender`] says it once a minute, over the MQTT session or, while there is none, over HTTP.
-//! Nothing is decided by it, and what was lost is not sent again.
+//! Vitals of the machine, read from the kernel's /proc and /sys. A [`Gauge`] reads them. A
+//! [`Sender`] sends them once a minute over the MQTT session, or over HTTP while no session is up.
+//! No decision depends on vitals, and lost ones are not sent again.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -22,41 +22,42 @@ use crate::system::disk;
 use crate::system::error_chain::chain;
 use crate::transfer::server::{Server, ServerError};
 
-/// Shares of time and rates over less than this say little.
+/// Shortest time span for meaningful percentages and rates.
 const LEAST_SPAN: Duration = Duration::from_millis(250);
-/// The first look is sent within this time, so that a fleet which starts at once spreads over it.
+/// The first vitals are sent within this time, so that a fleet that starts at once spreads over it.
 const FIRST_WITHIN: Duration = Duration::from_secs(10);
-/// How long a server that does not know what it is sent is left alone: it is older than this agent.
+/// Pause after the server answers that it does not know telemetry: the server is older than this
+/// agent.
 const UNKNOWN_PAUSE: Duration = Duration::from_secs(3600);
 
-/// Where the kernel shows how the machine does.
+/// Paths that vitals are read from.
 #[derive(Debug, Clone)]
 pub struct Places {
     /// `/proc`.
     pub proc: PathBuf,
     /// `/sys`.
     pub sys: PathBuf,
-    /// What lies on the file system that counts.
+    /// A path on the reported file system.
     pub data: PathBuf,
 }
 
 impl Places {
-    /// Those of this machine, with the agent's data directory.
+    /// The paths of this machine, with the agent's data directory.
     pub fn of_this_machine(data: &Path) -> Self {
         Self { proc: "/proc".into(), sys: "/sys".into(), data: data.to_owned() }
     }
 }
 
-/// What only grows; two of them make shares and rates.
+/// Cumulative counters. Two readings give percentages and rates.
 #[derive(Debug, Clone, Copy, Default)]
 struct Counters {
-    /// Time of all processors, in the kernel's ticks, and of it that in which they did something.
+    /// Total and busy time of all processors, in kernel ticks.
     cpu: Option<(u64, u64)>,
-    /// Bytes in and out.
+    /// Bytes received and sent.
     network: Option<(u64, u64)>,
 }
 
-/// Looks at the machine, again and again.
+/// Reads the machine's vitals repeatedly.
 pub struct Gauge {
     places: Places,
     before: Option<(Instant, Counters)>,
@@ -64,13 +65,13 @@ pub struct Gauge {
 }
 
 impl Gauge {
-    /// One that has not looked yet.
+    /// A gauge without a first reading.
     pub fn new(places: Places) -> Self {
         Self { places, before: None, last: Vitals::default() }
     }
 
-    /// How the machine does at `now`. The first look knows no shares and rates; one that comes too
-    /// soon after the one before shows that again.
+    /// Reads the vitals at `now`. The first reading has no percentages and rates. A reading too
+    /// soon after the last one returns that one again.
     pub fn look(&mut self, now: Instant) -> Vitals {
         if self.before.is_some_and(|(at, _)| now.duration_since(at) < LEAST_SPAN) {
             return self.last;
@@ -111,7 +112,7 @@ impl Gauge {
     fn cpu(&self) -> Option<(u64, u64)> {
         let text = self.proc("stat")?;
         let line = text.lines().find_map(|line| line.strip_prefix("cpu "))?;
-        // What guests used is in what their hosts did already.
+        // Guest time is already included in the time of the hosts.
         let ticks: Vec<u64> =
             line.split_whitespace().take(8).map_while(|number| number.parse().ok()).collect();
         let idle = ticks.get(3)?.saturating_add(ticks.get(4).copied().unwrap_or(0));
@@ -119,7 +120,7 @@ impl Gauge {
         Some((all, all.saturating_sub(idle)))
     }
 
-    /// All there is, and what programs could not have.
+    /// Total memory, and the memory that is not available to programs.
     fn memory(&self) -> Option<(u64, u64)> {
         let text = self.proc("meminfo")?;
         let bytes = |key: &str| {
@@ -130,8 +131,8 @@ impl Gauge {
         Some((total, total.saturating_sub(bytes("MemAvailable")?)))
     }
 
-    /// Of the interfaces that are devices; where there are none, as in a container, of all but the
-    /// loopback. Bridges and the like would count everything twice.
+    /// Traffic of the interfaces that are devices. Without any, as in a container, traffic of all
+    /// interfaces but the loopback. Bridges and similar interfaces would count all traffic twice.
     fn network(&self) -> Option<(u64, u64)> {
         let text = self.proc("net/dev")?;
         let all = text.lines().filter_map(|line| {
@@ -163,7 +164,7 @@ impl Gauge {
         let read = |zone: fs::DirEntry| {
             fs::read_to_string(zone.path().join("temp")).ok()?.trim().parse::<i32>().ok()
         };
-        // A zone without a sensor says something that no robot survives.
+        // Ignore impossible values, which a zone without a sensor reports.
         let hottest =
             zones.filter_map(read).filter(|milli| (-40_000..=150_000).contains(milli)).max()?;
         Some(tenths(f64::from(hottest) / 1000.0))
@@ -180,9 +181,9 @@ fn tenths(value: f64) -> f32 {
     ((value * 10.0).round() / 10.0) as f32
 }
 
-/// Where vitals come from: the machine, or what stands for one.
+/// A source of vitals: the machine, or a simulation of one.
 pub trait Source: Send + 'static {
-    /// How it does now.
+    /// The current vitals.
     fn look(&mut self) -> Vitals;
 }
 
@@ -192,20 +193,20 @@ impl Source for Gauge {
     }
 }
 
-/// Vitals for whoever asks now. Who asks again and again gets them over the time in between.
+/// Vitals on request. Frequent requests get percentages and rates over the time since the last one.
 #[derive(Clone)]
 pub struct Asked {
     gauge: Arc<Mutex<Gauge>>,
 }
 
 impl Asked {
-    /// Of the machine at `places`.
+    /// A source for the machine at `places`.
     pub fn new(places: Places) -> Self {
         Self { gauge: Arc::new(Mutex::new(Gauge::new(places))) }
     }
 
-    /// How the machine does. After nobody has asked for a while it looks twice, or shares and rates
-    /// would be over all that time.
+    /// The current vitals. After a longer pause this takes two readings, because percentages and
+    /// rates would otherwise cover the whole pause.
     pub async fn now(&self) -> Vitals {
         const FRESH: Duration = Duration::from_secs(10);
         let mut gauge = self.gauge.lock().await;
@@ -219,32 +220,33 @@ impl Asked {
     }
 }
 
-/// Says again and again how the robot does.
+/// Sends the robot's vitals periodically.
 pub struct Sender<S> {
     /// The robot.
     pub robot_id: RobotId,
-    /// How often; zero: never.
+    /// Interval between messages; zero disables them.
     pub interval: Duration,
-    /// What is said.
+    /// Source of the vitals.
     pub source: S,
-    /// Where it goes while no session is up.
+    /// HTTP client for use while no session is up.
     pub server: Server,
 }
 
 impl<S: Source> Sender<S> {
-    /// Sends until the agent ends; `messages` go out while a session is up.
+    /// Sends until the agent ends, through `messages` while a session is up.
     pub async fn run(mut self, shared: Shared, messages: mpsc::Sender<Message>) {
         if self.interval.is_zero() {
             return;
         }
-        // A session brings the same with less, above all where a whole fleet starts at once.
+        // A session carries the same data at less cost, above all when a whole fleet starts at
+        // once.
         let mut tried = shared.mqtt_tried.subscribe();
         tokio::select! {
-            // Cancel-safe: a watch remembers what it holds, a token can be awaited again.
+            // Cancel-safe: a watch remembers its value, and a token can be awaited again.
             _ = tried.wait_for(|tried| *tried) => {}
             () = shared.shutdown.cancelled() => return,
         }
-        // The shares and rates of the first message begin here.
+        // This reading is the start of the first message's percentages and rates.
         self.source.look();
         let first = FIRST_WITHIN.min(self.interval).mul_f64(0.1 + 0.9 * rand::random::<f64>());
         let mut ticks = tokio::time::interval_at(Instant::now() + first, self.interval);
@@ -271,11 +273,11 @@ impl<S: Source> Sender<S> {
     }
 }
 
-/// How long the server is told nothing after this answer.
+/// Pause after this error before vitals are sent again.
 fn pause(error: &ServerError) -> Duration {
     match error {
         ServerError::TokenRefused(_) => REFUSED_POLL.mul_f64(spread()),
-        // It is let in at any time.
+        // The robot may be approved at any time.
         ServerError::Refused { code, .. } if code == AWAITS_APPROVAL => {
             REFUSED_POLL.mul_f64(spread())
         }
@@ -289,7 +291,7 @@ fn pause(error: &ServerError) -> Duration {
 
 fn say(messages: &mpsc::Sender<Message>, telemetry: &Telemetry) {
     match serde_json::to_vec(telemetry) {
-        // With a session that is too slow the next ones say more.
+        // Drop the message if the session is too slow: the next vitals are more useful.
         Ok(payload) => drop(messages.try_send(Message { topic: RobotTopic::Telemetry, payload })),
         Err(error) => tracing::error!(%error, "vitals can't be written as JSON"),
     }
@@ -354,7 +356,7 @@ mod tests {
             (second.network_in_bytes_per_s, second.network_out_bytes_per_s),
             (Some(1000), Some(150))
         );
-        // An interface was taken away, and counters began anew.
+        // An interface was removed, and the counters were reset.
         machine.write("proc/net/dev", NET_HEAD);
         machine.write("proc/stat", "cpu  1 0 1 1 1 0 0 0 0 0\n");
         let third = gauge.look(begun + Duration::from_secs(4));
@@ -437,7 +439,7 @@ mod tests {
         assert_eq!(pause(&ServerError::NotTheServer("a portal".to_owned())), Duration::ZERO);
     }
 
-    /// Says, of each look, whether a session had been tried by then.
+    /// Records for each reading whether a session had been tried before.
     struct Looks(Shared, mpsc::UnboundedSender<bool>);
 
     impl Source for Looks {

@@ -1,19 +1,19 @@
-//! The robot's token as everything that talks to the server holds it: one value, which may change
-//! while the agent runs. It reads and writes no file.
+//! The robot's token, shared by all clients of the server. The value may change while the agent
+//! runs. This module reads and writes no file.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
-/// The robot's token. Clones are the same.
+/// The robot's token. Clones share one value.
 #[derive(Clone)]
 pub struct Credential(Arc<RwLock<String>>);
 
 impl Credential {
-    /// The token that is good now.
+    /// The current token.
     pub fn current(&self) -> String {
         self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// From now on this one is.
+    /// Replaces the current token.
     pub fn replace(&self, token: String) {
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = token;
     }

@@ -1,6 +1,6 @@
-//! What transfers teach about the way to the server: how fast, how far, how often it broke. Server
-//! and agent judge by it how a package should travel. It measures nothing itself and never reads
-//! the time.
+//! Measurements of the route to the server, taken from transfers: throughput, round-trip time, and
+//! interruptions. Server and agent use them to choose how a package travels. This module measures
+//! nothing itself and never reads the clock.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,16 +9,16 @@ use std::time::Duration;
 use task_proto::report::LinkFacts;
 use tokio::time::Instant;
 
-/// Shorter transfers say more about the connection's start than about its speed.
+/// Shorter transfers are ignored: they measure the start of the connection more than its speed.
 const MEASURED_BYTES: u64 = 64 * 1024;
-/// What the newest measurement counts for against all earlier ones.
+/// Weight of the newest measurement against all earlier ones.
 const NEWEST_SHARE: f64 = 0.3;
-/// For how long it is remembered that something broke.
+/// How long an interruption is remembered.
 const MEMORY: Duration = Duration::from_secs(3600);
-/// How many of each are remembered.
+/// Most interruptions of each kind that are remembered.
 const MAX_REMEMBERED: usize = 1000;
 
-/// The measurements of one link. Clones are the same.
+/// The measurements of one link. Clones share them.
 #[derive(Debug, Clone, Default)]
 pub struct LinkMeter(Arc<Mutex<Measured>>);
 
@@ -31,7 +31,7 @@ struct Measured {
 }
 
 impl LinkMeter {
-    /// So many bytes came in that time.
+    /// Records a transfer of `bytes` that took this long.
     pub fn transferred(&self, bytes: u64, took: Duration) {
         if bytes >= MEASURED_BYTES {
             let bytes_per_s = bytes as f64 / took.as_secs_f64().max(1e-6);
@@ -40,24 +40,24 @@ impl LinkMeter {
         }
     }
 
-    /// So long it took from a short question to its answer.
+    /// Records the time from a short request to its answer.
     pub fn round_trip(&self, took: Duration) {
         let mut measured = self.measured();
         measured.round_trip_ms =
             Some(averaged(measured.round_trip_ms, took.as_secs_f64() * 1000.0));
     }
 
-    /// A session had to be begun again.
+    /// Records that a session had to reconnect.
     pub fn reconnected(&self, now: Instant) {
         remember(&mut self.measured().reconnects, now);
     }
 
-    /// A transfer broke off.
+    /// Records an interrupted transfer.
     pub fn lost_transfer(&self, now: Instant) {
         remember(&mut self.measured().losses, now);
     }
 
-    /// What is known of the link; `None` before anything is.
+    /// The known facts about the link; `None` before the first measurement.
     pub fn facts(&self, now: Instant) -> Option<LinkFacts> {
         let measured = self.measured();
         let recent = |events: &VecDeque<Instant>| {
@@ -66,7 +66,7 @@ impl LinkMeter {
             u32::try_from(count).unwrap_or(u32::MAX)
         };
         let facts = LinkFacts {
-            // A conversion from floating point stays within the type's range.
+            // A conversion from floating point saturates at the type's range.
             throughput_bytes_per_s: measured.bytes_per_s.map(|rate| rate.round() as u64),
             rtt_ms: measured.round_trip_ms.map(|ms| ms.round() as u32),
             reconnects: recent(&measured.reconnects),
@@ -81,8 +81,7 @@ impl LinkMeter {
     }
 }
 
-/// Whether `now` says something about the link that `before` did not: what differs a little is no
-/// news.
+/// Whether `now` differs from `before` enough to report. Small differences do not count.
 pub fn is_news(before: Option<&LinkFacts>, now: Option<&LinkFacts>) -> bool {
     let (Some(before), Some(now)) = (before, now) else { return before.is_some() != now.is_some() };
     let differs = |before: Option<u64>, now: Option<u64>, least: u64| match (before, now) {
@@ -126,7 +125,7 @@ mod tests {
         meter.round_trip(Duration::from_millis(10));
         meter.round_trip(Duration::from_millis(20));
         assert_eq!(meter.facts(now).expect("measured").rtt_ms, Some(13));
-        // Faster than any clock can tell.
+        // Faster than the clock can measure.
         meter.transferred(u64::MAX, Duration::ZERO);
         assert!(meter.facts(now).expect("measured").throughput_bytes_per_s > Some(811_000));
     }

@@ -1,7 +1,7 @@
-//! Whose parts this robot wants to hear: what the MQTT session subscribes to, and the way of a part
-//! from the session to whoever gathers it. A part is acknowledged when its [`Arrived`] is dropped,
-//! so who is slow to write slows the sender down and nothing piles up here. It knows neither MQTT's
-//! packets nor the disk.
+//! The contents that this robot collects from parts: the list that the MQTT session subscribes to,
+//! and the channel from the session to the task that collects the parts. A part is acknowledged
+//! when its [`Arrived`] is dropped, so a slow writer slows down the sender and nothing accumulates
+//! here. This module knows neither MQTT packets nor the disk.
 
 use std::collections::BTreeMap;
 use task_proto::part::PartRange;
@@ -10,33 +10,33 @@ use bytes::Bytes;
 use task_proto::Digest;
 use tokio::sync::{mpsc, watch};
 
-/// What a robot that listens says of the parts it lacks.
+/// A collecting robot's request for missing parts.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Asks {
-    /// What its next report says, whatever that is sent for.
+    /// Missing parts, for the next report whatever its cause.
     pub missing: Option<Vec<PartRange>>,
-    /// Counts up each time that a report is to be sent for it, also if it says the same as the last
-    /// one.
+    /// Counter that increases each time this request needs a report of its own, even if the missing
+    /// parts are unchanged.
     pub times: u32,
 }
 
-/// Parts that nobody has taken yet, of one content. A part may be a whole package.
+/// Capacity of one content's queue of received parts. A part may be a whole package.
 const QUEUED_PARTS: usize = 2;
 
-/// The contents whose parts are wanted. Clones are the same.
+/// The contents with wanted parts. Clones share one list.
 #[derive(Debug, Clone, Default)]
 pub struct Listening(watch::Sender<Wishes>);
 
-/// What is wanted, and whether there is a session to hear it by.
+/// The wanted contents, and whether a session can receive their parts.
 #[derive(Debug, Default)]
 pub struct Wishes {
     is_away: bool,
-    /// How often something was wanted.
+    /// Counter of all requests so far.
     number: u64,
     wanted: BTreeMap<Digest, Wanted>,
 }
 
-/// That somebody gathers a content's parts. Who does it anew has another.
+/// A request to collect a content's parts. Each new request has a new number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wish {
     /// The content.
@@ -44,7 +44,7 @@ pub struct Wish {
     number: u64,
 }
 
-/// One content whose parts are wanted.
+/// One content with wanted parts.
 #[derive(Debug)]
 struct Wanted {
     number: u64,
@@ -53,37 +53,37 @@ struct Wanted {
     hearing: watch::Sender<Hearing>,
 }
 
-/// How the subscription to a content's parts stands.
+/// State of the subscription to a content's parts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Hearing {
-    /// There is no answer yet.
+    /// The broker has not answered yet.
     #[default]
     Asked,
-    /// There is no session.
+    /// No session is up.
     Away,
-    /// The broker does not allow it now.
+    /// The broker refuses the subscription for now.
     Refused,
-    /// Parts that are published from now on arrive.
+    /// Parts published from now on arrive.
     Yes,
 }
 
-/// Who gathers the parts of one content. Dropped, nobody does.
+/// Receiver of one content's parts. Dropping the receiver ends the request.
 #[derive(Debug)]
 pub struct Ear {
     wish: Wish,
     listening: Listening,
-    /// What arrives.
+    /// Received parts.
     pub parts: mpsc::Receiver<Arrived>,
-    /// How the subscription stands.
+    /// State of the subscription.
     pub hearing: watch::Receiver<Hearing>,
 }
 
-/// A message on a content's topic, not looked into.
+/// An unparsed message on a content's topic.
 #[derive(Debug)]
 pub struct Arrived {
-    /// The message.
+    /// Payload of the message.
     pub message: Bytes,
-    /// The sender may go on when this is dropped.
+    /// Acknowledges the message when dropped, so that the sender may continue.
     pub acknowledgement: Acknowledgement,
 }
 
@@ -94,17 +94,17 @@ pub struct Acknowledgement {
     acknowledge: mpsc::Sender<Due>,
 }
 
-/// Which message to acknowledge, and how.
+/// Packet id and quality of service of the message to acknowledge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Due {
-    /// Its packet id.
+    /// Packet id of the message.
     pub packet_id: u16,
-    /// Its quality of service.
+    /// Quality of service of the message.
     pub qos: u8,
 }
 
 impl Listening {
-    /// Wants the parts of the content of `size` bytes from now on.
+    /// Requests the parts of a content of `size` bytes from now on.
     pub fn listen(&self, digest: Digest, size: u64) -> Ear {
         let (sender, parts) = mpsc::channel(QUEUED_PARTS);
         let (told, hearing) = watch::channel(Hearing::Asked);
@@ -118,7 +118,7 @@ impl Listening {
         Ear { wish: Wish { digest, number }, listening: self.clone(), parts, hearing }
     }
 
-    /// Changes when other contents are wanted than before.
+    /// A receiver that is notified when the wanted contents change.
     pub fn changes(&self) -> watch::Receiver<Wishes> {
         self.0.subscribe()
     }
@@ -133,17 +133,17 @@ impl Listening {
             .collect()
     }
 
-    /// The largest content that is wanted.
+    /// Size of the largest wanted content.
     pub fn largest_bytes(&self) -> u64 {
         self.0.borrow().wanted.values().map(|wanted| wanted.size).max().unwrap_or(0)
     }
 
-    /// Where the parts of a content go, if it is wanted.
+    /// The channel for the parts of a content, if the content is wanted.
     pub fn way_to(&self, digest: &Digest) -> Option<mpsc::Sender<Arrived>> {
         self.0.borrow().wanted.get(digest).map(|wanted| wanted.parts.clone())
     }
 
-    /// Says how the subscription stands that was made for this wish.
+    /// Sets the state of the subscription for this request.
     pub fn tell(&self, wish: &Wish, hearing: Hearing) {
         if let Some(wanted) =
             self.0.borrow().wanted.get(&wish.digest).filter(|wanted| wanted.number == wish.number)
@@ -152,8 +152,8 @@ impl Listening {
         }
     }
 
-    /// Says whether there is a session; either way there are no subscriptions yet. Until it was
-    /// said there may be one soon.
+    /// Sets whether a session is up. Either way all subscriptions are gone. Before the first call a
+    /// session may still come up soon.
     pub fn session(&self, is_up: bool) {
         self.0.send_modify(|wishes| {
             wishes.is_away = !is_up;
@@ -168,7 +168,7 @@ impl Drop for Ear {
     fn drop(&mut self) {
         let Wish { digest, number } = self.wish;
         self.listening.0.send_if_modified(|Wishes { wanted, .. }| {
-            // Another may want the same content by now.
+            // Another task may have requested the same content since.
             let is_mine = wanted.get(&digest).is_some_and(|wanted| wanted.number == number);
             is_mine && wanted.remove(&digest).is_some()
         });
@@ -176,7 +176,7 @@ impl Drop for Ear {
 }
 
 impl Acknowledgement {
-    /// Of the message `due`, to be asked for through `acknowledge`.
+    /// An acknowledgement of the message `due`, sent through `acknowledge`.
     pub fn new(due: Due, acknowledge: mpsc::Sender<Due>) -> Self {
         Self { due, acknowledge }
     }
@@ -184,8 +184,8 @@ impl Acknowledgement {
 
 impl Drop for Acknowledgement {
     fn drop(&mut self) {
-        // Without its session there is nobody to acknowledge it to; brokers have far fewer messages
-        // in flight than fit.
+        // After the session's end there is no receiver for the acknowledgement. The queue never
+        // fills, because brokers have far fewer messages in flight.
         let _ = self.acknowledge.try_send(self.due);
     }
 }

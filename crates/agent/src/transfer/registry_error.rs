@@ -1,29 +1,29 @@
-//! By what a registry is known (OCI distribution specification): the header that names the bytes it
-//! has, and the error body when it refuses. Who answers with anything else is a proxy or a portal,
-//! and not the server.
+//! Marks that identify a registry (OCI distribution specification): the header with the digest of
+//! its bytes, and the body of its errors. An answer without them comes from a proxy or a portal,
+//! not from the server.
 
 use std::borrow::Cow;
 
 use http::HeaderName;
 use reqwest::Response;
 
-/// The digest of what an answer is about.
+/// Header with the digest of the answer's subject.
 pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-content-digest");
 
-/// The most of an error's body that is read.
+/// Most bytes of an error's body that are read.
 const MAX_BYTES: usize = 4096;
 
-/// An error in the registry's words.
+/// A registry's error.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct RegistryWords {
-    /// The code of the specification; empty where what came is no registry's error.
+    /// Error code of the specification; empty if the body is not a registry's error.
     pub(crate) code: String,
-    /// The message, or all that came, on one line.
+    /// The message, or the whole body, on one line.
     pub(crate) text: String,
 }
 
 impl RegistryWords {
-    /// Reads them from an answer; what breaks off is as good as whole.
+    /// Reads the error from an answer. A truncated body counts as complete.
     pub(crate) async fn read(response: &mut Response) -> Self {
         let mut body = Vec::new();
         while let Ok(Some(chunk)) = response.chunk().await {
@@ -45,7 +45,7 @@ impl RegistryWords {
         Self { code: code.unwrap_or_default().to_owned(), text }
     }
 
-    /// Whether a registry said it.
+    /// Whether the error comes from a registry.
     pub(crate) fn are_a_registrys(&self) -> bool {
         !self.code.is_empty()
     }

@@ -1,6 +1,6 @@
-//! The HTTP half of the link: enrol, ask for the desired state, deliver reports. It tells "the
-//! server said no" from "something else answered" (a captive portal, a proxy); it never retries and
-//! decides nothing.
+//! The HTTP half of the link: enrolls the robot, requests the desired state, and delivers reports.
+//! It distinguishes a refusal by the server from an answer by another system (a captive portal, a
+//! proxy). It never retries and decides nothing.
 
 use std::time::Duration;
 
@@ -20,23 +20,24 @@ use task_proto::{Digest, InstanceId, RobotId};
 
 use crate::transfer::credential::Credential;
 
-/// The longest answer that is read.
+/// Longest answer that is read.
 const MAX_ANSWER_BYTES: usize = 8 * 1024 * 1024;
-/// How long a connection may take to come about.
+/// Timeout for opening a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long a whole request may take.
+/// Timeout for a whole request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
-/// How long a connection is kept for the next request: a pull makes several in a row, then nothing
-/// for minutes, and a fleet's idle connections would cost the server more than its sessions.
+/// How long an idle connection is kept for the next request. A pull makes several requests in a row
+/// and then none for minutes. A fleet's idle connections would cost the server more than its
+/// sessions.
 pub const KEPT_CONNECTION: Duration = Duration::from_secs(3);
 
-/// Why there is no answer to use.
+/// Reasons for a missing or unusable answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ServerError {
-    /// No connection, or it broke.
+    /// The connection failed or broke.
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
-    /// Something answered that is not taskd.
+    /// The answer does not come from taskd.
     #[error("something else answers in the server's place: {0}")]
     NotTheServer(String),
     /// The token is not accepted.
@@ -47,27 +48,27 @@ pub enum ServerError {
     Busy {
         /// The HTTP status.
         status: u16,
-        /// When it wants to be asked again.
+        /// Wait that the server requests.
         retry_after: Option<Duration>,
     },
-    /// The server said no.
+    /// The server refused the request.
     #[error("the server refuses: {message} ({code})")]
     Refused {
-        /// The stable code.
+        /// Stable error code.
         code: String,
-        /// For people.
+        /// Text for people.
         message: String,
     },
 }
 
-/// The server, as one registered robot sees it.
+/// Client of the server for one registered robot.
 #[derive(Clone)]
 pub struct Server {
     client: reqwest::Client,
     base: Url,
     robot: RobotId,
     token: Credential,
-    /// What every request says of the agent that makes it.
+    /// Headers of every request that identify the agent.
     said: HeaderMap,
 }
 
@@ -76,11 +77,11 @@ pub struct Server {
 pub struct Sent {
     /// The signed state.
     pub envelope: Envelope,
-    /// The server's mark for just these bytes. It means something only to the server.
+    /// The server's entity tag for exactly these bytes, opaque to the agent.
     pub tag: Option<HeaderValue>,
 }
 
-/// The one HTTP client of the agent, which speaks TLS like this.
+/// Creates the agent's only HTTP client, with this TLS configuration.
 pub fn client(tls: ClientConfig) -> Result<reqwest::Client, reqwest::Error> {
     reqwest::Client::builder()
         .tls_backend_preconfigured(tls)
@@ -106,7 +107,7 @@ pub async fn enroll(
 }
 
 impl Server {
-    /// The server at `base`, for the robot with this token.
+    /// A client of the server at `base`, for the robot with this token.
     pub fn new(
         client: reqwest::Client,
         base: Url,
@@ -116,8 +117,8 @@ impl Server {
         Self { client, base, robot, token: token.into(), said: HeaderMap::new() }
     }
 
-    /// The same, as the agent `instance` that runs at `place`: to another one the server gives
-    /// nothing for a while.
+    /// Identifies this client as the agent `instance` that runs at `place`. For a while the server
+    /// gives nothing to another agent.
     pub fn speaking_as(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
         let said = [
             (INSTANCE_HEADER, Some(instance.to_string())),
@@ -131,12 +132,13 @@ impl Server {
         self
     }
 
-    /// The same with another token.
+    /// Copies this client with another token.
     pub fn with_token(&self, token: String) -> Self {
         Self { token: token.into(), ..self.clone() }
     }
 
-    /// The signed desired state; `None` if it is still the one that was sent with the tag `known`.
+    /// Returns the signed desired state; `None` if it has not changed since the answer with the tag
+    /// `known`.
     pub async fn desired(&self, known: Option<&HeaderValue>) -> Result<Option<Sent>, ServerError> {
         let url = at(&self.base, &format!("robots/{}/desired", self.robot));
         let answer = self.ask::<()>(Method::GET, url, None, known).await?;
@@ -146,27 +148,27 @@ impl Server {
         Ok(Some(Sent { envelope: parse(&answer.body)?, tag: answer.headers.get(ETAG).cloned() }))
     }
 
-    /// Delivers a report; once this returns it is stored.
+    /// Delivers a report. On return the server has stored the report.
     pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
         let url = at(&self.base, &format!("robots/{}/report", self.robot));
         let answer = self.ask(Method::POST, url, Some(report), None).await?;
         parse(&answer.body)
     }
 
-    /// Says how the robot's machine does.
+    /// Sends the vitals of the robot's machine.
     pub async fn telemetry(&self, telemetry: &Telemetry) -> Result<(), ServerError> {
         let url = at(&self.base, &format!("robots/{}/telemetry", self.robot));
         self.ask(Method::POST, url, Some(telemetry), None).await.map(drop)
     }
 
-    /// Asks where the robot's MQTT session goes.
+    /// Requests the endpoint of the robot's MQTT session.
     pub async fn mqtt_endpoint(&self) -> Result<MqttEndpoint, ServerError> {
         let url = at(&self.base, &format!("robots/{}/mqtt", self.robot));
         let answer = self.ask::<()>(Method::GET, url, None, None).await?;
         parse(&answer.body)
     }
 
-    /// Asks for a token to go over to. The first use of it ends the one in use.
+    /// Requests the next token. Its first use invalidates the current one.
     pub async fn next_token(&self) -> Result<String, ServerError> {
         let url = at(&self.base, &format!("robots/{}/token", self.robot));
         let answer = self.ask::<()>(Method::POST, url, None, None).await?;
@@ -174,7 +176,7 @@ impl Server {
         Ok(token)
     }
 
-    /// Sends; once more if the token was replaced while the request was under way.
+    /// Sends a request, and repeats it once if the token was replaced meanwhile.
     async fn ask<B: Serialize>(
         &self,
         method: Method,
@@ -247,7 +249,7 @@ fn refusal(answer: &Answer) -> ServerError {
             retry_after: seconds.map(Duration::from_secs),
         };
     }
-    // A proxy also says 401 or 403; only the server says it in its own words.
+    // A proxy may also answer 401 or 403, but only the server's answer has its error body.
     let Ok(body) = serde_json::from_slice::<ErrorBody>(&answer.body) else {
         return not_the_server(answer);
     };

@@ -1,5 +1,5 @@
-//! The agent's HTTP half against a server that misbehaves: what it takes for a refusal, what for a
-//! stranger's answer, and what it obeys.
+//! The agent's HTTP half against a server that misbehaves: which answers count as a refusal, which
+//! as a stranger's, and which the agent obeys.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -23,11 +23,11 @@ use task_transport::Trust;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
-/// How long a test waits for what should come at once.
+/// Time limit for events that should come at once.
 const PATIENCE: Duration = Duration::from_secs(20);
 const REFUSAL: &str = r#"{"error":{"code":"unauthorized","message":"no such token"}}"#;
 
-/// A tag as the server gives them: more than the generation, and for nobody else to understand.
+/// A tag in the server's format: more than the generation, and opaque to clients.
 const TAG: &str = "\"1-0123456789abcdef\"";
 
 /// One answer: status, content type, body.
@@ -163,7 +163,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
     assert_eq!(tokens(), is("old", None), "too young");
     rotation.step(1_000 + 3_600_000).await;
     assert_eq!(tokens(), is("old", Some("new")));
-    // No answer: the server may have taken it or not, so both are kept.
+    // No answer: the server may have accepted the report or not, so both are kept.
     fake.set((503, "text/plain", String::new()));
     rotation.step(4_000_000).await;
     assert_eq!(tokens(), is("old", Some("new")));
@@ -175,7 +175,7 @@ async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_w
     fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
     rotation.step(8_000_000).await;
     assert_eq!(tokens(), is("newer", None), "whoever is told no was recognised");
-    // Somebody registered the robot anew beside the running agent.
+    // The robot was registered anew beside the running agent.
     let anew = Identity { token: "anew".to_owned(), ..Identity::read(&path).unwrap() };
     anew.write(&path).unwrap();
     fake.set((201, "application/json", r#"{"token":"lost"}"#.to_owned()));
@@ -302,7 +302,8 @@ async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_
         _ => false,
     };
     while !is_found(next().await) {}
-    // A session measures better how far the server is; without one the answers say it.
+    // A session measures the distance to the server better; without a session the answers' times
+    // are used.
     let facts = || shared.meter.facts(tokio::time::Instant::now());
     assert_eq!(facts(), None);
     shared.mqtt_up.send_replace(false);

@@ -1,5 +1,4 @@
-//! Packages are built: by the real colcon where that matters, by stand-ins where it is about
-//! limits.
+//! Building packages: with the real colcon where that matters, with stand-ins for tests of limits.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
@@ -27,7 +26,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::harness::{eventually, lives, other_user, supervisor, within, write};
 
-/// A version directory with an order to build it.
+/// A version directory with an order to build the version.
 struct TestBuild {
     dir: tempfile::TempDir,
     order: BuildOrder,
@@ -52,7 +51,7 @@ impl TestBuild {
         Self { dir, order }
     }
 
-    /// A build whose colcon is this script, among the system's other tools.
+    /// A build with this script as colcon, among the system's other tools.
     fn with_colcon(script: &str) -> Self {
         let mut build = Self::new(Vec::new());
         let bin = build.dir.path().join("bin");
@@ -259,7 +258,7 @@ async fn a_build_is_optimised_and_leaves_tests_out() {
         std::fs::read_to_string(build.order.version.install().join("plain/share/plain/kind"))
             .expect("installed");
     assert_eq!(kind, "Release");
-    // A colcon that knows nothing of cmake is asked nothing about it.
+    // A colcon that does not know cmake is given no cmake arguments.
     let bare = TestBuild::with_colcon("echo \"asked: $*\"; mkdir -p install/talker");
     bare.run().await.expect("built");
     assert!(bare.log().contains("--install-base install\n"), "{}", bare.log());
@@ -358,7 +357,7 @@ async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
         "{log}"
     );
     assert!(!log.contains("GOT"), "{log}");
-    // All of it is root's now, for everybody to read who gets there, and nobody to change.
+    // All of it is root's now: readable by every user who reaches it, and writable by none.
     let about = |name: &str| {
         let about = std::fs::metadata(build.order.version.root().join(name)).expect("there");
         (about.uid(), about.mode() & 0o7777)

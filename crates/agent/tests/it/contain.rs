@@ -1,5 +1,5 @@
-//! What a task can't do: outlive its stop, starve its neighbours, become root, look into the agent.
-//! On machines without the means for one of these it is tested what holds there instead.
+//! Containment: a task can't outlive its stop, starve its neighbours, become root or look into the
+//! agent. On machines without the means for one of these, the test checks the remaining guarantees.
 
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::os::unix::process::CommandExt as _;
@@ -17,7 +17,7 @@ use crate::harness::{TestRun, eventually, lives, other_user, supervisor, within}
 
 const SHORT_GRACE: Duration = Duration::from_millis(300);
 
-/// Leaves its parent, its process group, its session and its environment behind, and stays.
+/// Leaves its parent, process group, session and environment behind, and stays.
 const RUNAWAY: &str = r#"
 stay='trap "" INT TERM HUP; echo $$ >> pids; while :; do sleep 1000; done'
 (setsid env -i PATH="$PATH" bash -c "setsid bash -c '$stay' & exit" &)
@@ -55,7 +55,7 @@ fn living(pids: &[u32]) -> Vec<u32> {
     pids.iter().copied().filter(|pid| lives(*pid)).collect()
 }
 
-/// How many processes and threads a user has.
+/// Number of processes and threads of a user.
 fn threads_of(uid: u32) -> usize {
     let table = ProcessEntry::all().expect("process table");
     let owned = table.iter().filter(|entry| {
@@ -69,7 +69,7 @@ fn threads_of(uid: u32) -> usize {
         .sum()
 }
 
-/// A task of the same user that says again and again that it can still do something.
+/// A task of the same user that reports repeatedly that it still works.
 async fn neighbour(user: &TaskUser) -> TestRun {
     let mut run = TestRun::grouped(
         "count=0; while sleep 0.02; do count=$((count + 1)); echo beat $count; done",
@@ -107,8 +107,8 @@ async fn a_start_that_hangs_is_ended_with_its_control_group() {
         return eprintln!("unavailable: this machine has no control groups that may be written to");
     };
     let dir = RunDir::create(&run.run_dir()).expect("dir");
-    // What enters a frozen group gets no further, as where its directory is on a file system that
-    // does not answer.
+    // A process that enters a frozen group gets no further, as with a run directory on a file
+    // system that does not answer.
     let group = cgroups.create(dir.path(), &RunLimits::default()).expect("made");
     std::fs::write(group.path().join("cgroup.freeze"), "1").expect("frozen");
     tokio::select! {
@@ -161,8 +161,8 @@ async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environm
     let name = cgroup.file_name().and_then(|name| name.to_str()).expect("a name");
     assert!(group.lines().any(|line| line.starts_with("0::") && line.ends_with(name)), "{group}");
     started.shim.signal(Signal::SIGKILL).expect("killed");
-    // Another supervisor, as after a restart of the agent; only the run directory tells it of the
-    // group.
+    // Another supervisor, as after a restart of the agent; it learns of the group only from the run
+    // directory.
     let observed = within("the notice", supervisor().wait(&run.run_dir())).await.expect("observed");
     assert_eq!(observed, Observed::Gone);
     assert_eq!(living(&pids), Vec::<u32>::new());
@@ -179,8 +179,8 @@ async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
     start(&bomb).await;
     bomb.wrote("Resource temporarily unavailable").await;
     let most = threads_of(user.uid);
-    // The neighbour has two or three; without a controller what ran at the start is added to the
-    // limit.
+    // The neighbour has two or three; without a controller, the processes that ran at the start are
+    // added to the limit.
     assert!((10..=72).contains(&most), "{most}");
     goes_on(&neighbour).await;
     let stopped = stop(&bomb).await;
@@ -203,7 +203,7 @@ async fn a_task_that_wants_eight_gigabytes_gets_its_limit_and_says_so() {
     if Cgroups::find().is_some_and(|cgroups| cgroups.isolates()) {
         assert_eq!(ended, Observed::OutOfMemory { limit_bytes: 256 << 20 });
     } else {
-        // Each process by itself: the one that asks too much is refused, and can say so.
+        // Each process by itself: one that asks for too much is refused, and can report that.
         assert_eq!(ended, Observed::Exited(ExitStatus::Code(1)));
         assert!(greedy.log().contains("memory exhausted"), "{}", greedy.log());
     }
@@ -244,7 +244,7 @@ fn may_lower_scores() -> bool {
     u64::from_str_radix(powers.trim(), 16).expect("a number") & (1 << 24) != 0
 }
 
-/// What a hostile package would try first. Each line prints what it got.
+/// The first attempts of a hostile package. Each line prints its result.
 const BURGLAR: &str = r#"
 got() { if "$@" >/dev/null 2>&1; then echo "GOT $*"; fi; }
 got cat "$DATA/identity.json"
@@ -318,7 +318,7 @@ async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
     assert_eq!(unexpected, Vec::<&str>::new());
 }
 
-/// What a task may put in the place of the directory that it runs in, which it owns the way to.
+/// Things that a task may put in place of its run directory, since the task owns the path to it.
 const EXCHANGES: [&str; 4] = [
     "mkfifo src",
     "mkfifo pipe; ln -s pipe src",
@@ -337,7 +337,7 @@ async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
         run.run_as(&user);
         run.spec.directory = work.join("src");
         user.make_home(&run.spec.directory).expect("made");
-        // Only root may open it, and waits for ever if it does.
+        // Only root may open the pipe, and waits for ever if it does.
         let pipe = run.path("roots-pipe");
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).expect("a pipe");
         run.spec.environment.insert("ROOTS_PIPE".to_owned(), pipe.display().to_string());
@@ -389,7 +389,7 @@ fn handing_over_follows_no_link_and_leaves_what_was_handed_over_alone() {
     std::fs::write(tree.join("late"), "").expect("late");
     user.hand_over(&tree).expect("nothing to do");
     assert_eq!(owner(&tree.join("late")), 0);
-    // A link in the place of the tree is refused, not followed.
+    // A link in place of the tree is refused, not followed.
     std::os::unix::fs::symlink(temp.path(), temp.path().join("tree-link")).expect("link");
     user.hand_over(&temp.path().join("tree-link")).expect_err("refused");
 }
@@ -425,7 +425,8 @@ fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
 )]
 fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
     let Some(user) = other_user() else { return };
-    // As by `sudo`: what the task starts there is root's, and nobody else may signal it.
+    // As by `sudo`: the process that the task starts there is root's, and no other user may signal
+    // it.
     let mut run = TestRun::of(
         "./as-root --reuid=0 --regid=0 --clear-groups sh -c 'echo $$ > pid; exec sleep 1000' &
          until [ -s pid ]; do :; done; exit 3",
@@ -435,7 +436,7 @@ fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
     std::fs::copy("/usr/bin/setpriv", &setpriv).expect("copied");
     std::fs::set_permissions(&setpriv, std::fs::Permissions::from_mode(0o4755)).expect("set");
     let dir = RunDir::create(&run.run_dir()).expect("dir");
-    // By which the end of this test finds them.
+    // The end of this test finds the processes by this variable.
     run.spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
     dir.write_spec(&run.spec).expect("written");
     user.hand_over(dir.path()).expect("handed over");

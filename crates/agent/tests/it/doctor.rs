@@ -129,7 +129,7 @@ fn a_setting_that_is_wrong_is_named() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_server_that_can_not_be_reached_is_told_apart_from_another_program() {
     let dir = tempfile::tempdir().unwrap();
-    // Bound and not listening: nobody else gets the port either.
+    // Bound and not listening: no other process gets the port either.
     let nobody = tokio::net::TcpSocket::new_v4().unwrap();
     nobody.bind("127.0.0.1:0".parse().unwrap()).unwrap();
     write_identity(dir.path(), &format!("http://{}", nobody.local_addr().unwrap()));
@@ -139,8 +139,7 @@ async fn a_server_that_can_not_be_reached_is_told_apart_from_another_program() {
     write_identity(dir.path(), "http://nowhere.invalid:8080");
     assert_found(&doctor(dir.path(), &[]), "dns", "bad", "nowhere.invalid");
 
-    // It answers to everything as a server would that stands in another year, and whose tokens are
-    // others.
+    // The server answers every request as one with a clock in another year and with other tokens.
     let date = [("date", "Sun, 06 Nov 1994 08:49:37 GMT")];
     let refusal = r#"{"error":{"code":"unauthorized","message":"no such token"}}"#;
     let routes = axum::Router::new()

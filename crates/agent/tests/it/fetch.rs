@@ -269,7 +269,7 @@ async fn what_is_not_the_server_counts_as_not_reached() {
         Answer::Anonymous,
         Answer::Status(204, login),
     ];
-    // A proxy whose server restarts.
+    // A proxy during a restart of its server.
     answers.extend(
         [403, 404, 410, 451]
             .map(|status| Answer::Status(status, vec![("content-type", "text/plain")])),
@@ -433,7 +433,7 @@ async fn too_little_room_is_said_before_anything_travels() {
     assert!(error.to_string().contains("in reserve"), "{error}");
     assert_eq!(site.asked(), [0; 0]);
 
-    // What an earlier try had gathered only takes up more of the room that is missing.
+    // Parts gathered by an earlier try only take up more of the missing room.
     site.put_part(&site.content[..100]);
     assert_eq!(site.pull().await.unwrap_err().code(), Some(FailureCode::DISK_FULL));
     assert!(!site.part().exists());

@@ -12,7 +12,7 @@ use tokio::net::{TcpListener, TcpStream};
 /// without a fault.
 pub type Fault = fn(u64) -> Option<u64>;
 
-/// Where the proxy for `server` listens, and how many bytes it has flipped.
+/// The address of the proxy for `server`, and its number of flipped bytes.
 pub async fn proxy(server: SocketAddr, fault: Fault) -> (SocketAddr, Arc<AtomicU64>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let (address, flipped) = (listener.local_addr().unwrap(), Arc::<AtomicU64>::default());

@@ -1,4 +1,5 @@
-//! The gate with real programs: its answers, its reasons, and what is left of one that hangs.
+//! The gate with real programs: its answers, its reasons, and the leftovers of a program that
+//! hangs.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt as _;
@@ -14,7 +15,7 @@ use task_proto::{DeploymentId, RobotId, TaskName};
 
 use crate::harness::eventually;
 
-/// Asks a gate that is `script`; the directory is where it ran.
+/// Asks the gate `script`; `dir` is its working directory.
 async fn ask(
     dir: &Path,
     script: &str,

@@ -110,7 +110,7 @@ async fn a_lifecycle_node_is_brought_to_active_and_shut_down() {
         assert!(graph.change_state(&mapper, transition, CALL).await.unwrap(), "{transition:?}");
         assert_eq!(graph.lifecycle_state(&mapper, CALL).await.unwrap(), state);
     }
-    // Its services may answer before it has said that they are its own.
+    // Its services may answer before the node has announced them as its own.
     shows(&graph, "the mapper with its lifecycle", |snapshot| {
         snapshot.named(&mapper).any(Node::has_lifecycle)
     })
@@ -233,7 +233,8 @@ async fn diagnostics_are_heard() {
         snapshot.publishers_of(&name("/diagnostics")).next().is_some()
     })
     .await;
-    // A status that is sent before both sides have met is lost, so it is sent until one arrives.
+    // A status sent before both sides have matched is lost, so the status is sent until one
+    // arrives.
     let status = loop {
         node.order("diagnose battery is low").await;
         match tokio::time::timeout(std::time::Duration::from_millis(200), statuses.recv()).await {
@@ -325,7 +326,7 @@ async fn a_killed_node_is_not_taken_for_the_one_started_after_it() {
     let before = shows(&graph, "the talker", |snapshot| has(snapshot, "/talker")).await;
     let ghost = only(&before, "/talker").participant;
     killed.kill().await;
-    // It gets the ports that have become free, which the killed one's participant still announces.
+    // The new node gets the freed ports, which the killed node's participant still announces.
     let started = RosNode::start("talker.py", 97, &[]).await;
     let is_new = |node: &Node| node.name == name("/talker") && node.participant != ghost;
     let after =

@@ -1,5 +1,5 @@
-//! The process that takes part in the ROS graph for the agent: what it may do, what strangers can
-//! do to it, and that its loss is no more than a moment without a graph.
+//! The agent's process that takes part in the ROS graph: its permissions, its exposure to
+//! strangers, and that its loss costs no more than a moment without a graph.
 
 use std::net::UdpSocket;
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ use crate::harness::{eventually, lives, within};
 use crate::ros::{CALL, RosNode, name, open, program};
 use crate::rtps;
 
-/// What a process may grow by under an attack.
+/// Maximum memory growth of a process under an attack.
 const GROWTH_BYTES: u64 = 64 << 20;
 
 fn facts(domain_id: u16) -> RosFacts {
@@ -51,7 +51,7 @@ fn signal(pid: u32, signal: Signal) {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
-    // What a library opens need not be closed by itself when something is started.
+    // A file that a library opens need not be closed by itself when a process is started.
     let kept = std::fs::File::open("/proc/self/status").unwrap();
     fcntl(&kept, FcntlArg::F_SETFD(FdFlag::empty())).unwrap();
     let graph = open(98).await;
@@ -78,7 +78,7 @@ async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
     assert!(score > 0, "{score}");
     if nix::unistd::geteuid().is_root() {
         assert!(std::fs::read(format!("{proc}/environ")).unwrap().is_empty());
-        // Its own: standard streams, sockets, what it waits with. None of the agent's files.
+        // Its own: standard streams, sockets, descriptors to wait with. None of the agent's files.
         for file in std::fs::read_dir(format!("{proc}/fd")).unwrap() {
             let target = std::fs::read_link(file.unwrap().path()).unwrap().display().to_string();
             let number_of_a_kind =
@@ -115,7 +115,7 @@ async fn packets_that_state_gigabytes_cost_no_memory_and_the_graph_still_answers
     {
         let after = rtps::memory_of(pid);
         assert!(after.0 < before.0 + GROWTH_BYTES, "{what}: {before:?} became {after:?}");
-        // This process runs other tests as well, whose threads take address space.
+        // This process runs other tests as well, and their threads take address space.
         assert!(
             pid == own || after.1 < before.1 + GROWTH_BYTES,
             "{what}: {before:?} became {after:?}"
@@ -127,7 +127,8 @@ async fn packets_that_state_gigabytes_cost_no_memory_and_the_graph_still_answers
     graph.close().await;
 }
 
-/// Announces a participant and says which samples it has: whoever believes it asks for them.
+/// Announces a participant and its available samples: a participant that believes the announcement
+/// requests the samples.
 fn is_matched(
     socket: &UdpSocket,
     domain_id: u16,
@@ -238,7 +239,7 @@ async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
     ));
     let refused = access.open(Some(&facts)).await.err().expect("a refusal while it is away");
     assert_eq!(refused.code, FailureCode::GRAPH_UNAVAILABLE);
-    // Nobody asks for it: what nodes say is kept again all the same.
+    // Without a request, the nodes' log lines are kept again all the same.
     let kept = async {
         loop {
             node.order("warn heard again").await;

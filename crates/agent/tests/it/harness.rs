@@ -1,4 +1,4 @@
-//! What the tests share: a deadline for everything that is awaited, and a run of a script under the
+//! Shared test helpers: a deadline for everything that is awaited, and a run of a script under the
 //! real shim.
 
 use std::collections::BTreeMap;
@@ -19,18 +19,18 @@ use task_agent::setup::environment;
 use task_agent::setup::launch::Interrupt;
 use task_agent::system::task_user::TaskUser;
 
-/// Longer than anything here takes on a loaded machine.
+/// Longer than any test step takes on a loaded machine.
 const DEADLINE: Duration = Duration::from_secs(60);
 
-/// `future`'s output, or a panic that says what did not happen.
+/// Returns `future`'s output, or panics with the missing event.
 pub async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
     tokio::time::timeout(DEADLINE, future)
         .await
         .unwrap_or_else(|_| panic!("not within {DEADLINE:?}: {what}"))
 }
 
-/// Waits until `condition` gives a value. The one place that looks again and again: for what has no
-/// event to wait for.
+/// Polls until `condition` returns a value. The only polling in these tests, for conditions without
+/// an event to wait for.
 pub async fn eventually<T>(what: &str, mut condition: impl FnMut() -> Option<T>) -> T {
     let mut tick = tokio::time::interval(Duration::from_millis(20));
     within(what, async {
@@ -72,15 +72,15 @@ impl TestRun {
         Self { dir, supervisor: supervisor(), spec }
     }
 
-    /// The same with the machine's control groups, where there are any.
+    /// The same with the machine's control groups, if available.
     pub fn grouped(script: &str) -> Self {
         let mut run = Self::of(script);
         run.supervisor = grouped_supervisor();
         run
     }
 
-    /// Makes it run as `user`, in a directory of that user's own, below one that it can only pass
-    /// through.
+    /// Makes the script run as `user`, in a directory of that user's own, below one that the user
+    /// can only pass through.
     pub fn run_as(&mut self, user: &TaskUser) {
         self.spec.directory = self.path("work");
         user.make_home(&self.spec.directory).expect("handed over");
@@ -104,7 +104,7 @@ impl TestRun {
             .cgroup
     }
 
-    /// Where the script runs.
+    /// A path in the script's working directory.
     pub fn path(&self, name: &str) -> PathBuf {
         self.dir.path().join(name)
     }
@@ -139,7 +139,7 @@ impl TestRun {
     }
 }
 
-/// No test leaves a process behind, whatever it died of.
+/// Ensures that no test leaves a process behind, even after a panic.
 impl Drop for TestRun {
     fn drop(&mut self) {
         let containment = Containment::new(&self.run_dir(), None, self.cgroup_if_any());
@@ -147,13 +147,14 @@ impl Drop for TestRun {
     }
 }
 
-/// A supervisor whose shims are the binary under test, and that uses the machine's control groups,
-/// if it may.
+/// A supervisor that runs the binary under test as shims, and uses the machine's control groups if
+/// permitted.
 pub fn grouped_supervisor() -> Supervisor {
     Supervisor::new(env!("CARGO_BIN_EXE_task-agent"), Cgroups::find())
 }
 
-/// A user id that no other test uses; `None`, said aloud, for tests that do not run as root.
+/// A user id that no other test uses; `None`, with a printed note, for tests that do not run as
+/// root.
 #[expect(clippy::print_stderr, reason = "what is not tested is said aloud")]
 pub fn other_user() -> Option<TaskUser> {
     static USED: AtomicU32 = AtomicU32::new(0);
@@ -165,12 +166,12 @@ pub fn other_user() -> Option<TaskUser> {
     Some(TaskUser { name: uid.to_string(), uid, gid: uid, groups: vec![uid + 50] })
 }
 
-/// A supervisor whose shims are the binary under test, and that has no control groups.
+/// A supervisor that runs the binary under test as shims, without control groups.
 pub fn supervisor() -> Supervisor {
     Supervisor::new(env!("CARGO_BIN_EXE_task-agent"), None)
 }
 
-/// Whether `pid` is there and no zombie.
+/// Whether `pid` exists and is no zombie.
 pub fn lives(pid: u32) -> bool {
     ProcessEntry::of(pid).expect("process table").is_some_and(|entry| !entry.is_zombie)
 }

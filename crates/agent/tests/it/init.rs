@@ -10,7 +10,7 @@ use task_agent::process::program::ProcessEntry;
 use crate::doctor::write_identity;
 use crate::harness::eventually;
 
-/// Ends with what was started, whatever becomes of the test.
+/// Kills its processes when dropped, for any outcome of the test.
 struct Namespace(Child);
 
 impl Drop for Namespace {

@@ -1,5 +1,5 @@
-//! Launchers: what reaches `ros2 launch`, and who is asked to end. A recorded `ros2` stands in for
-//! the real one.
+//! Launchers: the arguments that reach `ros2 launch`, and the processes that are asked to end. A
+//! recorded `ros2` stands in for the real one.
 
 use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt;
@@ -133,9 +133,9 @@ async fn launch_arguments_reach_ros2_as_they_are() {
     assert_eq!(inherited.collect::<Vec<_>>(), Vec::<&String>::new());
 }
 
-/// Behaves as `ros2 launch` without a terminal: it starts a node in its own process group and sends
-/// it a SIGINT when it gets one. The node counts those that reach it until its launcher has seen
-/// the first.
+/// Behaves as `ros2 launch` without a terminal: starts a node in its own process group and forwards
+/// a SIGINT to the node. The node counts the SIGINTs that arrive until its launcher has seen the
+/// first.
 const LAUNCHER: &str = r#"#!/usr/bin/env python3
 import os, signal, subprocess, sys
 NODE = '''

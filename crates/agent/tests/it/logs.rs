@@ -1,4 +1,4 @@
-//! What real nodes say on ROS topics is kept with the task whose process said it.
+//! Real nodes' messages on ROS topics are kept with the task of the publishing process.
 
 use task_agent::logs::Logs;
 use task_agent::logs::archive::Wanted;
@@ -11,7 +11,7 @@ use task_proto::report::RosFacts;
 use crate::harness::within;
 use crate::ros::{RosNode, open, program};
 
-/// Longer than a look at who takes part in the graph takes, shorter than a test may.
+/// Longer than one poll of the ROS graph's participants, shorter than a test's limit.
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(200);
 
 #[tokio::test(flavor = "multi_thread")]
@@ -36,7 +36,7 @@ async fn what_nodes_say_is_kept_with_their_task() {
             .unwrap()
     };
     let has = |lines: &[LogLine], text: &str| lines.iter().any(|line| line.text == text);
-    // What is sent before both sides have met is lost, so it is sent until it arrives.
+    // Messages sent before both sides have matched are lost, so each is sent until it arrives.
     let all = async {
         let mut tick = tokio::time::interval(PAUSE);
         loop {

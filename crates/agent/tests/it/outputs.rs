@@ -1,5 +1,5 @@
-//! Bringing files back, to what is no registry and from under a task that goes on writing. The way
-//! to a real one is in the tests of the whole.
+//! Uploading outputs, to a server that is no registry and from under a task that goes on writing.
+//! The tests of the whole system cover the upload to a real registry.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
@@ -100,7 +100,7 @@ async fn what_is_not_the_server_takes_no_files_and_loses_none() {
 
 #[tokio::test]
 async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() {
-    // A file in one piece or in parts, and what is made of it.
+    // A file in one piece or in parts, and the expected result.
     let bodies = [(1, "its own "), (MANY, "its own "), (1, "{"), (1, "{\"schemaVersion\"")];
     for ((times, garbled), faults) in bodies.into_iter().flat_map(|body| [(body, 2), (body, 1000)])
     {
@@ -169,8 +169,8 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
 async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
     let left = Left::new();
     let map = left.map();
-    // A registry that has nothing; between a look at what it has and the sending, the task writes
-    // once more.
+    // An empty registry; between the query of its content and the upload, the task writes once
+    // more.
     let registry = move |request: Request| {
         let map = map.clone();
         async move {

@@ -37,7 +37,7 @@ fn with(parts: PartPatience) -> FetchSettings {
     FetchSettings { parts, ..settings() }
 }
 
-/// A package, who pushes it, and an agent's session between them.
+/// A package, its pusher, and an agent's session between them.
 struct Rig {
     site: Arc<Site>,
     peer: Peer,
@@ -121,7 +121,7 @@ impl Rig {
             .for_each(|index| self.peer.publish(&self.topic(), 1, &self.message(index)));
     }
 
-    /// Waits until so many bytes are there.
+    /// Waits until this number of bytes has arrived.
     async fn has(&self, bytes: u64) {
         let mut progress = self.progress.subscribe();
         within("the parts", progress.wait_for(|progress| progress.done == bytes)).await.unwrap();
@@ -168,7 +168,7 @@ async fn what_is_pushed_gets_its_place_without_a_pull_at_every_quality_of_servic
         let rig = Rig::new(patient()).await;
         let gathering = rig.listen().await;
         let before = rig.peer.seen.borrow().acknowledged;
-        // In whatever order.
+        // In any order.
         for index in (0..rig.cut.count()).rev() {
             rig.peer.publish(&rig.topic(), qos, &rig.message(index));
         }
@@ -188,9 +188,10 @@ async fn parts_that_are_lacking_are_asked_for() {
     let patience = PartPatience { silence: Duration::from_millis(300), deaf: LONG, starved: LONG };
     let rig = Rig::new(with(patience)).await;
     let gathering = rig.listen().await;
-    // Nobody has said how many there are.
+    // The number of parts is still unknown.
     rig.asked(&[(0, u32::MAX)]).await;
-    // It joined late: what went out before is asked for at once, a gap once it is quiet.
+    // The agent joined late: parts sent earlier are requested at once, a gap only after a quiet
+    // period.
     rig.push([10]);
     rig.asked(&[(0, 9)]).await;
     rig.push((11..rig.cut.count()).filter(|&index| index != 20));
@@ -240,7 +241,7 @@ async fn hostile_messages_are_passed_over() {
     ] {
         rig.peer.publish(&rig.topic(), 1, &hostile);
     }
-    // Of another package, and again what is there, with other bytes.
+    // A part of another package, and a part that is present already, with other bytes.
     rig.peer.publish("taskd/v1/p/sha256:00", 1, &good);
     rig.peer.publish("taskd/v1/r/r00000000000000a1/desired", 1, b"{");
     let double = Part {
@@ -331,7 +332,8 @@ async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out()
     assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
 }
 
-/// Half of the parts are there when the agent ends; gives what the next one goes on from.
+/// Half of the parts are present when the agent ends; returns the state from which the next agent
+/// continues.
 async fn ended_half_way() -> Rig {
     let mut rig = Rig::new(patient()).await;
     let cancel = CancellationToken::new();
@@ -453,7 +455,7 @@ async fn a_package_may_come_as_one_message() {
     let size = u32::try_from(rig.site.content.len()).unwrap();
     assert!(rig.site.content.len() > mqtt::MESSAGE_BYTES);
     let whole = Part { index: 0, count: 1, part_bytes: size, bytes: &rig.site.content }.encode();
-    // The session can't read it; the next one can, because this package is wanted.
+    // The session can't read the part; the next one can, because this package is wanted.
     rig.peer.publish(&rig.topic(), 1, &whole);
     rig.peer.until("another session", |seen| seen.sessions == 2).await;
     rig.peer.subscribed(&rig.topic()).await;

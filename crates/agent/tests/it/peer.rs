@@ -1,5 +1,5 @@
-//! An MQTT 3.1.1 peer for the agent's sessions that does what a test says: refuses subscriptions,
-//! keeps its own time, sends what no honest broker would, breaks off. It knows as much of the
+//! A scriptable MQTT 3.1.1 peer for the agent's sessions: refuses subscriptions, keeps its own
+//! time, sends packets that no honest broker would, breaks off. It implements as much of the
 //! protocol as an agent uses.
 
 use std::collections::BTreeSet;
@@ -11,12 +11,12 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::{mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
-/// What the peer has seen.
+/// Packets that the peer has received.
 #[derive(Debug, Default, Clone)]
 pub struct Seen {
     /// Sessions there were.
     pub sessions: u32,
-    /// What the session is subscribed to.
+    /// Topics that the session is subscribed to.
     pub topics: BTreeSet<String>,
     /// SUBSCRIBE packets for parts that were refused.
     pub refused: u32,
@@ -26,7 +26,7 @@ pub struct Seen {
     pub heard: Vec<(String, Vec<u8>)>,
 }
 
-/// Where the packets for a session go, and how it is ended.
+/// Channel of the packets for a session, and the means to end the session.
 type Line = (mpsc::UnboundedSender<Vec<u8>>, CancellationToken);
 
 /// The peer.
@@ -63,7 +63,7 @@ impl Peer {
         peer
     }
 
-    /// Waits until the peer has seen what is expected.
+    /// Waits until the peer has received the expected packets.
     pub async fn until(&self, what: &str, expected: impl FnMut(&Seen) -> bool) -> Seen {
         let mut seen = self.seen.subscribe();
         let found = seen.wait_for(expected);
@@ -76,7 +76,7 @@ impl Peer {
             .await;
     }
 
-    /// Publishes to the session that there is, whatever it is subscribed to.
+    /// Publishes to the current session, regardless of its subscriptions.
     pub fn publish(&self, topic: &str, qos: u8, message: &[u8]) {
         let mut body = text(topic);
         if qos > 0 {

@@ -51,7 +51,7 @@ pub struct RosNode {
 }
 
 impl RosNode {
-    /// Starts it in this domain and waits until it says that it is up.
+    /// Starts the script in this domain and waits until the script reports that it is up.
     pub async fn start(script: &str, domain_id: u16, arguments: &[&str]) -> Self {
         Self::start_with(script, domain_id, arguments, &[]).await
     }
@@ -87,7 +87,7 @@ impl RosNode {
         self.child.id().expect("it runs")
     }
 
-    /// Has it do this, and waits until it has.
+    /// Sends this command, and waits until the command is done.
     pub async fn order(&mut self, line: &str) {
         let input = self.input.as_mut().expect("input");
         input.write_all(format!("{line}\n").as_bytes()).await.expect("input");
@@ -99,13 +99,13 @@ impl RosNode {
         assert_eq!(line.as_deref(), Some(wanted));
     }
 
-    /// Lets it leave the graph by itself.
+    /// Lets the node leave the graph in an orderly way.
     pub async fn leave(mut self) {
         self.input = None;
         within("the node to leave", self.child.wait()).await.expect("exit");
     }
 
-    /// Kills it without a word.
+    /// Kills the node without a farewell.
     pub async fn kill(mut self) {
         within("the node to die", self.child.kill()).await.expect("kill");
     }

@@ -2,7 +2,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
 
-/// `DATA_FRAG`: it says how large the whole sample is.
+/// `DATA_FRAG`: states the size of the whole sample.
 pub fn data_frag(
     prefix: [u8; 12],
     endpoints: Endpoints,
@@ -21,7 +21,7 @@ pub fn data_frag(
     datagram(prefix, 0x16, &body)
 }
 
-/// `HEARTBEAT`: it says which samples there are.
+/// `HEARTBEAT`: states the available samples.
 pub fn heartbeat(prefix: [u8; 12], endpoints: Endpoints, last: i64, count: u32) -> Vec<u8> {
     let mut body = endpoints.ids().to_vec();
     body.extend(sequence_number(1));
@@ -30,7 +30,7 @@ pub fn heartbeat(prefix: [u8; 12], endpoints: Endpoints, last: i64, count: u32) 
     datagram(prefix, 0x07, &body)
 }
 
-/// `GAP`: it says which samples there are not.
+/// `GAP`: states the unavailable samples.
 pub fn gap(prefix: [u8; 12], endpoints: Endpoints, from: i64, to: i64) -> Vec<u8> {
     let mut body = endpoints.ids().to_vec();
     body.extend(sequence_number(from));
@@ -71,13 +71,13 @@ pub fn announcement(prefix: [u8; 12], number: u32, at: u16) -> Vec<u8> {
     datagram
 }
 
-/// A reader and the writer that speaks to it.
+/// A reader and its writer.
 #[derive(Clone, Copy)]
 pub struct Endpoints([u8; 8]);
 
 /// Those by which participants find each other.
 pub const PARTICIPANTS: Endpoints = Endpoints([0, 1, 0, 0xc7, 0, 1, 0, 0xc2]);
-/// Those by which they say what they publish.
+/// The endpoints that announce publications.
 pub const PUBLICATIONS: Endpoints = Endpoints([0, 0, 3, 0xc7, 0, 0, 3, 0xc2]);
 
 impl Endpoints {
@@ -115,8 +115,7 @@ pub fn kinds(datagram: &[u8]) -> Vec<u8> {
     kinds
 }
 
-/// The ports at which the first participant of this domain listens: for discovery and for what it
-/// is sent.
+/// The ports of the first participant of this domain: for discovery and for user traffic.
 fn ports(domain_id: u16) -> [u16; 2] {
     [10, 11].map(|port| 7400 + 250 * domain_id + port)
 }

@@ -1,5 +1,4 @@
-//! A server that answers for a package's blobs as a test says, and a robot's data directory beside
-//! it.
+//! A server that answers for a package's blobs on the test's command, and a robot's data directory.
 
 use std::fs;
 use std::path::PathBuf;
@@ -30,27 +29,27 @@ const CHUNK_BYTES: usize = 64 * 1024;
 pub const BLOB_UNKNOWN: &str =
     r#"{"errors":[{"code":"BLOB_UNKNOWN","message":"the blob is not here"}]}"#;
 pub const TOKEN: &str = "the robot's token";
-/// Whatever a server does, a pull has ended by then.
+/// Time limit by which a pull has ended, for any behaviour of the server.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 /// How the server answers one request for a blob.
 #[derive(Debug, Clone)]
 pub enum Answer {
-    /// As it should.
+    /// Correct.
     Well,
-    /// As it should, but the connection breaks after so many bytes.
+    /// Correct, but the connection breaks after this number of bytes.
     Cut(usize),
-    /// As it should, but after so many bytes nothing more comes.
+    /// Correct, but the transfer stalls after this number of bytes.
     Stall(usize),
-    /// As it should, but a byte at a time: each comes soon, all of them never.
+    /// Correct, but a byte at a time: each byte arrives soon, the complete blob never.
     Drip,
-    /// The whole blob, whatever range was asked for.
+    /// The whole blob, for any requested range.
     IgnoreRange,
     /// This status, in a registry's words.
     Refused(u16),
     /// This status and these headers, with an empty body.
     Status(u16, Vec<(&'static str, &'static str)>),
-    /// A page, as a captive portal shows it.
+    /// An HTML page, as from a captive portal.
     Html(u16),
     /// The right headers, other bytes.
     OtherBytes,
@@ -58,7 +57,7 @@ pub enum Answer {
     Endless,
     /// A length that is not the blob's.
     Length(u64),
-    /// The right bytes without anything that says what they are.
+    /// The right bytes without headers that describe them.
     Anonymous,
     /// A range that was not asked for.
     OtherRange,
@@ -138,7 +137,7 @@ impl Site {
         );
     }
 
-    /// Pulls by way of a proxy that flips bytes; gives how many it has.
+    /// Directs pulls through a proxy that flips bytes; returns the count of flipped bytes.
     pub async fn behind_flips(&mut self, fault: Fault) -> Arc<AtomicU64> {
         let server = self.server.socket_addrs(|| None).unwrap()[0];
         let (proxy, flipped) = flips::proxy(server, fault).await;

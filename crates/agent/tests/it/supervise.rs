@@ -1,5 +1,5 @@
-//! Tasks under the real shim: they outlive whoever started them, are found again, and end without a
-//! trace.
+//! Tasks under the real shim: they outlive the process that started them, are found again, and end
+//! without a trace.
 
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -118,8 +118,8 @@ async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
     let start = run.supervisor.start(dir.path(), &run.spec);
     assert!(tokio::time::timeout(Duration::from_millis(50), start).await.is_err());
     drop(stalled);
-    // Whoever waited for the lock would have it now. A process that another test is just starting
-    // shares it for a moment.
+    // A waiting process would have the lock now. A process that another test is just starting
+    // shares the lock for a moment.
     let over = eventually("the lock", || dir.try_lock().expect("locked")).await;
     assert_eq!(dir.spec().expect("readable"), None);
     drop(over);
@@ -167,14 +167,14 @@ fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
     });
 }
 
-/// Not a test of its own: it is the agent that the next test runs as a process and kills.
+/// Not a test of its own: the agent that the next test runs as a process and kills.
 #[tokio::test]
 async fn starter() {
     let Some(dir) = std::env::var_os("STARTER_DIR").map(PathBuf::from) else { return };
     let spec: RunSpec =
         serde_json::from_slice(&std::fs::read(dir.join("order.json")).expect("order"))
             .expect("spec");
-    // What a shell's `&` does to everything it starts.
+    // A shell's `&` does this to every process that the shell starts.
     // SAFETY: ignoring a signal installs no handler.
     unsafe { nix::sys::signal::signal(Signal::SIGINT, SigHandler::SigIgn) }.expect("ignored");
     supervisor().start(&dir.join("run"), &spec).await.expect("started");
@@ -217,8 +217,8 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
         matches!(observed, Observed::Running { pid, .. } if pid == recorded.task.pid),
         "{observed:?}"
     );
-    // It was started by a process that ignored SIGINT; a trap on it works only where that was not
-    // inherited.
+    // The run was started by a process that ignored SIGINT; a trap on SIGINT works only where the
+    // ignored signal was not inherited.
     let (waited, stopped) = within(
         "the stop",
         futures_util::future::join(
@@ -232,8 +232,8 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
-/// Ignores what can be ignored, and has children in sessions of their own, one of them without its
-/// environment.
+/// Ignores every signal that can be ignored, and has children in sessions of their own, one of them
+/// without its environment.
 const STUBBORN: &str = r#"
 trap '' INT TERM HUP
 stubborn='trap "" INT TERM HUP; echo $$ >> pids; while :; do sleep 1000; done'
@@ -300,7 +300,7 @@ async fn a_task_that_ends_takes_its_daemons_with_it() {
 
 #[tokio::test]
 async fn without_its_shim_a_task_is_ended_and_gone() {
-    // Only the shim could tell whose the process without its environment is.
+    // Only the shim could identify the owner of the process without its environment.
     let (run, started, pids) = start_stubborn(&STUBBORN.replace("env -i PATH=\"$PATH\"", "")).await;
     let dir = run.run_dir();
     let kill = async { started.shim.signal(Signal::SIGKILL).expect("killed") };
@@ -326,7 +326,7 @@ async fn a_pid_that_was_used_again_is_not_mistaken() {
         ProcessIdentity { boot_id: "0f5e1f2a-an-earlier-boot".to_owned(), ..own },
     ] {
         dir.write_started(&Started { shim: imposter.clone(), task: imposter }).expect("pid file");
-        // A stop would end this very process if it went by the pid.
+        // A stop by pid would end this very process.
         assert_eq!(
             run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"),
             Observed::Gone

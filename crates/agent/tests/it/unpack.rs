@@ -1,5 +1,5 @@
-//! Hostile and honest archives against the unpacker. Whatever it is given, nothing changes outside
-//! the staging directory.
+//! Hostile and honest archives against the unpacker. No archive changes anything outside the
+//! staging directory.
 
 use std::collections::BTreeMap;
 use std::fs;

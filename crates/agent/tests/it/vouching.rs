@@ -1,5 +1,5 @@
-//! Who vouches for a package, against a real HTTP server that has, or does not have, what
-//! publishers have signed.
+//! Signature checks of packages, against a real HTTP server with or without the publishers'
+//! signatures.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
@@ -36,7 +36,7 @@ use tokio_util::sync::CancellationToken;
 use crate::harness::{eventually, within};
 use crate::site::BLOB_UNKNOWN;
 
-/// What the server has, by digest, and what was asked for.
+/// The server's objects, by digest, and the requests for them.
 #[derive(Default)]
 struct Shelf {
     blobs: HashMap<String, Vec<u8>>,
@@ -279,7 +279,7 @@ async fn endless_data_in_the_place_of_a_signature_is_not_even_asked_for() {
     let signatures = vec![SignatureRef { manifest: talker.manifest.digest, envelope: endless }];
     robot.told_of(&talker, Evidence { lists: Vec::new(), signatures });
     assert!(robot.vouch(&talker).await.is_err());
-    // Nor are more bytes read than were announced, whatever comes.
+    // No more bytes are read than were announced, even if more arrive.
     let ada = signature(1, &talker);
     let short = BlobRef { size: 10, ..robot.shelve(&ada) };
     let signatures = vec![SignatureRef { manifest: talker.manifest.digest, envelope: short }];
@@ -380,7 +380,7 @@ async fn a_list_by_others_than_the_keepers_changes_nothing_and_is_told() {
     let refused = robot.vouching.facts().refused_list.unwrap();
     assert!(refused.contains("signed by 0 of the 1 keepers"), "{refused}");
     assert_eq!(robot.vouching.version(), 0);
-    // Nor does what was signed as something else.
+    // Nor does an envelope that was signed as another type.
     let other = Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&forged).unwrap(), &key(7));
     robot.told(&talker, &[&other], &[&eve]);
     assert!(robot.vouch(&talker).await.is_err());
@@ -411,7 +411,7 @@ async fn a_step_that_is_under_way_when_its_publishers_are_not_trusted_does_nothi
             "{at}: {}",
             refused.failure
         );
-        // What was planned on another judgement is judged again; what decides is final.
+        // A package planned on another judgement is judged again; the deciding judgement is final.
         assert_eq!(refused.retry_after_ms.is_none(), matches!(at, 0 | 5), "{at}");
     }
     assert_eq!(site.asked(), 0, "nothing was fetched");
@@ -441,7 +441,7 @@ async fn a_first_start_is_not_made_by_a_list_that_is_over_and_a_restart_is() {
     let start =
         async |run: &ActiveRun| robot.start(&talker.name, run).await.unwrap_err().failure.code;
     assert_eq!(start(&first).await, FailureCode::PUBLISHERS_EXPIRED);
-    // A restart comes as far as the manifest, which nobody has here.
+    // A restart gets as far as the manifest, which is absent here.
     let again = ActiveRun { ever_started: true, ..first };
     assert_eq!(start(&again).await, FailureCode::PACKAGE_UNAVAILABLE);
 }

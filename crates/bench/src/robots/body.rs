@@ -1,6 +1,6 @@
-//! A simulated robot's body: the agent's own effects for whatever concerns packages (fetch, verify,
-//! unpack, delete), and a body without processes, ROS and a ledger on the disk for the rest. What
-//! it starts lives at once and for ever.
+//! A simulated robot's body: the agent's own effects for packages (fetch, verify, unpack, delete),
+//! and a body without processes, ROS and a ledger on the disk for the rest. Started tasks run at
+//! once and forever.
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -22,7 +22,7 @@ use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-/// The pid of whatever it starts.
+/// The pid of every started task.
 const PID: u32 = 1;
 
 /// The body of one robot.
@@ -30,12 +30,12 @@ pub struct Body {
     robot: Robot,
     facts: HostFacts,
     health: watch::Sender<Health>,
-    /// The run directories, by name, of what it has started and not stopped.
+    /// The run directories, by name, of tasks that were started and not stopped.
     alive: Mutex<BTreeSet<String>>,
 }
 
 impl Body {
-    /// A body around the agent's own effects, which says this of its machine.
+    /// A body around the agent's own effects, with these facts about its machine.
     pub fn new(robot: Robot, facts: HostFacts) -> Self {
         Self { robot, facts, health: watch::Sender::new(Health::Unknown), alive: Mutex::default() }
     }
@@ -51,7 +51,7 @@ impl Effects for Body {
     }
 
     fn write_ledger(&self, _: &Ledger) -> Result<(), LedgerError> {
-        // Every real robot has a disk of its own; here thousands would share one.
+        // Every real robot has its own disk; here thousands would share one.
         Ok(())
     }
 

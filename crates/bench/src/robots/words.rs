@@ -1,4 +1,4 @@
-//! What a run and the process of its robots say to each other: one JSON document a line. Moments
+//! Messages between a run and the process of its robots: one JSON document per line. Points in time
 //! are nanoseconds of the machine's monotonic clock, which both read.
 
 use std::net::Ipv4Addr;
@@ -9,24 +9,24 @@ use task_proto::api::EnrollResponse;
 use task_proto::envelope::PublicKey;
 use task_proto::{CaPin, DeploymentId, MacAddress};
 
-/// The first line to the process: which robots there are. Every further line is an [`Order`].
+/// The first line to the process: the list of its robots. Every further line is an [`Order`].
 #[derive(Serialize, Deserialize)]
 pub struct Crew {
     /// The server's URL.
     pub server: String,
-    /// Of its certificate authority, if it encrypts.
+    /// Pin of the certificate authority; absent without encryption.
     pub pin: Option<CaPin>,
-    /// The MQTT listener's host; the port is in each robot's enrolment.
+    /// The MQTT listener's host; the port is in each robot's enrollment.
     pub mqtt_host: String,
     /// The key that its states are signed with.
     pub key: PublicKey,
-    /// Where the robots have their data.
+    /// Directory of the robots' data.
     pub data: PathBuf,
-    /// Between two polls, milliseconds, while a session is up; robots vary it by half.
+    /// Milliseconds between two polls while a session is up; robots vary the interval by half.
     pub poll_ms: u64,
     /// Whether each robot connects over HTTP from an address of its own below 127.0.0.0/16.
     pub own_addresses: bool,
-    /// The number of the first of the robots; those after it count on.
+    /// The number of the first robot; the others count on from there.
     pub first: usize,
     /// The robots.
     pub members: Vec<Member>,
@@ -35,13 +35,13 @@ pub struct Crew {
 /// A registered robot.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Member {
-    /// The MAC it registered by.
+    /// The MAC used for registration.
     pub mac: MacAddress,
-    /// What the server said.
+    /// The server's answer to the enrollment.
     pub enrolled: EnrollResponse,
 }
 
-/// What the robots are told.
+/// Messages to the robots.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Order {
@@ -49,34 +49,35 @@ pub enum Order {
     Start,
 }
 
-/// What the process says. A robot is its number.
+/// Messages from the process. A robot is identified by its number.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Word {
     /// The process has all that its robots need.
     Ready,
-    /// A session is up and the server has stored a report that says the robot keeps to its state.
+    /// A session is up and the server has stored a report that shows the robot in its desired
+    /// state.
     Reconciled {
-        /// Who.
+        /// Number of the robot.
         robot: usize,
-        /// When.
+        /// Time of the event.
         at_ns: u64,
     },
     /// The server has acknowledged, and so stored, a report that the ordered package is verified
     /// and unpacked.
     Verified {
-        /// Who.
+        /// Number of the robot.
         robot: usize,
-        /// By which order.
+        /// The deployment.
         deployment: DeploymentId,
         /// When the acknowledgement came.
         at_ns: u64,
     },
     /// The robot reported a failure.
     Failed {
-        /// Who.
+        /// Number of the robot.
         robot: usize,
-        /// By which order.
+        /// The deployment.
         deployment: DeploymentId,
         /// Code and text.
         why: String,

@@ -1,6 +1,6 @@
-//! `taskbench blob`: how fast blobs leave the server and what that costs it, beside nginx with the
-//! same files in the same run. Every connection is another robot's, with its own token and the
-//! right to just these blobs.
+//! `taskbench blob`: how fast blobs leave the server and at what cost, compared with nginx with the
+//! same files in the same run. Every connection belongs to a different robot, with its own token
+//! and the right to just these blobs.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -27,7 +27,7 @@ use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
 /// The ratios of one program's figures to the other's.
 pub(crate) const RATIO: &str = "taskd / nginx";
-/// How long the small blob is fetched each time.
+/// Duration of each measurement of the small blob.
 const SMALL_TIME: Duration = Duration::from_secs(4);
 /// Bytes of the small blob.
 const SMALL_BYTES: u64 = 10_000;
@@ -61,7 +61,7 @@ pub struct BlobFlags {
     run: RunFlags,
 }
 
-/// One thing to fetch by so many.
+/// One blob to fetch by a number of robots.
 struct Case<'a> {
     blob: BlobRef,
     clients: usize,
@@ -69,7 +69,7 @@ struct Case<'a> {
     robots: &'a [EnrollResponse],
 }
 
-/// Runs it.
+/// Runs the scenario.
 pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     let (began, seed) = (Instant::now(), flags.run.seed());
     let mut run = Run::begin("blob", seed).await;
@@ -127,8 +127,8 @@ fn large_case(blob: BlobRef, clients: usize, robots: &[EnrollResponse]) -> Case<
     Case { blob, clients, until: Until::Fetches(fetches), robots }
 }
 
-/// Pushes a package of `size` random bytes and orders it for the robots meant by `selector`; gives
-/// its blob.
+/// Pushes a package of `size` random bytes and orders the package for the robots that match
+/// `selector`; returns its blob.
 pub(crate) async fn order_blob(
     server: &Server,
     name: &str,
@@ -147,7 +147,7 @@ pub(crate) async fn order_blob(
     Ok(content)
 }
 
-/// Where each of the robots fetches the blob from taskd.
+/// Targets for each robot's download of the blob from taskd.
 pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) -> Vec<Target> {
     let tls = tls(taskd.pin);
     let target = |robot: &EnrollResponse| Target {
@@ -160,7 +160,7 @@ pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) 
     robots.iter().map(target).collect()
 }
 
-/// Where as many fetch it from nginx.
+/// Targets for the same number of downloads from nginx.
 pub(crate) fn at_nginx(nginx: &Peer, blob: BlobRef, count: usize) -> Vec<Target> {
     let path = format!("/{}", blob.digest.hex());
     vec![
@@ -193,8 +193,8 @@ async fn measure_cases(
         let mut figures = [Figures::default(), Figures::default()];
         for turn in 0..flags.runs {
             progress.says(&format!("{} bytes to {} clients", case.blob.size, case.clients));
-            // Who goes first changes, so that neither always finds the machine as the other left
-            // it.
+            // The order alternates, so that neither server always finds the machine as the other
+            // left it.
             for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {
                 match (side, nginx, &others) {
                     (0, ..) => {
@@ -223,7 +223,7 @@ async fn measure_cases(
     Ok(())
 }
 
-/// What was measured of one server, run by run.
+/// Measurements of one server, run by run.
 #[derive(Default)]
 struct Figures {
     cpu_s_per_gb: Vec<f64>,

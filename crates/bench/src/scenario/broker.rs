@@ -1,7 +1,7 @@
-//! `taskbench broker`: how soon a short message of its own reaches each of many connected robots,
-//! beside mosquitto in the same run. Both send with QoS 1 to clients of the same making. taskd's
-//! front rings from within; mosquitto is handed the messages by one publisher, all at once, which
-//! is the most it can be given.
+//! `taskbench broker`: how soon a different short message reaches each of many connected robots,
+//! compared with mosquitto in the same run. Both send with QoS 1 to clients of the same
+//! implementation. The MQTT front of taskd sends from within; mosquitto receives the messages from
+//! one publisher, all at once, which is the highest load it can be given.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -32,7 +32,7 @@ const PAYLOAD_BYTES: usize = 300;
 const CONNECTS_AT_ONCE: usize = 64;
 /// Messages to each client after its first one.
 const WARM_ROUNDS: usize = 5;
-/// How long one round may take.
+/// Time limit of one round.
 const ROUND_LIMIT: Duration = Duration::from_secs(60);
 
 /// What to measure.
@@ -53,13 +53,13 @@ pub struct BrokerFlags {
     run: RunFlags,
 }
 
-/// Who sends.
+/// The sender of the messages.
 enum Sender {
     Front { process: Process, input: ChildStdin },
     Mosquitto(Peer),
 }
 
-/// What one server did.
+/// Measurements of one server.
 #[derive(Default)]
 struct Figures {
     connected_s: Vec<f64>,
@@ -69,7 +69,7 @@ struct Figures {
     anonymous_bytes: Vec<f64>,
 }
 
-/// Runs it.
+/// Runs the scenario.
 pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("broker", flags.run.seed()).await;
@@ -224,7 +224,8 @@ impl Clients {
         Ok(Self { tasks, shared })
     }
 
-    /// Has everybody sent one message; gives the milliseconds until the last one has theirs.
+    /// Sends one message to every client; returns the milliseconds until the last client has
+    /// received its message.
     async fn round(&self, publisher: &mut Publisher) -> anyhow::Result<f64> {
         self.shared.received.store(0, Ordering::SeqCst);
         let all = self.shared.all.notified();
@@ -276,7 +277,7 @@ async fn listen(link: Link, shared: Arc<Shared>) {
 /// Sends one message to every client.
 struct Publisher {
     sender: Sender,
-    /// For mosquitto: a connection, and all the messages. What comes back is read elsewhere.
+    /// For mosquitto: a connection, and all the messages. A separate task reads the answers.
     link: Option<(tokio::net::tcp::OwnedWriteHalf, Vec<u8>, JoinHandle<()>)>,
 }
 

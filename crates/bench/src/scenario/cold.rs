@@ -1,6 +1,6 @@
-//! The part of `taskbench blob` that asks whether control stays alive: an API call is timed over
-//! and over while different large blobs come from the disk, served by taskd itself, and then by
-//! nginx on the same machine.
+//! The part of `taskbench blob` that tests whether control stays responsive: an API call is timed
+//! over and over while different large blobs come from the disk, served by taskd itself, and then
+//! by nginx on the same machine.
 
 use std::time::{Duration, Instant};
 
@@ -18,22 +18,22 @@ use crate::run::{Point, Run, Unit};
 use crate::server::Server;
 use crate::taskd::Taskd;
 
-/// How often the API is asked while the pulls go on.
+/// Interval between API calls during the pulls.
 const PROBE_INTERVAL: Duration = Duration::from_millis(5);
 
-/// How it is measured.
+/// Parameters of the measurement.
 pub struct Plan {
-    /// How often.
+    /// Number of runs.
     pub runs: u32,
-    /// How many blobs, and robots that pull one each.
+    /// Number of blobs, and of robots that pull one each.
     pub pulls: usize,
     /// The size of each.
     pub size: u64,
-    /// What the blobs are made of.
+    /// The seed of the blobs' bytes.
     pub seed: u64,
 }
 
-/// Measures it, and ends the server.
+/// Runs the measurement, and ends the server.
 pub async fn measure(
     run: &mut Run,
     plan: &Plan,
@@ -55,8 +55,7 @@ pub async fn measure(
         progress.says("pulling from disk");
         let mut p99 = [None, None];
         for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {
-            // What is mapped can't be thrown out of the page cache; a server that has just started
-            // maps nothing.
+            // Mapped pages can't be evicted from the page cache; a fresh server maps nothing.
             taskd = taskd.restart().await?;
             make_cold(&taskd, &blobs)?;
             let each = |(index, robot): (usize, &EnrollResponse)| match (side, nginx) {
@@ -91,7 +90,7 @@ pub async fn measure(
     taskd.end().await
 }
 
-/// How long the API took for each answer while all of `targets` were fetched, in milliseconds.
+/// Latency of each API call while all of `targets` were fetched, in milliseconds.
 async fn probe_during(
     server: &Server,
     robot: &RobotId,
@@ -122,7 +121,7 @@ fn percentile_99(samples: &[f64]) -> Option<f64> {
         .map(|quantity| quantity.p99)
 }
 
-/// Throws what the page cache has of the blobs away, so that they have to be read from the disk.
+/// Evicts the blobs from the page cache, so that they have to be read from the disk.
 fn make_cold(taskd: &Taskd, blobs: &[BlobRef]) -> anyhow::Result<()> {
     for blob in blobs {
         let path = taskd.blobs().join(blob.digest.hex());

@@ -1,5 +1,5 @@
-//! `taskbench fleet`: how one server bears a fleet: all connect at once, then one deployment goes
-//! to all.
+//! `taskbench fleet`: the load of a fleet on one server: all robots connect at once, then one
+//! deployment goes to all.
 
 use std::time::{Duration, Instant};
 
@@ -17,9 +17,9 @@ use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
 /// As the agent's own default.
 const POLL: Duration = Duration::from_secs(300);
-/// Open files of a process beside those of its robots.
+/// Open files of a process apart from those of its robots.
 const OTHER_FILES: usize = 500;
-/// The most robots: what the addresses and ports of one machine are good for.
+/// The most robots: limited by the addresses and ports of one machine.
 const MOST_ROBOTS: u32 = 20_000;
 
 /// What to measure.
@@ -73,8 +73,7 @@ impl Choice {
 pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
     let begun = Instant::now();
     let most = flags.robots.iter().map(|robots| *robots as usize).max().unwrap_or(1);
-    // The server has all sessions, and fewer HTTP connections at a time if there is no room for
-    // more.
+    // The server holds all sessions, and fewer HTTP connections at a time if files are scarce.
     let needed = most.min(ROBOTS_PER_PROCESS) * FILES_PER_ROBOT;
     allow_files((needed.max(most + most / 2) + OTHER_FILES) as u64)?;
     let seed = flags.run.seed();
@@ -107,7 +106,7 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
 async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result<(Point, String)> {
     let mut order =
         if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
-    // All robots' sessions come from one address, which on the road they do not.
+    // All robots' sessions come from one address, unlike in production.
     order.settings.push(("TASKD_MAX_SILENT_PER_ADDRESS".to_owned(), MOST_ROBOTS.to_string()));
     let taskd = Taskd::start(&flags.taskd, &order).await?;
     let mut fleet = Fleet::assemble(&taskd, robots, POLL, None).await?;

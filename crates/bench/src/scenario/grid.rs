@@ -1,5 +1,5 @@
-//! Which runs the paper's experiment consists of: mechanisms × payloads × robots × repetitions, in
-//! a shuffled order that a seed repeats, and the plots that show them.
+//! The runs of the paper's experiment: mechanisms × payloads × robots × repetitions, in a shuffled
+//! order that a seed repeats, and the plots of the results.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -19,7 +19,7 @@ pub const MOST_ROBOTS: usize = 8;
 /// The paper's package sizes in Fig. 11.
 const FIGURE_11_BYTES: [u64; 2] = [2_000_000, 9_700_000];
 
-/// How bytes travel in a run, with what it was set to.
+/// A delivery mechanism of a run, with its settings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mechanism {
     /// MQTT announces, the robot pulls.
@@ -30,7 +30,7 @@ pub enum Mechanism {
     OneMessage,
     /// Nothing is announced; robots ask on their timer.
     Poll,
-    /// Beside the announcement.
+    /// Inside the announcement's message.
     Inline,
     /// The server's rules decide.
     Adaptive,
@@ -49,7 +49,7 @@ impl Mechanism {
         Self::DirectPush(2),
     ];
 
-    /// What is ordered.
+    /// The choice for the order.
     pub fn choice(self) -> DeliveryChoice {
         match self {
             Self::PushPull => DeliveryChoice::PushPull,
@@ -60,7 +60,7 @@ impl Mechanism {
         }
     }
 
-    /// Whether a package of this size may be ordered so.
+    /// Whether a package of this size may be ordered with this mechanism.
     fn takes(self, payload_bytes: u64) -> bool {
         self != Self::Inline || payload_bytes <= MOST_INLINE_BYTES
     }
@@ -83,15 +83,15 @@ impl fmt::Display for Mechanism {
 /// One run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Cell {
-    /// How the bytes travel.
+    /// The mechanism of delivery.
     pub mechanism: Mechanism,
-    /// How many.
+    /// Size of the payload, in bytes.
     pub payload_bytes: u64,
-    /// To how many robots.
+    /// Number of robots.
     pub robots: usize,
 }
 
-/// How much is measured.
+/// The size of the experiment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Extent {
     /// Enough to see that all works.
@@ -102,7 +102,7 @@ pub enum Extent {
     Full,
 }
 
-/// All runs in the order in which they are made.
+/// All runs in the order of their execution.
 pub fn runs(extent: Extent, repetitions: usize, seed: u64) -> Vec<Cell> {
     let cells = cells(extent);
     let mut runs: Vec<Cell> =
@@ -151,7 +151,7 @@ fn robots(extent: Extent, mechanism: Mechanism, payload_bytes: u64) -> &'static 
     }
 }
 
-/// The paper's figures, and what it names beside them.
+/// The paper's figures, and the further quantities in its text.
 pub fn plots() -> Vec<Plot> {
     let bytes = |title: &str, y: &str, least: f64, most: f64| Plot {
         title: title.to_owned(),

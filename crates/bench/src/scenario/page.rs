@@ -1,9 +1,9 @@
-//! `taskbench page`: the page in a real browser, in front of a fleet that reports all the time. How
-//! soon the first rows are there, how long the browser's main thread is busy at a time while
-//! somebody scrolls, and whether its memory grows.
+//! `taskbench page`: the page in a real browser, in front of a fleet that reports all the time.
+//! Measures how soon the first rows are shown, how long the browser's main thread is busy at a time
+//! during scrolling, and whether the browser's memory grows.
 //!
-//! The browser is driven by `page/look.mjs`, which node runs with what `scripts/need page` has
-//! installed.
+//! The browser is driven by `page/look.mjs`, which runs in node with the packages that
+//! `scripts/need page` installs.
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -20,8 +20,8 @@ use crate::progress::say;
 use crate::run::{Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
-/// What the browser does before and after it is watched: it starts, loads, and waits for its last
-/// words to be read.
+/// Time for the browser outside the watched period: its start, loading the page, and reading its
+/// last output.
 const MARGIN_S: u64 = 90;
 
 /// What to measure.
@@ -45,30 +45,30 @@ pub struct PageFlags {
     run: RunFlags,
 }
 
-/// What the browser saw.
+/// Measurements from the browser.
 #[derive(Debug, Deserialize)]
 struct Seen {
     /// Its version.
     browser: String,
     /// From asking for the page, with a session, until rows were drawn.
     first_rows_ms: Vec<f64>,
-    /// Likewise, until all robots were there.
+    /// From the same request until all robots were shown.
     all_rows_ms: Vec<f64>,
-    /// How long the main thread was busy for each frame that it drew while somebody scrolled.
+    /// How long the main thread was busy for each frame drawn during scrolling.
     frame_ms: Vec<f64>,
-    /// The processor time in that: what other programs on its cores add to it is left out.
+    /// The processor time of each frame: delays by other programs on the same cores are excluded.
     frame_cpu_ms: Vec<f64>,
-    /// All tasks of the main thread in that time, most of them the browser's own small ones.
+    /// All tasks of the main thread in that time, most of them small ones of the browser itself.
     task_ms: Vec<f64>,
     /// The JavaScript heap after a collection, again and again.
     heap_bytes: Vec<f64>,
     /// Events that the page took in.
     events: u64,
-    /// Over so many seconds.
+    /// The period of `events`, in seconds.
     events_s: f64,
 }
 
-/// Runs it.
+/// Runs the scenario.
 pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("page", flags.run.seed()).await;
@@ -90,7 +90,7 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     point.measure("heap", Unit::Bytes, seen.heap_bytes);
     let events_per_s = seen.events as f64 / seen.events_s;
     point.measure("events_taken_in", Unit::PerSecond, [events_per_s]);
-    // Each report moves a robot on, so where fewer arrive, robots or the server did not keep up.
+    // Each report advances a robot, so with fewer events the robots or the server did not keep up.
     if events_per_s < f64::from(flags.rate) * 0.95 {
         point.fail(format!(
             "of {} reports each second the page took in {events_per_s:.0}",
@@ -106,7 +106,7 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     Ok(run)
 }
 
-/// Lets the robots report until the browser has seen enough.
+/// Lets the robots report until the browser has finished its measurement.
 async fn watch(
     taskd: &Taskd,
     robots: &mut [Reporter],

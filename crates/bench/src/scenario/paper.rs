@@ -1,4 +1,4 @@
-//! `taskbench paper`: the measurements of the paper made again, every mechanism side by side.
+//! `taskbench paper`: repeats the measurements of the paper, with every mechanism side by side.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -15,19 +15,19 @@ use crate::progress::{RunProgress, say};
 use crate::run::{Point, Run, RunFlags, Unit};
 use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
-/// Between two polls where MQTT announces: the agent's own default.
+/// Poll interval when MQTT announces changes: the agent's own default.
 const SLOW_POLL: Duration = Duration::from_secs(300);
-/// How long the robots may take to connect.
+/// Time limit for the robots to connect.
 const START_LIMIT: Duration = Duration::from_secs(60);
-/// How long an order may take, whatever its size.
+/// Time limit of an order, independent of its size.
 const ORDER_LIMIT: Duration = Duration::from_secs(20);
 /// The rate that an unlimited machine reaches at least, bytes per second of all robots together.
 const SLOW_MACHINE_BYTES_PER_S: u64 = 20_000_000;
-/// What counts as about as fast: this many times as long,
+/// Factor below which two durations count as about equal,
 const NEARLY: f64 = 1.1;
-/// or so much longer.
+/// or difference in milliseconds.
 const NEARLY_MS: f64 = 20.0;
-/// How long blobs stay on the server that nobody needs any more.
+/// How long unreferenced blobs stay on the server.
 const BLOB_GRACE: &str = "40s";
 
 /// What to measure.
@@ -61,7 +61,7 @@ pub struct PaperFlags {
     run: RunFlags,
 }
 
-/// What a server and its robots are set to, so that they serve some mechanisms.
+/// Settings of a server and its robots for a group of mechanisms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Setting {
     AsItComes,
@@ -90,7 +90,7 @@ struct Stand {
     fleet: Fleet,
 }
 
-/// Runs the experiment; gives the run, and is true to failures: they are in it.
+/// Runs the experiment; returns the run, with all failures in it.
 pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     let begun = Instant::now();
     let seed = flags.run.seed();
@@ -127,8 +127,8 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
         };
         let outcome = match run_once(&stand.taskd, &mut stand.fleet, order).await {
             Ok(outcome) => outcome,
-            // It is this mechanism's failure; the others are measured with a server and robots that
-            // are well.
+            // The failure belongs to this mechanism; the others are measured with a fresh server
+            // and fresh robots.
             Err(error) => {
                 let why = stand.taskd.ended().unwrap_or_else(|| format!("{error:#}"));
                 *stand = Stand::start(&flags, Setting::of(cell.mechanism), link.as_ref()).await?;
@@ -187,7 +187,7 @@ impl Stand {
     }
 }
 
-/// The runs that were asked for.
+/// The requested runs.
 fn chosen(flags: &PaperFlags, seed: u64) -> anyhow::Result<Vec<Cell>> {
     anyhow::ensure!((0.1..=3600.0).contains(&flags.poll_s), "--poll-s: expected 0.1 to 3600");
     let (extent, usual) = match (flags.quick, flags.full) {
@@ -213,7 +213,7 @@ fn chosen(flags: &PaperFlags, seed: u64) -> anyhow::Result<Vec<Cell>> {
     Ok(cells)
 }
 
-/// How long a run may take: what it needs on a slow machine or on the link, twice.
+/// Time limit of a run: twice the time needed on a slow machine or on the link.
 fn limit(flags: &PaperFlags, cell: &Cell) -> Duration {
     let rate = flags.link.map_or(SLOW_MACHINE_BYTES_PER_S, |link| {
         (link.bits_per_s / 8).min(SLOW_MACHINE_BYTES_PER_S)
@@ -250,7 +250,7 @@ fn notes(flags: &PaperFlags) -> Vec<String> {
     ]
 }
 
-/// What adaptive chose, by size.
+/// The choices of the adaptive mechanism, by size.
 fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
     let mut chosen: BTreeMap<u64, BTreeSet<&str>> = BTreeMap::new();
     for (cell, outcomes) in results.iter().filter(|(cell, _)| cell.mechanism == Mechanism::Adaptive)
@@ -267,7 +267,7 @@ fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
         .then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
 }
 
-/// At how many places adaptive is about as fast as the fastest of the others.
+/// The number of cells in which adaptive is about as fast as the fastest of the others.
 fn how_good_adaptive_is(points: &[Point]) -> Option<String> {
     let adaptive = Mechanism::Adaptive.to_string();
     let delay = |point: &Point| point.quantities.get("delay").map(|delay| delay.median);
@@ -341,7 +341,7 @@ mod tests {
             point(pull, 2.0, 1000.0),
             point(adaptive, 3.0, 1200.0),
             point(poll, 3.0, 1000.0),
-            // Nothing to compare it with.
+            // No other point to compare with.
             point(adaptive, 4.0, 1.0),
         ];
         let said = how_good_adaptive_is(&points).expect("said");

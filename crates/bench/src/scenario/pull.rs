@@ -1,6 +1,6 @@
 //! `taskbench pull`: one large package to several robots, from the order until all have verified
-//! and unpacked it, beside what a script would do: `curl`, then `openssl dgst`, then `tar`, against
-//! nginx, as many times side by side.
+//! and unpacked the package, compared with a script: `curl`, then `openssl dgst`, then `tar`,
+//! against nginx, with the same number in parallel.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -24,17 +24,17 @@ use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
 
 /// Our own series in the results.
 const OWN: &str = "taskd";
-/// The other's.
+/// Series name of the script's programs.
 const PROGRAMS: &str = "curl, openssl, tar";
-/// The ratios of the one's figures to the other's.
+/// The ratios of taskd's figures to the programs' figures.
 const RATIO: &str = "taskd / programs";
 /// As the agent's own default.
 const POLL: Duration = Duration::from_secs(300);
-/// How long the robots may take to connect.
+/// Time limit for the robots to connect.
 const START_LIMIT: Duration = Duration::from_secs(60);
-/// How long one order may take.
+/// Time limit of one order.
 const ORDER_LIMIT: Duration = Duration::from_secs(300);
-/// What a shell does for each robot: $1 is the address, $2 the directory.
+/// The shell script for each robot: $1 is the address, $2 the directory.
 const SCRIPT: &str = "set -e; curl -sS --fail -o \"$2/blob\" \"$1\"; \
                       openssl dgst -sha256 -r \"$2/blob\" | cut -d ' ' -f 1; tar --zstd -x -f \"$2/blob\" -C \"$2\"";
 
@@ -56,7 +56,7 @@ pub struct PullFlags {
     run: RunFlags,
 }
 
-/// Runs it.
+/// Runs the scenario.
 pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     let (begun, seed) = (Instant::now(), flags.run.seed());
     let mut run = Run::begin("pull", seed).await;
@@ -91,7 +91,7 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
             seed: seed.wrapping_mul(1 << 11).wrapping_add(u64::from(turn) + 1),
             limit: ORDER_LIMIT,
         };
-        // Who goes first changes, so that neither always finds the machine as the other left it.
+        // The order alternates, so that neither side always finds the machine as the other left it.
         for is_own in [turn % 2 == 0, turn % 2 == 1] {
             if is_own {
                 let outcome = run_once(&taskd, &mut fleet, order).await?;
@@ -122,7 +122,7 @@ fn settings(flags: &PullFlags) -> [(&'static str, f64); 2] {
     [("payload_bytes", (flags.megabytes * 1_000_000) as f64), ("robots", f64::from(flags.robots))]
 }
 
-/// The scripts, and what they fetch.
+/// The scripts, and their source.
 struct Scripts {
     nginx: Peer,
     blob: BlobRef,
@@ -145,8 +145,8 @@ impl Scripts {
         Ok(Self { nginx, blob, payload, count })
     }
 
-    /// Runs all side by side; gives the time until the last has ended, and the processor seconds of
-    /// them and of nginx.
+    /// Runs all scripts in parallel; returns the time until the last has ended, and the processor
+    /// seconds of them and of nginx.
     async fn run(&self) -> anyhow::Result<(Duration, f64)> {
         let dirs = (0..self.count)
             .map(|_| memory_directory("taskbench-script-"))
@@ -183,7 +183,7 @@ impl Scripts {
     }
 }
 
-/// What was measured of one side, run by run. A run in which something failed has no time.
+/// Measurements of one side, run by run. A run with a failure has no time.
 #[derive(Default)]
 struct Figures {
     point: Point,

@@ -1,5 +1,5 @@
-//! Robots that are connected over MQTT, have one order, and report on it when they are due: their
-//! reports are measured, or only keep a fleet lively.
+//! Robots that are connected over MQTT, have one order, and report on that order at fixed times:
+//! their reports are measured, or only keep a fleet busy.
 
 use std::time::{Duration, Instant};
 
@@ -18,10 +18,10 @@ use crate::taskd::Taskd;
 
 /// Connections opened at a time.
 const CONNECTS_AT_ONCE: usize = 64;
-/// One in so many reports says that the task is in another phase; the others, that it has come
-/// further in its own.
+/// One in this many reports shows the next phase of the task; the others show progress within a
+/// phase.
 const REPORTS_PER_PHASE: u64 = 10;
-/// How long the last acknowledgements may take.
+/// Time limit for the last acknowledgements.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// From ordering the reports until the first is due.
 const LEAD: Duration = Duration::from_millis(500);
@@ -33,7 +33,7 @@ pub struct Reporter {
     report: Report,
 }
 
-/// Registers `count` robots, orders them something and connects them.
+/// Registers `count` robots, orders a package for them and connects them.
 pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter>> {
     let robots = enrol(&taskd.server, count).await?;
     let (package, version) = ("status".parse()?, "1".parse()?);
@@ -57,7 +57,7 @@ pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter
     futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await
 }
 
-/// What a robot says while it fetches.
+/// A robot's report during a fetch.
 fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<Report> {
     let blob = BlobRef { digest: Digest::of(b""), size: 0 };
     let (name, version) = ("status".parse()?, "1".parse()?);
@@ -94,9 +94,9 @@ fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<R
     })
 }
 
-/// Lets all robots report `rate` times a second together, for so many seconds, each in its turn.
-/// Gives when that began, and for each robot how long after it was due each report was stored, in
-/// milliseconds.
+/// Lets all robots report `rate` times a second together, for the given number of seconds, each in
+/// its turn. Returns the start time, and for each robot how long after its due time each report was
+/// stored, in milliseconds.
 pub async fn report_at(
     robots: &mut [Reporter],
     rate: u32,
@@ -113,7 +113,7 @@ pub async fn report_at(
 }
 
 impl Reporter {
-    /// Reports whenever it is due, acknowledged or not; gives how long after that each report was
+    /// Reports at the due times, acknowledged or not; returns how long after that each report was
     /// stored, in milliseconds.
     async fn keep_reporting(&mut self, due: Vec<Instant>) -> anyhow::Result<Vec<f64>> {
         let mut stored = Vec::with_capacity(due.len());

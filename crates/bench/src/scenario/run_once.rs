@@ -1,6 +1,6 @@
-//! One order, from its making to its end: a package that nobody has seen, pushed beforehand; the
-//! time from the order to each robot's verified answer; the bytes at the server's sockets
-//! meanwhile; whether every robot has what was pushed.
+//! One order, from its creation to its end: a package that no robot has cached, pushed beforehand;
+//! the time from the order to each robot's verified answer; the bytes at the server's sockets
+//! meanwhile; whether every robot has the pushed payload.
 
 use std::time::Duration;
 
@@ -17,27 +17,28 @@ use crate::taskd::Taskd;
 
 /// The name of every package.
 const NAME: &str = "taskbench";
-/// The rule that a decision names when a robot was told to pull because it was too slow.
+/// The rule in the decision for a robot that was told to pull because its pushed transfer was too
+/// slow.
 const FELL_BEHIND: &str = "fell behind";
-/// Payloads above it are hashed again in samples only: the agent has hashed each.
+/// Payloads above this size are hashed again in samples only: the agent has hashed each.
 const CHECKED_BYTES: u64 = 20_000_000;
 
-/// What is ordered.
+/// Parameters of one order.
 #[derive(Debug, Clone, Copy)]
 pub struct OneOrder {
-    /// How the bytes are to travel.
+    /// The delivery mechanism to use.
     pub choice: DeliveryChoice,
-    /// How many.
+    /// Size of the payload.
     pub payload_bytes: u64,
-    /// To the first so many robots of the fleet.
+    /// Number of robots; the order goes to the first ones of the fleet.
     pub robots: usize,
-    /// What the bytes are made from; no two orders of a run have the same.
+    /// Seed of the payload's bytes; unique for each order of a run.
     pub seed: u64,
-    /// How long it may take.
+    /// Time limit.
     pub limit: Duration,
 }
 
-/// What became of it.
+/// The result of one order.
 #[derive(Debug, Default)]
 pub struct Outcome {
     /// Each robot's delay, and why others did not arrive.
@@ -45,20 +46,20 @@ pub struct Outcome {
     /// Bytes at the sockets both ways, from the order to the last answer, the order itself
     /// included.
     pub mqtt_bytes: u64,
-    /// Likewise.
+    /// Bytes at the HTTP sockets, both ways, over the same time.
     pub http_bytes: u64,
     /// Processor seconds of the server, from the order to the last answer.
     pub server_cpu_s: f64,
-    /// Likewise of all robots together.
+    /// Processor seconds of all robots together, over the same time.
     pub robots_cpu_s: f64,
-    /// The decisions that were made: mechanism and rule.
+    /// The decisions: mechanism and rule.
     pub decisions: Vec<String>,
-    /// Robots that were told to pull because they were too slow.
+    /// Robots that were told to pull because their transfers were too slow.
     pub fell_behind: usize,
 }
 
-/// Makes the order and waits for its end. An error is one of the bench; what the system does wrong
-/// is in the outcome.
+/// Makes the order and waits for its end. An error means that the bench failed; failures of the
+/// system under test are in the outcome.
 pub async fn run_once(
     taskd: &Taskd,
     fleet: &mut Fleet,
@@ -106,13 +107,13 @@ pub async fn run_once(
     };
     outcome.read_decisions(&view, order.choice);
     check_payloads(fleet, &mut outcome.arrivals, order.payload_bytes, &name, &manifest, payload)?;
-    // Robots keep it until the next order takes its place; its name is of no more use.
+    // Robots keep the package until the next order replaces it; its name is no longer needed.
     taskd.server.remove_package(&name, &manifest).await.context("the package can't be removed")?;
     Ok(outcome)
 }
 
 impl Outcome {
-    /// An order by which none of so many robots got anything.
+    /// The outcome of an order by which none of `robots` robots received the package.
     pub fn failed(why: String, robots: usize) -> Self {
         Self {
             arrivals: Arrivals { arrived: Vec::new(), failures: vec![why; robots] },
@@ -142,8 +143,8 @@ impl Outcome {
     }
 }
 
-/// What is on the robots, or a failure of each that has something else. Its agent has verified it:
-/// this checks the bench.
+/// Digests of the payloads on the robots; a failure for each robot with a different payload. The
+/// agent has verified each payload: this checks the bench.
 fn check_payloads(
     fleet: &Fleet,
     arrivals: &mut Arrivals,
@@ -166,7 +167,7 @@ fn check_payloads(
     Ok(())
 }
 
-/// The figures now, and how many bytes asking for them costs.
+/// The current byte counters, and how many bytes the request itself costs.
 async fn own_bytes(taskd: &Taskd) -> anyhow::Result<(ServerInfo, u64)> {
     let first = taskd.server.info().await?;
     let second = taskd.server.info().await?;

@@ -1,7 +1,7 @@
 //! `taskbench status`: robots that report at a fixed rate over MQTT, and how long each report takes
-//! to be stored, which is when it is acknowledged. Beside it, in the same run and directory, what
-//! one fsync takes. A report is measured from when it was due, so that a server that falls behind
-//! shows.
+//! to be stored, which is when the report is acknowledged. The duration of one fsync is measured in
+//! the same run and directory. A report is measured from its due time, so that a server that falls
+//! behind shows.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -41,7 +41,7 @@ pub struct StatusFlags {
     run: RunFlags,
 }
 
-/// Runs it.
+/// Runs the scenario.
 pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("status", flags.run.seed()).await;
@@ -112,7 +112,7 @@ async fn measure(
     Ok(())
 }
 
-/// What appending a page and syncing it takes, again and again, in milliseconds.
+/// Durations of appending and syncing a page, repeatedly, in milliseconds.
 fn sync_ms(dir: &Path) -> anyhow::Result<Vec<f64>> {
     let mut file = tempfile::tempfile_in(dir).context("a file to sync")?;
     let mut samples = Vec::with_capacity(SYNCS);

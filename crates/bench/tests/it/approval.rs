@@ -1,6 +1,6 @@
-//! A robot enrols with a token that wants approval: its command waits, over a restart and without
-//! the token, and goes on by itself; an agent that was started too early does as well. One that is
-//! rejected is told so.
+//! A robot enrolls with a token that requires approval: its command waits, over a restart and
+//! without the token, and goes on by itself; so does an agent that was started too early. A
+//! rejected robot is told so.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;
@@ -11,7 +11,7 @@ use task_proto::report::Phase;
 
 use crate::harness::{PATIENCE, Robot, Server, eventually, program, write_package};
 
-/// What the robot's command prints goes here.
+/// The output of the robot's command.
 fn printed(data: &Path) -> String {
     std::fs::read_to_string(data.with_extension("enroll.log")).unwrap_or_default()
 }

@@ -1,5 +1,5 @@
-//! The whole system through a broker that is not its own: a real mosquitto, with the files that the
-//! server writes for it.
+//! The whole system through an external broker: a real mosquitto, with the files that the server
+//! writes for that broker.
 #![expect(clippy::disallowed_methods, reason = "the broker is a process")]
 
 use std::net::{SocketAddr, TcpListener};
@@ -22,7 +22,7 @@ use crate::proxy::Proxy;
 
 pub const PASSWORD: &str = "the-servers-password";
 
-/// A mosquitto without any state of its own, on one port as long as the test lasts.
+/// A mosquitto without persistent state, on one port for the duration of the test.
 pub struct Mosquitto {
     process: Option<Process>,
     dir: PathBuf,
@@ -37,17 +37,17 @@ impl Mosquitto {
         mosquitto
     }
 
-    /// Known, and not started yet.
+    /// Prepares a broker without starting it.
     pub fn new(dir: &Path) -> Self {
         Self::named(dir, "mosquitto")
     }
 
-    /// One of several.
+    /// Prepares one of several brokers.
     pub fn named(dir: &Path, name: &str) -> Self {
         let dir = dir.join(name);
         std::fs::create_dir(&dir).expect("directory");
-        // Nothing else is likely to take the port until mosquitto does: it can't be given one that
-        // is bound.
+        // Mosquitto can't be given a bound port. Another process is unlikely to take the port
+        // before mosquitto does.
         let free = TcpListener::bind("127.0.0.1:0").expect("port");
         let address = free.local_addr().expect("bound");
         let path = dir.display();
@@ -63,7 +63,7 @@ impl Mosquitto {
         Self { process: None, dir, address, scheme: "mqtt" }
     }
 
-    /// Has it encrypt from its next start on; gives the pin of the authority behind its
+    /// Turns on TLS from the next start on; returns the pin of the authority behind the
     /// certificate.
     fn encrypt(&mut self) -> CaPin {
         let certificate = Certificate::new().expect("a certificate");
@@ -79,7 +79,7 @@ impl Mosquitto {
     }
 
     pub async fn launch(&mut self) {
-        // Not on every user's path.
+        // Mosquitto is not on every user's path.
         let mut command = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"]
             .iter()
             .find(|path| Path::new(path).exists())
@@ -89,18 +89,18 @@ impl Mosquitto {
             .await;
     }
 
-    /// `kill -9`: all that it knew is gone.
+    /// Sends `kill -9`: all of the broker's state is gone.
     pub fn kill(&mut self) {
         self.process.take().expect("it runs").kill();
     }
 
-    /// What the server's setting says.
+    /// The broker's URL as in the server's setting.
     pub fn url(&self) -> String {
         format!("{}://taskd:{PASSWORD}@{}", self.scheme, self.address)
     }
 
-    /// Its configuration from its next start on: that of `taskd broker conf`, with this directory
-    /// and on loopback only.
+    /// Writes the configuration for the next start: that of `taskd broker conf`, with this
+    /// directory and on loopback only.
     pub async fn configure(&self, server: &Server) {
         let conf = server.operate(["broker", "conf"]).await;
         let (port, path) = (self.address.port(), self.dir.display().to_string());
@@ -112,12 +112,12 @@ impl Mosquitto {
             .expect("written");
     }
 
-    /// What it has logged.
+    /// The broker's log.
     pub fn log(&self) -> String {
         std::fs::read_to_string(self.dir.join("log")).expect("a log")
     }
 
-    /// Takes one account out of its files.
+    /// Removes one account from the broker's files.
     fn forget(&self, user: &str) {
         let path = self.dir.join("passwd");
         let accounts = std::fs::read_to_string(&path).expect("written");
@@ -126,7 +126,7 @@ impl Mosquitto {
             .expect("written");
     }
 
-    /// What an operator does after robots were enrolled: new files, then SIGHUP.
+    /// An operator's steps after robots were enrolled: new files, then SIGHUP.
     pub async fn learn(&self, server: &Server) {
         for file in ["acl", "passwd"] {
             let text = server.operate(["broker", file]).await;
@@ -139,7 +139,7 @@ impl Mosquitto {
     }
 }
 
-/// How many robots the server knows to be at the broker.
+/// Number of robots that the server knows to be connected to the broker.
 async fn connected(server: &Server) -> Option<u64> {
     let info: ServerInfo = serde_json::from_value(server.get("/api/v1/server").await?).ok()?;
     Some(info.traffic.robots_connected)
@@ -160,7 +160,7 @@ pub async fn says(server: &Server, what: &str) {
     .await;
 }
 
-/// A service that says something on both streams.
+/// A service that writes to both streams.
 pub fn worker(dir: &Path, version: &str) -> PathBuf {
     let package = dir.join(format!("worker-{version}"));
     let script = format!("echo hello {version}; echo oops {version} >&2; exec sleep 1000\n");
@@ -201,7 +201,7 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
     for number in 1..=2 {
         robots.push(Robot::start(&server, dir.path(), &format!("robot-{number}"), number).await);
     }
-    // They are refused until the broker has learned of them.
+    // The robots are refused until the broker has learned of them.
     mosquitto.learn(&server).await;
     wait_connected(&server, 2).await;
     server.push(&worker(dir.path(), "1.0.0"), "*").await;
@@ -215,7 +215,7 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
         assert_eq!(view.from, LogsFrom::Robot, "asked over the broker");
     }
 
-    // The broker dies in the middle of an order and comes back knowing nobody.
+    // The broker dies in the middle of an order and comes back without any session.
     server.push(&worker(dir.path(), "2.0.0"), "*").await;
     mosquitto.kill();
     says(&server, "the broker at").await;
@@ -226,14 +226,14 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
     server.wait_ready().await;
     wait_connected(&server, 2).await;
 
-    // The server comes back to a broker where the robots have stayed.
+    // The server returns to a broker where the robots have stayed connected.
     server.kill();
     server.restart().await;
     wait_connected(&server, 2).await;
     server.operate(["stop", "worker", "--on", "robot-1"]).await;
     server.wait_phase("robot-1", "worker", Phase::Stopped).await;
 
-    // The will of a robot that is cut off, and what it published before.
+    // The will of a disconnected robot, and its earlier publications.
     robots[1].kill();
     wait_connected(&server, 1).await;
     eventually("the server's memory of robot-2", async || {
@@ -297,7 +297,7 @@ async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
     wait_connected(&server, 1).await;
     server.push(&worker(dir.path(), "1.0.0"), "*").await;
     runs(&server, "robot-1", "1.0.0").await;
-    // Who trusts the system's roots alone does not trust this one.
+    // A server that trusts only the system's roots does not trust this broker.
     server.restart_with("TASKD_BROKER_PIN", None).await;
     says(&server, "no TLS with").await;
 }
@@ -372,17 +372,17 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
         while !matches!(next(&mut events).await, Packet::SubAck(_)) {}
     }
 
-    // Another's status is not taken from it, its own is.
+    // The status of the other robot is not accepted from this client, its own is.
     publish(&client, &mut events, other, "status", status(true)).await;
     publish(&client, &mut events, own, "status", status(true)).await;
     wait_connected(&server, 1).await;
     server.wait_online(own.as_str()).await;
-    // An order for the other is rung first, and does not come here; its own does.
+    // The notice of the other robot's order is sent first, and does not arrive here; its own does.
     server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
     server.push(&worker(dir.path(), "1.1.0"), "robot-1").await;
     let desired = format!("taskd/v1/r/{own}/desired");
     let mut rung = 0;
-    // Its state as it was when it came, and with the order.
+    // Its state at the time of the connection, and the state with the order.
     while rung < 2 {
         if let Packet::Publish(message) = next(&mut events).await {
             assert_eq!(message.topic, desired);
@@ -393,7 +393,7 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     wait_connected(&server, 0).await;
 }
 
-/// Whether the server is at this broker.
+/// Whether the server is connected to this broker.
 async fn is_at(server: &Server, broker: &Mosquitto) -> bool {
     let info = server.get("/api/v1/server").await.expect("it answers");
     info["mqtt"] == broker.address.to_string()
@@ -421,7 +421,7 @@ async fn robot_at_another_broker_than_the_server_comes_to_the_servers() {
     brokers[0].launch().await;
     server.wait_ready().await;
     assert!(is_at(&server, &brokers[0]).await, "the second one refuses it");
-    // The server names the same places in the same order as before.
+    // The server names the same endpoints in the same order as before.
     wait_connected(&server, 1).await;
     server.push(&worker(dir.path(), "1.0.0"), "*").await;
     runs(&server, "robot-1", "1.0.0").await;
@@ -461,7 +461,7 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
     let view = logs(&server, "robot-1").await;
     assert_eq!(view.from, LogsFrom::Robot, "asked over the second broker");
 
-    // An agent that knows one address is told the broker at which the server is.
+    // An agent that knows one address is told the server's current broker.
     let token: Value = serde_json::from_slice(
         &std::fs::read(robot.data().join("identity.json")).expect("identity"),
     )
@@ -487,7 +487,7 @@ async fn robots_follow_the_server_from_broker_to_broker_without_enrolling_again(
         Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
     wait_connected(&server, 1).await;
 
-    // The broker is down: HTTP works, robots poll, and it heals by itself.
+    // The broker is down: HTTP works, robots poll, and the connection recovers by itself.
     server.restart_with("TASKD_BROKER", Some(&mosquitto.url())).await;
     says(&server, "can't be reached").await;
     server.push(&worker(dir.path(), "1.0.0"), "*").await;
@@ -499,7 +499,7 @@ async fn robots_follow_the_server_from_broker_to_broker_without_enrolling_again(
     server.push(&worker(dir.path(), "2.0.0"), "*").await;
     runs(&server, "robot-1", "2.0.0").await;
 
-    // Back again, while mosquitto lives on and holds the robot's session.
+    // Back to the built-in broker, while mosquitto lives on and holds the robot's session.
     server.restart_with("TASKD_BROKER", None).await;
     server.wait_ready().await;
     wait_connected(&server, 1).await;

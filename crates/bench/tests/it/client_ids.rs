@@ -1,6 +1,6 @@
-//! Client ids at an external broker: nobody ends the session of the server or of a robot by
-//! connecting with its id, and `taskd doctor` finds a broker that would let them. With a real
-//! mosquitto and a real NATS server.
+//! Client ids at an external broker: no client ends the session of the server or of a robot by
+//! connecting with the same client id, and `taskd doctor` detects a broker that would permit this.
+//! With a real mosquitto and a real NATS server.
 #![expect(clippy::disallowed_methods, reason = "the broker is a process")]
 
 use std::net::{SocketAddr, TcpListener};
@@ -18,7 +18,7 @@ use tokio::net::TcpStream;
 use crate::broker::{Mosquitto, PASSWORD, logs, next, runs, wait_connected, worker};
 use crate::harness::{PATIENCE, Process, Robot, Server, eventually, required};
 
-/// What a robot has written down.
+/// The robot's identity file.
 fn identity(robot: &Robot) -> Value {
     serde_json::from_slice(&std::fs::read(robot.data().join("identity.json")).expect("identity"))
         .expect("json")
@@ -86,8 +86,8 @@ async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
     runs(&server, "robot-2", "1.0.0").await;
 
-    // A mosquitto that tells clients apart by their ids: those that can be known are nobody's any
-    // more.
+    // A mosquitto that tells clients apart by their ids: predictable ids no longer belong to any
+    // session.
     let (verdict, words) = doctor(&server).await;
     assert!(
         verdict == "notice" && words.contains("use_username_as_clientid true"),
@@ -102,7 +102,7 @@ async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
     assert_eq!(after, before, "somebody was displaced: {}", mosquitto.log());
     assert_undisturbed(&server, "robot-2", 1).await;
     drop(held);
-    // Those that the sessions have, from the log: nobody but the broker's administrator sees it.
+    // The sessions' real ids, from the log, which only the broker's administrator sees.
     let log = mosquitto.log();
     let ids_of = |user: &str| {
         let line = log
@@ -147,8 +147,8 @@ impl Nats {
     fn new(dir: &Path) -> Self {
         let dir = dir.join("nats");
         std::fs::create_dir(&dir).expect("directory");
-        // Nothing else is likely to take the ports until the server does: it can't be given any
-        // that are bound.
+        // Another process is unlikely to take the ports before the server does: the server can't be
+        // given bound ports.
         let free = [(); 2].map(|()| TcpListener::bind("127.0.0.1:0").expect("port"));
         let [mqtt, client] = free.each_ref().map(|listener| listener.local_addr().expect("bound"));
         let path = dir.display();
@@ -164,12 +164,12 @@ impl Nats {
         format!("mqtt://taskd:{PASSWORD}@{}", self.mqtt)
     }
 
-    /// What it has logged.
+    /// The broker's log.
     fn log(&self) -> String {
         std::fs::read_to_string(self.dir.join("log")).expect("a log")
     }
 
-    /// What an operator does after robots were enrolled.
+    /// An operator's steps after robots were enrolled.
     async fn learn(&self, server: &Server) {
         let text = server.operate(["broker", "nats"]).await;
         assert!(!text.contains(PASSWORD));
@@ -204,7 +204,7 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     server.push(&worker(dir.path(), "1.0.0"), "robot-2").await;
     runs(&server, "robot-2", "1.0.0").await;
 
-    // NATS ends a session for whoever knows its client id. Nobody does.
+    // NATS ends a session for any client that knows the session's client id. No client knows one.
     let (verdict, words) = doctor(&server).await;
     assert!(
         verdict == "notice" && words.contains("NATS has no such setting"),

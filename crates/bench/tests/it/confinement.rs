@@ -1,4 +1,4 @@
-//! Whom tasks run as and what they may use, from the package to what the operator reads.
+//! The tasks' users and their confinement, from the package to the operator's view.
 
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
@@ -46,8 +46,7 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     }
 }
 
-/// What a package would try on its neighbour, and on itself. Each line that it writes is something
-/// that it got.
+/// Attempts of a package on its neighbour, and on itself. Each line of its output is a success.
 const BURGLAR: &str = r#"
 got() { if "$@" >/dev/null 2>&1; then echo "GOT $*" >> "$FOUND"; fi; }
 touch mine && echo "own directory: writable" >> "$FOUND"
@@ -147,7 +146,7 @@ async fn package_that_was_changed_on_the_disk_is_not_started_and_comes_anew() {
     assert!(log.contains("src is not what was unpacked"), "{log}");
 }
 
-/// Gives a tree to the account of all tasks, as agents did that let tasks own what they run.
+/// Gives a tree to the account of all tasks, as earlier agents did that let tasks own their files.
 fn give_to_all_tasks(path: &Path) {
     let about = std::fs::symlink_metadata(path).expect("there");
     std::os::unix::fs::lchown(path, Some(65_534), Some(65_534)).expect("given");
@@ -250,7 +249,7 @@ async fn a_task_that_wants_eight_gigabytes_fails_alone_and_by_name() {
     .expect("limits");
     fleet.server.push(&greedy, "*").await;
     let failure = failure_of(&fleet.server, "greedy", Phase::Failed).await;
-    // What the robot says of itself is what it does.
+    // The robot's reported confinement matches its actual one.
     match eventually("the robot's facts", async || robot(&fleet.server).await.host).await.isolation
     {
         Isolation::Cgroup => {

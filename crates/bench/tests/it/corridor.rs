@@ -1,6 +1,6 @@
 //! The paper's experiment, its figures 7 and 8: a mapping package goes to a robot as a job, is
-//! built there, maps a corridor while the agent keeps its lifecycle node active, and the map comes
-//! back, as good as it is said to be.
+//! built there, maps a corridor while the agent keeps its lifecycle node active, and the map is
+//! uploaded, as good as the paper claims.
 
 use std::path::Path;
 
@@ -18,8 +18,7 @@ async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
     let stage = Stage::bare().await;
     let package = stage.dir.path().join("corridor_mapping");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/corridor_mapping"), &package);
-    // As the example has it, but in less time: fewer particles, and a robot that drives twice as
-    // fast.
+    // As in the example, but in less time: fewer particles, and a robot that drives twice as fast.
     let toml = std::fs::read_to_string(package.join("task.toml")).expect("task.toml");
     let quick = toml.replace("particles = 20", "particles = 8").replace("rate = 4.0", "rate = 8.0");
     assert_ne!(quick, toml);

@@ -26,7 +26,7 @@ async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
 
     let package = dir.path().join("heavy");
     write_package(&package, "heavy", "1.0.0", "service", "exec sleep 1000\n");
-    // Random bytes do not compress, so what travels is what was asked for.
+    // Random bytes do not compress, so the bytes transferred equal the bytes requested.
     let mut random = rand::rngs::SmallRng::seed_from_u64(1);
     let mut file = std::fs::File::create(package.join("ballast.bin")).expect("ballast");
     let mut chunk = vec![0; 1_000_000];
@@ -72,7 +72,7 @@ async fn a_running_task_outlives_its_agent() {
 
     fleet.robots[0].kill();
     fleet.robots[0].restart();
-    // What only the new agent can have done.
+    // Work that only the new agent can have done.
     let second = fleet.package("second", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&second, "*").await;
     let after = fleet.server.wait_phase("robot-1", "second", Phase::Running).await;

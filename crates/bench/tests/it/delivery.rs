@@ -15,7 +15,8 @@ fn package(dir: &std::path::Path, bytes: usize) -> std::path::PathBuf {
     package
 }
 
-/// Orders the package so, waits until it runs, and gives how its bytes were to travel.
+/// Deploys the package in this way, waits until the task runs, and returns the planned delivery of
+/// its bytes.
 async fn deliver(server: &Server, package: &std::path::Path, delivery: &str) -> Delivery {
     let package = package.to_str().expect("utf-8 path");
     let order = ["push", package, "--to", "robot-1", "--yes", "--delivery", delivery, "-o", "json"];
@@ -61,7 +62,7 @@ async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
         Robot::start_with(&server, dir.path(), "robot-1", 1, &server.url(""), &often).await;
     let sent = async || Some(server.robot("robot-1").await?.mqtt?.traffic.messages_out);
     let package = package(dir.path(), 100);
-    // A robot is sent its state when its agent names itself, which it does over MQTT and over HTTP.
+    // A robot is sent its state when its agent identifies itself, over MQTT and over HTTP.
     eventually("the robot to be sent its state", async || sent().await.filter(|count| *count > 0))
         .await;
     let before = sent().await.expect("connected");

@@ -12,7 +12,8 @@ use crate::harness::{Fleet, Robot, Server, add_ballast, eventually, write_packag
 use crate::proxy::Proxy;
 
 const BALLAST_BYTES: usize = 8 * 1024 * 1024;
-/// At this pace the package takes some seconds, in which things can happen to it.
+/// At this rate the package's transfer takes some seconds, in which the test can disturb the
+/// transfer.
 const SLOW_BYTES_PER_S: u64 = 2 * 1024 * 1024;
 const FAST_BYTES_PER_S: u64 = 1 << 30;
 

@@ -1,5 +1,5 @@
-//! `task-agent doctor` on a robot whose agent runs and whose server is there: what it says of the
-//! ways to the server, and that it disturbs neither.
+//! `task-agent doctor` on a robot with a running agent and a reachable server: its findings about
+//! the routes to the server, and that it disturbs neither.
 
 use serde_json::Value;
 

@@ -1,6 +1,6 @@
-//! One robot's credentials in the hands of something that floods the server by both ways: another
-//! robot's order arrives and is carried out all the same, the flood is shown, and its robot comes
-//! back once it behaves.
+//! A flood over both routes with one robot's credentials: another robot's order arrives and is
+//! carried out all the same, the flood is shown, and its robot comes back once its behaviour is
+//! normal.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -22,7 +22,7 @@ fn token_of(robot: &Robot) -> String {
     identity["token"].as_str().expect("a token").to_owned()
 }
 
-/// Publishes as fast as it can, and comes back a hundred times a second.
+/// Publishes as fast as possible, and reconnects a hundred times a second.
 async fn flood_mqtt(options: MqttOptions, topic: String) {
     let mut tick = tokio::time::interval(Duration::from_millis(10));
     loop {
@@ -36,7 +36,7 @@ async fn flood_mqtt(options: MqttOptions, topic: String) {
     }
 }
 
-/// Posts what is no report as fast as it can. Counts how often it was refused for that.
+/// Posts invalid reports as fast as possible. Counts the refusals for that reason.
 async fn flood_http(client: reqwest::Client, url: String, token: String, refused: Arc<AtomicU64>) {
     loop {
         let request = client.post(&url).bearer_auth(&token).json(&serde_json::json!({}));
@@ -86,7 +86,8 @@ async fn a_flood_by_one_robot_keeps_nothing_from_another() {
     })
     .await;
 
-    // The flood goes on, and the other robot is ordered something, does it, and says so.
+    // The flood goes on, and the other robot receives an order, carries the order out, and reports
+    // that.
     let package = dir.path().join("steady");
     write_package(&package, "steady", "1.0.0", "service", "exec sleep 1000\n");
     server.push(&package, "good").await;
@@ -96,7 +97,7 @@ async fn a_flood_by_one_robot_keeps_nothing_from_another() {
     assert!(server.robot("good").await.expect("there").conditions.is_empty());
     assert!(trouble().await.is_some(), "it still floods");
 
-    // Once it stops, its robot is like any other again, by itself.
+    // Once the flood stops, its robot recovers without help.
     flood.shutdown().await;
     eventually("it to be forgiven", async || trouble().await.is_none().then_some(())).await;
     bad.restart();

@@ -1,4 +1,4 @@
-//! What strangers on the ROS network can do to a robot: a real agent with a task that promises
+//! Attacks of strangers on the ROS network against a robot: a real agent with a task that promises
 //! nodes, under the packets that once took a gigabyte each, and with the process killed that takes
 //! part in the graph.
 
@@ -14,7 +14,7 @@ use crate::rtps;
 
 const READY: &str =
     "restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\nnodes = ['/watched']\n";
-/// What a process may grow by under the attack.
+/// Maximum memory growth of a process under the attack.
 const GROWTH_BYTES: u64 = 64 << 20;
 
 fn words_of(pid: u32, file: &str) -> String {
@@ -22,7 +22,7 @@ fn words_of(pid: u32, file: &str) -> String {
     String::from_utf8_lossy(&bytes).replace('\0', " ")
 }
 
-/// The agent of this robot, and its process on the graph, if it has one just now.
+/// The agent of this robot, and the agent's process on the graph, if that runs at the moment.
 fn agent_and_graph(stage: &Stage) -> Option<(u32, u32)> {
     let data = stage.robot.data().display().to_string();
     let pids: Vec<u32> = std::fs::read_dir("/proc")

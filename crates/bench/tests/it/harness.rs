@@ -1,6 +1,5 @@
-//! Starts the real programs with data directories of their own, on ports of their own, and ends
-//! them. It asks them only through their public faces: commands, the HTTP API, files an operator
-//! may read.
+//! Starts the real programs with their own data directories and ports, and stops them. Tests query
+//! them only through public interfaces: commands, the HTTP API, files an operator may read.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
 use std::ffi::OsStr;
@@ -22,14 +21,14 @@ use tempfile::TempDir;
 
 use crate::leftovers;
 
-/// How long anything that should happen may take on a busy machine.
+/// Time limit for any expected event on a busy machine.
 pub const PATIENCE: Duration = Duration::from_secs(90);
 
-/// Lines that are shown of a log when a test fails.
+/// Maximum number of log lines shown when a test fails.
 const MAX_SHOWN: usize = 100;
 
-/// Whom the robots' tasks run as where the tests run as root, as agents on real robots do: nobody
-/// who owns anything.
+/// User id of the robots' tasks where the tests run as root, as with agents on real robots: a user
+/// that owns nothing.
 const TASK_USER: &str = "65534";
 
 /// The path of one of the workspace's programs.
@@ -45,18 +44,18 @@ pub fn program(name: &str) -> PathBuf {
     path
 }
 
-/// A variable that `./scripts/test` sets.
+/// Reads an environment variable that `./scripts/test` sets.
 pub fn required(variable: &str) -> String {
     std::env::var(variable)
         .unwrap_or_else(|_| panic!("{variable} is not set: run the tests with ./scripts/test"))
 }
 
-/// Asks again until there is an answer; fails with `what` when patience ends.
+/// Polls until `ask` returns an answer; fails with `what` after [`PATIENCE`].
 pub async fn eventually<T>(what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T {
     eventually_within(PATIENCE, what, ask).await
 }
 
-/// The same, for what takes longer than most.
+/// The same with another time limit, for events that take longer than most.
 pub async fn eventually_within<T>(
     patience: Duration,
     what: &str,
@@ -67,7 +66,7 @@ pub async fn eventually_within<T>(
         .unwrap_or_else(|| panic!("after {patience:?} still waiting for {what}"))
 }
 
-/// Asks again until there is an answer or patience ends.
+/// Polls until `ask` returns an answer or `patience` ends.
 pub async fn within<T>(patience: Duration, mut ask: impl AsyncFnMut() -> Option<T>) -> Option<T> {
     let start = Instant::now();
     let mut tick = tokio::time::interval(Duration::from_millis(50));
@@ -80,7 +79,7 @@ pub async fn within<T>(patience: Duration, mut ask: impl AsyncFnMut() -> Option<
     }
 }
 
-/// A client that trusts the authority with this pin, where there is one.
+/// A client that trusts the certificate authority with this pin, if there is one.
 fn client(pin: Option<CaPin>) -> reqwest::Client {
     // For clients that a test makes itself. A second install is refused because the first is in
     // place.
@@ -99,19 +98,19 @@ impl Process {
         Self(command.stdin(Stdio::null()).spawn().expect("program starts"))
     }
 
-    /// What a power cut or `kill -9` does.
+    /// Sends SIGKILL, which acts like a power cut.
     pub fn kill(&mut self) {
         self.0.kill().expect("killable");
         self.0.wait().expect("reaped");
     }
 
-    /// SIGTERM, and its exit code.
+    /// Sends SIGTERM and returns the exit code.
     pub fn terminate(&mut self) -> Option<i32> {
         self.signal(Signal::SIGTERM);
         self.0.wait().expect("reaped").code()
     }
 
-    /// Whatever a signal does.
+    /// Sends any signal.
     pub fn signal(&self, signal: Signal) {
         let pid = nix::unistd::Pid::from_raw(i32::try_from(self.0.id()).expect("pid"));
         nix::sys::signal::kill(pid, signal).expect("signalled");
@@ -125,14 +124,14 @@ impl Drop for Process {
     }
 }
 
-/// A `taskd serve` with its own data directory; it keeps its ports over restarts.
+/// A `taskd serve` with its own data directory. Its ports stay the same over restarts.
 pub struct Server {
     process: Option<Process>,
     data: PathBuf,
     settings: Vec<(String, String)>,
     pub http: SocketAddr,
     pub mqtt: SocketAddr,
-    /// Of its certificate authority, if it encrypts.
+    /// Pin of its certificate authority, if the server encrypts.
     pub pin: Option<CaPin>,
     client: reqwest::Client,
 }
@@ -149,7 +148,7 @@ impl Server {
         server
     }
 
-    /// Starts one at these addresses, which another has left.
+    /// Starts a server at these addresses, which an earlier server has released.
     pub async fn start_at(
         data: &Path,
         settings: &[(&str, &str)],
@@ -162,7 +161,7 @@ impl Server {
         server
     }
 
-    /// Starts though something is missing that it would need to be ready.
+    /// Starts a server that lacks something that readiness requires.
     pub async fn start_unready(data: &Path, settings: &[(&str, &str)]) -> Self {
         let mut server = Self::new(data, settings);
         server.launch().await;
@@ -211,7 +210,7 @@ impl Server {
         .await;
     }
 
-    /// Until this robot's session has come about.
+    /// Waits until this robot's session is established.
     pub async fn wait_online(&self, robot: &str) {
         eventually("the robot to be online", async || {
             self.robot(robot).await?.online.then_some(())
@@ -219,13 +218,12 @@ impl Server {
         .await;
     }
 
-    /// What `/readyz` says.
+    /// The response of `/readyz`.
     pub async fn readiness(&self) -> Option<Value> {
         self.client.get(self.url("/readyz")).send().await.ok()?.json().await.ok()
     }
 
-    /// Ends it and starts it again with another setting, `None`: without it. It listens for MQTT
-    /// elsewhere then.
+    /// Restarts the server with another setting; `None` removes the setting. The MQTT port changes.
     pub async fn restart_with(&mut self, name: &str, value: Option<&str>) {
         self.terminate();
         self.set(name, value);
@@ -233,7 +231,7 @@ impl Server {
         self.launch().await;
     }
 
-    /// A setting that holds from the next start on; `None`: its default does.
+    /// Changes a setting from the next start on; `None` restores the default.
     pub fn set(&mut self, name: &str, value: Option<&str>) {
         self.settings.retain(|(known, _)| known != name);
         self.settings.extend(value.map(|value| (name.to_owned(), value.to_owned())));
@@ -255,7 +253,7 @@ impl Server {
         self.process.as_ref().expect("server runs").signal(signal);
     }
 
-    /// Starts it again on the same data and ports.
+    /// Restarts the server on the same data and ports.
     pub async fn restart(&mut self) {
         self.launch().await;
         self.wait_ready().await;
@@ -273,7 +271,7 @@ impl Server {
             .to_owned()
     }
 
-    /// `GET` as the operator; `None` while the server is away.
+    /// `GET` as the operator; `None` while the server is down.
     pub async fn get(&self, path: &str) -> Option<Value> {
         let answer =
             self.client.get(self.url(path)).bearer_auth(self.operator_token()).send().await.ok()?;
@@ -289,7 +287,7 @@ impl Server {
         serde_json::from_value(self.get(&format!("/api/v1/deployments/{id}")).await?).ok()
     }
 
-    /// Waits until `robot` has `task` in `phase`, and gives the robot.
+    /// Waits until `robot` has `task` in `phase`, and returns the robot.
     pub async fn wait_phase(&self, robot: &str, task: &str, phase: Phase) -> RobotView {
         eventually(&format!("{task} on {robot} to be {phase}"), async || {
             let view = self.robot(robot).await?;
@@ -308,7 +306,7 @@ impl Server {
         command
     }
 
-    /// Runs an operator's command that must end with status 0.
+    /// Runs an operator's command that must exit with status 0.
     pub async fn operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> String {
         let output = self.try_operate(args).await;
         let (out, err) =
@@ -317,7 +315,7 @@ impl Server {
         out.into_owned()
     }
 
-    /// Runs an operator's command, whatever its status.
+    /// Runs an operator's command and accepts any exit status.
     pub async fn try_operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> Output {
         let mut command = self.command(args);
         tokio::task::spawn_blocking(move || command.output().expect("taskd runs"))
@@ -325,7 +323,7 @@ impl Server {
             .expect("no panic")
     }
 
-    /// Uploads `package` and orders it for `selector`; gives the deployment.
+    /// Uploads `package`, deploys it to `selector` and returns the deployment.
     pub async fn push(&self, package: &Path, selector: &str) -> DeploymentView {
         self.push_with(package, selector, &[]).await
     }
@@ -366,7 +364,7 @@ pub struct Robot {
 }
 
 impl Robot {
-    /// Enrols over `url` (the server's own, or a proxy's before it) and starts.
+    /// Enrolls over `url` (the server's own, or that of a proxy before the server) and starts.
     pub async fn start(server: &Server, dir: &Path, name: &str, number: u8) -> Self {
         Self::start_with(server, dir, name, number, &server.url(""), &[]).await
     }
@@ -391,12 +389,12 @@ impl Robot {
         robot
     }
 
-    /// Enrols it anew with this token; the agent must not be running.
+    /// Enrolls the robot anew with this token; the agent must not be running.
     pub async fn enroll_anew(&self, number: u8, token: &str) {
         enroll(&self.data, number, &self.environment, &["--token", token, "--force"]).await;
     }
 
-    /// Somebody who has this robot's identity and starts an agent with it elsewhere.
+    /// An attacker with this robot's identity who starts an agent elsewhere.
     pub fn stolen(&self, dir: &Path, name: &str) -> Self {
         let data = dir.join(name);
         std::fs::create_dir(&data).expect("directory");
@@ -409,7 +407,7 @@ impl Robot {
         thief
     }
 
-    /// A whole copy of this robot's data, as it is now. Its agent does not run yet.
+    /// A full copy of this robot's current data. Its agent does not run yet.
     pub fn copied(&self, dir: &Path, name: &str) -> Self {
         let data = dir.join(name);
         let copied =
@@ -419,7 +417,8 @@ impl Robot {
         Self { process: None, data, environment, name: self.name.clone(), id }
     }
 
-    /// One that enrols by itself in the directory `name` below `dir`. Its agent does not run yet.
+    /// A robot that enrolls by itself in the directory `name` below `dir`. Its agent does not run
+    /// yet.
     pub fn enrolled(dir: &Path, name: &str, id: RobotId, environment: &[(&str, &str)]) -> Self {
         let environment =
             environment.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect();
@@ -455,12 +454,12 @@ impl Robot {
         self.process.take().expect("agent runs").terminate()
     }
 
-    /// SIGSTOP: it is there, and does nothing.
+    /// Sends SIGSTOP: the agent exists and does nothing.
     pub fn freeze(&self) {
         self.process.as_ref().expect("agent runs").signal(Signal::SIGSTOP);
     }
 
-    /// SIGCONT.
+    /// Sends SIGCONT.
     pub fn thaw(&self) {
         self.process.as_ref().expect("agent runs").signal(Signal::SIGCONT);
     }
@@ -494,8 +493,8 @@ async fn enroll(data: &Path, number: u8, environment: &[(String, String)], optio
     assert!(output.status.success(), "enroll: {}", String::from_utf8_lossy(&output.stderr));
 }
 
-/// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that goes with
-/// the test.
+/// A server and robots named `robot-1`, `robot-2`, …, each in a directory below one that is removed
+/// with the test.
 pub struct Fleet {
     // Robots end before the server, and both before their directory is removed.
     pub robots: Vec<Robot>,
@@ -517,7 +516,7 @@ impl Fleet {
         fleet
     }
 
-    /// Writes a package that runs `script` with `sh`, and gives its directory.
+    /// Writes a package that runs `script` with `sh`, and returns its directory.
     pub fn package(&self, name: &str, version: &str, kind: &str, script: &str) -> PathBuf {
         let dir = self.dir.path().join(format!("{name}-{version}"));
         write_package(&dir, name, version, kind, script);
@@ -535,7 +534,7 @@ pub fn write_package(dir: &Path, name: &str, version: &str, kind: &str, script: 
     std::fs::write(dir.join("main.sh"), script).expect("main.sh");
 }
 
-/// Adds bytes to a package that do not compress, so that as many travel.
+/// Adds incompressible bytes to a package, so that the same number of bytes is transferred.
 pub fn add_ballast(package: &Path, bytes: usize) {
     let mut ballast = vec![0; bytes];
     rand::rngs::SmallRng::seed_from_u64(1).fill(&mut ballast[..]);
@@ -551,14 +550,14 @@ fn ros_is_for_all() -> bool {
     [python.canonicalize().expect("python3"), python].iter().all(|path| path.ancestors().all(open))
 }
 
-/// A directory that tasks may write to, whoever they run as.
+/// Creates a directory that tasks may write to under any user.
 pub fn open_directory(path: &Path) {
     std::fs::create_dir(path).expect("directory");
     std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o1777)).expect("open to all");
 }
 
-/// Where a test has failed, what a program said last is all there is to learn from: its directory
-/// goes with the test.
+/// Shows the programs' last log lines when a test has failed, because the test's directory is
+/// removed with the test.
 #[expect(clippy::print_stderr, reason = "the test runner shows what a failed test printed")]
 fn show_log_of_failed(path: &Path) {
     if std::thread::panicking() {
@@ -573,7 +572,7 @@ fn log_file(path: &Path) -> File {
     File::options().create(true).append(true).open(path).expect("log file")
 }
 
-/// A request in the name of a robot, as its agent makes it after a restart in the data directory
+/// A request in the name of a robot, as its agent sends after a restart in the data directory
 /// `data`.
 pub fn from_restarted_agent(
     request: reqwest::RequestBuilder,

@@ -1,5 +1,4 @@
-//! What someone with an operator's or one robot's credentials may try: hostile archives, other
-//! robots' topics.
+//! Attacks with an operator's or one robot's credentials: hostile archives, other robots' topics.
 
 use std::path::Path;
 use std::time::Duration;
@@ -45,8 +44,8 @@ fn archive(entries: &[Vec<u8>]) -> Vec<u8> {
     tar
 }
 
-/// Uploads a package whose content is `tar`, past `taskd push` and its checks, as any OCI client
-/// could; gives the answer.
+/// Uploads a package with the content `tar`, past `taskd push` and its checks, as any OCI client
+/// could; returns the answer.
 async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> (u16, String) {
     let content = zstd::encode_all(tar, 3).expect("compressed");
     let config = json!({

@@ -1,4 +1,4 @@
-//! What a killed agent leaves behind: processes, which name its directory, and control groups.
+//! Leftovers of a killed agent: processes, which name its directory, and control groups.
 
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -20,8 +20,8 @@ pub fn end(data: &Path) {
     groups.iter().for_each(|group| remove_cgroup(group));
 }
 
-/// The control groups of a robot's runs, and of what else it has started: those that none but its
-/// killed agent removes.
+/// The control groups of a robot's runs and of its other processes: those that only the killed
+/// agent would remove.
 fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
     let entries = |dir: PathBuf| {
         std::fs::read_dir(dir).into_iter().flatten().flatten().map(|entry| entry.path())
@@ -45,8 +45,8 @@ fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
     written.chain(joined).collect()
 }
 
-/// Ends what is left in the group and removes it, and what it lay in if no other test has groups
-/// there.
+/// Ends the group's remaining processes and removes the group, and its parent if no other test has
+/// groups there.
 fn remove_cgroup(group: &Path) {
     let start = Instant::now();
     while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < PATIENCE {
@@ -63,7 +63,7 @@ fn remove_cgroup(group: &Path) {
     let _ = std::fs::remove_dir(base.join("shims")).and_then(|()| std::fs::remove_dir(base));
 }
 
-/// Kills every process of ours whose environment or command line names `dir`.
+/// Kills all our processes with `dir` in their environment or command line.
 fn end_processes_below(dir: &Path) {
     let needle = dir.to_str().expect("utf-8 path").as_bytes().to_owned();
     // Killing a shim frees its children; a few rounds find those too.
@@ -74,7 +74,7 @@ fn end_processes_below(dir: &Path) {
     }
 }
 
-/// Pids whose environment or command line contains `needle`, our own process left out.
+/// Pids of processes with `needle` in their environment or command line, except our own process.
 pub fn processes_with(needle: &[u8]) -> Vec<i32> {
     let own = i32::try_from(std::process::id()).expect("pid");
     std::fs::read_dir("/proc")

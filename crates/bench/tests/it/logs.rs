@@ -1,5 +1,5 @@
-//! What a task says reaches the operator: asked for, followed over breaks, and within bounds when
-//! it is a flood.
+//! A task's output reaches the operator: requested, followed over disconnections, and within bounds
+//! during a flood.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read, Write as _};
@@ -13,7 +13,7 @@ use task_proto::report::Phase;
 
 use crate::harness::{Fleet, PATIENCE, eventually, open_directory};
 
-/// A robot with a task that does what it is told.
+/// A robot with a task that follows the test's commands.
 struct Bench {
     fleet: Fleet,
     orders: PathBuf,
@@ -40,7 +40,7 @@ impl Bench {
     /// Has the task run a line of shell.
     async fn order(&self, line: String) {
         let orders = self.orders.clone();
-        // The task may not have made it yet.
+        // The task may not have created the file yet.
         let mut made = eventually("the task to take orders", async || {
             File::options().write(true).open(&orders).ok()
         })
@@ -80,7 +80,7 @@ fn lines_of(stream: Option<impl Read + Send + 'static>) -> Receiver<String> {
     receiver
 }
 
-/// `taskd logs -f`; it ends with the test.
+/// `taskd logs -f`; the process ends with the test.
 struct Follower {
     child: Child,
     lines: Receiver<String>,
@@ -166,7 +166,7 @@ async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
         texts(&bench.logs(&[]).await).contains(&"before").then_some(())
     })
     .await;
-    // What is asked for of the past is no bound for what a break leaves out.
+    // A limit on past lines is no limit on the lines that a disconnection leaves out.
     let follower = bench.follow(&["-n", "1", "speaker"]);
     while follower.next().text != "before" {}
     for number in 0..30 {
@@ -178,7 +178,7 @@ async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
             bench.fleet.server.restart().await;
         }
     }
-    // What was said in the moment before the stream began may come by it.
+    // Lines written in the moment before the stream began may arrive by the stream.
     let said =
         std::iter::repeat_with(|| follower.next().text).filter(|text| text.starts_with("line "));
     let seen: Vec<String> = said.take(30).collect();

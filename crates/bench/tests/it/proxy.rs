@@ -1,5 +1,5 @@
-//! A TCP proxy that counts what passes and can slow it down: bad Wi-Fi, and a witness of what was
-//! transferred. It never looks into the bytes.
+//! A TCP proxy that counts the bytes passed and can slow them down: simulates bad Wi-Fi and
+//! measures transfers. The proxy never inspects the bytes.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
-/// A running proxy; it ends with the test's runtime.
+/// A running proxy; ends with the test's runtime.
 pub struct Proxy {
     pub address: SocketAddr,
     to_client: Arc<AtomicU64>,
@@ -61,7 +61,7 @@ async fn forward(
         let mut buffer = vec![0; 64 * 1024];
         while let Ok(count @ 1..) = from_server.read(&mut buffer).await {
             let pause = Duration::from_secs_f64(count as f64 / rate.load(Ordering::SeqCst) as f64);
-            // A timer, not a guess: this is what makes the link slow.
+            // A real timer: this delay makes the link slow.
             let (written, ()) =
                 tokio::join!(to_client.write_all(&buffer[..count]), tokio::time::sleep(pause));
             if written.is_err() {

@@ -1,5 +1,5 @@
-//! What an operator sees of a robot's ROS graph and does to its nodes, through the whole system:
-//! real nodes, the real commands, and the health of the task that follows.
+//! An operator's view of a robot's ROS graph and actions on its nodes, through the whole system:
+//! real nodes, the real commands, and the resulting health of the task.
 
 use std::collections::BTreeSet;
 
@@ -17,7 +17,7 @@ impl Stage {
         serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"))
     }
 
-    /// What a command that fails says.
+    /// The error output of a failing command.
     async fn refused(&self, words: &[&str]) -> String {
         let output = self.server.try_operate(words).await;
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -55,8 +55,8 @@ async fn an_operator_looks_at_nodes_and_changes_them() {
     let set = stage.asked(&["param", "set", ROBOT, "/asked", "resolution", "2"]).await;
     assert_eq!(set["parameter"]["value"], 2.0, "a whole number becomes the node's double: {set}");
     assert_eq!(stage.say("/say").await, "2.0", "as an independent client hears");
-    // What the node said about it is kept with its task, once, though it stands on its standard
-    // error as well.
+    // The node's log line about this is kept with its task, once, though the line is on its
+    // standard error as well.
     let said = eventually("the node's words", async || {
         let logs = stage.asked(&["logs", ROBOT, "asked", "--level", "warn"]).await;
         let lines = logs["lines"].as_array().expect("lines").clone();

@@ -1,5 +1,5 @@
 //! Independent OCI clients: the `oci-client` crate and `crane` push to the package store and pull
-//! from it.
+//! from the store.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::path::Path;

@@ -1,6 +1,6 @@
 //! A robot is revoked while everything is under way: its session, a download, a request that is
-//! being sent, and a token it was about to go over to. All of it ends at once; what runs on the
-//! robot goes on, and the robot says why it is out.
+//! being sent, and a pending next token. All of it ends at once; the robot's tasks go on, and the
+//! robot reports the reason for its exclusion.
 
 use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, MqttOptions};
 use serde_json::Value;
@@ -21,7 +21,7 @@ fn token_of(robot: &Robot) -> String {
     identity["token"].as_str().expect("a token").to_owned()
 }
 
-/// What `task-agent status` says.
+/// The output of `task-agent status`.
 async fn status(robot: &Robot) -> Value {
     #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
     let mut command = std::process::Command::new(program("task-agent"));
@@ -61,7 +61,7 @@ async fn half_a_report(server: &Server, robot: &str, token: &str) -> TcpStream {
          content-type: application/json\r\ncontent-length: 100\r\nexpect: 100-continue\r\n\r\n"
     );
     stream.write_all(head.as_bytes()).await.expect("sent");
-    // The server asks for the body once it has let the robot in.
+    // The server asks for the body once the robot is admitted.
     let mut go_on = [0; 25];
     stream.read_exact(&mut go_on).await.expect("100 Continue");
     assert!(go_on.starts_with(b"HTTP/1.1 100"), "{}", String::from_utf8_lossy(&go_on));
@@ -78,8 +78,8 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let heavy = fleet.package("heavy", "1.0.0", "service", "exec sleep 1000\n");
     add_ballast(&heavy, HEAVY_BYTES);
     fleet.server.operate(["push", heavy.to_str().expect("utf-8")]).await;
-    // The robot itself is not to fetch what is fetched below in its name. Its session lasts half a
-    // minute.
+    // The robot itself must not download what this test downloads in its name. Its session lasts
+    // half a minute.
     fleet.robots[0].freeze();
     let blob = fleet.server.push(&heavy, "*").await.package.content;
     let (server, robot) = (&fleet.server, &fleet.robots[0]);
@@ -146,7 +146,7 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     let out = fleet.server.operate(["robot", "list"]).await;
     assert!(out.contains("offline revoked"), "{out}");
 
-    // It comes back, and to what was ordered meanwhile, once it is registered anew.
+    // The robot comes back, and to the orders made meanwhile, once it is registered anew.
     let out =
         fleet.server.operate(["enroll-token", "create", "--robot", "robot-1", "--uses", "1"]).await;
     fleet.robots[0].terminate();

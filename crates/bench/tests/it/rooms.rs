@@ -11,7 +11,7 @@ use proc_macro2::{TokenStream, TokenTree};
 
 /// Entries of a directory of source beside its `mod.rs`, `lib.rs` and `main.rs`.
 const MAX_ENTRIES: usize = 14;
-/// Directories that are larger, with their number of entries: it only shrinks.
+/// Larger directories, with their number of entries: the list only shrinks.
 const LARGER: [(&str, usize); 5] = [
     ("crates/agent/src/ros/graph", 17),
     ("crates/bench/src", 26),
@@ -221,7 +221,7 @@ fn circle(graph: &BTreeMap<String, BTreeSet<String>>) -> Option<Vec<String>> {
     }
 }
 
-/// What the source does against the table of its rooms.
+/// Violations of the table of rooms in the source.
 fn violations(
     rows: &[Row],
     modules: &[Module],

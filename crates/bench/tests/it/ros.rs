@@ -1,6 +1,6 @@
-//! "Running" as ROS says it: real rclpy nodes, built by real colcon and pushed through the whole
-//! system, keep or break what their packages promise. Each test has a server, a robot and a ROS
-//! domain of its own; its tasks go side by side.
+//! "Running" as ROS reports: real rclpy nodes, built by real colcon and pushed through the whole
+//! system, keep or break the promises of their packages. Each test has its own server, robot and
+//! ROS domain; its tasks run side by side.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::net::UdpSocket;
@@ -20,13 +20,13 @@ use crate::harness::{
 use crate::leftovers::processes_with;
 use crate::talker::trigger;
 
-/// Where the package lies whose node does as it is told.
+/// Directory of the package with the scriptable node.
 const PROBE: &str = "tests/it/graph_probe";
-/// How long a job may take on a busy machine.
+/// Time limit for a job on a busy machine.
 const JOB_PATIENCE: Duration = Duration::from_secs(600);
 
-/// A ROS domain that nobody else on this machine has while this lives: a port that no participant
-/// of it uses is the lock.
+/// A ROS domain reserved on this machine while this value lives. The lock is a port that no
+/// participant of the domain uses.
 pub struct Domain {
     pub id: String,
     _lock: UdpSocket,
@@ -34,7 +34,7 @@ pub struct Domain {
 
 impl Domain {
     fn free() -> Self {
-        // Domains whose ports lie below those the system gives out; port 7400 + 250 n + 249 would
+        // Domains with all ports below the system's ephemeral ports; port 7400 + 250 n + 249 would
         // be the 120th participant's.
         let free = |id: u16| {
             let lock = UdpSocket::bind(("127.0.0.1", 7400 + 250 * id + 249)).ok()?;
@@ -53,7 +53,7 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// A stage whose node is built.
+    /// A stage with a built node.
     pub async fn start() -> Self {
         let stage = Self::bare().await;
         stage.build().await;
@@ -71,7 +71,7 @@ impl Stage {
         .await
     }
 
-    /// A stage whose robot has settings of its own for this domain, and nothing is built.
+    /// A stage with extra robot settings for this domain, without anything built.
     pub async fn with(own: impl FnOnce(&str) -> Vec<(&'static str, String)>) -> Self {
         let domain = Domain::free();
         let dir = TempDir::new().expect("temp dir");
@@ -85,13 +85,13 @@ impl Stage {
         Self { robot, server, domain, dir }
     }
 
-    /// Builds the node, for packages that are not to be built.
+    /// Builds the node in advance, for packages that the robot does not build.
     pub async fn build(&self) {
         build(&activate(), &self.dir.path().join("built")).await;
     }
 
-    /// A package whose node gets `arguments`, and whose task.toml has `rest` behind its `[run]`
-    /// table. It is built already.
+    /// A prebuilt package. Its node gets `arguments`, and its task.toml has `rest` after the
+    /// `[run]` table.
     pub fn package(&self, name: &str, version: &str, arguments: &str, rest: &str) -> PathBuf {
         let dir = self.dir.path().join(format!("{name}-{version}"));
         copy(&self.dir.path().join("built/install"), &dir.join("install"));
@@ -112,7 +112,7 @@ impl Stage {
             .find(|task| task.task.as_str() == name)
     }
 
-    /// Waits until the task, which is built on the robot, runs.
+    /// Waits until a task that is built on the robot runs.
     pub async fn builds(&self, name: &str) {
         eventually_within(JOB_PATIENCE, &format!("{name} to be built"), async || {
             let task = self.task(name).await?;
@@ -122,7 +122,7 @@ impl Stage {
         .await;
     }
 
-    /// Waits until the task runs as it should.
+    /// Waits until the task is running and healthy.
     pub async fn runs(&self, name: &str) -> RobotTask {
         self.is(name, Phase::Running, |task| task.degraded.is_none().then_some(task)).await
     }
@@ -131,7 +131,7 @@ impl Stage {
         self.is(name, Phase::Failed, |task| task.failure).await
     }
 
-    /// Waits for a job's good end.
+    /// Waits until a job has succeeded.
     pub async fn succeeds(&self, name: &str) {
         eventually_within(JOB_PATIENCE, &format!("{name} to succeed"), async || {
             let task = self.task(name).await?;
@@ -163,7 +163,7 @@ impl Stage {
         })
     }
 
-    /// The process of the task's node, which is the one that has these words in its command line.
+    /// The process of the task's node, found by these words in its command line.
     fn node(&self, name: &str) -> i32 {
         let needle = format!("tasks/{name}/");
         let found: Vec<i32> = processes_with(self.dir.path().to_str().expect("utf-8").as_bytes())
@@ -210,7 +210,7 @@ fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
 }
 
-/// What a person does who builds the package on their own machine.
+/// Builds the package as a person would on their own machine.
 async fn build(activate: &str, dir: &Path) {
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join(PROBE), &dir.join("src"));
     let mut colcon = tokio::process::Command::new("bash");
@@ -290,7 +290,7 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
     let by = |timeout_s: u32, what: &str| {
         format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\n{what}\n")
     };
-    // What is missing must be known by then, what is refused is so whenever it is seen.
+    // A missing item is judged at the deadline, a refused one as soon as the refusal is seen.
     let (short, long) = (|what: &str| by(30, what), |what: &str| by(80, what));
     stage.push("absent", "--node lidar", &short("nodes = ['/mapper']")).await;
     stage
@@ -380,7 +380,7 @@ async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
     }
     assert_eq!(stage.fails("crashing").await.code.as_str(), "process_exited");
 
-    // What its launcher starts again is brought up again.
+    // A process that its launcher restarts is brought up again.
     stage.signal("back", Signal::SIGKILL);
     eventually("the node to be active again", async || {
         (stage.log("back").matches("activated with late = 2").count() == 2).then_some(())
@@ -402,7 +402,7 @@ async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
     stage.robot.kill();
     stage.signal("lost", Signal::SIGKILL);
     stage.robot.restart();
-    // Only the new agent can tell, and by then it has looked at the other task as well.
+    // Only the new agent can report this, and by then the agent has checked the other task as well.
     assert_eq!(stage.degrades("lost").await.code.as_str(), "node_vanished");
     let after = stage.runs("kept").await;
     assert_eq!((pid_of(&after), after.restarts), (pid_of(&before), before.restarts));
@@ -434,7 +434,7 @@ async fn a_version_that_does_not_get_ready_gives_way_to_the_one_before() {
         })
         .await;
     assert_ne!(pid_of(&after), pid_of(&before));
-    // The one before is on the graph, and active, for whoever asks.
+    // The previous version is on the graph, and active, for any client.
     eventually("the old version to be active again", async || {
         (stage.log("mapper").matches("activated with late = 1").count() == 2).then_some(())
     })

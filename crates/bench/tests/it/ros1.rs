@@ -10,15 +10,15 @@ use task_proto::report::{FailureCode, Phase};
 use crate::harness::{Fleet, Robot, Server, eventually, required};
 use crate::leftovers::processes_with;
 
-/// A ROS 1 master's address that nobody uses, and how its nodes find it.
+/// The unused address of a ROS 1 master, and the nodes' means of finding the master.
 struct Master {
     uri: String,
 }
 
 impl Master {
     fn on_a_free_port() -> Self {
-        // The port is free again when the master begins; nobody else asks the kernel for this very
-        // one.
+        // The port is free again when the master begins; no other process asks the kernel for this
+        // very port.
         let port = TcpListener::bind("127.0.0.1:0")
             .and_then(|free| free.local_addr())
             .expect("a port")
@@ -30,7 +30,7 @@ impl Master {
         [("ROS_MASTER_URI", &self.uri), ("ROS_IP", "127.0.0.1")]
     }
 
-    /// What one of ROS 1's own programs says, `None` when it fails.
+    /// The output of one of ROS 1's own programs, `None` when the program fails.
     async fn ask(&self, home: &Path, program: &str, arguments: &[&str]) -> Option<String> {
         let mut command = tokio::process::Command::new(format!("/usr/bin/{program}"));
         command

@@ -72,7 +72,7 @@ async fn every_robot_gets_the_very_bytes_by_every_mechanism_of_the_paper() {
     let points = arrived(dir.path(), "paper", &output);
     for mechanism in MECHANISMS {
         let of = points.iter().filter(|point| point["series"] == mechanism);
-        // What rides inside an announcement is small.
+        // Content inside an announcement is small.
         assert_eq!(of.clone().count(), if mechanism == "inline" { 2 } else { 4 }, "{mechanism}");
         for point in of {
             let payload = point["settings"]["payload_bytes"].as_f64().expect("set");

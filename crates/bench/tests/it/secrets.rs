@@ -1,6 +1,6 @@
-//! Known secrets go through the real programs, which log all they can, and through what people do
-//! wrong: none turns up in a log, a command line, a URL, an answer or an error, and the few files
-//! that hold one are their owner's alone.
+//! Known secrets go through the real programs, which log at the highest level, and through users'
+//! mistakes: no secret appears in a log, a command line, a URL, an answer or an error, and the few
+//! files that hold a secret are readable by their owner only.
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::collections::BTreeSet;
@@ -21,10 +21,10 @@ use tokio::net::{TcpListener, TcpStream};
 
 use crate::harness::{Robot, Server, from_restarted_agent, program, write_package};
 
-/// Files that may hold a secret, if nobody else can read them.
+/// Files that may hold a secret, if only their owner can read them.
 const KEEPERS: [&str; 3] = ["operator.token", "identity.json", "credentials.json"];
 
-/// What must not turn up anywhere, with what it is.
+/// Secrets that must not appear anywhere, each with a description.
 #[derive(Default)]
 struct Secrets(Vec<(&'static str, String)>);
 
@@ -49,7 +49,7 @@ impl Secrets {
     }
 }
 
-/// Every command line on this machine while the test runs.
+/// All command lines on this machine during the test.
 struct Witness {
     end: Sender<()>,
     watching: JoinHandle<BTreeSet<Vec<u8>>>,
@@ -80,7 +80,7 @@ impl Witness {
     }
 }
 
-/// Stands before the server and keeps what it is sent.
+/// Stands before the server and records all bytes sent to the server.
 async fn listen_in(target: SocketAddr) -> (SocketAddr, Arc<Mutex<Vec<u8>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("port");
     let (address, heard) =
@@ -111,7 +111,7 @@ async fn forward(client: TcpStream, target: SocketAddr, heard: Arc<Mutex<Vec<u8>
     tokio::select! { () = upstream => {}, _ = downstream => {} }
 }
 
-/// Runs it with `input` on its standard input, whatever its status.
+/// Runs the command with `input` on its standard input and accepts any exit status.
 async fn run(mut command: Command, input: &str) -> Output {
     let input = input.to_owned();
     let run = move || {
@@ -128,8 +128,8 @@ async fn run(mut command: Command, input: &str) -> Output {
     tokio::task::spawn_blocking(run).await.expect("no panic")
 }
 
-/// Runs it until it has said `words` on its standard error, then kills it. Gives all that it said
-/// there.
+/// Runs the command until its standard error contains `words`, then kills the process. Returns its
+/// complete standard error.
 async fn run_until(mut command: Command, words: &'static str) -> Vec<u8> {
     let run = move || {
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("runs");
@@ -164,7 +164,7 @@ fn mangled(token: &str) -> String {
     format!("{}{last}", &token[..token.len() - 1])
 }
 
-/// What people do wrong with secrets at the command line; each must fail.
+/// Users' mistakes with secrets at the command line; each must fail.
 async fn do_wrong(
     server: &Server,
     dir: &Path,
@@ -210,7 +210,7 @@ async fn do_wrong(
         assert!(!output.status.success(), "{shown}");
         secrets.assert_absent(&shown, &[output.stdout, output.stderr].concat());
     }
-    // A password is not even taken from where others could read it.
+    // A password is not accepted from places where other users could read the password.
     for (flag, value) in [
         ("--broker", format!("mqtt://u:{password}-seen@127.0.0.1:1")),
         ("--database", format!("{url}-seen")),
@@ -249,7 +249,7 @@ async fn ask_wrongly(server: &Server, tokens: &[String], password: &str) -> Vec<
     answers
 }
 
-/// Someone with a password signs in, by the command line and at the page. Gives the token of the
+/// A user with a password signs in, by the command line and at the page. Returns the token of the
 /// command line.
 async fn person(
     server: &Server,
@@ -286,8 +286,8 @@ async fn person(
     signed_in
 }
 
-/// A robot enrols, runs a task that says all it was given, and is made a next token. Gives it and
-/// the tokens it had.
+/// A robot enrolls, runs a task that prints all its inputs, and is issued a next token. Returns the
+/// robot and its tokens.
 async fn robot(
     server: &Server,
     dir: &Path,
@@ -343,7 +343,7 @@ async fn robot(
     (robot, [enrolment, token])
 }
 
-/// What an administrator can read.
+/// Reads everything that an administrator can read.
 async fn read_all(server: &Server, secrets: &Secrets) {
     let paths = [
         "server",

@@ -1,5 +1,5 @@
-//! What an administrator sets for a robot at the server holds on the robot, without a restart, and
-//! later without a server.
+//! An administrator's settings for a robot at the server take effect on the robot, without a
+//! restart, and later without a server.
 
 use nix::sys::signal::Signal;
 use task_proto::report::Phase;
@@ -33,8 +33,8 @@ async fn a_robot_has_its_ros_from_the_server() {
     })
     .await;
 
-    // All of them die, and there is no server when the agent is back: what was set is known, and
-    // the task runs by it.
+    // All of them die, and there is no server when the agent is back: the settings are known, and
+    // the task runs by them.
     stage.server.kill();
     stage.robot.kill();
     stage.signal("talker", Signal::SIGKILL);

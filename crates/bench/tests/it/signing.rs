@@ -1,5 +1,5 @@
-//! Publishers' signatures through the real programs: what enough have signed runs, whatever way it
-//! takes, and nothing else.
+//! Publishers' signatures through the real programs: packages with enough signatures run on any
+//! route, and no others.
 
 use std::path::{Path, PathBuf};
 
@@ -26,7 +26,7 @@ pub async fn new_key(server: &Server, dir: &Path, name: &str) -> (String, String
 }
 
 impl Site {
-    /// A robot that trusts `keys`, of which it takes `threshold`.
+    /// A robot that trusts `keys` and requires signatures by `threshold` of them.
     pub async fn start(threshold: u8, keys: &[&str]) -> (Self, Vec<(String, String)>) {
         let dir = tempfile::tempdir().expect("temp dir");
         let server = Server::start(&dir.path().join("server")).await;
@@ -48,7 +48,7 @@ impl Site {
         (Self { server, robot, dir }, made)
     }
 
-    /// A service that says its version in a file, out of everybody's way.
+    /// A service that writes its version to a file in a separate place.
     pub fn package(&self, version: &str) -> PathBuf {
         let package = self.dir.path().join(format!("worker-{version}"));
         write_package(&package, "worker", version, "service", "exec sleep 1000\n");
@@ -160,7 +160,7 @@ async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_with
     .await;
     assert_eq!(revoked.tasks[0].phase, Phase::Running, "what runs goes on");
 
-    // The machine goes down and comes back: what nobody vouches for any more is not started.
+    // The machine goes down and comes back: a package that is no longer vouched for is not started.
     let pid = revoked.tasks[0].active.as_ref().expect("active").pid;
     site.robot.kill();
     let pid = nix::unistd::Pid::from_raw(i32::try_from(pid).expect("a pid"));

@@ -1,5 +1,5 @@
-//! What somebody gets who has a token and no key, and a thief who has the server's key, a state
-//! that it signed once, or a robot's identity.
+//! Attacks by a holder of a token without a key, and by a thief who has the server's key, a state
+//! that the server signed once, or a robot's identity.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -23,8 +23,8 @@ use tokio::task::JoinHandle;
 use crate::harness::{Server, eventually, from_restarted_agent, open_directory, write_package};
 use crate::signing::{Site, new_key};
 
-/// Somebody in the server's place, with a state for the robot and blobs, who listens to what the
-/// robot says.
+/// An impostor in the server's place, with a state for the robot and blobs, that records the
+/// robot's requests.
 #[derive(Clone, Default)]
 struct Thief(Arc<Mutex<Loot>>);
 
@@ -79,7 +79,7 @@ fn has(robot: &RobotView, code: &str) -> bool {
     robot.conditions.iter().any(|condition| condition.code == code)
 }
 
-/// What the server has for a robot whose identity is in `data`.
+/// The server's desired state for the robot with the identity in `data`.
 async fn desired_by(server: &Server, data: &std::path::Path) -> reqwest::Response {
     let identity = std::fs::read(data.join("identity.json")).expect("identity");
     let identity: Value = serde_json::from_slice(&identity).expect("json");
@@ -89,7 +89,7 @@ async fn desired_by(server: &Server, data: &std::path::Path) -> reqwest::Respons
     from_restarted_agent(request, data).send().await.expect("an answer")
 }
 
-/// The state that the server has for the robot, as it signed it.
+/// The robot's desired state as signed by the server.
 async fn signed_state(site: &Site) -> Envelope {
     desired_by(&site.server, site.robot.data()).await.json().await.expect("an envelope")
 }
@@ -175,7 +175,7 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let order = site.push("1.0", &["--sign", &keys[0].0]).await;
     let running = site.wait(&order, Phase::Running).await.tasks.remove(0).active;
-    // Uploaded by somebody with an operator's token and no key.
+    // Uploaded with an operator's token and without a signing key.
     let marker = site.dir.path().join("open");
     open_directory(&marker);
     let evil = site.dir.path().join("worker-evil");
@@ -275,7 +275,7 @@ async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_th
     assert_eq!(desired_by(&site.server, thief.data()).await.status(), StatusCode::UNAUTHORIZED);
 }
 
-/// A server with a robot that it has heard of.
+/// A server with a robot that has already reported.
 async fn with_a_known_robot() -> (Site, Vec<(String, String)>) {
     let (site, keys) = Site::start(1, &["ada.key"]).await;
     let is_known = |view: &RobotView| view.online && view.host.is_some();
@@ -303,7 +303,7 @@ async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_there() {
     site.wait(&order, Phase::Running).await;
     copy.restart();
     is_noticed(&site).await;
-    // By then it has come back, and would have been told of the order again.
+    // By then the robot has come back, and would have been told of the order again.
     let both = |view: &RobotView| has(view, "duplicate_identity");
     eventually("both to be seen", async || site.server.robot("robot-1").await.filter(both)).await;
     assert!(!copy.data().join("tasks/worker").exists(), "the copy got the order");

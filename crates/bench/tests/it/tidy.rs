@@ -1,6 +1,6 @@
-//! Holds the countable rules of style: each file says what it is for, files and functions stay
-//! short, and a test that the table of attacks names is there. It reads formatted source as text
-//! and never judges anything that needs understanding.
+//! Holds the countable rules of style: each file states its purpose, files and functions stay
+//! short, and each test that the table of attacks names exists. The test reads formatted source as
+//! text and never judges anything that needs understanding.
 
 use std::path::{Path, PathBuf};
 

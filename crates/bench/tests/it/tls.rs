@@ -1,5 +1,5 @@
 //! Encryption through the real programs: one token is all a robot needs, a proxy's one port is
-//! enough, and a server that is not the one it was enrolled at gets nothing.
+//! enough, and a server other than the one of the robot's enrollment gets nothing.
 #![expect(clippy::disallowed_methods, reason = "a test starts a proxy")]
 
 use std::net::SocketAddr;
@@ -15,7 +15,7 @@ use crate::harness::{Process, Robot, Server, eventually, program, write_package}
 const ENCRYPTED: (&str, &str) = ("TASKD_TLS_PRIVATE_CA", "true");
 const KEYED: (&str, &str) = ("TASKD_TLS_CLIENT_CERTIFICATES", "true");
 
-/// Pushes a package to `robot-1` and waits until it runs.
+/// Pushes a package to `robot-1` and waits until the task runs.
 async fn run_something(server: &Server, dir: &Path, version: &str) {
     let package = dir.join(format!("worker-{version}"));
     write_package(&package, "worker", version, "service", "exec sleep 1000\n");
@@ -47,8 +47,8 @@ async fn one_token_is_all_a_robot_needs_and_another_server_gets_nothing() {
     let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
     connected(&server).await;
     run_something(&server, dir.path(), "1.0.0").await;
-    // At the same addresses there is now somebody else, who knows as much of the robot as a copy of
-    // the database tells.
+    // At the same addresses there is now an impostor with all the knowledge of the robot that a
+    // copy of the database reveals.
     server.terminate();
     let copy = dir.path().join("impostor");
     std::fs::create_dir(&copy).expect("made");
@@ -95,7 +95,7 @@ async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
             && said.contains("--server: the token is for a server that encrypts"),
         "{said}"
     );
-    // Nor is the robot's own, whatever its settings say.
+    // The robot's own server is not trusted either, with any of the robot's settings.
     assert!(agent(&enroll(&server.url(""))).await.status.success());
     let refused = agent(&["run"]).await;
     let said = String::from_utf8_lossy(&refused.stderr);
@@ -148,7 +148,7 @@ async fn an_own_certificate_is_taken_from_its_files_without_a_restart() {
 async fn a_proxys_one_port_is_enough() {
     let dir = tempfile::tempdir().expect("temp dir");
     let authority = Authority::new(&dir.path().join("root.pem"));
-    // What robots are told of MQTT is a port that nobody listens on, as behind a firewall.
+    // The MQTT port announced to robots has no listener, as behind a firewall.
     let closed = free_address().port().to_string();
     let server =
         Server::start_with(&dir.path().join("server"), &[("TASKD_PUBLIC_MQTT_PORT", &closed)])
@@ -209,7 +209,7 @@ fn free_address() -> SocketAddr {
         .expect("a port")
 }
 
-/// nginx, as docs/tls.md has it.
+/// nginx, configured as in docs/tls.md.
 struct Proxy {
     _process: Process,
     address: SocketAddr,

@@ -4,22 +4,22 @@ use std::fmt;
 
 use super::{AssignmentView, DeploymentView};
 
-/// Names listed of one group of robots.
+/// The most names listed for one group of robots.
 const MAX_NAMES: usize = 20;
 
 /// The robots on which a deployment has not settled.
 #[derive(Debug, Default)]
 pub struct Awaited<'a> {
-    /// Online, and their batch has begun: the next batch waits for them.
+    /// Online, and their batch has begun: the next batch waits for these robots.
     pub busy: Vec<&'a AssignmentView>,
     /// Online, and their batch has not begun.
     pub queued: Vec<&'a AssignmentView>,
-    /// Offline: they go on when they are back, and the others don't wait for them.
+    /// Offline: they continue when they are back, and the other robots don't wait for them.
     pub offline: Vec<&'a AssignmentView>,
 }
 
 impl DeploymentView {
-    /// The robots on which it has not settled; none where the view has no assignments.
+    /// The robots on which the deployment has not settled; none if the view has no assignments.
     pub fn awaited(&self) -> Awaited<'_> {
         let mut awaited = Awaited::default();
         for one in self.assignments.iter().flatten().filter(|one| !one.phase.is_settled(self.kind))
@@ -54,7 +54,7 @@ impl fmt::Display for Awaited<'_> {
     }
 }
 
-/// The names of the first `most` robots, and how many more there are.
+/// The names of the first `most` robots, and the number of further robots.
 pub fn names(robots: &[&AssignmentView], most: usize) -> String {
     let named: Vec<&str> = robots.iter().take(most).map(|one| one.name.as_str()).collect();
     match robots.len().saturating_sub(most) {

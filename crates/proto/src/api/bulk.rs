@@ -1,25 +1,25 @@
-//! Bodies of what is done to many robots at once: it is done to all that are meant, or to none.
+//! Bodies of changes to many robots at once: a change applies to all matched robots, or to none.
 
 use serde::{Deserialize, Serialize};
 
 use crate::id::{LabelKey, Labels};
 use crate::selector::Selector;
 
-/// `POST /bulk/labels` (maintain): what is neither set nor removed stays. The answer is
+/// `POST /bulk/labels` (maintain): labels that are neither set nor removed stay. The answer is
 /// [`super::MatchedRobots`].
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BulkLabels {
-    /// Which robots.
+    /// The robots to change.
     pub selector: Selector,
-    /// Labels that each gets, in the place of what it has under the same key.
+    /// Labels to set on each robot; they replace labels with the same key.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub set: Labels,
-    /// Keys of labels that each loses, if it has them.
+    /// Keys of labels to remove from each robot that has them.
     #[serde(default)]
     pub remove: Vec<LabelKey>,
-    /// Only say which robots it would be.
+    /// Only list the robots that match.
     #[serde(default)]
     pub dry_run: bool,
 }
@@ -29,9 +29,9 @@ pub struct BulkLabels {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BulkRemove {
-    /// Which robots.
+    /// The robots to remove.
     pub selector: Selector,
-    /// Only say which robots it would be.
+    /// Only list the robots that match.
     #[serde(default)]
     pub dry_run: bool,
 }

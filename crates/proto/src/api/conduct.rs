@@ -2,15 +2,16 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What was done about robots that sent more than they may, or what they may not.
+/// Measures against robots that exceeded their limits or sent forbidden messages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ConductTotals {
-    /// How often one was slowed.
+    /// Number of times that a robot was slowed down.
     pub slowed: u64,
-    /// How often one was cut off.
+    /// Number of times that a robot was disconnected.
     pub cut: u64,
-    /// How often one that was cut off came too early, or asked for more than it was held up for.
+    /// Number of times that a disconnected robot came back too early, or asked for more than it was
+    /// held up for.
     pub turned_away: u64,
 }

@@ -1,4 +1,4 @@
-//! How the bytes of an order travel: what the operator chose, and what was decided for each robot.
+//! How the bytes of a package travel: the operator's choice, and the decision for each robot.
 
 use std::fmt;
 
@@ -6,12 +6,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::desired::Delivery;
 
-/// What an operator may order. An unknown word is refused: it would be an order half understood.
+/// Delivery methods that an operator may order. An unknown word is refused, because the order would
+/// be only half understood.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "kebab-case")]
 pub enum DeliveryChoice {
-    /// The server's rules decide, robot by robot.
+    /// The server's rules decide for each robot.
     #[default]
     Adaptive,
     /// The server announces, the robot pulls over HTTP.
@@ -20,30 +21,30 @@ pub enum DeliveryChoice {
     DirectPush,
     /// Nothing is published; the robot asks on its own timer.
     Poll,
-    /// The bytes ride inside the announcement itself.
+    /// The bytes travel inside the announcement itself.
     Inline,
 }
 
-/// The mechanism by which one robot gets its bytes, and why that one.
+/// The method by which one robot receives its bytes, with the reason.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DeliveryDecision {
     /// How the bytes travel.
     pub mechanism: Delivery,
-    /// The rule's name; `ordered` where the operator chose, `fell behind` where a robot was told to
-    /// pull instead.
+    /// The rule's name; `ordered` if the operator chose, `fell behind` if a robot was told to pull
+    /// instead.
     pub rule: String,
-    /// For people: what decided, with its values: `size 9.7 MB > 256 KB`.
+    /// For people: the deciding condition, with its values: `size 9.7 MB > 256 KB`.
     pub because: String,
 }
 
-/// The lowest priority an order may have.
+/// The lowest priority of an order.
 pub const MIN_PRIORITY: i32 = -100;
-/// The highest.
+/// The highest priority of an order.
 pub const MAX_PRIORITY: i32 = 100;
 
 impl DeliveryChoice {
-    /// The mechanism, where the operator left nothing to decide.
+    /// The method, if the operator's choice leaves nothing to decide.
     pub fn mechanism(self) -> Option<Delivery> {
         match self {
             Self::Adaptive => None,

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::id::Labels;
 use crate::{MacAddress, RobotId, RobotName, TokenId};
 
-/// `GET /enrollment-tokens` (administer): those that are still good for something.
+/// `GET /enrollment-tokens` (administer): the tokens that can still be used.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentTokenList {
@@ -13,63 +13,63 @@ pub struct EnrollmentTokenList {
     pub tokens: Vec<EnrollmentTokenView>,
 }
 
-/// An enrolment token, without its secret.
+/// An enrollment token, without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentTokenView {
-    /// By which it is revoked.
+    /// The token's id, used to revoke the token.
     pub id: TokenId,
     /// The only robot that may use it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<RobotName>,
-    /// Labels that each robot gets which uses it.
+    /// Labels of each robot that enrolls with this token.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Enrolments left; absent: any number. With none left it is only good for one whose answer was
-    /// lost.
+    /// Enrollments left; absent: any number. With none left, the token only serves a robot that
+    /// retries because the answer was lost.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub uses_left: Option<u64>,
-    /// Whether a robot that comes by it waits to be approved.
+    /// Whether a robot that enrolls with this token must be approved.
     #[serde(default)]
     pub approval: bool,
-    /// When it was made.
+    /// When the token was made.
     pub created_at_ms: u64,
-    /// When it ends.
+    /// When the token expires.
     pub expires_at_ms: u64,
 }
 
-/// The code of a robot's refusal while it waits to be approved.
+/// Code of the refusal that a robot receives while it awaits approval.
 pub const AWAITS_APPROVAL: &str = "awaits_approval";
 
-/// `GET /pending-robots` (administer): robots that wait to be approved.
+/// `GET /pending-robots` (administer): robots that await approval.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PendingRobotList {
-    /// Who has waited for longest first.
+    /// Sorted by waiting time, the longest first.
     pub robots: Vec<PendingRobot>,
 }
 
-/// A robot that waits to be approved. Name, MAC and labels are what it says of itself, but for the
-/// token's labels.
+/// A robot that awaits approval. Name, MAC and labels are the robot's own claims, except the labels
+/// from the token.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PendingRobot {
-    /// Its identity.
+    /// The robot's identity.
     pub id: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// Its MAC.
+    /// The robot's MAC address.
     pub mac: MacAddress,
-    /// Its labels.
+    /// The robot's labels.
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Since when it waits.
+    /// When the wait began.
     pub since_ms: u64,
-    /// The enrolment token it came by.
+    /// The enrollment token that the robot used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub token: Option<TokenId>,
-    /// Where it came from.
+    /// The address that the robot enrolled from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
 }
@@ -78,40 +78,40 @@ pub struct PendingRobot {
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateEnrollmentToken {
-    /// Only for this robot, by id or name, which may register again with it.
+    /// The only robot that may use the token, by id or name; a known robot may register again with
+    /// it.
     #[serde(default)]
     pub robot: Option<String>,
-    /// How many enrolments it is good for; absent: as many as the server's setting `enrolment.uses`
-    /// says.
+    /// Number of enrollments allowed; absent: the server's setting `enrolment.uses`.
     #[serde(default)]
     pub uses: Option<u64>,
-    /// Whether it is good for any number of them; not with `uses`.
+    /// Whether the number of enrollments is unlimited; excludes `uses`.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub unlimited: bool,
     /// Lifetime in seconds; the server's default is a day.
     #[serde(default)]
     pub ttl_s: Option<u64>,
-    /// Labels each robot that uses it gets.
+    /// Labels of each robot that enrolls with this token.
     #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(inline))]
     pub labels: Labels,
-    /// Whether a robot that comes by it waits to be approved, also where the server does not ask
-    /// that of all.
+    /// Whether a robot that enrolls with this token must be approved, even if the server does not
+    /// require approval of all robots.
     #[serde(default)]
     pub approval: bool,
 }
 
-/// A new enrolment token. The secret is shown this once.
+/// A new enrollment token. The secret is shown this once.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EnrollmentToken {
-    /// The public part of it.
+    /// The public part of the token.
     pub id: String,
     /// The whole token.
     pub token: String,
-    /// How many enrolments it is good for; absent: any number.
+    /// Number of enrollments left; absent: any number.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub uses_left: Option<u64>,
-    /// When it ends.
+    /// When the token expires.
     pub expires_at_ms: u64,
 }

@@ -1,82 +1,83 @@
-//! Bodies of the feed: the last things in the fleet that are worth a look. It is in memory and
-//! starts empty with the server; what must not be lost is in the audit.
+//! Bodies of the feed: recent notable events in the fleet. The feed is in memory and starts empty
+//! with the server; records that must not be lost are in the audit.
 
 use serde::{Deserialize, Serialize};
 
 use crate::log::LogLevel;
 use crate::{DeploymentId, RobotId, RobotName};
 
-/// The most entries the server keeps, and the most that are answered at once.
+/// The most entries that the server keeps, and the most in one answer.
 pub const MAX_FEED_ENTRIES: usize = 2000;
 
-/// `GET /feed` (read), optionally `?after=<number>` and `?limit=` (absent: 100): the newest of
-/// those that the person may see.
+/// `GET /feed` (read), optionally `?after=<number>` and `?limit=` (absent: 100): the newest entries
+/// visible to the user.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct FeedPage {
-    /// The newest last; with `after` and more than `limit` of them, the oldest of those after it.
+    /// The entries, the newest last; with `after` and more than `limit` entries, the oldest after
+    /// that number.
     pub entries: Vec<FeedEntry>,
 }
 
-/// Something that happened.
+/// An event in the fleet.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct FeedEntry {
-    /// Grows by one; it goes on growing when the server has been restarted.
+    /// Increasing number; continues to grow after a restart of the server.
     pub number: u64,
-    /// When.
+    /// Time of the event.
     pub at_ms: u64,
-    /// What kind of thing.
+    /// Type of the event.
     pub kind: FeedKind,
-    /// How serious: `info`, `warn` or `error`.
+    /// Severity: `info`, `warn` or `error`.
     pub level: LogLevel,
-    /// The robot it is about, if it is one.
+    /// The robot concerned, if the event is about a single robot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot: Option<RobotId>,
-    /// Its name then.
+    /// The robot's name at that time.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub robot_name: Option<RobotName>,
-    /// The deployment it is about.
+    /// The deployment concerned.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deployment: Option<DeploymentId>,
-    /// For people: one sentence.
+    /// Description for people: one sentence.
     pub text: String,
 }
 
-/// What kind of thing happened.
+/// Type of an event.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum FeedKind {
-    /// A robot came online; many at once are one entry without a robot.
+    /// A robot came online; many at once form one entry without a robot.
     RobotOnline,
-    /// A robot went offline; likewise.
+    /// A robot went offline; many at once form one entry without a robot.
     RobotOffline,
     /// A robot registered.
     RobotEnrolled,
-    /// A robot was put out or removed.
+    /// A robot was revoked or removed.
     RobotRevoked,
-    /// A robot sent more than it may, or what it may not, and was cut off.
+    /// A robot exceeded its limits or sent forbidden messages, and was disconnected.
     RobotMisbehaved,
     /// A robot reported a new condition.
     RobotCondition,
     /// A task failed, or was rolled back.
     TaskFailed,
-    /// A task that had failed runs, or has succeeded.
+    /// A task that had failed runs again, or has succeeded.
     TaskRecovered,
     /// A deployment was ordered.
     DeploymentBegun,
-    /// Every robot's part of a deployment is settled.
+    /// All assignments of a deployment are settled.
     DeploymentSettled,
-    /// Too many robots failed.
+    /// A deployment paused because too many robots failed.
     DeploymentPaused,
-    /// An operator took it back.
+    /// An operator cancelled a deployment.
     DeploymentCancelled,
-    /// The broker can't be reached, or can again.
+    /// The broker became unreachable, or is reachable again.
     Broker,
-    /// The server's disk is nearly full, or is not any more.
+    /// The server's disk is nearly full, or has enough space again.
     Disk,
-    /// A kind of a newer version.
+    /// An event type unknown to this version.
     #[serde(other)]
     Unknown,
 }

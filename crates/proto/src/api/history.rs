@@ -1,4 +1,4 @@
-//! Bodies about what became of assignments, and when.
+//! Bodies about the history of assignments.
 
 use serde::{Deserialize, Serialize};
 
@@ -9,80 +9,80 @@ use crate::manifest::TaskKind;
 use crate::report::{Failure, Phase, Progress};
 use crate::vitals::Vitals;
 
-/// The most entries of a timeline; the first and the newest are kept.
+/// The most entries of a timeline; the first and the newest entries are kept.
 pub const MAX_TIMELINE: usize = 64;
 
-/// When an assignment came into a phase, or tried it again.
+/// Time at which an assignment entered a phase, or retried it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TimelineEntry {
     /// The phase.
     pub phase: Phase,
-    /// When, by the server's clock.
+    /// Time by the server's clock.
     pub at_ms: u64,
-    /// The try, from 1; 0 where tries are not counted.
+    /// The attempt, from 1; 0 if attempts are not counted.
     #[serde(default)]
     pub attempt: u32,
 }
 
 /// `GET /robots/{robot}/tasks` (read), optionally `?limit=` (1 to 200, absent: 50),
-/// `?before=<deployment>` and `?task=`: everything that was ordered for a robot.
+/// `?before=<deployment>` and `?task=`: all orders for a robot.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TaskHistory {
-    /// The newest first.
+    /// The assignments, the newest first.
     pub assignments: Vec<PastAssignment>,
-    /// What `before` is for the older ones; absent: these were the last.
+    /// The value of `before` for the next page; absent on the last page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<DeploymentId>,
 }
 
-/// A deployment's part for the robot that was asked about.
+/// A deployment's assignment to the requested robot.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PastAssignment {
     /// The deployment.
     pub deployment: DeploymentId,
-    /// What it brought.
+    /// The package of the deployment.
     pub package: PackageRef,
     /// Service or job.
     #[serde(default)]
     pub kind: TaskKind,
-    /// Whether its batch has begun.
+    /// Whether the robot's batch has begun.
     pub released: bool,
-    /// Whether it is what the robot should have now, running or stopped; absent: no more, or not
-    /// yet.
+    /// Whether the task should be running or stopped now, if the assignment is part of the robot's
+    /// desired state; absent: no longer, or not yet.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub wanted: Option<Wanted>,
-    /// Where it stands.
+    /// The current or last phase.
     pub phase: Phase,
-    /// How far the phase has come.
+    /// Progress within the phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
-    /// Why it failed.
+    /// Why the assignment failed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Failure>,
-    /// Tries of the phase.
+    /// Attempts in the phase.
     pub attempts: u32,
-    /// How its bytes travelled, and why.
+    /// How the package's bytes travelled, and the reason for that choice.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub delivery: Option<DeliveryDecision>,
-    /// The phases it went through, the oldest first.
+    /// Past phases, the oldest first.
     pub timeline: Vec<TimelineEntry>,
-    /// When it was ordered.
+    /// When the deployment was ordered.
     pub created_at_ms: u64,
-    /// When it last changed.
+    /// Time of the latest change.
     pub updated_at_ms: u64,
-    /// The newer deployment that took its place.
+    /// The newer deployment that replaced this one on the robot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub superseded_by: Option<DeploymentId>,
 }
 
-/// `GET /robots/{robot}/vitals` (read): the last hour, about one a minute; gone when the server
-/// restarts.
+/// `GET /robots/{robot}/vitals` (read): samples of the last hour, about one per minute; lost when
+/// the server restarts.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct VitalsView {
-    /// The oldest first.
+    /// The samples, the oldest first.
     pub samples: Vec<Vitals>,
 }

@@ -1,4 +1,4 @@
-//! The part of the HTTP API that is about robots' log lines.
+//! The part of the HTTP API about robots' log lines.
 
 use serde::{Deserialize, Serialize};
 
@@ -34,50 +34,51 @@ pub struct LogsQuery {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogsView {
-    /// Whose lines these are.
+    /// Origin of the lines.
     pub from: LogsFrom,
-    /// For how many milliseconds nothing was heard of the robot's lines; 0 for its own answer.
+    /// Milliseconds since the robot's lines were last received; 0 for the robot's own answer.
     pub age_ms: u64,
-    /// Why it is not the robot's own answer.
+    /// Why the answer is not the robot's own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
-    /// The oldest first.
+    /// The lines, the oldest first.
     pub lines: Vec<LogLine>,
-    /// Lines that the server never saw because they were too many; the robot kept them.
+    /// Number of lines that the server never received because of the rate limit; the robot kept
+    /// them.
     #[serde(default)]
     pub suppressed: u64,
 }
 
-/// Where log lines were read.
+/// Origin of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum LogsFrom {
-    /// The robot, which keeps them all for a while.
+    /// The robot, which keeps all lines for a while.
     Robot,
-    /// The server's memory, which has the last that the robot published by itself.
+    /// The server's memory, which has the latest lines that the robot published by itself.
     Server,
 }
 
-/// What `GET /robots/{robot}/logs?follow=true` streams: each is the `data` of a server-sent event
-/// whose `event` is the tag's value.
+/// An event of the stream `GET /robots/{robot}/logs?follow=true`: each is the `data` of a
+/// server-sent event whose `event` is the tag's value.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "type", rename_all = "snake_case")]
 pub enum LogEvent {
-    /// The robot publishes its lines from now on. Comes again after a gap: what was said in it is
-    /// to be had by asking.
+    /// The robot publishes its lines from now on. Repeated after a gap: request the lines of the
+    /// gap separately.
     Following,
-    /// The robot can't be reached, and is asked again and again.
+    /// The robot can't be reached; the server keeps retrying.
     Away {
-        /// Why.
+        /// Why the robot can't be reached.
         reason: String,
     },
-    /// Lines as they came, the oldest first.
+    /// New lines, the oldest first.
     Lines {
         /// The lines.
         lines: Vec<LogLine>,
-        /// Lines that were left out since the ones before because they were too many; the robot
+        /// Number of lines left out since the previous event because of the rate limit; the robot
         /// keeps them.
         suppressed: u64,
     },

@@ -1,4 +1,4 @@
-//! Where robots reach MQTT, and what an operator gives to a broker that is not the server's own.
+//! The MQTT endpoint of robots, and the files that an operator gives to an external broker.
 
 use std::fmt;
 
@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::pin::CaPin;
 use crate::topic::TopicPrefix;
 
-/// Where a robot's MQTT session goes: part of the answer to an enrolment, and
-/// `GET /robots/{robot}/mqtt` (that robot).
+/// The MQTT endpoint of a robot: part of the answer to an enrollment, and of `GET
+/// /robots/{robot}/mqtt` (that robot).
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MqttEndpoint {
@@ -17,22 +17,22 @@ pub struct MqttEndpoint {
     pub host: Option<String>,
     /// TCP port.
     pub port: u16,
-    /// What all topics start with.
+    /// The prefix of all topics.
     pub prefix: TopicPrefix,
-    /// Whether the port speaks TLS.
+    /// Whether the port uses TLS.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tls: bool,
-    /// The broker there is not the server's own. Absent: it is, and the password is the robot's
-    /// token.
+    /// Set if the broker is not the server's own. Absent: the server's own broker, where the
+    /// password is the robot's token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub external: Option<ExternalBroker>,
-    /// Other external brokers with the same accounts, in the order in which a robot tries them when
-    /// the first one does not answer. Agents that don't know this field ask the server again.
+    /// Other external brokers with the same accounts, in the order that a robot tries them if the
+    /// first does not answer. Agents that don't know this field ask the server again.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub alternatives: Vec<MqttPlace>,
 }
 
-/// Where an external broker listens.
+/// Address of an external broker.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MqttPlace {
@@ -41,24 +41,24 @@ pub struct MqttPlace {
     pub host: Option<String>,
     /// TCP port.
     pub port: u16,
-    /// Whether the port speaks TLS.
+    /// Whether the port uses TLS.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub tls: bool,
 }
 
-/// What is otherwise with a broker that is not the server's own. Its PUBACK says that the broker
-/// took a message, and nothing of the server: reports go over HTTP, whose answer means stored.
+/// Differences of a broker that is not the server's own. Its PUBACK means that the broker took a
+/// message, and says nothing about the server: reports go over HTTP, whose answer means stored.
 #[derive(Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ExternalBroker {
-    /// The robot's password there, in the place of its token, which such a broker is never shown.
+    /// The robot's password for this broker. The robot's token is never shown to such a broker.
     pub password: String,
-    /// The robot's MQTT client id there. No other client knows it, so that none can end this
-    /// robot's session by connecting with the same id. Absent: the robot id.
+    /// The robot's MQTT client id for this broker. No other client knows it, so that none can end
+    /// this robot's session by connecting with the same id. Absent: the robot id.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub client_id: Option<String>,
-    /// The authority behind the broker's certificate, if that is to be it alone and no root of the
-    /// robot's system.
+    /// The only authority trusted for the broker's certificate, in place of the robot's system
+    /// roots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
 }
@@ -69,7 +69,7 @@ impl fmt::Debug for ExternalBroker {
     }
 }
 
-/// `GET /broker` (administer): the files of a mosquitto.
+/// `GET /broker` (administer): configuration files for mosquitto.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BrokerFiles {
@@ -77,12 +77,12 @@ pub struct BrokerFiles {
     pub acl: String,
     /// Mosquitto's password file: salted hashes.
     pub passwd: String,
-    /// Mosquitto's configuration of the listener.
+    /// Mosquitto's listener configuration.
     #[serde(default)]
     pub conf: String,
 }
 
-/// `GET /broker/nats` (administer): the file of a NATS server.
+/// `GET /broker/nats` (administer): configuration file for a NATS server.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct NatsFile {
@@ -94,21 +94,21 @@ pub struct NatsFile {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BrokerChecks {
-    /// One for each broker, in the order of the setting.
+    /// One test per broker, in the order of the setting.
     pub brokers: Vec<BrokerCheck>,
 }
 
-/// The test of one external broker with two accounts that are there for it alone.
+/// The test of one external broker, made with two accounts reserved for it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BrokerCheck {
     /// Host and port.
     pub address: String,
-    /// Whether one account ends the session of another by connecting with its client id. Absent:
-    /// the test did not get so far.
+    /// Whether one account can end another's session by connecting with its client id. Absent: the
+    /// test did not get that far.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub displaces: Option<bool>,
-    /// Why it did not.
+    /// Why the test did not complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
 }

@@ -1,4 +1,4 @@
-//! Bodies about packages: their versions, what is in them, and what differs.
+//! Bodies about packages: their versions, their files, and differences between versions.
 
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +10,7 @@ use crate::{Digest, TaskName};
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageList {
-    /// Sorted by name; of one name those with a tag first, each the newest first.
+    /// Sorted by name; within a name, versions with a tag first, each group with the newest first.
     pub packages: Vec<PackageView>,
 }
 
@@ -20,9 +20,9 @@ pub struct PackageList {
 pub struct PackageView {
     /// The pinned package.
     pub package: PackageRef,
-    /// When it was pushed.
+    /// When the package was pushed.
     pub pushed_at_ms: u64,
-    /// Its manifest.
+    /// The package's task manifest.
     pub manifest: TaskManifest,
 }
 
@@ -30,22 +30,22 @@ pub struct PackageView {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageVersions {
-    /// Its name.
+    /// The package's name.
     pub name: TaskName,
-    /// Those with a tag first, each the newest first.
+    /// Versions with a tag first, each group with the newest first.
     pub versions: Vec<PackageView>,
-    /// Which of them robots should have now, and how many of the robots that the person may see. A
-    /// manifest may be here that is not among the versions: robots go on with what was deleted.
+    /// The manifests that robots should have now, with the number of robots visible to the user. A
+    /// manifest may be missing from the versions: robots keep running deleted packages.
     pub running: Vec<PackageUse>,
 }
 
-/// How many robots should have a package now.
+/// Number of robots that should have a package now.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageUse {
-    /// Which package.
+    /// The package's manifest.
     pub manifest: Digest,
-    /// How many robots.
+    /// Number of robots.
     pub robots: u64,
 }
 
@@ -62,23 +62,23 @@ pub struct PackageFiles {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageFile {
-    /// Where, below the package's directory, joined by `/`.
+    /// Path below the package's directory, joined by `/`.
     pub path: String,
-    /// What it is.
+    /// Type of the entry.
     pub kind: PackageFileKind,
-    /// Its permission bits.
+    /// Permission bits of the entry.
     pub mode: u32,
     /// Bytes of a file; 0 for the others.
     pub size: u64,
     /// SHA-256 of a file's bytes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub digest: Option<Digest>,
-    /// Where a link leads.
+    /// Target of a link.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target: Option<String>,
 }
 
-/// What an entry of a package is.
+/// Type of a package's entry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
@@ -91,18 +91,18 @@ pub enum PackageFileKind {
     Link,
 }
 
-/// `GET /packages/{package}/diff?from=&to=` (read): what differs between two of its versions. All
-/// are sorted by path.
+/// `GET /packages/{package}/diff?from=&to=` (read): differences between two versions of a package.
+/// All lists are sorted by path.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PackageDiff {
-    /// What only the second has.
+    /// Entries that only the second version has.
     pub added: Vec<PackageFile>,
-    /// What only the first has.
+    /// Entries that only the first version has.
     pub removed: Vec<PackageFile>,
-    /// What both have, but not the same.
+    /// Entries that both versions have, with differences.
     pub changed: Vec<ChangedFile>,
-    /// Whether the task manifests differ in more than the version and what describes the files.
+    /// Whether the task manifests differ beyond the version and the description of the files.
     pub manifest_changed: bool,
 }
 
@@ -110,10 +110,10 @@ pub struct PackageDiff {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ChangedFile {
-    /// Where.
+    /// Path of the entry.
     pub path: String,
-    /// What the first has there.
+    /// The entry in the first version.
     pub from: PackageFile,
-    /// What the second has there.
+    /// The entry in the second version.
     pub to: PackageFile,
 }

@@ -1,5 +1,4 @@
-//! The part of the HTTP API that is about people: who they are, how they sign in, their tokens, and
-//! what they did.
+//! The part of the HTTP API about people: users, sign-in, access tokens and the audit.
 
 use serde::{Deserialize, Serialize};
 
@@ -16,23 +15,24 @@ pub struct UserList {
     pub users: Vec<UserView>,
 }
 
-/// A person as an administrator sees them.
+/// A user as administrators see them.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct UserView {
-    /// What they sign in with.
+    /// The name to sign in with.
     pub name: UserName,
-    /// What they may do.
+    /// The user's roles.
     pub roles: Roles,
-    /// To which robots they are limited; absent: to none.
+    /// Selector of the robots that the user is limited to; absent: all robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scope: Option<Selector>,
-    /// Whether they can sign in with a password.
+    /// Whether the user can sign in with a password.
     pub has_password: bool,
-    /// Who they are at the provider by which they sign in, behind its issuer; absent: they don't.
+    /// The user's subject at the OpenID provider, prefixed by its issuer; absent: no sign-in by a
+    /// provider.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub subject: Option<String>,
-    /// When they were added.
+    /// When the user was added.
     pub created_at_ms: u64,
 }
 
@@ -40,45 +40,46 @@ pub struct UserView {
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AddUser {
-    /// What they sign in with.
+    /// The name to sign in with.
     pub name: UserName,
-    /// What they may do.
+    /// The user's roles.
     pub roles: Roles,
-    /// To which robots they are limited; absent or `*`: to none.
+    /// Selector of the robots that the user is limited to; absent or `*`: all robots.
     #[serde(default)]
     pub scope: Option<Selector>,
-    /// Their first password; without one they can't sign in by a password.
+    /// The first password; without one, the user can't sign in with a password.
     #[serde(default)]
     pub password: Option<String>,
 }
 
-/// `PATCH /users/{user}` (administer): absent fields stay.
+/// `PATCH /users/{user}` (administer): absent fields stay unchanged.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct EditUser {
-    /// What they may do from now on.
+    /// The new roles.
     #[serde(default)]
     pub roles: Option<Roles>,
-    /// To which robots they are limited from now on; `*`: to none.
+    /// The new selector of the robots that the user is limited to; `*`: all robots.
     #[serde(default)]
     pub scope: Option<Selector>,
 }
 
-/// `PUT /users/{user}/password` (administer). Ends what was signed in with the old one.
+/// `PUT /users/{user}/password` (administer). Ends sessions and logins made with the old password.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SetPassword {
-    /// The new one.
+    /// The new password.
     pub password: String,
 }
 
-/// `PUT /password` (any user): one's own. Ends what was signed in with the old one.
+/// `PUT /password` (any user): changes the caller's password. Ends sessions and logins made with
+/// the old one.
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ChangePassword {
-    /// The one there is.
+    /// The current password.
     pub old: String,
-    /// The new one.
+    /// The new password.
     pub new: String,
 }
 
@@ -86,11 +87,11 @@ pub struct ChangePassword {
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LogIn {
-    /// Who.
+    /// The user's name.
     pub user: UserName,
-    /// Their password.
+    /// The user's password.
     pub password: String,
-    /// How long it should live, in seconds; absent: 30 days, which is also the most.
+    /// Lifetime of the token in seconds; absent: 30 days, which is also the maximum.
     #[serde(default)]
     pub ttl_s: Option<u64>,
 }
@@ -102,10 +103,10 @@ pub struct SignIn {
     /// The operator token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub token: Option<String>,
-    /// Or who,
+    /// The user's name, together with `password`, in place of a token.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub user: Option<UserName>,
-    /// with their password.
+    /// The user's password.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub password: Option<String>,
 }
@@ -116,56 +117,57 @@ pub struct SignIn {
 pub struct SessionView {
     /// When the caller's session ends; absent: not signed in.
     pub expires_at_ms: Option<u64>,
-    /// Another way to sign in than with a password; absent: there is none.
+    /// The provider for sign-in without a password; absent: none configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provider: Option<ProviderView>,
-    /// The caller was signed in until the server was restarted, which ends all sessions.
+    /// Whether the caller was signed in until the server restarted, which ends all sessions.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub ended_by_restart: bool,
 }
 
-/// A provider by which people may sign in.
+/// A provider that users may sign in with.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ProviderView {
-    /// What it is called.
+    /// The provider's display name.
     pub title: String,
-    /// Where the browser has to go.
+    /// URL that the browser must open to sign in.
     pub url: String,
 }
 
-/// `GET /me` (any person): who the caller is and what they may.
+/// `GET /me` (any person): the caller's identity and permissions.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Me {
     /// The user's name, `operator.token` for the first token.
     pub name: UserName,
-    /// What the token allows.
+    /// The roles that the token allows.
     pub roles: Roles,
-    /// The same, one by one.
+    /// The permissions of these roles, one by one.
     pub permissions: Vec<Permission>,
-    /// The selectors that a robot has to match, every one; none: all robots.
+    /// Selectors that a robot must match, all of them; empty: all robots.
     pub scope: Vec<Selector>,
-    /// The token that was shown.
+    /// Id of the token in this request.
     pub token: TokenId,
 }
 
-/// Where a person's token came from.
+/// Origin of a user's token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TokenOrigin {
     /// From the server's data directory.
     First,
-    /// It was made with another.
+    /// Made with another token.
     Token,
     /// From `taskd login`.
     Login,
-    /// From signing in at the page.
+    /// From signing in on the page.
     Page,
 }
 
-/// `GET /tokens` (any person): one's own; with `?all=true` (administer) everybody's.
+/// `GET /tokens` (any person): the caller's tokens; with `?all=true` (administer) those of all
+/// users.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TokenList {
@@ -173,51 +175,51 @@ pub struct TokenList {
     pub tokens: Vec<TokenView>,
 }
 
-/// A person's access token, without its secret.
+/// A user's access token, without its secret.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TokenView {
-    /// By which it is revoked.
+    /// The token's id, used to revoke the token.
     pub id: TokenId,
-    /// Whose it is.
+    /// The token's user.
     pub user: UserName,
-    /// Where it came from.
+    /// The token's origin.
     pub origin: TokenOrigin,
-    /// What it is for, in its maker's words.
+    /// Description of the token's purpose, by its creator.
     pub title: String,
-    /// The roles it is limited to; absent: its user's.
+    /// The roles that the token is limited to; absent: its user's roles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub roles: Option<Roles>,
-    /// The robots it is limited to; absent: its user's.
+    /// The robots that the token is limited to; absent: its user's robots.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scope: Option<Selector>,
-    /// When it was made.
+    /// When the token was made.
     pub created_at_ms: u64,
-    /// When it ends.
+    /// When the token expires.
     pub expires_at_ms: Option<u64>,
-    /// When it was revoked; only the first token is listed after that.
+    /// When the token was revoked; afterwards, only the first token is listed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub revoked_at_ms: Option<u64>,
 }
 
-/// `POST /tokens` (any user who signed in with a password): a token of one's own that may do as
-/// much or less.
+/// `POST /tokens` (any user who signed in with a password): creates a token with the caller's
+/// permissions or fewer.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct CreateToken {
-    /// Whose it is; absent: one's own. Another's takes an administrator.
+    /// The token's user; absent: the caller. A token for another user requires an administrator.
     #[serde(default)]
     pub user: Option<UserName>,
-    /// What it is for.
+    /// Description of the token's purpose.
     #[serde(default)]
     pub title: String,
-    /// The roles it is limited to; absent: all of its user's.
+    /// The roles that the token is limited to; absent: all of its user's.
     #[serde(default)]
     pub roles: Option<Roles>,
-    /// The robots it is limited to; absent: all of its user's.
+    /// The robots that the token is limited to; absent: all of its user's.
     #[serde(default)]
     pub scope: Option<Selector>,
-    /// How long it lives, in seconds; absent: 90 days.
+    /// Lifetime of the token in seconds; absent: 90 days.
     #[serde(default)]
     pub ttl_s: Option<u64>,
 }
@@ -226,13 +228,13 @@ pub struct CreateToken {
 #[derive(Clone, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AccessToken {
-    /// The public part of it.
+    /// The public part of the token.
     pub id: TokenId,
     /// The whole token.
     pub token: String,
-    /// Whose it is.
+    /// The token's user.
     pub user: UserName,
-    /// When it ends.
+    /// When the token expires.
     pub expires_at_ms: u64,
 }
 
@@ -265,8 +267,8 @@ pub struct AuditQuery {
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct AuditPage {
-    /// What was found.
+    /// The matching entries.
     pub records: Vec<AuditRecord>,
-    /// The number of the last entry there is; 0 if there is none.
+    /// The number of the last entry in the log; 0 if the log is empty.
     pub last: u64,
 }

@@ -1,4 +1,4 @@
-//! Bodies about what the server is, and what went over its connections.
+//! Bodies about the server's identity and the traffic of its connections.
 
 use serde::{Deserialize, Serialize};
 
@@ -14,79 +14,80 @@ pub struct ServerInfo {
     pub version: String,
     /// The key that signs desired states.
     pub key: PublicKey,
-    /// The pin of the authority that made its certificate, if that is its own.
+    /// The pin of the authority that issued the server's certificate, if the server has its own
+    /// authority.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
-    /// Where MQTT is: the listener's address, `host:port`, as bound, or the external broker's.
+    /// The MQTT address, `host:port`: the listener's, as bound, or the external broker's.
     pub mqtt: String,
     /// The server's clock.
     pub now_ms: u64,
-    /// What went over MQTT since the server started.
+    /// MQTT traffic since the server started.
     #[serde(default)]
     pub traffic: MqttTraffic,
-    /// What went over HTTP since then.
+    /// HTTP traffic since the server started.
     #[serde(default)]
     pub http: HttpTraffic,
-    /// What was done about robots that misbehaved since then.
+    /// Measures against misbehaving robots since the server started.
     #[serde(default)]
     pub conduct: ConductTotals,
 }
 
-/// What went over HTTP, all connections together, counted at the sockets. In is towards the server.
+/// HTTP traffic of all connections together, counted at the sockets. "In" is towards the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct HttpTraffic {
-    /// Connections that were taken.
+    /// Connections accepted.
     pub connections: u64,
     /// Requests whose head was read.
     pub requests: u64,
-    /// Bytes, heads and bodies.
+    /// Bytes received, heads and bodies.
     pub bytes_in: u64,
-    /// Likewise.
+    /// Bytes sent, heads and bodies.
     pub bytes_out: u64,
 }
 
-/// What went over MQTT, all connections together, the server's own watchdog excepted. With an
-/// external broker only the server's own connection to it is known.
+/// MQTT traffic of all connections together, except the server's own watchdog. With an external
+/// broker, only the server's own connection to the broker is counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct MqttTraffic {
-    /// Robots that are connected now.
+    /// Robots connected now.
     pub robots_connected: u64,
-    /// Clients that were let in.
+    /// Clients accepted.
     pub connections_accepted: u64,
-    /// Clients that were turned away: too many, too slow, a wrong password, no MQTT.
+    /// Clients refused: too many, too slow, a wrong password, no MQTT.
     pub connections_refused: u64,
-    /// Messages that were sent where their sender may not, or could not be stored.
+    /// Messages refused: sent to a topic that the sender may not use, or impossible to store.
     pub messages_refused: u64,
-    /// Messages that a listener would have got, had it kept up.
+    /// Messages dropped because a subscriber was too slow.
     pub messages_dropped: u64,
-    /// The connections' own figures, added up.
+    /// Sum of the traffic of all connections.
     pub all: Traffic,
 }
 
-/// What went over an MQTT connection since it began. In is towards the server.
+/// Traffic of an MQTT connection since its start. "In" is towards the server.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Traffic {
-    /// Bytes, with those that were refused.
+    /// Bytes received, including refused ones.
     pub bytes_in: u64,
-    /// Likewise.
+    /// Bytes sent.
     pub bytes_out: u64,
-    /// MQTT control packets, CONNECT included.
+    /// MQTT control packets received, including CONNECT.
     pub packets_in: u64,
-    /// MQTT control packets, CONNACK included.
+    /// MQTT control packets sent, including CONNACK.
     pub packets_out: u64,
-    /// PUBLISH.
+    /// PUBLISH packets received.
     pub messages_in: u64,
-    /// PUBLISH.
+    /// PUBLISH packets sent.
     pub messages_out: u64,
-    /// PUBACK.
+    /// PUBACK packets received.
     pub acks_in: u64,
-    /// PUBACK.
+    /// PUBACK packets sent.
     pub acks_out: u64,
 }
 
@@ -94,8 +95,8 @@ pub struct Traffic {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MqttConnection {
-    /// When it began.
+    /// When the connection began.
     pub since_ms: u64,
-    /// What went over it.
+    /// Traffic of the connection.
     pub traffic: Traffic,
 }

@@ -1,4 +1,4 @@
-//! Bodies about the server itself: how it does, who is connected, by what rules it decides.
+//! Bodies about the server itself: its health, its connections and its rules.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,48 +7,48 @@ use crate::desired::Delivery;
 use crate::id::LabelValue;
 use crate::{RobotId, RobotName};
 
-/// `GET /server/status` (read). Robots and sites are those that the person may see.
+/// `GET /server/status` (read). Robots and sites are limited to those visible to the user.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ServerStatus {
     /// The server's version.
     pub version: String,
-    /// How long it has been up.
+    /// Seconds since the server started.
     pub uptime_s: u64,
     /// The server's clock.
     pub now_ms: u64,
-    /// How many robots there are.
+    /// Number of robots.
     pub robots: RobotCounts,
-    /// What went over MQTT since the start.
+    /// MQTT traffic since the start.
     pub mqtt: MqttTraffic,
-    /// What went over HTTP since the start.
+    /// HTTP traffic since the start.
     pub http: HttpTraffic,
     /// Robots that pull packages.
     pub transfers: TransferStatus,
-    /// By the label `site`, the one with the most robots first, at most [`MAX_SITES`].
+    /// Robots grouped by the label `site`, the largest sites first, at most [`MAX_SITES`].
     pub sites: Vec<SiteStatus>,
-    /// How fast reports are stored.
+    /// Rate and latency of storing reports.
     pub reports: ReportStatus,
-    /// Where the fleet's state is kept.
+    /// The database of the fleet's state.
     pub database: DatabaseStatus,
     /// The data directory's file system.
     pub disk: DiskStatus,
-    /// What carries the doorbell.
+    /// The broker that carries the notices of new states.
     pub broker: BrokerStatus,
-    /// Where the server listens.
+    /// Addresses that the server listens on.
     pub listeners: Vec<ListenerView>,
 }
 
 /// The most sites of a [`ServerStatus`].
 pub const MAX_SITES: usize = 100;
 
-/// How many robots there are.
+/// Number of robots.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotCounts {
-    /// Registered.
+    /// Registered robots.
     pub known: u64,
-    /// Of them connected over MQTT or polling.
+    /// Registered robots that are connected over MQTT or polling.
     pub online: u64,
 }
 
@@ -56,11 +56,11 @@ pub struct RobotCounts {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TransferStatus {
-    /// Under way.
+    /// Transfers in progress.
     pub active: u64,
-    /// Told to wait for their turn.
+    /// Robots waiting for a transfer slot.
     pub waiting: u64,
-    /// What they get together, over the last seconds.
+    /// Total throughput over the last seconds.
     pub bytes_per_s: u64,
 }
 
@@ -68,54 +68,55 @@ pub struct TransferStatus {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SiteStatus {
-    /// The label's value; absent: the robots that have no such label.
+    /// The label's value; absent: the robots without this label.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub site: Option<LabelValue>,
-    /// How many.
+    /// Number of robots.
     pub robots: u64,
-    /// Of them online.
+    /// Number of robots online.
     pub online: u64,
-    /// The median of what transfers to them have shown; absent where none was measured.
+    /// Median of the throughput measured in transfers to these robots; absent without measurements.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub throughput_bytes_per_s: Option<u64>,
-    /// Likewise, from a request to the first byte of its answer.
+    /// Median of the time from a request to the first byte of its answer; absent without
+    /// measurements.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rtt_ms: Option<u64>,
 }
 
-/// How fast reports are stored: of the last minute.
+/// Rate and latency of storing reports, over the last minute.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ReportStatus {
-    /// Stored a second.
+    /// Reports stored per second.
     pub per_s: f64,
-    /// From its arrival until it was stored, of half of them at most; absent where none came.
+    /// Median time from a report's arrival until it was stored; absent without reports.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency_ms_p50: Option<f64>,
-    /// Likewise, of 99 in a hundred.
+    /// 99th percentile of the time from a report's arrival until it was stored; absent without
+    /// reports.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latency_ms_p99: Option<f64>,
 }
 
-/// Where the fleet's state is kept.
+/// The database of the fleet's state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DatabaseStatus {
     /// `sqlite` or `postgres`.
     pub kind: String,
-    /// Absent where the database does not say.
+    /// Size of the database; absent if the database does not report it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub size_bytes: Option<u64>,
-    /// Of a question asked now.
+    /// Latency of a query made for this answer.
     pub latency_ms: f64,
-    /// For people: why orders and reports are refused; absent where nothing is known against the
-    /// database.
+    /// For people: why orders and reports are refused; absent if the database has no known problem.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub problem: Option<String>,
-    /// When the server last checked all of it since its start and found nothing wrong. SQLite only.
+    /// Time of the last full check without errors since the server's start. SQLite only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fully_checked_at_ms: Option<u64>,
-    /// For people: how the database itself notices damage to its pages. Postgres only.
+    /// For people: how the database detects damage to its pages. Postgres only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub guard: Option<String>,
 }
@@ -124,15 +125,15 @@ pub struct DatabaseStatus {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct DiskStatus {
-    /// What the server may still write.
+    /// Bytes that the server may still write.
     pub free_bytes: u64,
-    /// Its size.
+    /// Size of the file system.
     pub total_bytes: u64,
-    /// Of it packages and what robots brought back.
+    /// Bytes used by packages and by outputs from robots.
     pub packages_bytes: u64,
 }
 
-/// What carries the doorbell.
+/// The broker that carries the notices of new states.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct BrokerStatus {
@@ -140,11 +141,11 @@ pub struct BrokerStatus {
     pub kind: String,
     /// Whether a message would get through now.
     pub healthy: bool,
-    /// For people: what is wrong, or where it is.
+    /// For people: the problem, or the broker's address.
     pub detail: String,
 }
 
-/// Where the server listens.
+/// An address that the server listens on.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ListenerView {
@@ -152,86 +153,86 @@ pub struct ListenerView {
     pub kind: String,
     /// `address:port`, as bound.
     pub address: String,
-    /// Whether it speaks TLS.
+    /// Whether the listener uses TLS.
     pub tls: bool,
 }
 
 /// `GET /server/sessions` (read), optionally `?limit=` (1 to 1,000, absent: 100) and
-/// `?after=<name>`: the robots that are connected over MQTT and that the person may see.
+/// `?after=<name>`: the robots connected over MQTT and visible to the user.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SessionList {
     /// Sorted by the robots' names.
     pub sessions: Vec<RobotSession>,
-    /// How many there are in all.
+    /// Number of sessions on all pages.
     pub total: u64,
-    /// What `after` is for the next ones; absent: these were the last.
+    /// The value of `after` for the next page; absent on the last page.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next: Option<RobotName>,
 }
 
-/// A robot's MQTT connection and what it listens to. With an external broker only whom it has
-/// announced is known.
+/// A robot's MQTT connection and its subscriptions. With an external broker, only robots announced
+/// by the broker are known.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RobotSession {
-    /// Whose.
+    /// The robot's id.
     pub robot: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// When it began.
+    /// When the connection began.
     pub since_ms: u64,
-    /// The peer, `ip:port`; absent where it is not known.
+    /// The peer, `ip:port`; absent if unknown.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub address: Option<String>,
     /// Sorted by filter.
     pub subscriptions: Vec<Subscription>,
-    /// What went over it.
+    /// Traffic of the connection.
     pub traffic: Traffic,
 }
 
-/// What a client listens to.
+/// A client's subscription.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Subscription {
-    /// Which topics.
+    /// The filter of topics.
     pub topic_filter: String,
-    /// The highest quality of service that it is sent with, 0 to 2.
+    /// The highest quality of service for its messages, 0 to 2.
     pub qos: u8,
 }
 
-/// `GET /server/rules` (read): how bytes travel with `adaptive`, and the limits that hold.
+/// `GET /server/rules` (read): the rules of `adaptive` delivery, and the limits in effect.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct ServerRules {
-    /// The first whose condition holds decides.
+    /// The rules in order: the first rule with a true condition decides.
     pub rules: Vec<RuleView>,
-    /// By their keys in the configuration.
+    /// The limits, by their keys in the configuration.
     pub limits: Vec<LimitView>,
 }
 
-/// A rule as it stands.
+/// A delivery rule in effect.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RuleView {
-    /// From 1.
+    /// Position of the rule, from 1.
     pub order: u64,
-    /// Its name, as decisions show it.
+    /// The rule's name, as shown with decisions.
     pub name: String,
-    /// In words: `size ≤ 256 KB, robots ≥ 8`; empty: it always decides.
+    /// The condition as text: `size ≤ 256 KB, robots ≥ 8`; empty: always true.
     pub condition: String,
-    /// What is used then.
+    /// The delivery method that the rule selects.
     pub mechanism: Delivery,
-    /// Whether the operator wrote it; the others are built in.
+    /// Whether the operator wrote the rule; all others are built in.
     pub own: bool,
 }
 
-/// A limit that holds.
+/// A limit in effect.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct LimitView {
-    /// Its key in the configuration: `transfers.at_once`.
+    /// The limit's key in the configuration: `transfers.at_once`.
     pub key: String,
-    /// Its value with its unit, or `none`.
+    /// The limit's value with its unit, or `none`.
     pub value: String,
 }

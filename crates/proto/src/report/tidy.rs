@@ -1,8 +1,9 @@
-//! What of a report is kept: texts and lists in their bounds, and no control characters in them.
+//! Trims a report to the fields that are stored: texts and lists within their bounds, without
+//! control characters.
 
 use super::{Condition, HostFacts, MAX_CODE_BYTES, Report};
 
-/// The most conditions of a robot, or entries of another list of its own, that are kept.
+/// The most conditions of a robot, or entries of another list of its own, that we store.
 const MAX_ENTRIES: usize = 32;
 /// The longest text of a failure, of a condition and of a fact about the machine, in characters.
 pub(super) const MAX_FAILURE_CHARS: usize = 4096;
@@ -10,9 +11,9 @@ const MAX_CONDITION_CHARS: usize = 500;
 const MAX_FACT_CHARS: usize = 200;
 
 impl Report {
-    /// The same as far as it is kept: texts without control characters and no longer than they may
-    /// be, lists with their first entries. What it says of a robot is shown to everybody who may
-    /// see that one, each time something changes.
+    /// The report as we store it: texts without control characters and within their maximum length,
+    /// lists cut to their first entries. The stored report is shown to all users who may see the
+    /// robot, at each change.
     #[must_use]
     pub fn tidied(mut self) -> Self {
         self.boot_id = fact(&self.boot_id);
@@ -56,7 +57,8 @@ fn fact(text: &str) -> String {
     clean(text, MAX_FACT_CHARS)
 }
 
-/// So much of a text; control characters, which a package could smuggle in, become spaces.
+/// The first `max_chars` characters of a text. Control characters, which a package could smuggle
+/// in, become spaces.
 pub(super) fn clean(text: &str, max_chars: usize) -> String {
     text.chars()
         .map(|c| if c.is_control() && c != '\n' { ' ' } else { c })

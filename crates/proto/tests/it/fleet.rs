@@ -1,4 +1,4 @@
-//! How robots do, what is set for them, what became of their tasks, and how the server does.
+//! Robots' vitals, their settings, the outcomes of their tasks, and the server's status.
 
 use serde_json::json;
 use task_proto::api::{
@@ -89,7 +89,7 @@ fn settings_that_can_not_be_read_leave_the_rest_readable() {
     assert_eq!((&read.settings, read.tasks.len()), (&rest, 1));
     let set = read.settings;
     assert!(set.underlays.is_some() && set.ros_domain_id.is_some(), "the rest is read: {set:?}");
-    // What an older server writes.
+    // A document of an older server.
     value.as_object_mut().expect("an object").remove("settings");
     assert!(serde_json::from_value::<DesiredState>(value).expect("reads").settings.is_empty());
     let mut value: serde_json::Value = serde_json::from_str(&golden("report.json")).expect("json");

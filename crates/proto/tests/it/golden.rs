@@ -1,6 +1,6 @@
-//! Compares what is written with `tests/golden/`, and reads it as a newer and an older version of
-//! the other side would. After a wanted change: `UPDATE_GOLDEN=1 cargo test -p task-proto`, and
-//! change docs/protocol.md with it.
+//! Compares written documents with `tests/golden/`, and reads them as a newer and an older version
+//! of the other side would. After an intended change: `UPDATE_GOLDEN=1 cargo test -p task-proto`,
+//! and change docs/protocol.md too.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -211,7 +211,7 @@ pub fn manifest() -> TaskManifest {
     }
 }
 
-/// Adds a field nobody knows to every object.
+/// Adds an unknown field to every object.
 fn from_the_future(value: &Value) -> Value {
     match value {
         Value::Array(items) => items.iter().map(from_the_future).collect(),
@@ -242,7 +242,7 @@ pub fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
     serde_json::from_str::<T>(&written).expect("reads what it wrote");
 }
 
-/// A reader of this version must not mind what a later version adds. Only where maps hold no free
+/// A reader of this version must ignore additions of a later version. Only where maps hold no free
 /// keys.
 pub fn check_tolerance<T: DeserializeOwned + PartialEq + Debug>(name: &str) {
     let value: Value = serde_json::from_str(&golden(name)).expect("json");

@@ -1,4 +1,4 @@
-//! The documents about packages and about what is done to many robots.
+//! The documents about packages and about bulk actions on robots.
 
 use task_proto::Digest;
 use task_proto::api::{

@@ -72,8 +72,7 @@ fn people_and_their_tokens() {
     check_tolerance::<Me>("me.json");
 }
 
-/// An entry's bytes and how they are chained may never change: what was written down once has to
-/// hold for ever.
+/// An entry's bytes and their chaining may never change: written entries must stay valid for ever.
 #[test]
 fn entries_of_the_audit() {
     let entry = AuditEntry {

@@ -1,6 +1,6 @@
-//! Passwords: which are good enough, how they are hashed and checked. Hashing is meant to be slow,
-//! so it happens off the async threads, few at a time, with a rest as long as the work, and a flood
-//! of sign-ins is turned away instead of waiting. It never sees who the password belongs to.
+//! Password rules, hashing and verification. Hashing is slow on purpose, so it runs off the async
+//! threads, few at a time, each followed by a pause as long as the work. A flood of sign-ins is
+//! refused and does not queue. This module never knows the owner of a password.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,27 +11,27 @@ use task_proto::UserName;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Instant;
 
-/// How many wait for their turn; one more is turned away.
+/// Maximum queue length; a further request is refused.
 const MOST_WAITING: usize = 32;
-/// The shortest password, in characters.
+/// Minimum password length, in characters.
 const SHORTEST: usize = 12;
-/// The longest, in bytes.
+/// Maximum password length, in bytes.
 const LONGEST: usize = 1024;
-/// The hash of a password that nobody knows, at the costs of new ones: what is checked for a user
-/// who has none.
+/// The hash of an unknown password, at the costs of new hashes: verified for a user without a
+/// password.
 const DECOY: &str = "$argon2id$v=19$m=19456,t=2,p=1$oiWDNzbpRSZLLWAsLdq6YA$fFQXZmPfKzsmg/2F1msjXUWT4U8aycI1kUvh4FTMccY";
 
-/// What is kept of a password: an argon2id hash in PHC form, with its own salt and costs.
+/// The stored form of a password: an argon2id hash in PHC form, with its own salt and costs.
 #[derive(Clone, PartialEq, Eq)]
 pub struct PasswordHash(String);
 
 impl PasswordHash {
-    /// As it is stored.
+    /// The stored text.
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
-    /// As it was stored.
+    /// Wraps a stored text.
     pub fn stored(text: String) -> Self {
         Self(text)
     }
@@ -43,33 +43,33 @@ impl std::fmt::Debug for PasswordHash {
     }
 }
 
-/// Why a password was not hashed or checked.
+/// The reason why a password was not hashed or verified.
 #[derive(Debug, thiserror::Error)]
 pub enum PasswordError {
-    /// It is too easy to guess, or too long.
+    /// The password is too easy to guess, or too long.
     #[error("{0}")]
     Unfit(String),
-    /// Too many are under way.
+    /// Too many requests are queued.
     #[error("too many sign-ins at once")]
     Busy,
-    /// The hash can't be made, or what is stored is none.
+    /// The hash can't be computed, or the stored text is not a hash.
     #[error("a password could not be hashed")]
     Failed,
 }
 
-/// Hashes and checks. Clones share the same turns.
+/// Hashes and verifies passwords. Clones share the same limits.
 #[derive(Debug, Clone)]
 pub struct Passwords {
     turns: Arc<Semaphore>,
     places: Arc<Semaphore>,
     decoy: PasswordHash,
-    /// How long the last check took, in microseconds.
+    /// Duration of the last verification, in microseconds.
     took_us: Arc<AtomicU64>,
 }
 
 impl Default for Passwords {
     fn default() -> Self {
-        // A quarter of the cores, and half of each at that.
+        // A quarter of the cores, at half of their time.
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let at_once = (cores / 4).clamp(1, 4);
         let places = Arc::new(Semaphore::new(at_once + MOST_WAITING));
@@ -83,7 +83,7 @@ impl Default for Passwords {
 }
 
 impl Passwords {
-    /// The hash of a new password of `user`.
+    /// Hashes a new password of `user`.
     pub async fn hash(
         &self,
         user: &UserName,
@@ -94,7 +94,8 @@ impl Passwords {
         self.work(move || hashed(&password)).await?
     }
 
-    /// Whether `password` is the one that was hashed. Without a hash it takes as long, and is not.
+    /// Whether `password` matches the hash. Without a hash the call takes as long, and returns
+    /// false.
     pub async fn verify(
         &self,
         password: &str,
@@ -119,7 +120,7 @@ impl Passwords {
         checked
     }
 
-    /// Takes as long as the last check, without its work.
+    /// Takes as long as the last verification, without its work.
     pub async fn pretend(&self) {
         tokio::time::sleep(Duration::from_micros(self.took_us.load(Ordering::Relaxed))).await;
     }
@@ -131,7 +132,7 @@ impl Passwords {
         let place = self.places.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
         let turn = self.turns.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
         let begun = Instant::now();
-        // The work goes on if the caller goes away, so its turn must as well.
+        // The work continues if the caller goes away, so its turn must continue too.
         let working = tokio::spawn(async move {
             let done = tokio::task::spawn_blocking(work).await;
             tokio::spawn(rest(begun, turn, place));
@@ -144,7 +145,7 @@ impl Passwords {
     }
 }
 
-/// Keeps the turn for as long again as the work took.
+/// Holds the turn for as long again as the work took.
 async fn rest(begun: Instant, turn: OwnedSemaphorePermit, place: OwnedSemaphorePermit) {
     tokio::time::sleep(begun.elapsed()).await;
     drop((turn, place));
@@ -157,8 +158,8 @@ fn hashed(password: &str) -> Result<PasswordHash, PasswordError> {
         .map_err(|_| PasswordError::Failed)
 }
 
-/// Long is all that a password has to be, as NIST SP 800-63B has it, and not what anyone would try
-/// first.
+/// Length is the only requirement for a password, as in NIST SP 800-63B, besides not being an
+/// obvious guess.
 fn check(user: &UserName, password: &str) -> Result<(), PasswordError> {
     let unfit = |reason: &str| Err(PasswordError::Unfit(reason.to_owned()));
     if password.chars().count() < SHORTEST {
@@ -219,7 +220,8 @@ mod tests {
         );
         assert!(hash.as_str().contains(costs) && passwords.decoy.as_str().contains(costs));
         assert_eq!(hash.as_str().len(), passwords.decoy.as_str().len());
-        // It is really looked at: one that can't be is noticed, and one that fits opens nothing.
+        // The decoy is really verified: an unreadable hash would be noticed, and a matching one
+        // grants nothing.
         let unreadable = Passwords {
             decoy: PasswordHash::stored("nonsense".to_owned()),
             ..Passwords::default()
@@ -261,7 +263,7 @@ mod tests {
             "{held} at once, {places} in all"
         );
         let mut flood = tokio::task::JoinSet::new();
-        // What is being checked is not let go before all have come.
+        // The running verification is held until all requests have arrived.
         let gate = Arc::new(std::sync::Barrier::new(2));
         for _ in 0..held {
             let (passwords, gate) = (passwords.clone(), gate.clone());

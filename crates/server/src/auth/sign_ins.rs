@@ -1,8 +1,8 @@
-//! How often signing in with a password may fail: for an account, and from an address. An address
-//! from which an account was signed in to lately has a count of its own for that account, and no
-//! other counts there: neither strangers elsewhere nor neighbours behind the same address lock its
-//! owner out. Every attempt counts as failed until it has succeeded, so many at once count as many.
-//! Memory is bounded. It never sees a password.
+//! Limits failed password sign-ins per account and per address. If an account has recently signed
+//! in from an address, the pair of both has a separate count, and no other count applies to it. So
+//! neither strangers elsewhere nor neighbours behind the same address can lock the account's owner
+//! out. Every attempt counts as failed until it has succeeded, so concurrent attempts all count.
+//! Memory is bounded. This module never sees a password.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -11,15 +11,17 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use task_proto::UserName;
 
-/// For how long failures count.
+/// Period for which failures count.
 const WINDOW_MS: u64 = 15 * 60 * 1000;
-/// Failures for one account, from all strange addresses together, or from one that is known for it.
+/// Maximum failures for one account: from all unfamiliar addresses together, or from one familiar
+/// address.
 const MOST_FOR_ACCOUNT: u32 = 10;
-/// Failures from one address, for accounts that are not known there. A whole lab may be behind one.
+/// Maximum failures from one address, for accounts unfamiliar there. A whole lab may share one
+/// address.
 const MOST_FROM_ADDRESS: u32 = 50;
-/// The most counts of each kind.
+/// Maximum counts of each kind.
 const MOST_COUNTS: usize = 8_192;
-/// Accounts and addresses that are known to belong together.
+/// Maximum familiar pairs of account and address.
 const MOST_FAMILIAR: usize = 8_192;
 
 /// The counts.
@@ -29,27 +31,28 @@ pub struct SignIns(Mutex<Counts>);
 #[derive(Debug, Default)]
 struct Counts {
     accounts: Windows<UserName>,
-    /// Names that nobody has: answered like others, but they must not take room from those.
+    /// Names without an account: answered like others, but they must not take room from real
+    /// accounts.
     nobody: Windows<UserName>,
     addresses: Windows<IpAddr>,
-    /// Those of which only the address is known. Wrong passwords don't count here, or the other way
-    /// round.
+    /// Attempts of which only the address is known. Wrong passwords don't count here, and these
+    /// attempts don't count as wrong passwords.
     unnamed: Windows<IpAddr>,
     pairs: Windows<(UserName, IpAddr)>,
     familiar: HashMap<(UserName, IpAddr), u64>,
 }
 
-/// No more attempts for a while.
+/// Further attempts are refused for a while.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Blocked {
-    /// Until when.
+    /// The end of the block.
     pub until_ms: u64,
-    /// Whether this is the first attempt that is refused.
+    /// Whether this is the first refused attempt.
     pub is_news: bool,
 }
 
 impl SignIns {
-    /// An attempt is about to be made. `is_known` says whether there is such an account.
+    /// Counts an attempt before it is made. `is_known` tells whether the account exists.
     pub fn begin(
         &self,
         user: &UserName,
@@ -68,24 +71,24 @@ impl SignIns {
         accounts.count(user.clone(), MOST_FOR_ACCOUNT, now_ms)
     }
 
-    /// An attempt is about to be made of which only the address is known.
+    /// Counts an attempt of which only the address is known, before it is made.
     pub fn begin_unnamed(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
         self.lock().unnamed.count(network(address), MOST_FROM_ADDRESS, now_ms)
     }
 
-    /// That one has succeeded.
+    /// The unnamed attempt has succeeded.
     pub fn unnamed_succeeded(&self, address: IpAddr) {
         self.lock().unnamed.take_back(&network(address));
     }
 
-    /// Until when names that are not known at the address are refused there. A wrong password for
-    /// one that is known there is told the same, so that nobody learns which names are.
+    /// The end of the block for unfamiliar names at the address. A wrong password for a familiar
+    /// name gets the same answer, so that an attacker can't learn which names are familiar.
     pub fn blocked_at(&self, address: IpAddr, now_ms: u64) -> Option<Blocked> {
         self.lock().addresses.exceeded(&network(address), MOST_FROM_ADDRESS, now_ms)
     }
 
-    /// The attempt that was begun has succeeded: it counts no longer, and the address is known for
-    /// the account.
+    /// The attempt has succeeded: it no longer counts, and the address is now familiar for the
+    /// account.
     pub fn succeeded(&self, user: &UserName, address: IpAddr, now_ms: u64) {
         let pair = (user.clone(), network(address));
         let mut counts = self.lock();
@@ -101,7 +104,7 @@ impl SignIns {
         counts.familiar.insert(pair, now_ms);
     }
 
-    /// The attempt that was begun was not made after all.
+    /// The attempt was not made after all.
     pub fn given_up(&self, user: &UserName, is_known: bool, address: IpAddr) {
         self.lock().take_back(&(user.clone(), network(address)), is_known);
     }
@@ -124,7 +127,7 @@ impl Counts {
     }
 }
 
-/// Counts that begin anew when their window is over.
+/// Counts that restart when their window is over.
 #[derive(Debug)]
 struct Windows<K> {
     counts: HashMap<K, Window>,
@@ -147,8 +150,8 @@ impl<K: Eq + Hash> Windows<K> {
         let is_over = |window: &Window| now_ms.saturating_sub(window.began_ms) >= WINDOW_MS;
         if self.counts.len() >= MOST_COUNTS && !self.counts.contains_key(&key) {
             self.counts.retain(|_, window| !is_over(window));
-            // Whoever fills it with names or addresses gains as many tries as a fresh start of the
-            // server gives.
+            // An attacker that fills the table with names or addresses gains as many tries as a
+            // restart of the server gives.
             if self.counts.len() >= MOST_COUNTS {
                 self.counts.clear();
             }
@@ -164,7 +167,7 @@ impl<K: Eq + Hash> Windows<K> {
         Err(Blocked { until_ms: window.began_ms + WINDOW_MS, is_news: window.count == most + 1 })
     }
 
-    /// Until when no more is let through; `None`: more is.
+    /// The end of the block; `None`: more attempts are permitted.
     fn exceeded(&self, key: &K, most: u32, now_ms: u64) -> Option<Blocked> {
         let until_ms = |window: &Window| window.began_ms + WINDOW_MS;
         let window = self
@@ -181,7 +184,7 @@ impl<K: Eq + Hash> Windows<K> {
     }
 }
 
-/// Whoever has one IPv6 address has 2^64 of them.
+/// The network that counts as one address: the owner of one IPv6 address has 2^64 of them.
 fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(address) => {
@@ -238,7 +241,8 @@ mod tests {
         }
         assert!(sign_ins.begin(&user("alice"), true, address(1), NOW_MS).is_err());
         assert_eq!(sign_ins.begin(&user("alice"), true, address(2), NOW_MS), Ok(()));
-        // Neighbours in one IPv6 network are one, and an IPv4 address stays itself in IPv6 clothes.
+        // Neighbours in one IPv6 network count as one, and an IPv4 address stays the same when
+        // mapped into IPv6.
         let six = |text: &str| network(text.parse().expect("an address"));
         assert_eq!(six("2001:db8::1"), six("2001:db8::ffff:1:2"));
         assert_ne!(six("2001:db8::1"), six("2001:db8:0:1::1"));

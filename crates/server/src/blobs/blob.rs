@@ -1,6 +1,6 @@
-//! A blob to read, and the check of its file after a read has failed. A mapped page that cannot be
-//! read raises SIGBUS in the process that touches it, so mapped bytes go to sockets only, where the
-//! kernel reads them and a failure ends one write.
+//! A readable blob, and the check of its file after a failed read. A mapped page that cannot be
+//! read raises SIGBUS in the process that touches it. Mapped bytes therefore only go to sockets,
+//! where the kernel reads them and a failure ends one write.
 
 use std::fs::{self, File};
 use std::io::{self, IoSliceMut};
@@ -21,12 +21,12 @@ use super::upload::hash;
 use super::{BlobError, Shared, on_disk};
 use crate::config::BlobRead;
 
-/// Bytes that are read at once to have them in the page cache.
+/// Bytes per read when a range is loaded into the page cache.
 const SCRAP_BYTES: usize = 64 * 1024;
-/// The suffix of a file that did not hold its blob any more.
+/// The suffix of a file that no longer holds its blob.
 const DAMAGED: &str = "damaged";
 
-/// A blob to read. It stays readable while this lives, even if the blob is deleted.
+/// A readable blob. It stays readable while this value lives, even if the blob is deleted.
 #[derive(Clone)]
 pub struct Blob {
     pub(super) digest: Digest,
@@ -35,7 +35,7 @@ pub struct Blob {
     file: Arc<File>,
     /// The whole file, if blobs are mapped. Only the kernel may read these bytes.
     pub(super) mapped: Option<Bytes>,
-    /// Permits to read from the disk.
+    /// Permits for disk reads.
     disk: Arc<Semaphore>,
     store: Weak<Shared>,
 }
@@ -80,7 +80,7 @@ impl Blob {
         &self.quoted_digest
     }
 
-    /// Its size in bytes.
+    /// The blob's size in bytes.
     pub fn size(&self) -> u64 {
         self.size
     }
@@ -115,8 +115,8 @@ impl Blob {
         read.await.map_err(unreadable)
     }
 
-    /// Copies `length` bytes at `offset`, or gives `None` where that would wait for the disk or
-    /// fail: then the next step reads on a blocking thread and meets the error again.
+    /// Copies `length` bytes at `offset`. Returns `None` if the read would wait for the disk or
+    /// fail. The next step then reads on a blocking thread and meets the error again.
     pub(super) fn read_cached(&self, offset: u64, length: usize) -> Option<Bytes> {
         let mut bytes = vec![0; length];
         let mut read = 0;
@@ -139,8 +139,8 @@ impl Blob {
         Ok(bytes.into())
     }
 
-    /// Has the kernel read these bytes into the page cache. Not through the mapping: all threads
-    /// share its lock, and would wait for the disk with this one.
+    /// Makes the kernel read these bytes into the page cache. This does not use the mapping: all
+    /// threads share its lock, and would wait for the disk with this one.
     pub(super) fn read_ahead(&self, offset: u64, length: usize) -> io::Result<()> {
         let mut scrap = vec![0; SCRAP_BYTES.min(length)];
         let end = offset + length as u64;
@@ -151,8 +151,8 @@ impl Blob {
         Ok(())
     }
 
-    /// Reads from the disk on a blocking thread, a few readers at a time. After a failure the
-    /// blob's file is checked.
+    /// Reads from the disk on a blocking thread, limited to a few readers at a time. After a
+    /// failure the blob's file is checked.
     pub(super) async fn with_disk_permit<T, F>(self, read: F) -> io::Result<T>
     where
         T: Send + 'static,
@@ -170,7 +170,7 @@ impl Blob {
         reading.await.map_err(io::Error::other)?
     }
 
-    /// Begins to check the blob's file, unless that is under way.
+    /// Starts a check of the blob's file, unless one is running.
     fn failed(&self, error: &io::Error) {
         let Some(store) = self.store.upgrade() else { return };
         let digest = self.digest;
@@ -198,8 +198,8 @@ impl Blob {
     }
 }
 
-/// Renames a file that does not hold the blob, so that the blob counts as absent and can be pushed
-/// again. True if it was renamed; false if it holds the blob or is gone.
+/// Renames a file that does not hold its blob, so that the blob counts as absent and can be pushed
+/// again. Returns true after a rename, and false if the file is sound or gone.
 fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> {
     let failed = |action| BlobError::disk(action, path);
     let before = match fs::metadata(path) {
@@ -210,7 +210,7 @@ fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> 
         Algorithm::Sha256 => hash::<Sha256>(path).map(|hash| Digest::from_sha256(hash.into())),
         Algorithm::Sha512 => hash::<Sha512>(path).map(|hash| Digest::from_sha512(hash.into())),
     };
-    // An error is that of a sector: the file will not get better.
+    // A read error is that of a disk sector: the file will not get better.
     let is_sound = actual.is_ok_and(|actual| actual == digest);
     // A push may have put a good file in its place meanwhile.
     if is_sound || fs::metadata(path).map_err(failed("look at"))?.ino() != before {
@@ -220,7 +220,7 @@ fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> 
     Ok(true)
 }
 
-/// A blob's file with an offset of its own: many read the same file.
+/// A blob's file with a separate offset: many readers share the file.
 struct BlobReader {
     blob: Blob,
     offset: u64,

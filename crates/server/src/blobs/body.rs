@@ -1,6 +1,6 @@
-//! A blob's bytes as the body of an HTTP answer: slices of bounded size, and a length known from
-//! the start. Reads that would wait for the disk are done on a blocking thread, so that one cold
-//! blob never stalls the other connections.
+//! A blob's bytes as the body of an HTTP answer: slices of bounded size, with the length known from
+//! the start. Reads that would wait for the disk run on a blocking thread, so that one cold blob
+//! never stalls the other connections.
 
 use std::io;
 use std::ops::Range;
@@ -14,25 +14,25 @@ use http_body::{Body, Frame, SizeHint};
 
 use super::{Blob, BytesFor};
 
-/// The most bytes handed out at once.
+/// The largest slice.
 const SLICE_BYTES: u64 = 128 * 1024;
-/// The most bytes that are looked at ahead for whether they are in memory, in one system call, and
-/// that are read ahead if they are not. They may be thrown out again before they are sent; then a
-/// page is read where it should not be, which costs other connections a moment.
+/// The most bytes that one system call checks for presence in memory, and that are read ahead if
+/// they are absent. The kernel may evict them again before they are sent. A page is then read on
+/// the wrong thread, which costs other connections a moment.
 const LOOK_AHEAD_BYTES: usize = 1024 * 1024;
-/// No page of memory is smaller.
+/// The smallest size of a memory page.
 const PAGE_BYTES: usize = 4096;
 
 /// Part of a blob, on its way to a client.
 pub struct BlobBody {
     blob: Blob,
-    /// The blob's mapped bytes, if the kernel is the one that reads them.
+    /// The blob's mapped bytes, if the kernel reads them.
     mapped: Option<Bytes>,
     left: Range<u64>,
-    /// The end of the mapped bytes that were in memory at the last look.
+    /// The end of the mapped bytes that the last check found in memory.
     in_memory_until: u64,
-    /// Whether others are to have theirs first. A client that is as fast as memory would otherwise
-    /// keep a thread until it has all.
+    /// Whether the body yields to other tasks before the next slice. A client as fast as memory
+    /// would otherwise keep a thread until its last byte.
     is_turn_over: bool,
     /// The next slice, while it is being fetched from the disk.
     pending: Option<BoxFuture<'static, io::Result<Bytes>>>,
@@ -46,7 +46,7 @@ impl BlobBody {
         Self { blob, mapped, in_memory_until, left: range, is_turn_over: false, pending: None }
     }
 
-    /// The next slice if it is in memory; else starts to fetch it.
+    /// The next slice if it is in memory. Otherwise starts the read.
     fn next_slice(&mut self) -> io::Result<Option<Bytes>> {
         let start = self.left.start;
         let length =
@@ -121,8 +121,8 @@ impl Body for BlobBody {
     }
 }
 
-/// How many of these mapped bytes, counted from the first, can be read without waiting for the
-/// disk. Too few cost only a detour.
+/// The number of these mapped bytes, counted from the first, that can be read without waiting for
+/// the disk. Too low a number only costs a detour.
 fn bytes_in_memory(slice: &[u8]) -> usize {
     // SAFETY: `sysconf` only reads its argument.
     let page = usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) })

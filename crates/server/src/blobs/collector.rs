@@ -1,7 +1,7 @@
-//! Collects what nobody needs any more: uploads that were given up, blobs that nothing refers to.
-//! Blobs of a package that a robot should have, or may get back, are kept whatever happened to
-//! their manifest. A blob is left alone for a grace time after a pusher last asked for it, so that
-//! a push in progress finds what it found before; for a shorter one if robots have dropped it.
+//! Deletes unneeded data: abandoned uploads, and blobs without a reference. Blobs of a package that
+//! a robot should have, or may get back, are kept even if their manifest is deleted. A blob is left
+//! alone for a grace time after the last request of a pusher, so that a push in progress finds the
+//! blobs that it found before. The grace time is shorter for blobs that robots have dropped.
 
 use std::time::Duration;
 
@@ -17,11 +17,11 @@ const MAX_AT_ONCE: usize = 256;
 /// The shortest and longest time between two collections.
 const INTERVAL: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(600)];
 
-/// How long what a robot has dropped is left alone, if the grace is not shorter: it brings back
-/// more.
+/// Grace time of blobs that a robot has dropped, unless the usual grace is shorter: the robot
+/// brings back more.
 const DROPPED_GRACE: Duration = Duration::from_secs(3600);
 
-/// What one collection removed.
+/// The number of items that one collection removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Collected {
     /// Unfinished uploads.
@@ -30,18 +30,18 @@ pub struct Collected {
     pub blobs: usize,
 }
 
-/// Why a collection did not end. The next one begins anew.
+/// The cause of a failed collection. The next one begins anew.
 #[derive(Debug, thiserror::Error)]
 pub enum CollectError {
-    /// The blob store refused.
+    /// The blob store failed.
     #[error("unneeded blobs can't be deleted")]
     Blobs(#[from] BlobError),
-    /// The database refused.
+    /// The database failed.
     #[error("the database can't tell which blobs are needed")]
     Store(#[from] StoreError),
 }
 
-/// Collects now and then, until it is told to stop.
+/// Collects at intervals until it is stopped.
 pub async fn run(
     store: Store,
     blobs: Blobs,
@@ -71,7 +71,7 @@ pub async fn run(
     }
 }
 
-/// Removes what has not been needed for `grace`.
+/// Removes data that has been unneeded for `grace`.
 pub async fn collect(
     store: &Store,
     blobs: &Blobs,
@@ -84,8 +84,8 @@ pub async fn collect(
     let uploads = blobs.drop_idle_uploads(before(grace)).await?;
     let mut old = blobs.untouched_since(before(grace)).await?;
     let mut dropped = store.blobs_dropped_by_robots().await?;
-    // Most are needed, and that is found out while nobody waits. The rest is looked at once more
-    // below.
+    // Most blobs are needed, and this look-up blocks no pusher. The remaining candidates are
+    // checked once more below.
     let needed = store.needed_blobs().await?;
     old.retain(|digest| !needed.contains(digest));
     dropped.retain(|digest| !needed.contains(digest));
@@ -94,8 +94,8 @@ pub async fn collect(
     Ok(Collected { uploads, blobs: removed })
 }
 
-/// Removes those of `candidates` that nobody needs, or has asked for since `before_ms`; says how
-/// many.
+/// Removes those of `candidates` that are unneeded and were not requested since `before_ms`.
+/// Returns their number.
 async fn remove(
     store: &Store,
     blobs: &Blobs,
@@ -107,7 +107,7 @@ async fn remove(
         let collection = blobs.begin_collection().await;
         let mut untouched = Vec::with_capacity(candidates.len());
         for &digest in candidates {
-            // A pusher may have asked for it since it was listed.
+            // A pusher may have asked for the blob since it was listed.
             if blobs.is_untouched_since(digest, before_ms).await? {
                 untouched.push(digest);
             }

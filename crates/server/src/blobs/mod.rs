@@ -1,10 +1,10 @@
 //! Owns the bytes of packages on disk, under the digest they hash to; it never changes a blob that
 //! is whole.
 //!
-//! A blob lies in `blobs/<algorithm>/<hex>`. It is renamed into place when it is whole, verified
-//! and synced. The store of blobs knows no references: what may be deleted is [`collector`]'s
-//! decision. A blob's modification time is when it was last asked for by someone who pushes; its
-//! content is never judged by it.
+//! A blob lies in `blobs/<algorithm>/<hex>`. We rename it into place when it is complete, verified
+//! and synced. The blob store knows no references: [`collector`] decides which blobs may be
+//! deleted. A blob's modification time records the last request by a pusher; it never says anything
+//! about the content.
 
 mod blob;
 mod body;
@@ -31,14 +31,14 @@ pub use upload::{InvalidUploadId, UploadId};
 use crate::config::BlobRead;
 use crate::domain::delivery::shown_bytes;
 
-/// Reads from the disk for answers at the same time. More would not be faster, and would keep the
-/// processor from those who wait for something else.
+/// Limit of concurrent disk reads for answers. More would not be faster, and would keep the
+/// processor from tasks that wait for something else.
 const DISK_READS: usize = 2;
 
 /// The blob store's limits and choices.
 #[derive(Debug, Clone, Copy)]
 pub struct BlobSettings {
-    /// How blobs are read.
+    /// The way in which blobs are read.
     pub reading: BlobRead,
     /// The largest blob that is accepted.
     pub max_blob_bytes: u64,
@@ -46,11 +46,11 @@ pub struct BlobSettings {
     pub max_uploads: usize,
     /// The most blobs kept open for the next reader.
     pub max_open_blobs: usize,
-    /// The most bytes kept of what one robot brings back. While older ones go, it may have twice as
-    /// many on the disk.
+    /// The most bytes kept of one robot's uploads. While older blobs are being deleted, the robot
+    /// may have twice as many on the disk.
     pub max_robot_bytes: u64,
-    /// What people leave free on the disk, in bytes, for the database and all else. Robots leave
-    /// twice as much.
+    /// Free disk space that people's uploads leave for the database and everything else, in bytes.
+    /// Robots' uploads leave twice as much.
     pub reserve_bytes: u64,
 }
 
@@ -67,7 +67,7 @@ impl Default for BlobSettings {
     }
 }
 
-/// Why the blob store did not do it.
+/// An error of the blob store.
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
     /// There is no such unfinished upload.
@@ -76,73 +76,74 @@ pub enum BlobError {
     /// Another request writes to the same upload.
     #[error("another request is writing to this upload")]
     UploadBusy,
-    /// [`BlobSettings::max_uploads`] is reached, and none gives way; or a robot has its share.
+    /// [`BlobSettings::max_uploads`] is reached and no upload can be evicted; or a robot has
+    /// reached its share.
     #[error("{max} uploads are unfinished already; finish or cancel one")]
     TooManyUploads {
         /// The limit.
         max: usize,
     },
-    /// A chunk does not begin where the upload stands.
+    /// A chunk does not begin at the upload's offset.
     #[error("the chunk begins at byte {given}, the upload stands at {offset}")]
     OutOfOrder {
         /// Where the chunk begins.
         given: u64,
-        /// Where it has to begin.
+        /// The upload's offset.
         offset: u64,
     },
-    /// More bytes than a blob may have.
+    /// The blob exceeds the size limit.
     #[error("the blob is larger than this server's limit of {max} bytes")]
     TooLarge {
         /// The limit.
         max: u64,
     },
-    /// More at a time than one robot may bring back.
+    /// The robot exceeds its share of the disk.
     #[error(
         "{kept} bytes of what this robot brought back are on the disk, {max} may be: older ones leave it within hours (robots.output_bytes)"
     )]
     TooMuchOfRobot {
         /// The limit.
         max: u64,
-        /// What is there, uploads that are not finished included.
+        /// Bytes stored for the robot, including unfinished uploads.
         kept: u64,
     },
-    /// The bytes hash to something else.
+    /// The bytes do not hash to the announced digest.
     #[error("the bytes hash to {actual}, not to {expected}")]
     WrongDigest {
-        /// What was announced.
+        /// The announced digest.
         expected: Box<Digest>,
-        /// What they hash to.
+        /// The digest of the received bytes.
         actual: Box<Digest>,
     },
-    /// The sender went away.
+    /// The body broke off: the sender went away or fell silent.
     #[error("the upload's body broke off")]
     Interrupted(#[source] Box<dyn std::error::Error + Send + Sync>),
     /// The disk is full.
     #[error("the server's disk is full")]
     DiskFull,
-    /// What is free of the disk is not for this.
+    /// The upload would use the reserved part of the disk.
     #[error(
         "the server's disk is nearly full: the last {} of it are kept for its database and what robots report \
          (disk_reserve)", shown_bytes(*reserve)
     )]
     DiskReserved {
-        /// What is kept free, in bytes.
+        /// The reserved disk space, in bytes.
         reserve: u64,
     },
-    /// The disk refused.
+    /// A file operation failed.
     #[error("the blob store can't {action} {path}")]
     Disk {
-        /// What was tried.
+        /// The operation.
         action: &'static str,
-        /// On which file.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
 }
 
 impl BlobError {
-    /// Whether the bytes are more than there is room for.
+    /// Whether the error means that there is no room for the bytes.
     fn is_want_of_room(&self) -> bool {
         matches!(
             self,
@@ -162,7 +163,7 @@ impl BlobError {
     }
 }
 
-/// The blob store. Clones are the same store.
+/// The blob store. Clones share one store.
 #[derive(Clone)]
 pub struct Blobs {
     shared: Arc<Shared>,
@@ -172,27 +173,27 @@ struct Shared {
     directory: PathBuf,
     settings: BlobSettings,
     uploads: Uploads,
-    /// Blobs opened before, the latest first: opening and mapping costs more than a small blob's
-    /// bytes.
+    /// Recently opened blobs, the latest first: opening and mapping a small blob costs more than
+    /// its bytes.
     open: Mutex<VecDeque<Blob>>,
-    /// Blobs whose files are checked because a read failed.
+    /// Blobs with a running check of their file after a failed read.
     checked: Mutex<HashSet<Digest>>,
     disk: Arc<Semaphore>,
     collection: Arc<RwLock<()>>,
 }
 
-/// While this lives, no blob is collected: whoever found one present can still rely on it.
+/// While this guard lives, no blob is collected: a caller that found a blob present can rely on it.
 pub struct NoCollection {
     _guard: OwnedRwLockReadGuard<()>,
 }
 
-/// While this lives, nobody relies on what [`NoCollection`] protects.
+/// While this guard lives, there is no [`NoCollection`], so blobs can be deleted.
 pub struct Collection {
     _guard: OwnedRwLockWriteGuard<()>,
 }
 
 impl Blobs {
-    /// Opens the store in `data`, which gets the directories `blobs` and `uploads`.
+    /// Opens the store in `data`, and creates the directories `blobs` and `uploads` there.
     pub fn open(data: &Path, settings: BlobSettings) -> Result<Self, BlobError> {
         let directory = data.join("blobs");
         for algorithm in Algorithm::ALL {
@@ -219,17 +220,18 @@ impl Blobs {
         self.shared.settings
     }
 
-    /// Holds back the collector.
+    /// Blocks the collector while the guard lives.
     pub async fn hold_collection(&self) -> NoCollection {
         NoCollection { _guard: Arc::clone(&self.shared.collection).read_owned().await }
     }
 
-    /// Waits until nobody holds back the collector, and holds back everybody else.
+    /// Waits until no caller blocks the collector, and then makes new callers of
+    /// [`Self::hold_collection`] wait.
     pub async fn begin_collection(&self) -> Collection {
         Collection { _guard: Arc::clone(&self.shared.collection).write_owned().await }
     }
 
-    /// The blob, if it is here.
+    /// The blob; `None` if the store does not have it.
     pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
         if let Some(blob) = self.shared.already_open(digest) {
             return Ok(Some(blob));
@@ -242,7 +244,7 @@ impl Blobs {
         Ok(opened.await?.map(|blob| self.shared.keep_open(blob)))
     }
 
-    /// Stores small bytes that are in memory already, and says what they hash to.
+    /// Stores small bytes from memory, and returns their digest.
     pub async fn put(&self, algorithm: Algorithm, bytes: Bytes) -> Result<Digest, BlobError> {
         let digest = algorithm.digest(&bytes);
         let partial = self.shared.uploads.fresh_path();
@@ -257,7 +259,7 @@ impl Blobs {
                 .map_err(BlobError::disk("write", &partial))
                 .and_then(|()| move_into_place(&partial, &target));
             if stored.is_err() {
-                // Best effort: what stays is removed at the next start.
+                // Best effort: the next start removes a file that remains.
                 let _ = fs::remove_file(&partial);
             }
             stored
@@ -266,7 +268,8 @@ impl Blobs {
         Ok(digest)
     }
 
-    /// Notes that somebody who pushes counts on the blob; false if it is not here.
+    /// Updates the blob's modification time, because a pusher relies on the blob; false if it is
+    /// absent.
     pub async fn touch(&self, digest: Digest, now_ms: u64) -> Result<bool, BlobError> {
         let path = self.path(digest);
         on_disk(move || {
@@ -307,12 +310,12 @@ impl Blobs {
         .await
     }
 
-    /// Bytes of all blobs.
+    /// The total size of all blobs, in bytes.
     pub async fn used_bytes(&self) -> Result<u64, BlobError> {
         let directory = self.shared.directory.clone();
         on_disk(move || {
             let sum = |algorithm: Algorithm| {
-                // One that is deleted meanwhile takes no room.
+                // A blob that is deleted meanwhile takes no room.
                 let entries = fs::read_dir(directory.join(algorithm.as_str()))?.flatten();
                 Ok(entries
                     .filter_map(|entry| entry.metadata().ok())
@@ -328,7 +331,7 @@ impl Blobs {
         .await
     }
 
-    /// Whether the blob is here and was last touched before `before_ms`.
+    /// Whether the blob is present and was last touched before `before_ms`.
     pub async fn is_untouched_since(
         &self,
         digest: Digest,
@@ -343,7 +346,8 @@ impl Blobs {
         .await
     }
 
-    /// Deletes a blob. Only the collector may, which knows that nothing refers to it.
+    /// Deletes a blob. Only the collector may do so, because it knows that nothing refers to the
+    /// blob.
     pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
         self.shared.close(digest);
         let path = self.path(digest);
@@ -354,7 +358,8 @@ impl Blobs {
             _ => Ok(()),
         })
         .await?;
-        // A reader may have opened it in between; it keeps its copy, later ones shall not find it.
+        // A reader may have opened the blob in between. That reader keeps its copy; later ones must
+        // not find it.
         self.shared.close(digest);
         Ok(())
     }
@@ -369,7 +374,7 @@ impl Shared {
         self.directory.join(digest.algorithm().as_str()).join(digest.hex())
     }
 
-    /// The blob, if it is open; it then is the last to be closed.
+    /// The blob, if it is open. This makes it the last one to be closed.
     fn already_open(&self, digest: Digest) -> Option<Blob> {
         let mut open = self.open_blobs();
         let at = open.iter().position(|blob| blob.digest == digest)?;
@@ -378,8 +383,8 @@ impl Shared {
         Some(blob)
     }
 
-    /// Keeps `blob` open, unless somebody else has opened it meanwhile: then theirs is used, so
-    /// that many first readers at once end with one mapping.
+    /// Keeps `blob` open. If a concurrent reader has opened it first, that mapping is used, so that
+    /// many first readers at once share one mapping.
     fn keep_open(&self, blob: Blob) -> Blob {
         let mut open = self.open_blobs();
         if let Some(earlier) = open.iter().find(|other| other.digest == blob.digest) {
@@ -399,7 +404,7 @@ impl Shared {
     }
 }
 
-/// Runs disk work where waiting hurts nobody.
+/// Runs disk work on a blocking thread.
 async fn on_disk<T, F>(work: F) -> Result<T, BlobError>
 where
     T: Send + 'static,
@@ -411,7 +416,7 @@ where
     }
 }
 
-/// Renames a synced file into the store, so that it survives a power cut under its new name.
+/// Renames a synced file into the store, so that its new name survives a power cut.
 fn move_into_place(partial: &Path, target: &Path) -> Result<(), BlobError> {
     fs::rename(partial, target).map_err(BlobError::disk("rename", partial))?;
     let directory = target.parent().unwrap_or(target);

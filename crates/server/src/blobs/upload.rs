@@ -1,7 +1,8 @@
-//! Unfinished uploads: `uploads/<id>.<repository>` holds the bytes that came, memory holds their
-//! running hash by SHA-256. After a restart they go on at the end of their file, and are hashed
-//! once they are whole. It never lets bytes become a blob before they hash to what was announced,
-//! nor robots take more than is theirs, nor uploads that somebody left keep others from pushing.
+//! Unfinished uploads. `uploads/<id>.<repository>` holds the received bytes; memory holds their
+//! running SHA-256 hash. After a restart an upload resumes at the end of its file, and the server
+//! hashes the file once all bytes are there. Bytes never become a blob before they hash to the
+//! announced digest. Robots never take more than their share, and abandoned uploads never keep
+//! others from pushing.
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
@@ -25,22 +26,22 @@ use tokio::sync::OwnedMutexGuard;
 use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
 use crate::system::data_directory::room;
 
-/// How much of a body is gathered before it is hashed and written in one go.
+/// Bytes of a body that are gathered before one hash and one write.
 const GATHERED_BYTES: usize = 1024 * 1024;
-/// How long a sender may be silent in the middle of a body.
+/// Time limit for a silent sender in the middle of a body.
 const SILENCE: Duration = Duration::from_secs(60);
-/// Uploads that one robot may leave unfinished: it sends one file after another, and forgets some
-/// on the way.
+/// Uploads that one robot may leave unfinished. A robot sends one file after another and abandons
+/// some on the way.
 const MAX_OF_ROBOT: usize = 8;
 const ID_DIGITS: usize = 32;
-/// What file systems take as one name.
+/// The longest file name that file systems accept, in bytes.
 const MAX_NAME_BYTES: usize = 255;
 
-/// Names an upload.
+/// The id of an upload.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct UploadId(String);
 
-/// A text that no upload is named by.
+/// The text is not an upload id.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("not the name of an upload")]
 pub struct InvalidUploadId;
@@ -72,7 +73,7 @@ pub(super) struct Uploads {
     active: Mutex<HashMap<UploadId, Active>>,
 }
 
-/// An upload and where it was begun.
+/// An upload and its repository.
 #[derive(Clone)]
 struct Active {
     repository: RepositoryName,
@@ -87,18 +88,18 @@ impl Active {
     }
 }
 
-/// One upload. Whoever holds its lock is the only writer.
+/// One upload. The holder of its lock is the only writer.
 struct Upload {
     path: PathBuf,
     file: File,
     offset: u64,
-    /// The same for those who don't hold the lock.
+    /// The offset again, readable without the lock.
     bytes: Arc<AtomicU64>,
-    /// `None`: it was begun before the server started.
+    /// `None`: the upload began before the server started.
     hasher: Option<Sha256>,
-    /// When it was begun or got its last bytes.
+    /// The time of the last write, or of the begin.
     written_at: Instant,
-    /// Finished or cancelled by whoever had the lock before.
+    /// Whether an earlier holder of the lock has finished or cancelled the upload.
     ended: bool,
 }
 
@@ -109,8 +110,8 @@ impl Upload {
         Ok(Self { path, file, offset: 0, bytes, hasher, written_at, ended: false })
     }
 
-    /// Takes up what an earlier process left. Its bytes came in order, so all that are there count:
-    /// whether they are the right ones is seen when they are hashed.
+    /// Resumes an upload of an earlier process. The bytes were written in order, so all of them
+    /// count. The final hash shows whether they are right.
     fn resume(path: PathBuf) -> io::Result<Self> {
         let file = File::options().write(true).open(&path)?;
         let offset = file.metadata()?.len();
@@ -118,8 +119,8 @@ impl Upload {
         Ok(Self { path, file, offset, bytes, hasher: None, written_at, ended: false })
     }
 
-    /// Takes all of `chunks` or, on an error, nothing: bytes beyond the offset are overwritten by
-    /// the next try.
+    /// Writes all of `chunks` or, on an error, none: the next try overwrites the bytes beyond the
+    /// offset.
     fn write(&mut self, chunks: &[Bytes]) -> Result<(), BlobError> {
         let mut offset = self.offset;
         for chunk in chunks {
@@ -135,8 +136,9 @@ impl Upload {
         Ok(())
     }
 
-    /// Orders those that nobody writes to by which gives way first: what was left for a while, the
-    /// empty before the rest, and then what was written to the longest ago.
+    /// The eviction order of uploads without an active writer: first those that were idle for
+    /// [`SILENCE`], empty ones before the rest, and then by the time of the last write, oldest
+    /// first.
     fn gives_way(&self) -> (bool, bool, Instant) {
         let is_left = self.written_at.elapsed() >= SILENCE;
         (!is_left, is_left && self.offset > 0, self.written_at)
@@ -149,7 +151,7 @@ impl Upload {
 
     fn finish(&mut self, expected: Digest, target: &Path) -> Result<u64, BlobError> {
         self.ended = true;
-        // A write that failed half way may have left bytes behind the end.
+        // A write that failed half way may have left bytes beyond the offset.
         self.file.set_len(self.offset).map_err(BlobError::disk("cut", &self.path))?;
         let unreadable = BlobError::disk("read", &self.path);
         let actual = match (expected.algorithm(), &self.hasher) {
@@ -175,8 +177,8 @@ impl Upload {
     }
 }
 
-/// The hash of a file. SHA-512 is computed so, which few ask for, and that of an upload which was
-/// taken up.
+/// Hashes a file. This computes SHA-512 digests, which are rare, and the digest of a resumed
+/// upload.
 pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
     let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; GATHERED_BYTES]);
     loop {
@@ -187,22 +189,22 @@ pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Out
     }
 }
 
-/// The name of an upload's file. That of a repository whose name leaves no room for the id is the
-/// id alone, which no restart goes on with.
+/// The name of an upload's file. If the repository's name leaves no room for the id, the file is
+/// named by the id alone, and no restart resumes the upload.
 fn file_name(id: &UploadId, repository: &RepositoryName) -> String {
     let name = format!("{}.{}", id.as_str(), repository.as_str().replace('/', "+"));
     if name.len() <= MAX_NAME_BYTES { name } else { id.as_str().to_owned() }
 }
 
-/// The upload that a file is named by.
+/// Parses the name of an upload's file.
 fn named_by(file_name: &OsStr) -> Option<(UploadId, RepositoryName)> {
     let (id, repository) = file_name.to_str()?.split_once('.')?;
     Some((id.parse().ok()?, repository.replace('+', "/").parse().ok()?))
 }
 
 impl Uploads {
-    /// Opens the directory, takes up the uploads that an earlier process left unfinished, as many
-    /// as there may be, the newest first, and removes whatever else is in it.
+    /// Opens the directory and resumes the unfinished uploads of an earlier process: the newest
+    /// ones, up to the limit. Removes all other files in the directory.
     pub(super) fn open(directory: PathBuf, settings: BlobSettings) -> Result<Self, BlobError> {
         let resume = || {
             fs::create_dir_all(&directory)?;
@@ -229,7 +231,7 @@ impl Uploads {
         Ok(Self { directory, settings, active: Mutex::new(active) })
     }
 
-    /// A name nothing else in the directory has.
+    /// A file name that is unused in the directory.
     pub(super) fn fresh_path(&self) -> PathBuf {
         self.directory.join(UploadId::random().as_str())
     }
@@ -238,8 +240,8 @@ impl Uploads {
         self.active.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes an upload in. Where every place is taken it gets one of a person's that nobody writes
-    /// to: that is returned, and the caller cancels it.
+    /// Adds an upload. At the limit, the new upload replaces a person's upload without an active
+    /// writer. That one is returned, and the caller cancels it.
     fn insert(
         &self,
         id: UploadId,
@@ -248,7 +250,7 @@ impl Uploads {
         let max = self.settings.max_uploads;
         let mut all = self.active();
         if let Some((robot, _)) = owner(&active.repository) {
-            // However many robots there are, a quarter stays free for operators.
+            // Independent of the number of robots, a quarter stays free for operators.
             let max_of_robots = max - max / 4;
             let robots: Vec<_> =
                 all.values().filter_map(|other| owner(&other.repository)).collect();
@@ -269,7 +271,7 @@ impl Uploads {
         Ok(left)
     }
 
-    /// Whether there is room for so many bytes more of a robot of which `kept` are kept already.
+    /// Checks that a robot may store `bytes` more; `kept` counts its stored bytes.
     fn check_room_of(&self, robot: &RobotId, bytes: u64, kept: u64) -> Result<(), BlobError> {
         let is_robots =
             |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
@@ -283,9 +285,9 @@ impl Uploads {
         self.check_reserve(bytes, self.settings.reserve_bytes.saturating_mul(2))
     }
 
-    /// Whether so many bytes more leave `reserve` free on the disk.
+    /// Checks that `bytes` more leave `reserve` bytes free on the disk.
     fn check_reserve(&self, bytes: u64, reserve: u64) -> Result<(), BlobError> {
-        // Where the disk can't be asked, it is full when it says so.
+        // If the free space is unknown, the disk is full when a write fails.
         match room(&self.directory) {
             Some((free, _)) if bytes > 0 && free < reserve.saturating_add(bytes) => {
                 Err(BlobError::DiskReserved { reserve })
@@ -295,7 +297,7 @@ impl Uploads {
     }
 }
 
-/// Of people's uploads that nobody writes to, the one that gives way first.
+/// The first upload in the eviction order among people's uploads without an active writer.
 fn left_by_people(all: &HashMap<UploadId, Active>) -> Option<(UploadId, OwnedMutexGuard<Upload>)> {
     let of_people = all.iter().filter(|(_, active)| owner(&active.repository).is_none());
     let left = of_people
@@ -305,14 +307,14 @@ fn left_by_people(all: &HashMap<UploadId, Active>) -> Option<(UploadId, OwnedMut
 }
 
 impl Blobs {
-    /// Begins an upload; only requests for the same repository reach it.
+    /// Begins an upload. Only requests for the same repository can reach it.
     pub async fn begin_upload(&self, repository: &RepositoryName) -> Result<UploadId, BlobError> {
         let id = UploadId::random();
         let path = self.shared.uploads.directory.join(file_name(&id, repository));
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
         let active = Active::new(repository.clone(), created);
-        // Best effort, both: what stays is an upload that nobody goes on with, which the collector
-        // gives up.
+        // Both removals are best effort: an upload that remains gets no more bytes, and the
+        // collector drops it.
         match self.shared.uploads.insert(id.clone(), active) {
             Ok(None) => {}
             Ok(Some(mut left)) => drop(on_disk(move || left.cancel()).await),
@@ -324,7 +326,7 @@ impl Blobs {
         Ok(id)
     }
 
-    /// How many bytes of an upload are here.
+    /// The number of bytes that an upload has received.
     pub async fn upload_offset(
         &self,
         repository: &RepositoryName,
@@ -333,8 +335,8 @@ impl Blobs {
         Ok(self.lock_upload(repository, id)?.offset)
     }
 
-    /// Whether so many bytes more would be taken. `kept` is what is kept of the robot whose
-    /// repository this is.
+    /// Checks that `bytes` more would be accepted. `kept` counts the stored bytes of the robot that
+    /// owns the repository.
     pub fn check_room(
         &self,
         repository: &RepositoryName,
@@ -352,14 +354,14 @@ impl Blobs {
         }
     }
 
-    /// How many bytes more people may bring, as far as the disk goes.
+    /// Free disk space for people's uploads, in bytes.
     pub fn room_for_people(&self) -> u64 {
         let uploads = &self.shared.uploads;
         room(&uploads.directory)
             .map_or(u64::MAX, |(free, _)| free.saturating_sub(uploads.settings.reserve_bytes))
     }
 
-    /// The largest blob that a repository takes.
+    /// The size limit of a blob in this repository.
     fn max_bytes_in(&self, repository: &RepositoryName) -> u64 {
         let BlobSettings { max_blob_bytes, max_robot_bytes, .. } = self.shared.settings;
         if owner(repository).is_some() {
@@ -369,10 +371,10 @@ impl Blobs {
         }
     }
 
-    /// Appends a body that begins at byte `start` (wherever the upload stands, if absent). What
-    /// came before an error or before the caller gave up is kept, and the next chunk begins there;
-    /// only where there is no room for it the upload ends. `kept` is as in [`Self::check_room`].
-    /// Returns the new offset.
+    /// Appends a body that begins at byte `start`, or at the upload's offset if that is absent.
+    /// Bytes received before an error, or before the caller gave up, are kept, and the next chunk
+    /// begins after them. The upload only ends if there is no room for the bytes. `kept` is as in
+    /// [`Self::check_room`]. Returns the new offset.
     pub async fn append<S, E>(
         &self,
         repository: &RepositoryName,
@@ -407,7 +409,7 @@ impl Blobs {
                 let written = on_disk(move || {
                     let written = room.and_then(|()| upload.write(&chunks));
                     if written.as_ref().is_err_and(BlobError::is_want_of_room) {
-                        // What is here already would keep the disk full, for the database as well.
+                        // The partial upload would keep the disk full, for the database as well.
                         // Best effort.
                         let _ = upload.cancel();
                     }
@@ -427,8 +429,8 @@ impl Blobs {
         }
     }
 
-    /// Makes the upload a blob, if it hashes to `expected`; else it is given up. Returns the blob's
-    /// size.
+    /// Makes the upload a blob if it hashes to `expected`, and drops it otherwise. Returns the
+    /// blob's size.
     pub async fn finish_upload(
         &self,
         repository: &RepositoryName,
@@ -440,7 +442,7 @@ impl Blobs {
         let finished = on_disk(move || {
             let finished = upload.finish(expected, &target);
             if finished.is_err() {
-                // Best effort: what stays is removed at the next start.
+                // Best effort: the next start removes a file that remains.
                 let _ = fs::remove_file(&upload.path);
             }
             finished
@@ -450,7 +452,7 @@ impl Blobs {
         finished
     }
 
-    /// Gives an upload up.
+    /// Cancels an upload.
     pub async fn cancel_upload(
         &self,
         repository: &RepositoryName,
@@ -461,16 +463,17 @@ impl Blobs {
         on_disk(move || upload.cancel()).await
     }
 
-    /// Gives up the uploads that got no byte since `before_ms`, and says how many.
+    /// Drops the uploads without a new byte since `before_ms`, and returns their number.
     pub async fn drop_idle_uploads(&self, before_ms: u64) -> Result<usize, BlobError> {
         let all: Vec<_> =
             self.shared.uploads.active().iter().map(|(id, a)| (id.clone(), a.clone())).collect();
         let mut dropped = 0;
         for (id, active) in all {
-            // Someone writes to it this moment: not idle, whatever the file's time says.
+            // An active writer holds the lock: the upload is not idle, whatever the file's time
+            // says.
             let Ok(mut upload) = active.upload.try_lock_owned() else { continue };
             let is_dropped = on_disk(move || {
-                // Whoever ended it hung up before it was forgotten.
+                // The request that ended the upload was dropped before it could remove the entry.
                 if upload.ended {
                     return Ok(true);
                 }
@@ -488,14 +491,14 @@ impl Blobs {
         Ok(dropped)
     }
 
-    /// The only writer's right to an upload. A second writer is refused rather than queued: its
+    /// Locks an upload for its only writer. A second writer is refused rather than queued: its
     /// chunk would be out of order anyway.
     fn lock_upload(
         &self,
         repository: &RepositoryName,
         id: &UploadId,
     ) -> Result<OwnedMutexGuard<Upload>, BlobError> {
-        // Held until the end: who looks for one to give way takes each for a moment.
+        // Held until the end: the search for an upload to evict locks each one for a moment.
         let all = self.shared.uploads.active();
         let active = all
             .get(id)
@@ -506,8 +509,8 @@ impl Blobs {
     }
 }
 
-/// Takes chunks from a body until there are enough for one write, and says if and how the body
-/// ended.
+/// Takes chunks from a body until there are enough for one write. Reports the end of the body, and
+/// its error.
 async fn gather<S, E>(
     body: &mut std::pin::Pin<&mut S>,
 ) -> (Vec<Bytes>, Option<Result<(), BlobError>>)
@@ -710,8 +713,7 @@ mod tests {
         for id in &ids {
             blobs.lock_upload(&repository, id).expect("there").written_at -= SILENCE;
         }
-        // The empty one gives way, then the one with bytes, and only then what was begun a moment
-        // ago.
+        // The empty upload is evicted first, then the one with bytes, and only then the recent one.
         for gone in [None, Some(1), Some(0), Some(2)] {
             ids.push(begin().await.expect("begins"));
             let there: Vec<bool> =

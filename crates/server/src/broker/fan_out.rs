@@ -1,7 +1,7 @@
-//! Sending a package's parts to many robots at once, on `p/<digest>`: to those it was granted to,
-//! as fast as the slowest of them listens, and no longer than the [`FanOut`] lives. A part is held
-//! once, and so long as somebody has not taken it. Nothing is retained: who subscribes late, or
-//! falls out, gets the rest in another way.
+//! Fan-out of a package's parts to many robots at once, on `p/<digest>`. Only permitted robots
+//! receive them, at the speed of the slowest subscriber, while the [`FanOut`] lives. A part is held
+//! once, until all subscribers have taken it. Nothing is retained: a robot that subscribes late, or
+//! drops out, gets the rest in another way.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,15 +16,16 @@ use super::front::{Front, Grant, NotGranted};
 
 /// The largest part, with its header.
 pub const MAX_PART_BYTES: usize = part::MAX_PART_BYTES as usize + part::HEADER_BYTES;
-/// How often it is looked who holds up the others.
+/// Interval between checks for subscribers that hold up the others.
 const LOOK_INTERVAL: Duration = Duration::from_millis(100);
 
-/// One message of a fan-out: a few bytes of its own before bytes that nobody copies.
+/// One message of a fan-out: a short header of its own, followed by shared bytes that are never
+/// copied.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Part {
-    /// What comes first.
+    /// The start of the payload.
     pub header: Bytes,
-    /// The rest.
+    /// The rest of the payload.
     pub bytes: Bytes,
 }
 
@@ -40,19 +41,19 @@ impl Part {
     }
 }
 
-/// How a package is fanned out.
+/// The settings of a package's fan-out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct FanOutSettings {
-    /// The size of its parts: few large ones are on their way at a time, more small ones.
+    /// The size of the package's parts: with large parts fewer are in flight at a time.
     pub part_bytes: usize,
-    /// The quality of service, if a robot's own subscription does not ask for less.
+    /// The quality of service, unless a robot's own subscription requests a lower one.
     pub qos: PartQos,
 }
 
 /// The quality of service of parts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum PartQos {
-    /// Sent, and that is all: what is lost is asked for again.
+    /// Sent without acknowledgement: robots request lost parts again.
     AtMostOnce,
     /// Acknowledged.
     #[default]
@@ -61,31 +62,31 @@ pub enum PartQos {
     ExactlyOnce,
 }
 
-/// Why a package, or a part of it, is not fanned out.
+/// The reason why a package, or one of its parts, is not fanned out.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FanOutError {
-    /// This package is being fanned out already.
+    /// This package is already in fan-out.
     #[error("package {0} is being fanned out already")]
     UnderWay(Digest),
-    /// As many packages as there may be are being fanned out.
+    /// The maximum number of packages is in fan-out.
     #[error("as many packages as there may be are being fanned out")]
     Busy,
     /// The part does not fit into a message.
     #[error("a part of {0} bytes is larger than {MAX_PART_BYTES}")]
     TooLarge(usize),
-    /// There is no session at the external broker, or it takes nothing.
+    /// There is no session at the external broker, or the broker accepts nothing.
     #[error("the external broker takes no parts")]
     BrokerAway,
 }
 
-/// A package on its way to many. Dropped, it ends: robots hear no further part and can't subscribe
-/// any more.
+/// A package in fan-out to many robots. Dropping the value ends the fan-out: robots receive no
+/// further part and can't subscribe any more.
 pub struct FanOut(Way);
 
 enum Way {
-    /// From our own front, to those it was granted to.
+    /// From the embedded broker's front, to permitted robots.
     Embedded(Granted),
-    /// Through another broker, to whoever subscribed there.
+    /// Through an external broker, to its subscribers.
     External(Crowd),
 }
 
@@ -115,7 +116,7 @@ impl FanOut {
         Ok(Self(Way::Embedded(Granted { front, grant })))
     }
 
-    /// At an external broker, whose access control list alone says who may listen.
+    /// Fans out at an external broker, where only the access control list restricts subscribers.
     pub(super) fn at(crowd: Crowd) -> Self {
         Self(Way::External(crowd))
     }
@@ -127,15 +128,15 @@ impl FanOut {
         }
     }
 
-    /// A report says whether the robot listens. Our own front knows by itself, an external broker
-    /// does not tell.
+    /// Records from a report whether the robot subscribes. The embedded front knows its
+    /// subscribers; an external broker does not tell us.
     pub fn told(&self, robot: &RobotId, is_listening: bool) {
         if let Way::External(crowd) = &self.0 {
             crowd.told(robot, is_listening);
         }
     }
 
-    /// How many robots listen now.
+    /// The number of robots that subscribe now.
     pub fn listeners(&self) -> usize {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.listeners(),
@@ -143,7 +144,7 @@ impl FanOut {
         }
     }
 
-    /// Whether the robot listens now.
+    /// Whether the robot subscribes now.
     pub fn is_listening(&self, robot: &RobotId) -> bool {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.is_listening(robot),
@@ -151,8 +152,8 @@ impl FanOut {
         }
     }
 
-    /// Waits until somebody has begun to listen since this was waited for last. Through an external
-    /// broker only [`Self::told`] says so.
+    /// Waits until a robot has subscribed since the last call. With an external broker only
+    /// [`Self::told`] provides this information.
     pub async fn joined(&self) {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.joined().await,
@@ -160,25 +161,26 @@ impl FanOut {
         }
     }
 
-    /// The robot may no longer hear it.
+    /// Withdraws the robot's permission.
     pub fn withdraw(&self, robot: &RobotId) {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.withdraw(robot, Instant::now()),
-            // It may go on listening, which is not counted any more.
+            // The robot may stay subscribed, but no longer counts.
             Way::External(crowd) => crowd.told(robot, false),
         }
     }
 
-    /// Robots that held up the others and were put out since this was asked last.
+    /// Robots that were removed since the last call because they held up the others.
     pub fn take_put_out(&self) -> Vec<RobotId> {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.take_put_out(),
-            // What a slow robot does not take the broker drops; its report says so.
+            // The broker drops parts that a slow robot does not take; the robot's report lists
+            // them.
             Way::External(_) => Vec::new(),
         }
     }
 
-    /// The bytes of the parts that are held for listeners, all listeners together.
+    /// The bytes of the parts that are held for subscribers, all subscribers together.
     pub fn queued_bytes(&self) -> usize {
         match &self.0 {
             Way::Embedded(Granted { grant, .. }) => grant.queued_bytes(),
@@ -186,9 +188,9 @@ impl FanOut {
         }
     }
 
-    /// Sends the next part to all who listen. Waits while the slowest of them is too far behind;
-    /// whoever holds up the others for long is put out. Once this returns the part is on its way,
-    /// not there: what arrived, robots report.
+    /// Sends the next part to all subscribers. Waits while the slowest is too far behind; a
+    /// subscriber that holds up the others for long is removed. When this returns, the part is in
+    /// flight and not yet delivered: robots report delivery.
     pub async fn publish(&mut self, part: Part) -> Result<(), FanOutError> {
         if part.len() > MAX_PART_BYTES {
             return Err(FanOutError::TooLarge(part.len()));
@@ -200,8 +202,8 @@ impl FanOut {
         Ok(())
     }
 
-    /// Waits until every listener, or the external broker, has acknowledged all that was sent, or
-    /// was put out, or `patience` is over.
+    /// Waits until every subscriber, or the external broker, has acknowledged all parts or was
+    /// removed, or until `patience` is over.
     pub async fn settle(&mut self, patience: Duration) {
         match &self.0 {
             Way::Embedded(granted) => granted.settle(patience).await,

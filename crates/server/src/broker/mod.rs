@@ -1,10 +1,10 @@
 //! Owns the MQTT broker as the rest of the server sees it; it never stores anything and never reads
 //! a payload.
 //!
-//! It rings a robot, receives what robots send and knows who is there. It asks a [`Gatekeeper`] who
-//! may come in and hands messages to an [`Inbox`]. [`Broker::start`] serves MQTT itself,
-//! [`Broker::connect`] makes the server a client of another broker; behind the handle both are the
-//! same to the rest of the server.
+//! The broker notifies robots, receives their messages and knows which robots are connected. A
+//! [`Gatekeeper`] decides which clients are admitted, and an [`Inbox`] receives the messages.
+//! [`Broker::start`] serves MQTT in this process; [`Broker::connect`] makes the server a client of
+//! another broker. The handle hides the difference from the rest of the server.
 
 mod external;
 mod fan_out;
@@ -33,14 +33,14 @@ pub use external::{CANARY_LEVEL, ExternalConfig, external_route};
 use external::{Crowd, External};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
-/// What reads clients' bytes; public for those who try it with any.
+/// The decoder of clients' bytes; public so that fuzzers can call it with arbitrary input.
 pub use front::codec;
 use router::Router;
 
-/// What a packet has around its message: the topic and the packet id.
+/// Bytes of a packet besides the message: the topic and the packet id.
 const AROUND_MESSAGE_BYTES: usize = 1024;
 
-/// What a client shows at the door.
+/// Credentials that a client presents in CONNECT.
 #[derive(Clone)]
 pub struct Login {
     /// The MQTT client id; empty if the client left the choice to us.
@@ -49,103 +49,106 @@ pub struct Login {
     pub user_name: Option<String>,
     /// The password, if there is one: a token.
     pub password: Option<String>,
-    /// Where the connection comes from.
+    /// The remote address of the connection.
     pub peer: SocketAddr,
-    /// What the client has proven when it shook hands.
+    /// Proof from the TLS handshake.
     pub proof: ClientProof,
 }
 
-/// Who a client turned out to be.
+/// The identity of an admitted client.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Principal {
-    /// A robot: speaks and listens on its own topics only. Its client id must be its robot id.
+    /// A robot: publishes and subscribes on its own topics only. Its client id must be its robot
+    /// id.
     Robot {
-        /// Which.
+        /// The robot's id.
         robot: RobotId,
-        /// Which of its tokens it showed; comes back with its messages.
+        /// The number of the token that was presented; it is attached to the robot's messages.
         token_number: u64,
-        /// Whether that has just ended its other tokens: who came in by those has to leave.
+        /// Whether this login has just ended the robot's other tokens: sessions admitted by those
+        /// tokens must be closed.
         is_first_use: bool,
     },
-    /// A person, or a program with a person's token: may listen below the prefix.
+    /// A person, or a program with a person's token: may subscribe below the prefix.
     Operator(UserName),
 }
 
-/// Why a client is not let in.
+/// The reason for refusing a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum Refusal {
     /// No such user, or the wrong password (CONNACK 4).
     #[error("bad user name or password")]
     BadCredentials,
-    /// Known, but not allowed: a revoked token, another robot's name as user name (CONNACK 5).
+    /// Known, but not allowed: a revoked token, or another robot's name as user name (CONNACK 5).
     #[error("not authorised")]
     NotAuthorised,
-    /// Nobody could say just now (CONNACK 3).
+    /// The decision could not be made now (CONNACK 3).
     #[error("the server cannot check credentials at the moment")]
     Unavailable,
 }
 
-/// Decides who may come in.
+/// Decides which clients are admitted.
 pub trait Gatekeeper: Send + Sync + 'static {
-    /// Who this is, or why they may not enter. After [`Limits::admit_timeout`] the client is told
-    /// [`Refusal::Unavailable`]; what was asked goes on to its end.
+    /// Returns the client's identity, or the reason for refusing. After [`Limits::admit_timeout`]
+    /// the client receives [`Refusal::Unavailable`]; the lookup itself still runs to its end.
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>>;
 }
 
 /// A message from a robot on its `report`, `status`, `reply` or `log` topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RobotMessage {
-    /// Who sent it: proven by the connection, or as far as an external broker's access control list
-    /// does.
+    /// The sender. The embedded broker proves the sender by the connection; an external broker only
+    /// as far as its access control list does.
     pub robot: RobotId,
-    /// Which of these topics.
+    /// The topic.
     pub topic: RobotTopic,
-    /// The bytes, unread.
+    /// The bytes, not decoded.
     pub payload: Bytes,
-    /// The peer's address; an external broker does not tell it.
+    /// The peer's address; unknown with an external broker.
     pub peer: Option<SocketAddr>,
-    /// The connection it came by, as in [`Inbox::connected`].
+    /// The connection that delivered the message, as in [`Inbox::connected`].
     pub connection: u64,
-    /// The token the connection was let in by, as in [`Principal::Robot`]. An external broker is
-    /// shown no token, so what comes from there can't speak for one, and no report does.
+    /// The token that admitted the connection, as in [`Principal::Robot`]. An external broker never
+    /// sees a token, so its messages can't speak for a token, and no report arrives through it.
     pub token_number: Option<u64>,
 }
 
-/// The message could not be stored; the robot keeps it and sends it again.
+/// The message could not be stored; the robot keeps the message and sends it again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("the message was not stored")]
 pub struct NotStored;
 
-/// Receives what robots send.
+/// Receives messages from robots.
 pub trait Inbox: Send + Sync + 'static {
-    /// A message arrived. The robot gets its acknowledgement once this resolves to `Ok`; on `Err`,
-    /// or after [`Limits::inbox_timeout`], its connection is closed instead, so that it sends
-    /// again. A message whose content is nonsense must resolve to `Ok`, or the robot would send it
-    /// for ever. May be dropped half-way.
+    /// Handles a message. The robot gets its acknowledgement once this resolves to `Ok`; on `Err`,
+    /// or after [`Limits::inbox_timeout`], the connection is closed instead, so that the robot
+    /// sends again. A message with invalid content must resolve to `Ok`, or the robot would send it
+    /// for ever. The future may be dropped half-way.
     fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>>;
 
-    /// A robot's session is live: [`Broker::ring`] reaches it from now on, so this is the moment to
-    /// send its state. `connection` grows with every connection of this process. Any earlier
-    /// session of this robot has fully ended. An external broker does not tell the peer.
+    /// A robot's session is live: [`Broker::ring`] reaches the robot from now on, so this is the
+    /// moment to send its state. `connection` grows with every connection of this process. Any
+    /// earlier session of this robot has fully ended. With an external broker the peer is unknown.
     fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64);
 
-    /// The robot's session with this number has ended. Comes exactly once for each `connected`,
-    /// after it.
+    /// The robot's session with this number has ended. Called exactly once for each `connected`,
+    /// after that call.
     fn disconnected(&self, robot: &RobotId, connection: u64);
 
-    /// The external broker is back, and any robot may be at it already: [`Broker::ring`] each, so
-    /// that those who are there have their state and say so.
+    /// The external broker is reachable again, and any robot may already be connected there. Call
+    /// [`Broker::ring`] for each robot, so that connected robots get their state and report their
+    /// presence.
     fn everyone_may_be_there(&self);
 }
 
-/// Where the broker listens and what bounds it.
+/// The broker's listener and bounds.
 #[derive(Debug, Clone)]
 pub struct BrokerConfig {
     /// The listener's address; port 0 picks a free one.
     pub listen: SocketAddr,
-    /// What it speaks, if it encrypts.
+    /// The TLS configuration, if the listener encrypts.
     pub tls: Option<Tls>,
-    /// What all topics start with.
+    /// The prefix of all topics.
     pub prefix: TopicPrefix,
     /// The bounds.
     pub limits: Limits,
@@ -153,35 +156,36 @@ pub struct BrokerConfig {
     pub conduct: Arc<Conduct>,
 }
 
-/// Bounds on everything a client may take up.
+/// Bounds on every resource that a client can use.
 #[derive(Debug, Clone)]
 pub struct Limits {
-    /// Connections at a time, those not yet admitted included.
+    /// Maximum concurrent connections, including those not yet admitted.
     pub max_connections: usize,
-    /// Those of one address that have not sent CONNECT yet; a further one takes the place of the
-    /// oldest.
+    /// Maximum connections of one address that have not sent CONNECT yet. At the limit, the oldest
+    /// is closed to admit a new one.
     pub max_silent_per_address: usize,
-    /// Operators among them.
+    /// Maximum operators among the connections.
     pub max_operators: usize,
-    /// Sessions of one person among those.
+    /// Maximum sessions of one person among the operators.
     pub max_sessions_per_person: usize,
     /// The largest packet of an admitted client, in bytes after the fixed header.
     pub max_packet_bytes: usize,
-    /// Filters in one SUBSCRIBE that are looked at, and subscriptions of one client.
+    /// Maximum filters that are read from one SUBSCRIBE, and maximum subscriptions of one client.
     pub max_filters: usize,
-    /// From accepting a connection until its CONNECT must be complete.
+    /// Time limit from accepting a connection until its CONNECT is complete.
     pub connect_timeout: Duration,
-    /// How long the gatekeeper may think.
+    /// Time limit of the gatekeeper's decision.
     pub admit_timeout: Duration,
-    /// How long the inbox may take to store a message.
+    /// Time limit of the inbox for storing a message.
     pub inbox_timeout: Duration,
-    /// How long a client may leave our bytes unread.
+    /// Time limit for a client to read the bytes that we send.
     pub write_timeout: Duration,
-    /// When a client that asked for no keepalive is taken for gone.
+    /// Silence after which a client without a keepalive counts as gone.
     pub max_silence: Duration,
-    /// How often the watchdog sends its canary through the listener.
+    /// Interval at which the watchdog sends its canary through the listener.
     pub canary_interval: Duration,
-    /// How long each half of its way may take: to be let in, and to hear itself.
+    /// Time limit of each half of the canary's path: to be admitted, and to receive its own
+    /// message.
     pub canary_timeout: Duration,
 }
 
@@ -205,32 +209,32 @@ impl Default for Limits {
     }
 }
 
-/// How the broker is. Watch it; on [`Health::Failed`] the server should say so and end.
+/// The broker's health. On [`Health::Failed`] the server should report the failure and end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Health {
-    /// The canary came through.
+    /// The canary arrived.
     Serving,
-    /// It did not, and a remedy is under way; says what was seen.
+    /// The canary did not arrive, and a remedy is under way; contains the observation.
     Recovering(String),
-    /// The remedies are used up; says what was seen last.
+    /// The remedies are used up; contains the last observation.
     Failed(String),
 }
 
-/// Why the broker did not start.
+/// The reason why the broker did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum BrokerError {
-    /// The address is taken, or not ours.
+    /// The address is in use, or does not belong to this machine.
     #[error("cannot listen for MQTT on {address}")]
     Listen {
         /// The configured address.
         address: SocketAddr,
-        /// What the system said.
+        /// The operating system's error.
         source: std::io::Error,
     },
     /// The router thread did not come up.
     #[error("the message router did not start: {reason}")]
     Router {
-        /// What was seen.
+        /// The observed failure.
         reason: String,
     },
 }
@@ -240,13 +244,13 @@ pub enum BrokerError {
 #[error("the robot is not connected over MQTT")]
 pub struct NotConnected;
 
-/// Why a question did not go out.
+/// The reason why a question was not sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum NotAsked {
     /// The robot has no live session here.
     #[error("the robot is not connected over MQTT")]
     NotConnected,
-    /// Too many questions wait for it already.
+    /// Too many questions are already queued for the robot.
     #[error("the robot has not taken the questions before this one")]
     Busy,
 }
@@ -279,16 +283,16 @@ impl Broker {
         Ok(Self { kind: Kind::Embedded(front), health })
     }
 
-    /// Becomes a client of another broker, now or as soon as that can be reached. Its health is
-    /// never
-    /// [`Health::Failed`]: it mends by itself.
+    /// Becomes a client of another broker, now or as soon as the broker is reachable. The health is
+    /// never [`Health::Failed`], because the connection recovers by itself.
     pub fn connect(config: ExternalConfig, inbox: Arc<dyn Inbox>) -> Self {
         let (external, health) = External::start(config, inbox);
         Self { kind: Kind::External(external), health }
     }
 
-    /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits: one undelivered payload
-    /// is held for a robot, and a newer one takes its place, also before the robot has subscribed.
+    /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits. One undelivered payload
+    /// is held for each robot, and a newer one replaces the held one, also before the robot has
+    /// subscribed.
     pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
         match &self.kind {
             Kind::Embedded(front) => front.ring(robot, payload),
@@ -296,8 +300,8 @@ impl Broker {
         }
     }
 
-    /// Whether [`Broker::ring`] may reach the robot. An external broker does not say who listens:
-    /// all of them may.
+    /// Whether [`Broker::ring`] may reach the robot. An external broker does not tell us its
+    /// subscribers, so every robot counts as reachable.
     pub fn may_reach(&self, robot: &RobotId) -> bool {
         match &self.kind {
             Kind::Embedded(front) => front.has_session(robot),
@@ -305,22 +309,22 @@ impl Broker {
         }
     }
 
-    /// Whether robots hear all that is said to them from a broker that is not the server's own.
+    /// Whether robots receive all messages from a broker that is not the server's own.
     pub fn is_external(&self) -> bool {
         matches!(self.kind, Kind::External(_))
     }
 
-    /// Waits until many more may be rung.
+    /// Waits until there is room for many more notifications.
     pub async fn room(&self) {
         match &self.kind {
-            // Each session holds its own one, so there always is.
+            // Each session holds its own payload, so there is always room.
             Kind::Embedded(_) => {}
             Kind::External(external) => external.room().await,
         }
     }
 
-    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions that have not
-    /// gone out when the session ends are lost.
+    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions still queued
+    /// when the session ends are lost.
     pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
         match &self.kind {
             Kind::Embedded(front) => front.ask(robot, payload),
@@ -328,9 +332,9 @@ impl Broker {
         }
     }
 
-    /// Lets `robots` subscribe to `p/<digest>`, to hear the parts that are published from then on,
-    /// until the [`FanOut`] is dropped. Few packages at a time. At an external broker every robot
-    /// may subscribe at any time.
+    /// Lets `robots` subscribe to `p/<digest>` until the [`FanOut`] is dropped. They receive the
+    /// parts that are published from then on. Only a few packages can be open at a time. At an
+    /// external broker every robot may subscribe at any time.
     pub fn fan_out(
         &self,
         digest: Digest,
@@ -345,8 +349,8 @@ impl Broker {
         }
     }
 
-    /// The bytes of packages' parts that are held for listeners: the front's backlog. Those on
-    /// their way to an external broker are as few as its window.
+    /// The bytes of packages' parts that are held for subscribers: the front's backlog. For an
+    /// external broker, the parts in flight are bounded by its window.
     pub fn queued_part_bytes(&self) -> usize {
         match &self.kind {
             Kind::Embedded(front) => front.grants().queued_bytes(),
@@ -354,8 +358,8 @@ impl Broker {
         }
     }
 
-    /// Ends the robot's session, if it has one: its token was revoked or it was removed. At an
-    /// external broker nobody can be put out; the robot just counts as gone.
+    /// Ends the robot's session, if any: its token was revoked, or the robot was removed. At an
+    /// external broker we cannot close sessions; the robot only counts as gone.
     pub fn disconnect(&self, robot: &RobotId) {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect(robot),
@@ -363,8 +367,8 @@ impl Broker {
         }
     }
 
-    /// Serves a client whose connection somebody else has accepted, once `handshake` ends. False:
-    /// the broker is another one, or has no room.
+    /// Serves a client on a connection that another listener has accepted, once `handshake` ends.
+    /// Returns false if the broker is external or has no room.
     pub fn take_in<S>(
         &self,
         peer: SocketAddr,
@@ -379,16 +383,17 @@ impl Broker {
         }
     }
 
-    /// Ends the person's sessions: what they may has changed, or one of their tokens has ended.
+    /// Ends the person's sessions: the person's rights have changed, or one of the person's tokens
+    /// has ended.
     pub fn disconnect_person(&self, user: &UserName) {
         match &self.kind {
             Kind::Embedded(front) => front.disconnect_person(user),
-            // There they are not ours to know.
+            // An external broker does not tell us its sessions.
             Kind::External(_) => {}
         }
     }
 
-    /// What went over MQTT so far; with an external broker only over our own connection.
+    /// MQTT traffic so far; with an external broker, only that of our own connection.
     pub fn traffic(&self) -> MqttTraffic {
         match &self.kind {
             Kind::Embedded(front) => front.traffic(),
@@ -396,7 +401,7 @@ impl Broker {
         }
     }
 
-    /// What went over the robot's connection, if it has one and it is ours.
+    /// Traffic of the robot's connection, if the robot is connected to the embedded broker.
     pub fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
         match &self.kind {
             Kind::Embedded(front) => front.traffic_of(robot),
@@ -404,7 +409,8 @@ impl Broker {
         }
     }
 
-    /// What the robot's session listens to, if it has one and it is ours; sorted by filter.
+    /// The subscriptions of the robot's session, sorted by filter, if the robot is connected to the
+    /// embedded broker.
     pub fn subscriptions_of(&self, robot: &RobotId) -> Vec<Subscription> {
         match &self.kind {
             Kind::Embedded(front) => front.subscriptions_of(robot),
@@ -412,7 +418,7 @@ impl Broker {
         }
     }
 
-    /// How many robots are connected.
+    /// The number of connected robots.
     pub fn connected_count(&self) -> usize {
         match &self.kind {
             Kind::Embedded(front) => front.connected_count(),
@@ -420,7 +426,7 @@ impl Broker {
         }
     }
 
-    /// The listener's address as bound; none with an external broker.
+    /// The listener's address as bound; `None` with an external broker.
     pub fn local_addr(&self) -> Option<SocketAddr> {
         match &self.kind {
             Kind::Embedded(front) => Some(front.local_addr()),
@@ -428,8 +434,8 @@ impl Broker {
         }
     }
 
-    /// Where the broker is, `host:port`; of several external ones that which the server was
-    /// connected to last.
+    /// The broker's `host:port`; of several external brokers, the one that the server was connected
+    /// to last.
     pub fn address(&self) -> String {
         match &self.kind {
             Kind::Embedded(front) => front.local_addr().to_string(),
@@ -437,13 +443,13 @@ impl Broker {
         }
     }
 
-    /// How the broker is, now and from now on.
+    /// The broker's health, now and from now on.
     pub fn health(&self) -> watch::Receiver<Health> {
         self.health.clone()
     }
 
-    /// Stops accepting, ends every session of ours and waits until all have ended, at most for
-    /// `patience`.
+    /// Stops accepting, ends every session of the embedded broker and waits until all have ended,
+    /// at most for `patience`.
     pub async fn shutdown(&self, patience: Duration) {
         match &self.kind {
             Kind::Embedded(front) => front.shutdown(patience).await,

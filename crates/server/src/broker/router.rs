@@ -1,7 +1,7 @@
-//! Owns rumqttd's router thread: what is published here reaches every listener. It never sees a
-//! client's bytes, topics or filters unchecked, because its thread dies of some of them; and since
-//! the router keeps a log for each filter and a record for each link name for ever, it gets two
-//! filters and a fixed set of names. Listeners pick out what they want.
+//! Owns rumqttd's router thread: a message published here reaches every subscriber. The router
+//! never sees a client's bytes, topics or filters unchecked, because some of them kill its thread.
+//! The router also keeps a log for each filter and a record for each link name for ever, so we use
+//! two filters and a fixed set of names. Subscribers select their messages themselves.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -15,26 +15,26 @@ use task_proto::topic::TopicPrefix;
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
-/// What the watchdog's canary travels on. No prefix can contain a space, so it meets nobody else.
+/// The topic of the watchdog's canary. No prefix can contain a space, so there is no collision.
 pub(super) const CANARY_TOPIC: &str = "router canary";
-/// What the publishing link may have waiting; the router being this far behind, messages to
-/// listeners are dropped.
+/// Maximum backlog of the publishing link; when the router is this far behind, messages to
+/// subscribers are dropped.
 const MAX_BACKLOG: usize = 1000;
-/// The router's log for each of the two filters: so much may a listener fall behind before it
-/// misses messages.
+/// The router's log for each of the two filters: the maximum lag of a subscriber before messages
+/// are lost.
 const SEGMENT_BYTES: usize = 2 * 1024 * 1024;
 const SEGMENTS: usize = 4;
-/// Messages the router hands a listener at a time.
+/// Messages that the router hands a subscriber at a time.
 const MAX_BATCH: u64 = 32;
-/// Links besides the listeners': the publisher's, the canary's, and some that are just ending.
+/// Links besides the subscribers': the publisher's, the canary's, and some that are just ending.
 const OTHER_LINKS: usize = 16;
-/// For the router to answer a new link.
+/// Time limit for the router to answer a new link.
 const LINK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The router, also across restarts of its thread.
 pub(super) struct Router {
     everything: String,
-    /// The names that are free.
+    /// The free link names.
     slots: Mutex<Vec<usize>>,
     max_links: usize,
     listeners: AtomicUsize,
@@ -47,15 +47,15 @@ pub(super) struct Router {
 struct Running {
     connect: Connect,
     publisher: Mutex<LinkTx>,
-    /// Ends when another life has taken this one's place.
+    /// Cancelled when another thread has replaced this one.
     replaced: CancellationToken,
 }
 
-/// Builds a link by name, if the thread lives. It blocks. (The router's sender has a type that
-/// can't be named, so it lives in a closure.)
+/// Builds a link by name, if the thread lives. This call blocks. (The type of the router's sender
+/// can't be named, so a closure holds the sender.)
 type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 
-/// What a listener asks for.
+/// The topics of a subscriber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Listening {
     /// Everything below the prefix.
@@ -64,7 +64,7 @@ pub(super) enum Listening {
     Canary,
 }
 
-/// A message as it comes out of the router.
+/// A message from the router.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Heard {
     pub(super) topic: String,
@@ -72,7 +72,7 @@ pub(super) struct Heard {
     pub(super) qos: QoS,
 }
 
-/// Why there is no listener, or no longer.
+/// The reason why there is no subscriber, or why a subscription has ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum RouterError {
     #[error("the router's thread has ended")]
@@ -103,7 +103,7 @@ impl Router {
         }))
     }
 
-    /// Starts over with a new thread. Listeners of the old one find that it is gone.
+    /// Replaces the thread by a new one. Subscribers of the old thread see that it is gone.
     pub(super) async fn restart(&self) -> Result<(), RouterError> {
         let running = Arc::new(Running::start(&self.everything, self.max_links).await?);
         let before = std::mem::replace(&mut *lock(&self.current), running);
@@ -111,8 +111,8 @@ impl Router {
         Ok(())
     }
 
-    /// Publishes to whoever listens now. It never waits; what a router in trouble can't take is
-    /// dropped, and the watchdog told.
+    /// Publishes to all current subscribers. Never waits; messages that a failing router can't take
+    /// are dropped, and the watchdog is told.
     pub(super) fn publish(&self, topic: &str, qos: QoS, payload: Bytes) {
         if topic != CANARY_TOPIC && self.listeners.load(Ordering::Relaxed) == 0 {
             return;
@@ -128,14 +128,13 @@ impl Router {
         let mut publisher = lock(&running.publisher);
         let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
         if !is_behind {
-            // Inside the router all is QoS 0, so the real one travels as one more level of the
-            // topic.
+            // Inside the router all messages are QoS 0, so the real QoS travels as one more level
+            // of the topic.
             let message =
                 Publish::new(Bytes::from(format!("{topic}/{}", qos as u8)), payload, false);
             publisher.buffer().push_back(Packet::Publish(message, None));
         }
-        // Says that there is something in the buffer; a full channel has many such notes in it
-        // already.
+        // Signals that the buffer is not empty; a full channel already contains many such notes.
         if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) =
             publisher.try_unsubscribe(NOTHING)
         {
@@ -153,7 +152,7 @@ impl Router {
         self.dropped.load(Ordering::Relaxed)
     }
 
-    /// A new listener, which hears what is published from now on.
+    /// A new subscriber, which receives messages published from now on.
     pub(super) async fn listen(
         self: &Arc<Self>,
         listening: Listening,
@@ -172,12 +171,13 @@ impl Router {
         Ok(listener)
     }
 
-    /// Returns when something was seen that only a dead router explains.
+    /// Returns when an observation proves that the router is dead.
     pub(super) async fn trouble(&self) {
         self.trouble.notified().await;
     }
 
-    /// Kills the router's thread the way a client once could: by a topic that is not ASCII.
+    /// Kills the router's thread in the same way as a client once could: by a topic that is not
+    /// ASCII.
     #[cfg(test)]
     pub(super) fn kill(&self) {
         let running = lock(&self.current).clone();
@@ -185,7 +185,7 @@ impl Router {
     }
 }
 
-/// A filter that nobody subscribes to.
+/// A filter without subscribers.
 const NOTHING: &str = "";
 
 impl Running {
@@ -208,11 +208,11 @@ impl Running {
     }
 }
 
-/// A link to the router's thread, which hears of it when this is dropped.
+/// A link to the router's thread, which is notified when the link is dropped.
 struct Link {
     tx: Option<LinkTx>,
     rx: LinkRx,
-    /// Free again only after the router was told that the link is gone.
+    /// Freed only after the router was told that the link is gone.
     _place: Option<Place>,
 }
 
@@ -224,11 +224,11 @@ impl Link {
     ) -> Result<Self, RouterError> {
         let (reply, answer) = oneshot::channel();
         let connect = connect.clone();
-        // A thread of its own: if the router dies just now this waits for ever, and the runtime
+        // A separate thread: if the router dies now, this call waits for ever, and the runtime
         // would wait with it.
         std::thread::spawn(move || {
             let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _place: place });
-            // If nobody waits any more, the link is dropped, and so closed, right here.
+            // If the receiver is gone, the link is dropped, and so closed, right here.
             let _ = reply.send(link);
         });
         match tokio::time::timeout(LINK_TIMEOUT, answer).await {
@@ -245,13 +245,14 @@ impl Drop for Link {
         let reason_code = DisconnectReasonCode::NormalDisconnection;
         tx.buffer().push_back(Packet::Disconnect(Disconnect { reason_code }, None));
         if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NOTHING) {
-            // The router is busy and must not miss this: wait for it where waiting holds up nobody.
+            // The router is busy and must not miss this: wait in a thread that holds up nothing
+            // else.
             std::thread::spawn(move || tx.unsubscribe(NOTHING).is_ok());
         }
     }
 }
 
-/// One of the names that listeners' links have, free again when this is dropped.
+/// One of the names of subscribers' links, freed when this is dropped.
 struct Place {
     router: Arc<Router>,
     slot: usize,
@@ -272,11 +273,11 @@ impl Drop for Place {
     }
 }
 
-/// Hears what is published.
+/// Receives published messages.
 pub(super) struct Listener {
     link: Link,
     replaced: CancellationToken,
-    /// The router waits to be told that what it handed over was taken.
+    /// The router waits for the confirmation that its last batch was taken.
     owes_ready: bool,
 }
 

@@ -1,6 +1,6 @@
 //! Watches the router: every few seconds a canary logs in through the real listener, publishes and
-//! must hear itself. A router that is dead or stuck is started anew; what that does not cure is
-//! given up on, and the server told.
+//! must receive its own message. A dead or stuck router is restarted. If that does not help, the
+//! watchdog gives up and tells the server.
 
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
@@ -21,9 +21,9 @@ use super::router::{CANARY_TOPIC, Router};
 use super::{Health, Limits};
 use crate::net::tls::Tls;
 
-/// Remedies tried in a row before the watchdog gives up.
+/// Consecutive remedies before the watchdog gives up.
 const MAX_REMEDIES: u32 = 3;
-/// More than any packet the canary gets.
+/// Larger than any packet that the canary receives.
 const MAX_PACKET_BYTES: usize = 1024;
 
 /// Starts watching; the receiver always has the latest finding.
@@ -55,17 +55,17 @@ struct Watchdog {
     flights: u64,
 }
 
-/// Why a canary did not come back, by what helps.
+/// The reason why a canary did not come back, by its remedy.
 #[derive(Debug, thiserror::Error)]
 enum Lost {
-    /// Nothing helps, if it lasts.
+    /// No remedy helps, if the failure lasts.
     #[error("the MQTT listener does not accept connections")]
     Listener(#[source] DialError),
     /// Time helps: the watchdog has no connection of its own, as when too many files are open. That
-    /// says nothing of the listener.
+    /// is no evidence about the listener.
     #[error("the watchdog can't open a connection to the MQTT listener")]
     Dial(#[source] DialError),
-    /// Time helps: too many connections, too much to do. A new router would only make it worse.
+    /// Time helps: too many connections, or overload. A new router would only increase the load.
     #[error("the MQTT front did not let the watchdog in: {0}")]
     Front(&'static str),
     /// A new router helps.
@@ -74,20 +74,20 @@ enum Lost {
 }
 
 impl Lost {
-    /// What a failed attempt to connect says.
+    /// Classifies a failed attempt to connect.
     fn by(error: DialError) -> Self {
         let refused = io::ErrorKind::ConnectionRefused;
         let is_refused =
             matches!(&error, DialError::Connect { source, .. } if source.kind() == refused);
         match error {
             error if is_refused => Self::Listener(error),
-            // As when the front closes a connection that it has no place for.
+            // For example, the front closes a connection for which it has no room.
             DialError::Tls { .. } => Self::Front("the connection broke"),
             error => Self::Dial(error),
         }
     }
 
-    /// Whether it may mean the end of the server, if it lasts.
+    /// Whether the failure may end the server, if it lasts.
     fn is_grave(&self) -> bool {
         matches!(self, Self::Listener(_) | Self::Router(_))
     }
@@ -135,7 +135,7 @@ impl Watchdog {
             .send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
     }
 
-    /// One canary, there and back.
+    /// Sends one canary and waits for its message.
     async fn fly(&mut self) -> Result<(), Lost> {
         self.flights += 1;
         let patience = self.limits.canary_timeout;
@@ -146,7 +146,7 @@ impl Watchdog {
     }
 }
 
-/// The smallest MQTT client that can sing.
+/// A minimal MQTT client for the canary.
 struct Bird {
     stream: Box<dyn Duplex>,
     input: BytesMut,
@@ -162,7 +162,7 @@ impl Bird {
         match bird.ask(Packet::Connect(connect, None, None, None, Some(login))).await {
             Some(Packet::ConnAck(ack, _)) => match ack.code {
                 ConnectReturnCode::Success => Ok(bird),
-                // The one thing the front needs for a canary is a link to the router.
+                // The only resource that the front needs for a canary is a link to the router.
                 ConnectReturnCode::ServiceUnavailable => {
                     Err(Lost::Router("it answers no new link"))
                 }
@@ -193,7 +193,7 @@ impl Bird {
         }
     }
 
-    /// Sends a packet and gives back the next that arrives; `None` if the connection breaks.
+    /// Sends a packet and returns the next one that arrives; `None` if the connection breaks.
     async fn ask(&mut self, packet: Packet) -> Option<Packet> {
         let mut output = BytesMut::new();
         V4.write(packet, &mut output).ok()?;
@@ -218,7 +218,7 @@ fn route(front: &Front) -> Route {
     Route { host: address.ip().to_string(), port: address.port(), tls, websocket: None }
 }
 
-/// Where a listener on `bound` is reached from this machine.
+/// The address at which this machine reaches a listener bound to `bound`.
 fn reachable(bound: SocketAddr) -> SocketAddr {
     let ip = match bound.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),

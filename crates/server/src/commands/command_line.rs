@@ -1,5 +1,5 @@
-//! The command line of `taskd` as a whole: what `main` parses, what shells complete and what the
-//! man pages are made of.
+//! The command line of `taskd` as a whole: the input of `main`, of shell completion and of the man
+//! pages.
 
 use std::ffi::OsString;
 
@@ -36,7 +36,7 @@ pub enum Command {
 }
 
 impl CommandLine {
-    /// What was typed, and what the environment adds.
+    /// The typed arguments, with defaults from the environment.
     pub fn read(
         words: impl IntoIterator<Item = impl Into<OsString> + Clone>,
     ) -> Result<Self, clap::Error> {
@@ -48,7 +48,7 @@ impl CommandLine {
         Ok(read)
     }
 
-    /// The same as clap's own description of it.
+    /// The command line as clap's own description.
     pub fn describe() -> clap::Command {
         Self::command()
     }

@@ -1,5 +1,5 @@
-//! `taskd completions` and `taskd man`: what a packager installs beside the program. Both are made
-//! of the command line itself, so they can't tell of anything that is not there.
+//! `taskd completions` and `taskd man`: documents that a packager installs beside the program. Both
+//! are generated from the command line itself, so they can't describe missing options.
 
 use std::path::PathBuf;
 
@@ -35,7 +35,8 @@ pub struct ManOrder {
     directory: PathBuf,
 }
 
-/// Prints the script for a shell. It asks this program, by its name in PATH, at each completion.
+/// Prints the script for a shell. The script calls this program, by its name in PATH, at each
+/// completion.
 pub(super) fn completions(order: &CompletionsOrder) -> Result<Outcome, CommandError> {
     let name = match order.shell {
         Shell::Bash => "bash",

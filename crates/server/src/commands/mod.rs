@@ -124,7 +124,7 @@ pub enum Command {
         #[command(subcommand)]
         action: token::Action,
     },
-    /// Make, list or revoke the tokens that robots enrol with
+    /// Make, list or revoke the tokens that robots enroll with
     EnrollToken {
         /// What to do.
         #[command(subcommand)]
@@ -184,22 +184,22 @@ pub struct Connection {
     pub output: Format,
 }
 
-/// How a command ended.
+/// The result of a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
-    /// Everything that was asked for.
+    /// The whole request succeeded.
     Succeeded,
-    /// It did not work, or no robot succeeded.
+    /// The command failed, or no robot succeeded.
     Failed,
-    /// The command line or the package is wrong, or no robot is meant.
+    /// The command line or the package is invalid, or no robot is selected.
     Usage,
     /// Some robots succeeded, others failed.
     SomeFailed,
     /// The server does not let this token do that.
     NotAllowed,
-    /// It was not done in time.
+    /// The time limit was reached.
     TimedOut,
-    /// Ctrl-C, while it waited.
+    /// Ctrl-C during a wait.
     Interrupted,
 }
 
@@ -212,7 +212,7 @@ impl From<Outcome> for ExitCode {
             Outcome::SomeFailed => 3,
             Outcome::NotAllowed => 4,
             Outcome::TimedOut => 5,
-            // As a shell says of a program that SIGINT has ended.
+            // The exit code of a program ended by SIGINT, by the shell's convention.
             Outcome::Interrupted => 130,
         })
     }
@@ -221,7 +221,7 @@ impl From<Outcome> for ExitCode {
 /// Why a command could not do its work.
 #[derive(Debug, thiserror::Error)]
 pub enum CommandError {
-    /// The server refused, or could not be asked.
+    /// The server refused the request, or could not be reached.
     #[error(transparent)]
     Client(#[from] ClientError),
     /// The directory is not a package that could run.
@@ -230,7 +230,7 @@ pub enum CommandError {
     /// A key can't be used.
     #[error(transparent)]
     Key(#[from] KeyError),
-    /// The command line asks for something that makes no sense.
+    /// The command line is inconsistent.
     #[error("{0}")]
     Usage(String),
     /// The audit's chain does not hold.
@@ -239,9 +239,9 @@ pub enum CommandError {
     /// A local file or stream.
     #[error("{what}")]
     Io {
-        /// What was being done.
+        /// The failed operation.
         what: String,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
 }
@@ -258,7 +258,7 @@ impl CommandError {
     }
 }
 
-/// Runs one command to its end. Results are on stdout, everything else has been said on stderr.
+/// Runs one command to its end. Results are on stdout, messages on stderr.
 pub async fn run(
     connection: &Connection,
     command: Command,
@@ -316,15 +316,15 @@ async fn dispatch(
     }
 }
 
-/// What every command that asks the server has at hand.
+/// State shared by all commands that use the server.
 pub(crate) struct Session {
     client: Client,
     output: Output,
 }
 
 impl Connection {
-    /// Who types a directory means its server, not the one that is in the environment; what goes
-    /// with that one is not for this one.
+    /// A typed directory means that directory's server, not the one from the environment; the
+    /// environment's token and pin belong to the latter and are dropped.
     pub(crate) fn prefer_what_is_typed(&mut self, is_typed: impl Fn(&str) -> bool) {
         if is_typed("data") && !is_typed("server") && self.server.take().is_some() {
             self.token.take_if(|_| !is_typed("token"));

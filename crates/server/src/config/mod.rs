@@ -1,8 +1,8 @@
 //! Owns the server's settings and where they come from; it never creates anything.
 //!
 //! Settings come from flags, then `TASKD_*` variables, then a TOML file, then defaults. One table
-//! names every setting, so the sources can't drift apart. The file is read and host names are
-//! resolved here.
+//! names every setting, so the sources can't drift apart. This module also reads the file and
+//! resolves host names.
 
 mod oidc;
 mod settings;
@@ -28,94 +28,94 @@ use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
 use crate::domain::delivery::{Rule, Rules};
 use crate::limits::conduct::ConductLimits;
 
-/// Everything `taskd serve` can be told.
+/// All settings of `taskd serve`.
 #[derive(Debug, Clone)]
 pub struct Config {
     /// The directory that holds all state.
     pub data: PathBuf,
-    /// Where HTTP listens; port 0 takes a free one.
+    /// The HTTP listener's address; port 0 picks a free port.
     pub http: SocketAddr,
-    /// Where MQTT listens; port 0 takes a free one.
+    /// The MQTT listener's address; port 0 picks a free port.
     pub mqtt: SocketAddr,
-    /// The MQTT brokers to be a client of, one at a time; absent: the server's own, which listens
-    /// at `mqtt`.
+    /// The external MQTT brokers, used one at a time; absent: the embedded broker, which listens at
+    /// `mqtt`.
     pub broker: Option<BrokerUrls>,
-    /// The authority behind its certificate; absent: the system's roots vouch for it.
+    /// The pinned authority of the external broker's certificate; absent: the system's roots.
     pub broker_pin: Option<CaPin>,
     /// The database's URL; absent: SQLite in the data directory.
     pub database: Option<String>,
-    /// How often a SQLite database is checked in full.
+    /// Interval between full checks of a SQLite database.
     pub database_check_interval: Duration,
-    /// What all MQTT topics start with.
+    /// The prefix of all MQTT topics.
     pub topic_prefix: TopicPrefix,
     /// Whether unencrypted listeners may be reached from other machines.
     pub allow_plaintext: bool,
     /// Whether and how the listeners encrypt.
     pub tls: TlsSettings,
-    /// How long an assignment may stay undone.
+    /// Time after which an assignment that is not done expires.
     pub assignment_expiry: Duration,
-    /// How long a signed desired state allows new work to be begun.
+    /// How long a signed desired state permits a robot to begin new work.
     pub desired_lifetime: Duration,
-    /// The MQTT host robots are told; absent: the host of the URL they already use.
+    /// The MQTT host that is announced to robots; absent: the host of the URL that they already
+    /// use.
     pub public_mqtt_host: Option<String>,
-    /// The MQTT port robots are told; absent: the one that is bound.
+    /// The MQTT port that is announced to robots; absent: the bound port.
     pub public_mqtt_port: Option<u16>,
-    /// After how long a silent robot that polls counts as offline; robots poll every 10 s unless
-    /// told otherwise.
+    /// Silence after which a polling robot counts as offline. Robots poll every 10 s by default.
     pub presence_timeout: Duration,
     /// How blobs are read.
     pub blob_read: BlobRead,
-    /// How long an unfinished upload or an unreferenced blob is kept.
+    /// Retention of an unfinished upload or an unreferenced blob.
     pub blob_grace: Duration,
-    /// The most HTTP connections at once; more wait in the listener's backlog.
+    /// Maximum concurrent HTTP connections; more wait in the listener's backlog.
     pub max_http_connections: usize,
-    /// The most MQTT connections at once; more are refused.
+    /// Maximum concurrent MQTT connections; more are refused.
     pub max_mqtt_connections: usize,
-    /// The most connections of one address that have shown no good token yet, over MQTT sent no
-    /// CONNECT; the oldest is closed for a further one.
+    /// Maximum unauthenticated connections of one address: over HTTP without a valid token, over
+    /// MQTT before CONNECT. At the limit, the oldest is closed to admit a new one.
     pub max_silent_per_address: usize,
-    /// The addresses of reverse proxies that are believed about where a request came from.
+    /// The addresses of reverse proxies whose forwarded client addresses are trusted.
     pub trusted_proxies: Vec<IpAddr>,
-    /// By which provider people may sign in; without an issuer by none.
+    /// The OpenID provider for sign-ins; without an issuer, such sign-ins are off.
     pub oidc: OidcSettings,
-    /// The most bytes one blob may have.
+    /// Maximum size of one blob, in bytes.
     pub max_blob_bytes: u64,
-    /// The most bytes that are unpacked of a package that comes as a directory.
+    /// Maximum unpacked size of a package that is uploaded as a directory, in bytes.
     pub max_upload_bytes: u64,
-    /// The most bytes that are kept of what one robot brings back; absent: 40 GB, or less on a
-    /// small disk.
+    /// Maximum bytes stored of one robot's uploaded outputs; absent: 40 GB, or less on a small
+    /// disk.
     pub max_robot_bytes: Option<u64>,
     /// How packages travel to robots.
     pub delivery: DeliverySettings,
-    /// What bounds the transfers of packages over HTTP.
+    /// The bounds on transfers of packages over HTTP.
     pub transfers: TransferLimits,
-    /// What a robot may send.
+    /// The rate limits for robots.
     pub robots: ConductLimits,
-    /// What a person may ask for.
+    /// The rate limits for people.
     pub people: PersonRates,
     /// Whether every new robot waits to be approved.
     pub enrolment_approval: bool,
-    /// How many robots an enrolment token is good for whose maker does not say.
+    /// The default number of robots that one enrollment token admits.
     pub enrolment_uses: u64,
-    /// How many robots may enrol in a minute; by one token half of them.
+    /// Maximum enrollments in a minute; one token may use half of them.
     pub enrolment_per_minute: u64,
-    /// What people's packages and uploads leave free on the disk; absent: a fortieth of it, 1 GB at
-    /// most.
+    /// Disk space that people's packages and uploads must leave free; absent: a fortieth of the
+    /// disk, 1 GB at most.
     pub disk_reserve: Option<u64>,
 }
 
 /// `[delivery]`: how packages travel to robots.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeliverySettings {
-    /// The size of a part in direct-push. A package that is not larger travels as one message.
+    /// The size of a part in direct-push. A package up to this size travels as one message.
     pub part_bytes: u32,
     /// The MQTT quality of service of parts: 0, 1 or 2.
     pub qos: u8,
-    /// The most bytes of a package that ride inside an announcement.
+    /// Maximum bytes of a package that are embedded in an announcement.
     pub inline_bytes: u32,
-    /// The label whose value says on which site a robot is.
+    /// The label whose value names a robot's site.
     pub site_label: LabelKey,
-    /// The operator's own rules, the first first.
+    /// The operator's own rules, in order of precedence.
     pub own_rules: Vec<Rule>,
 }
 
@@ -138,16 +138,16 @@ impl Default for DeliverySettings {
     }
 }
 
-/// How the blob handler gets at a file's bytes.
+/// How the blob handler reads a file's bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlobRead {
     /// Through the page cache, mapped into memory: fastest.
     Mmap,
-    /// By positioned reads: a disk error is an error instead of a signal.
+    /// By positioned reads: a disk error is returned as an error and does not raise a signal.
     Pread,
 }
 
-/// Where a setting was read.
+/// The source of a setting.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Origin {
     /// A command line flag.
@@ -173,21 +173,21 @@ impl std::fmt::Display for Origin {
     }
 }
 
-/// Settings that can't be used.
+/// A reason for rejecting the settings.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// A value does not parse.
     #[error("{origin}: {reason}")]
     Value {
-        /// Where it stands.
+        /// The source of the value.
         origin: Origin,
-        /// What is wrong with it.
+        /// The error in the value.
         reason: String,
     },
     /// A setting that does not exist.
     #[error("{origin}: there is no such setting{hint}")]
     Unknown {
-        /// Where it stands.
+        /// The source of the setting.
         origin: Origin,
         /// The setting that was probably meant, if one is close.
         hint: String,
@@ -195,65 +195,65 @@ pub enum ConfigError {
     /// The file can't be read.
     #[error("can't read the configuration file {}", path.display())]
     Unreadable {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: std::io::Error,
     },
     /// The file is not TOML.
     #[error("{} is not valid TOML: {reason}", path.display())]
     Syntax {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Where and why.
+        /// The position and the error.
         reason: String,
     },
-    /// No data directory is given and there is no home to put it in.
+    /// No data directory is given and there is no home directory for the default.
     #[error(
         "--data: no directory is given, and neither XDG_DATA_HOME nor HOME says where to put one"
     )]
     NoDataDirectory,
-    /// A password stands where every user of the machine can read it.
+    /// A password is in a place that every user of the machine can read.
     #[error(
         "--{name}: everybody on this machine can read a command line, so a URL with a password belongs in the \
          configuration file ({name} = \"…\") or in TASKD_{upper}", upper = name.to_uppercase()
     )]
     PasswordInSight {
-        /// Which setting.
+        /// The setting.
         name: &'static str,
     },
-    /// One public place, where robots are told several brokers.
+    /// One public address is set, but robots use several brokers.
     #[error(
         "public_mqtt_host and public_mqtt_port name one place, and broker names several; robots are told the hosts and \
          ports in broker"
     )]
     OnePlaceForSeveralBrokers,
-    /// The broker's password would cross the network readable.
+    /// The broker's password would cross the network unencrypted.
     #[error(
         "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
          give --allow-plaintext"
     )]
     PlaintextBroker {
-        /// Where the broker is.
+        /// The broker's address.
         address: String,
     },
     /// A certificate without its key, or the other way round.
     #[error("{given}: {missing} is missing")]
     HalfACertificate {
-        /// The setting there is.
+        /// The setting that is present.
         given: &'static str,
-        /// The one there is not.
+        /// The setting that is missing.
         missing: &'static str,
     },
-    /// Keys can't be shown where nobody shakes hands.
+    /// Client certificates need a TLS handshake, and the listeners do not encrypt.
     #[error(
         "tls.client_certificates: robots can't show their keys to a server that does not encrypt; set tls.private_ca"
     )]
     KeysInPlainText,
-    /// The provider can't be used without it.
+    /// The provider can't be used without this setting.
     #[error("{missing} is missing, and signing in by a provider does not work without it")]
     OidcIncomplete {
-        /// The setting there is not.
+        /// The setting that is missing.
         missing: &'static str,
     },
     /// An unencrypted listener would be reachable from other machines.
@@ -262,19 +262,19 @@ pub enum ConfigError {
          bind a loopback address or give --allow-plaintext"
     )]
     Plaintext {
-        /// Which listener.
+        /// The listener's setting.
         key: &'static str,
         /// Its address.
         address: SocketAddr,
     },
 }
 
-/// Variables that other commands and tasks use; `serve` is not confused by finding them.
+/// Variables that other commands and tasks use; `serve` ignores them.
 const FOREIGN_VARIABLES: [&str; 5] =
     ["TASKD_SERVER", "TASKD_TOKEN", "TASKD_PIN", "TASKD_ASSIGNMENT", "TASKD_LOG"];
-/// What the test suite's own variables start with.
+/// The prefix of the test suite's own variables.
 const TEST_VARIABLES: &str = "TASKD_TEST_";
-/// The largest configuration file that is read.
+/// Maximum size of a configuration file.
 const MAX_FILE_BYTES: u64 = 1024 * 1024;
 
 impl Config {
@@ -318,8 +318,8 @@ impl Config {
         }
     }
 
-    /// Merges the sources. `environment` is the process's, handed in so that tests need not change
-    /// it.
+    /// Merges the sources. `environment` is the process's environment, passed in so that tests need
+    /// not change it.
     pub fn load(
         flags: &ServeFlags,
         environment: impl IntoIterator<Item = (OsString, OsString)>,
@@ -349,7 +349,7 @@ impl Config {
         Ok(config)
     }
 
-    /// Refuses settings that do not go together.
+    /// Refuses settings that contradict each other.
     fn check(&self) -> Result<(), ConfigError> {
         self.oidc.check()?;
         let is_exposed =
@@ -387,9 +387,9 @@ impl Config {
         self.tls.encrypts(self.reached_from_elsewhere().is_some(), self.allow_plaintext)
     }
 
-    /// A listener that is reached from other machines.
+    /// The first listener that other machines can reach.
     fn reached_from_elsewhere(&self) -> Option<(&'static str, SocketAddr)> {
-        // Nothing listens for MQTT beside an external broker.
+        // With an external broker there is no MQTT listener.
         let mqtt = self.broker.is_none().then_some(("mqtt", self.mqtt));
         [("http", self.http)]
             .into_iter()
@@ -412,7 +412,7 @@ impl Config {
         }
         let text = std::fs::read_to_string(path).map_err(unreadable)?;
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            // Not the line itself, which may hold a password.
+            // The line itself is left out, because it may contain a password.
             let line = error
                 .span()
                 .map(|span| text[..span.start.min(text.len())].matches('\n').count() + 1);
@@ -434,7 +434,7 @@ impl Config {
         Ok(())
     }
 
-    /// A setting from a file. `key` is its name all in one, `origin` where it stands.
+    /// Applies a setting from a file. `key` is the full name, `origin` the place in the file.
     fn apply_value(
         &mut self,
         key: &str,
@@ -491,7 +491,7 @@ impl Config {
     }
 }
 
-/// The data directory of someone who names none.
+/// The default data directory.
 pub fn default_data_directory(variable: impl Fn(&str) -> Option<OsString>) -> Option<PathBuf> {
     let set = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let base =
@@ -551,7 +551,7 @@ impl clap::FromArgMatches for ServeFlags {
     }
 }
 
-/// Reads a time that something may last: not nothing, and at most ten years.
+/// Parses a duration that must be positive and at most ten years.
 pub fn lifetime(text: &str) -> Result<Duration, String> {
     const MOST: Duration = Duration::from_secs(3650 * 24 * 60 * 60);
     match parse_duration(text) {
@@ -562,7 +562,7 @@ pub fn lifetime(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Reads how many, which is at least one.
+/// Parses a count that must be at least one.
 pub fn at_least_one(text: &str) -> Result<u64, String> {
     text.parse()
         .ok()
@@ -570,7 +570,7 @@ pub fn at_least_one(text: &str) -> Result<u64, String> {
         .ok_or_else(|| "expected a whole number, 1 or more".to_owned())
 }
 
-/// Reads a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means
+/// Parses a whole number with a unit of time: `ms`, `s`, `m`, `h` or `d`. A number alone means
 /// seconds.
 pub fn parse_duration(text: &str) -> Option<Duration> {
     let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
@@ -586,7 +586,7 @@ pub fn parse_duration(text: &str) -> Option<Duration> {
     number.checked_mul(unit_ms).map(Duration::from_millis)
 }
 
-/// A suggestion for a mistyped key: the setting that shares its first letters or contains it.
+/// A suggestion for a mistyped key: the setting that shares its first letters or contains the key.
 fn nearest(key: &str) -> String {
     let shared = |other: &str| key.bytes().zip(other.bytes()).take_while(|(a, b)| a == b).count();
     let best = SETTINGS.iter().map(Setting::key).max_by_key(|other| shared(other));
@@ -597,7 +597,7 @@ fn nearest(key: &str) -> String {
 }
 
 /// Whether a database's URL has a password: `user:password@`, or in its query. A file's name may
-/// hold an `@`.
+/// contain an `@`.
 fn has_password(url: &str) -> bool {
     let Some(("postgres" | "postgresql", rest)) = url.split_once("://") else { return false };
     let (place, query) = rest.split_once('?').unwrap_or((rest, ""));

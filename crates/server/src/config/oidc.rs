@@ -1,6 +1,5 @@
-//! `[oidc]`: the OpenID Connect provider by which people may sign in, and `[[oidc.rules]]`, which
-//! give them what they may do by what the provider says of them. Without a rule that fits nobody
-//! may anything.
+//! `[oidc]`: the OpenID Connect provider for sign-ins, and `[[oidc.rules]]`, which map the
+//! provider's claims to rights. A user without a matching rule has no rights.
 
 use std::path::PathBuf;
 
@@ -10,42 +9,42 @@ use task_proto::selector::Selector;
 
 use super::ConfigError;
 
-/// The most rules.
+/// Maximum number of rules.
 const MAX_RULES: usize = 256;
-/// The longest claim or value of a rule.
+/// Maximum length of a rule's claim or value.
 const MAX_TEXT_BYTES: usize = 1024;
 
-/// `[oidc]`. It is there if an issuer is.
+/// `[oidc]`. Active if an issuer is set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OidcSettings {
-    /// The provider's URL, as it says it itself.
+    /// The provider's URL, exactly as the provider states it.
     pub issuer: String,
-    /// What the provider calls this server.
+    /// The provider's id of this server.
     pub client_id: String,
-    /// The file with what they share; absent: the client is a public one.
+    /// The file with the shared secret; absent: the client is a public one.
     pub client_secret_file: Option<PathBuf>,
-    /// Where browsers reach this server, without a path.
+    /// The URL at which browsers reach this server, without a path.
     pub public_url: String,
-    /// What is asked for.
+    /// The requested scopes.
     pub scopes: String,
-    /// The claim that is a new user's name.
+    /// The claim that becomes a new user's name.
     pub name_claim: String,
-    /// What the page calls the provider.
+    /// The page's name for the provider.
     pub title: String,
-    /// What somebody may do; the first that fits decides.
+    /// The role rules; the first matching rule decides.
     pub rules: Vec<RoleRule>,
 }
 
-/// `[[oidc.rules]]`: who has this claim has these roles.
+/// `[[oidc.rules]]`: a user with this claim has these roles.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct RoleRule {
-    /// The claim's name, or the path to it.
+    /// The claim's name, or its path.
     pub claim: String,
-    /// Its value, or one of its values.
+    /// The claim's value, or one of its values.
     pub value: String,
-    /// What they may do.
+    /// The roles of the user.
     pub roles: Roles,
-    /// To which robots they are limited; `None`: to none.
+    /// The robots to which the roles are limited; `None`: no limit.
     pub robots: Option<Selector>,
 }
 
@@ -65,13 +64,12 @@ impl Default for OidcSettings {
 }
 
 impl OidcSettings {
-    /// Where the provider sends the browser back to. It has to know this address.
+    /// The redirect URI for the browser. The provider has to know this address.
     pub fn redirect_uri(&self) -> String {
         format!("{}/api/v1/oidc/callback", self.public_url)
     }
 
-    /// The settings if there are any; an error if something is missing that they don't work
-    /// without.
+    /// Checks the settings, if there are any: an error if a required one is missing.
     pub(super) fn check(&self) -> Result<(), ConfigError> {
         if *self == Self::default() {
             return Ok(());
@@ -91,13 +89,13 @@ impl OidcSettings {
     }
 }
 
-/// What is wrong, and with which key below the table.
+/// An error, and the key below the table.
 pub(super) struct Wrong {
     pub(super) key: String,
     pub(super) reason: String,
 }
 
-/// A URL where nobody reads along: `https`, or on this machine.
+/// A URL that is safe from eavesdroppers: `https`, or on this machine.
 pub fn private_url(text: &str) -> Result<String, String> {
     let url = Url::parse(text).map_err(|_| format!("{text:?} is not a URL"))?;
     let is_local = matches!(url.host_str(), Some("localhost" | "127.0.0.1" | "[::1]"));
@@ -112,7 +110,7 @@ pub fn private_url(text: &str) -> Result<String, String> {
     Ok(text.to_owned())
 }
 
-/// Where browsers reach the server: scheme, host and port.
+/// The server's public origin: scheme, host and port.
 pub(super) fn public_url(text: &str) -> Result<String, String> {
     let url = Url::parse(text).ok().filter(|url| matches!(url.scheme(), "http" | "https"));
     let url =

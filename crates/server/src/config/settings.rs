@@ -1,5 +1,5 @@
-//! The one table of all settings that have a flag, a variable and a key in the file, and how their
-//! values are read.
+//! The one table of all settings that have a flag, a variable and a key in the file, and the
+//! parsers of their values.
 
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
@@ -430,7 +430,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     },
 ];
 
-/// The most that may ride inside an announcement: in base64 it still fits, beside a state of a few
+/// Maximum bytes embedded in an announcement: in base64 they still fit, beside a state of a few
 /// tasks.
 const MAX_INLINE_BYTES: u64 = 64 * 1024;
 
@@ -471,7 +471,7 @@ fn host_names(text: &str) -> Result<Vec<String>, String> {
 fn database_url(text: &str) -> Result<String, String> {
     let known =
         ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
-    // The URL may hold a password: it is not repeated.
+    // The URL may contain a password, so the message does not repeat the URL.
     if known {
         Ok(text.to_owned())
     } else {
@@ -486,8 +486,8 @@ fn count(text: &str, most: u64) -> Result<u64, String> {
     }
 }
 
-/// Reads a number of bytes: a whole number, alone or with `B`, `KB`, `MB` or `GB`, each 1,024 of
-/// the one before.
+/// Parses a number of bytes: a whole number, alone or with `B`, `KB`, `MB` or `GB`, each 1,024
+/// times the previous one.
 pub(super) fn size(text: &str) -> Option<u64> {
     let split = text.find(|c: char| !c.is_ascii_digit()).unwrap_or(text.len());
     let number: u64 = text[..split].parse().ok()?;

@@ -1,7 +1,6 @@
 //! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with
-//! the limits of each site, `[robots]` and `[people]` with what one may send, `[oidc]`, `[tls]`.
-//! What has one value is a setting like any other; the rest is read here. Every error names the key
-//! it is about.
+//! the limits of each site, `[robots]` and `[people]` with rate limits, `[oidc]`, `[tls]`. A key
+//! with a single value is an ordinary setting; the rest is read here. Every error names its key.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,27 +13,28 @@ use super::settings::{Setting, size};
 use super::{Config, ConfigError, Origin, nearest, oidc, parse_duration};
 use crate::domain::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
 
-/// The most sites with limits of their own.
+/// Maximum number of sites with limits of their own.
 const MAX_SITES: usize = 4096;
-/// The longest name of a rule.
+/// Maximum length of a rule's name.
 const MAX_NAME_CHARS: usize = 64;
-/// What a rule may use, by its word.
+/// The mechanisms that a rule may use, by their words.
 const MECHANISMS: [Delivery; 4] =
     [Delivery::PushPull, Delivery::DirectPush, Delivery::Inline, Delivery::Poll];
 
-/// What bounds the transfers of packages over HTTP.
+/// The bounds on transfers of packages over HTTP.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TransferLimits {
-    /// Of all robots together.
+    /// For all robots together.
     pub all: SiteLimits,
-    /// Of the robots on one site, by the value of [`super::DeliverySettings::site_label`].
+    /// For the robots on one site, by the value of [`super::DeliverySettings::site_label`].
     pub sites: BTreeMap<LabelValue, SiteLimits>,
 }
 
-/// `[people]`: what a person may ask for.
+/// `[people]`: rate limits of a person.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PersonRates {
-    /// Requests a second, for long; ten seconds' worth may come at once. Orders have as many again.
+    /// Sustained requests per second, with a burst of ten seconds' worth. Orders have a separate
+    /// limit of the same size.
     pub requests_per_s: u64,
 }
 
@@ -44,20 +44,20 @@ impl Default for PersonRates {
     }
 }
 
-/// What some robots may take together; `None`: as much as there is.
+/// Limits of a group of robots together; `None`: unlimited.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiteLimits {
-    /// Transfers at the same time.
+    /// Concurrent transfers.
     pub max: Option<u64>,
     /// Bytes per second.
     pub bytes_per_s: Option<u64>,
 }
 
-/// What a transfer has of a bandwidth at least: several times what an agent takes for a stall.
+/// Minimum bandwidth of a transfer: several times the speed that an agent treats as a stall.
 const LEAST_SHARE_BYTES_PER_S: u64 = 4 << 10;
 
 impl SiteLimits {
-    /// How many may go at the same time: no more than have something of the bandwidth.
+    /// Maximum concurrent transfers, such that each has a minimum share of the bandwidth.
     pub fn most(&self) -> Option<u64> {
         let with_share = self.bytes_per_s.map(|bytes| (bytes / LEAST_SHARE_BYTES_PER_S).max(1));
         [self.max, with_share].into_iter().flatten().min()
@@ -212,7 +212,7 @@ fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String
     Ok(Condition::Measure(quantity, comparison, read))
 }
 
-/// Refuses conditions that nothing can satisfy, alone or together.
+/// Refuses conditions that can never hold, alone or together.
 fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
     let mut ranges: BTreeMap<&str, (u64, u64)> = BTreeMap::new();
     for (key, condition) in conditions {
@@ -236,7 +236,7 @@ fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
     Ok(())
 }
 
-/// A robot is never in a deployment, a batch or on a site without itself.
+/// A robot always counts itself in its deployment, batch and site.
 fn least_possible(quantity: Quantity) -> u64 {
     u64::from(matches!(quantity, Quantity::Robots | Quantity::Batch | Quantity::SameSite))
 }

@@ -1,24 +1,23 @@
-//! `[tls]`: whether the listeners encrypt, and by whose certificate.
+//! `[tls]`: whether the listeners encrypt, and with which certificate.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-/// `[tls]`.
+/// The settings of the table `[tls]`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TlsSettings {
-    /// The file with the operator's own certificate chain. Not without `key`.
+    /// The file with the operator's own certificate chain. Requires `key`.
     pub certificate: Option<PathBuf>,
     /// The file with its key.
     pub key: Option<PathBuf>,
-    /// Whether robots are told the pin of the private authority, which then also makes the
-    /// certificate if there is no own one. Absent: as is best for the addresses that are listened
-    /// on.
+    /// Whether robots are told the pin of the private authority, which then also issues the
+    /// certificate if the operator provides none. Absent: chosen by the listeners' addresses.
     pub private_ca: Option<bool>,
-    /// Names and addresses that the authority's certificates are also good for.
+    /// Additional names and addresses in the authority's certificates.
     pub names: Vec<String>,
-    /// Whether robots have to show the key that they registered.
+    /// Whether robots must prove possession of their registered key.
     pub client_certificates: bool,
-    /// How often the operator's files are looked at.
+    /// Interval between checks of the operator's files.
     pub look_interval: Duration,
 }
 
@@ -41,12 +40,12 @@ impl TlsSettings {
         self.certificate.clone().zip(self.key.clone())
     }
 
-    /// Whether robots are told to trust the private authority alone.
+    /// Whether robots are told to trust only the private authority.
     pub fn tells_pin(&self) -> bool {
         self.private_ca.unwrap_or(self.certificate.is_none())
     }
 
-    /// Whether the listeners encrypt, if one of them is reached from other machines or not.
+    /// Whether the listeners encrypt, given whether other machines can reach one of them.
     pub(super) fn encrypts(&self, is_reached_from_elsewhere: bool, allow_plaintext: bool) -> bool {
         let by_default = is_reached_from_elsewhere && !allow_plaintext;
         self.certificate.is_some() || self.private_ca.unwrap_or(by_default)

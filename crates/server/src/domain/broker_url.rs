@@ -1,5 +1,5 @@
-//! Where an external broker is and as whom the server signs in there: the setting `broker`, read.
-//! Its password is in no message and no debug output; it connects to nothing.
+//! Parses the setting `broker`: the address of an external broker, and the server's account there.
+//! The password appears in no message and no debug output. This module opens no connection.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -7,15 +7,15 @@ use std::str::FromStr;
 
 use task_proto::RobotId;
 
-/// The schemes, each with its port where the URL names none, and whether it is TLS.
+/// The schemes, each with its default port, and whether it is TLS.
 const SCHEMES: [(&str, u16, bool); 2] = [("mqtt://", 1883, false), ("mqtts://", 8883, true)];
-/// More than any name or password needs; MQTT itself allows 64 KiB.
+/// More bytes than any name or password needs; MQTT itself allows 64 KiB.
 const MAX_BYTES: usize = 512;
 /// The most brokers in one list. A robot tries them one after another.
 const MAX_BROKERS: usize = 8;
 
-/// One URL or several, separated by commas: brokers with the same accounts, in the order in which
-/// they are tried.
+/// One URL or several, separated by commas: brokers with the same accounts, in the order of the
+/// connection attempts.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BrokerUrls(Vec<BrokerUrl>);
 
@@ -25,7 +25,7 @@ impl BrokerUrls {
         &self.0
     }
 
-    /// The first one, whose user and password all have.
+    /// The first broker. All others have its user and password.
     pub fn first(&self) -> &BrokerUrl {
         &self.0[0]
     }
@@ -37,7 +37,7 @@ impl FromStr for BrokerUrls {
     fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
         let begins =
             |text: &str| SCHEMES.iter().any(|(scheme, ..)| text.trim_start().starts_with(scheme));
-        // A password may hold a comma: only one that a URL follows separates.
+        // A password may hold a comma: only a comma followed by a URL separates.
         let mut ends: Vec<usize> = text
             .match_indices(',')
             .map(|(at, _)| at)
@@ -66,23 +66,24 @@ pub struct BrokerUrl {
     pub host: String,
     /// TCP port.
     pub port: u16,
-    /// Whether TLS is spoken there.
+    /// Whether the broker expects TLS.
     pub tls: bool,
-    /// The server's own user there.
+    /// The server's own user at the broker.
     pub user_name: String,
-    /// Its password.
+    /// The user's password.
     pub password: String,
 }
 
-/// A text that is no such URL. Never repeats the text, which may hold a password.
+/// The text is not a valid broker URL. The message never repeats the text, which may hold a
+/// password.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum InvalidBrokerUrl {
-    /// It begins otherwise.
+    /// The scheme is not `mqtt://` or `mqtts://`.
     #[error(
         "expected mqtt://USER:PASSWORD@HOST[:PORT] or mqtts://…, or \"embedded\" for the server's own broker"
     )]
     Form,
-    /// Without them the broker's access control list protects nothing.
+    /// No user or no password. Without them the broker's access control list protects nothing.
     #[error("it names no user or no password: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
     NoCredentials,
     /// The user can't be written into the broker's files, or is a robot's.
@@ -90,12 +91,12 @@ pub enum InvalidBrokerUrl {
         "its user name is not 1 to 64 letters, digits, '.', '_', '-' and '@', or has the form of a robot id"
     )]
     UserName,
-    /// A character that only fits in as %XX.
+    /// A character that is only valid as %XX.
     #[error(
         "its password holds a '%' that is not followed by two hex digits, or is longer than 512 bytes"
     )]
     Password,
-    /// No host, or one that no machine can have.
+    /// No host, or a host that no machine can have.
     #[error("its host is none: expected a name, an IPv4 address or an IPv6 address in brackets")]
     Host,
     /// Several URLs with different users or passwords.
@@ -106,20 +107,20 @@ pub enum InvalidBrokerUrl {
     /// More URLs than a robot would try.
     #[error("it names more than 8 brokers")]
     TooMany,
-    /// No port from 1 to 65535.
+    /// The port is not from 1 to 65535.
     #[error("its port is not a number from 1 to 65535")]
     Port,
 }
 
 impl BrokerUrl {
-    /// Whether the host is this machine, by its name.
+    /// Whether the host's name means this machine.
     pub fn is_loopback(&self) -> bool {
         let bare = self.host.trim_start_matches('[').trim_end_matches(']');
         self.host == "localhost"
             || bare.parse::<IpAddr>().is_ok_and(|address| address.is_loopback())
     }
 
-    /// `host:port`, as it may be shown.
+    /// `host:port`, without the password and so safe to show.
     pub fn address(&self) -> String {
         format!("{}:{}", self.host, self.port)
     }
@@ -183,7 +184,7 @@ fn host_and_port(place: &str) -> Result<(&str, Option<u16>), InvalidBrokerUrl> {
     }
 }
 
-/// The text with each `%XX` as the byte it stands for.
+/// Replaces each `%XX` by its byte.
 fn decoded(text: &str) -> Option<String> {
     let mut bytes = Vec::with_capacity(text.len());
     let mut rest = text.as_bytes();

@@ -1,6 +1,6 @@
-//! Which mechanism brings a package to a robot: rules, of which the first that matches decides.
-//! Functions of values; [`crate::orders::chooser`] gathers them, [`crate::config`] reads the
-//! operator's rules.
+//! Chooses the mechanism that brings a package to a robot: the first matching rule decides. These
+//! are pure functions. [`crate::orders::chooser`] gathers their inputs, and [`crate::config`] reads
+//! the operator's rules.
 
 use std::fmt;
 
@@ -10,51 +10,52 @@ use task_proto::desired::Delivery;
 
 /// The most rules an operator may write.
 pub const MAX_RULES: usize = 64;
-/// The rule's name where the operator chose the mechanism.
+/// The rule name shown when the operator chose the mechanism.
 pub const ORDERED: &str = "ordered";
-/// The rule's name where a robot that could not be kept up to date was told to pull.
+/// The rule name shown when a robot that could not be kept up to date was told to pull.
 pub const FELL_BEHIND: &str = "fell behind";
-/// The name of the rule that decides when no other does.
+/// The name of the last resort, which decides when no rule matches.
 const OTHERWISE: &str = "otherwise";
 
-/// What is known when one robot's part of a deployment begins.
+/// The facts known when one robot's part of a deployment begins.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct Inputs {
-    /// Bytes of the package as they travel: content and config.
+    /// Bytes of the package in transit: content and config.
     pub size: u64,
-    /// Those of them that this robot does not have.
+    /// The part of `size` that this robot does not have.
     pub lacking: u64,
     /// Robots in the deployment.
     pub robots: u64,
     /// Robots that begin together with this one.
     pub batch: u64,
-    /// Robots of the deployment on the same site, this one included; `None` where no rule asks.
+    /// Robots of the deployment on the same site, this one included; `None` if no rule asks for the
+    /// number.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub same_site: Option<u64>,
-    /// Whether it is connected over MQTT.
+    /// Whether the robot is connected over MQTT.
     pub connected: bool,
-    /// Whether its bytes cost money: the label `metered=true`.
+    /// Whether the robot's traffic costs money: the label `metered=true`.
     pub metered: bool,
-    /// Its link, as earlier transfers have shown; `None`: not measured.
+    /// The link's throughput in earlier transfers; `None`: not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub throughput_bytes_per_s: Option<u64>,
-    /// Likewise.
+    /// The link's round-trip time in earlier transfers; `None`: not measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rtt_ms: Option<u64>,
-    /// Transfers that broke off in the last hour before it reported.
+    /// Transfers that broke off in the last hour before the robot's report.
     pub losses: u64,
-    /// Sessions lost in that hour.
+    /// Sessions lost in the same hour.
     pub reconnects: u64,
-    /// What is left of its battery; `None`: not reported.
+    /// The battery's charge; `None`: not reported.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub battery_percent: Option<u64>,
-    /// Transfers that the server serves now.
+    /// Transfers that the server serves at the moment.
     pub transfers: u64,
-    /// Bytes of parts that wait in the server for listeners to take them.
+    /// Bytes of parts that wait in the server for subscribers to take them.
     pub backlog: u64,
 }
 
-/// Something that is counted or measured.
+/// A number that rules can compare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Quantity {
     /// [`Inputs::size`].
@@ -83,12 +84,12 @@ pub enum Quantity {
     Backlog,
 }
 
-/// In what a quantity is given and shown.
+/// The unit in which a quantity is given and shown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unit {
     /// `256 KB`; a KB is 1,024 bytes.
     Bytes,
-    /// The same, each second.
+    /// `256 KB/s`, in the units of [`Unit::Bytes`].
     BytesPerSecond,
     /// `100 ms`.
     Milliseconds,
@@ -98,7 +99,7 @@ pub enum Unit {
     Count,
 }
 
-/// How a quantity is compared with a rule's value.
+/// The comparison of a quantity with a rule's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Comparison {
     /// `>`
@@ -111,7 +112,7 @@ pub enum Comparison {
     Below,
 }
 
-/// Something that is so or not.
+/// A fact that is true or false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Flag {
     /// [`Inputs::metered`].
@@ -120,23 +121,23 @@ pub enum Flag {
     Connected,
 }
 
-/// What a rule asks for. What is not known satisfies no condition.
+/// One condition of a rule. A quantity that is not known satisfies no condition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Condition {
-    /// A quantity lies on one side of a value.
+    /// The quantity satisfies the comparison with a value.
     Measure(Quantity, Comparison, u64),
-    /// Something is so, or is not.
+    /// The flag has this value.
     Flag(Flag, bool),
 }
 
-/// If all conditions hold, this mechanism.
+/// A rule: its mechanism is used if all conditions hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Rule {
-    /// What it is called where a decision is shown.
+    /// The name shown with a decision.
     pub name: String,
-    /// What must hold; nothing: it always decides.
+    /// The conditions; without any, the rule always matches.
     pub conditions: Vec<Condition>,
-    /// What is used then.
+    /// The mechanism to use.
     pub mechanism: Delivery,
 }
 
@@ -160,14 +161,14 @@ impl Rules {
         Self(rules)
     }
 
-    /// The rules that hold after the operator's: nothing was measured to be faster or cheaper than
-    /// these and the last resort, see docs/delivery.md.
+    /// The rules that follow the operator's. In our measurements no mechanism was faster or cheaper
+    /// than these rules and the last resort; see docs/delivery.md.
     pub fn built_in() -> Vec<Rule> {
-        // The announcement's size, which is the setting, is added to its conditions.
+        // Its condition on the size is added later, because the limit is a setting.
         vec![Rule { name: "tiny".to_owned(), conditions: Vec::new(), mechanism: Delivery::Inline }]
     }
 
-    /// All of them in their order, in words, with the last resort.
+    /// Describes all rules in their order, with the last resort.
     pub fn views(&self) -> Vec<RuleView> {
         let said = |rule: &Rule| {
             rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ")
@@ -187,7 +188,7 @@ impl Rules {
         (1..).zip(self.0.iter().chain([&last])).map(view).collect()
     }
 
-    /// Whether `name` is taken by a rule that the operator did not write.
+    /// Whether `name` belongs to a rule that the operator did not write.
     pub fn is_reserved(name: &str) -> bool {
         [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name)
             || Self::built_in().iter().any(|rule| rule.name == name)
@@ -200,7 +201,7 @@ impl Rules {
     }
 }
 
-/// How the bytes travel to a robot of which `inputs` are known, where `choice` was ordered.
+/// Chooses the mechanism for a robot with these `inputs`, where `choice` was ordered.
 pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> DeliveryDecision {
     if let Some(mechanism) = choice.mechanism() {
         let because = format!("the order says {mechanism}");
@@ -227,8 +228,9 @@ pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> Deliver
     DeliveryDecision { mechanism, rule: name.to_owned(), because }
 }
 
-/// What kept the rules before from choosing something else than `mechanism`: of each its first
-/// condition that does not hold, of conditions about the same thing the last.
+/// The conditions that kept the earlier rules from choosing a mechanism other than `mechanism`: the
+/// first failed condition of each rule. Of several conditions on the same subject, only the last is
+/// kept.
 fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Condition> {
     let mut found: Vec<Condition> = Vec::new();
     for rule in before.iter().filter(|rule| rule.mechanism != mechanism) {
@@ -241,7 +243,7 @@ fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Cond
 }
 
 impl Condition {
-    /// Every condition there is, by its key in the configuration; those of quantities without their
+    /// Finds a condition by its key in the configuration. Conditions on quantities come without a
     /// value.
     pub fn by_key(key: &str) -> Option<ConditionKey> {
         if let Some(flag) = Flag::ALL.into_iter().find(|flag| flag.name() == key) {
@@ -254,7 +256,7 @@ impl Condition {
         })
     }
 
-    /// Whether it holds.
+    /// Whether the inputs satisfy the condition.
     pub fn holds(&self, inputs: &Inputs) -> bool {
         match *self {
             Self::Measure(quantity, comparison, value) => {
@@ -264,7 +266,7 @@ impl Condition {
         }
     }
 
-    /// How things stand with it, whether it holds or not: `size 9.7 MB > 256 KB`.
+    /// The state of the condition, whether it holds or not: `size 9.7 MB > 256 KB`.
     fn said_of(&self, inputs: &Inputs) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
@@ -285,7 +287,7 @@ impl Condition {
         }
     }
 
-    /// What it asks for: `size ≤ 256 KB`.
+    /// The condition in words: `size ≤ 256 KB`.
     fn words(&self) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
@@ -309,17 +311,17 @@ impl Condition {
     }
 }
 
-/// A condition whose value is still to be read.
+/// A condition without its value, which is read later.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConditionKey {
-    /// It needs a value in the quantity's unit.
+    /// A comparison; its value is a number in the quantity's unit.
     Measure(Quantity, Comparison),
-    /// It needs true or false.
+    /// A flag; its value is true or false.
     Flag(Flag),
 }
 
 impl Quantity {
-    /// All of them.
+    /// All quantities.
     pub const ALL: [Self; 12] = [
         Self::Size,
         Self::Lacking,
@@ -335,7 +337,7 @@ impl Quantity {
         Self::Backlog,
     ];
 
-    /// What its keys in the configuration begin with.
+    /// The prefix of the quantity's keys in the configuration.
     pub fn key(self) -> &'static str {
         match self {
             Self::Size => "size",
@@ -357,7 +359,7 @@ impl Quantity {
         if self == Self::SameSite { "robots on site" } else { self.key() }
     }
 
-    /// In what its values are given.
+    /// The unit of the quantity's values.
     pub fn unit(self) -> Unit {
         match self {
             Self::Size | Self::Lacking | Self::Backlog => Unit::Bytes,
@@ -392,7 +394,7 @@ impl Quantity {
 }
 
 impl Unit {
-    /// A value as people read it.
+    /// Formats a value for people.
     pub fn show(self, value: u64) -> String {
         match self {
             Self::Bytes => shown_bytes(value),
@@ -404,7 +406,7 @@ impl Unit {
     }
 }
 
-/// Bytes in the units in which the configuration gives them: `9.7 MB`.
+/// Bytes in the units of the configuration: `9.7 MB`.
 pub fn shown_bytes(bytes: u64) -> String {
     let units = [(1u64 << 30, "GB"), (1 << 20, "MB"), (1 << 10, "KB")];
     let Some((one, unit)) = units.into_iter().find(|(one, _)| bytes >= *one) else {
@@ -419,10 +421,10 @@ pub fn shown_bytes(bytes: u64) -> String {
 }
 
 impl Comparison {
-    /// All of them.
+    /// All comparisons.
     pub const ALL: [Self; 4] = [Self::Above, Self::AtMost, Self::AtLeast, Self::Below];
 
-    /// What a key in the configuration ends in.
+    /// The suffix of a key in the configuration.
     pub fn word(self) -> &'static str {
         match self {
             Self::Above => "above",
@@ -432,7 +434,7 @@ impl Comparison {
         }
     }
 
-    /// The least and the most that satisfy it; `None`: nothing does.
+    /// The least and the greatest value that satisfy the comparison; `None`: no value does.
     pub fn range(self, value: u64) -> Option<(u64, u64)> {
         match self {
             Self::Above => Some((value.checked_add(1)?, u64::MAX)),
@@ -466,10 +468,10 @@ impl Comparison {
 }
 
 impl Flag {
-    /// All of them.
+    /// All flags.
     pub const ALL: [Self; 2] = [Self::Metered, Self::Connected];
 
-    /// Its key in the configuration.
+    /// The flag's key in the configuration.
     pub fn name(self) -> &'static str {
         match self {
             Self::Metered => "metered",
@@ -525,8 +527,8 @@ mod tests {
         (decision.mechanism, decision.rule, decision.because)
     }
 
-    /// What the condition `key` with `value` says of inputs that satisfy it, and of some that do
-    /// not.
+    /// Checks the text of condition `key` with `value`, for inputs that satisfy the condition and
+    /// for inputs that do not.
     #[track_caller]
     fn check(key: &str, value: u64, yes: Inputs, because: &str, no: Inputs) {
         let own = [rule("own", &[(key, value)], Delivery::Poll)];

@@ -1,5 +1,5 @@
-//! What may become of an assignment and of a deployment as a whole. Functions of values; nothing is
-//! read or stored here.
+//! The state transitions of an assignment, and the state of a deployment as a whole. These are pure
+//! functions; nothing is read or stored here.
 //!
 //! ```text
 //!             report            report             report
@@ -7,31 +7,31 @@
 //!    │                 │                    │
 //!    └─────────────────┴────────────────────┴── an order or the clock ──► superseded | cancelled | expired
 //! ```
-//! A robot's word moves an assignment only forward out of a phase that is not final, and only
-//! within the run that was asked for; only an order begins a new run.
+//! A robot's report moves an assignment only forward, out of a phase that is not final, and only
+//! within the requested run. Only an order begins a new run.
 
 use task_proto::Generation;
 use task_proto::api::{DeploymentState, PhaseCount};
 use task_proto::manifest::TaskKind;
 use task_proto::report::{Failure, Phase, Progress, TaskReport};
 
-/// Where one assignment stands.
+/// The state of one assignment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Standing {
-    /// How often it was asked to start.
+    /// The number of times that the task was asked to start.
     pub run: u64,
     /// The phase of that run.
     pub phase: Phase,
-    /// How far the phase has come.
+    /// The progress within the phase.
     pub progress: Option<Progress>,
-    /// Why it failed.
+    /// The cause of a failure.
     pub failure: Option<Failure>,
     /// Tries of the phase.
     pub attempts: u32,
 }
 
 impl Standing {
-    /// Where it stands once the robot has said `report`; `None` if that changes nothing.
+    /// The state after the robot's `report`; `None` if the report changes nothing.
     pub fn after(&self, report: &TaskReport) -> Option<Self> {
         if self.phase.is_final() || report.run != self.run || !is_robots_word(report.phase) {
             return None;
@@ -46,28 +46,28 @@ impl Standing {
         (next != *self).then_some(next)
     }
 
-    /// Where it stands once a robot that accepted `observed` no longer lists it, if it was taken
-    /// out of the desired state in generation `removed`: it has been stopped.
+    /// The state after a robot that accepted `observed` no longer lists the task, if the task left
+    /// the desired state in generation `removed`: the task has been stopped.
     pub fn after_absence(&self, removed: Option<Generation>, observed: Generation) -> Option<Self> {
         let gone = !self.phase.is_final() && removed.is_some_and(|removed| observed >= removed);
         gone.then(|| Self { phase: Phase::Stopped, progress: None, failure: None, ..self.clone() })
     }
 }
 
-/// Whether the phase is one that a robot may report; the others only the server sets.
+/// Whether a robot may report the phase; only the server sets the others.
 fn is_robots_word(phase: Phase) -> bool {
     !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Expired | Phase::Unknown)
 }
 
-/// Whether `phase`, in which an order for a `kind` has settled, counts against the rollout. What an
-/// operator ended does not.
+/// Whether `phase`, in which an order for a `kind` has settled, counts as a failure of the rollout.
+/// A phase set by an operator does not.
 pub fn is_failure(phase: Phase, kind: TaskKind) -> bool {
     phase.is_settled(kind)
         && !phase.is_success(kind)
         && !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Stopped)
 }
 
-/// Where a deployment stands as a whole.
+/// The state of a deployment as a whole.
 pub fn state(
     kind: TaskKind,
     cancelled: bool,

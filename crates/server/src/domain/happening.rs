@@ -1,5 +1,5 @@
-//! Things that happened and are worth a look, as the place that notices them knows them.
-//! [`crate::orders::feed`] tells them.
+//! Events of the fleet, as known to the module that notices them. [`crate::orders::feed`] publishes
+//! them.
 
 use std::sync::Arc;
 
@@ -7,28 +7,28 @@ use task_proto::api::FeedKind;
 use task_proto::report::{Failure, Phase};
 use task_proto::{DeploymentId, RobotId, RobotName};
 
-/// Something that happened, as its own place knows it.
+/// An event, as known to the module that notices it.
 #[derive(Debug, Clone)]
 pub enum Happening {
-    /// A robot came, or went.
+    /// A robot went online (true) or offline (false).
     Presence(RobotId, bool),
-    /// A task came into a phase that is worth a look, or that mends one.
+    /// A task reached a phase worth showing, or one that ends such a phase.
     Task(Arc<TaskNews>),
-    /// Something about one robot.
+    /// An event of one robot.
     Robot(RobotId, FeedKind, String),
 }
 
-/// Where a robot's part of a deployment stands now.
+/// The phase of a robot's part of a deployment.
 #[derive(Debug)]
 pub struct TaskNews {
     /// The robot.
     pub robot: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
     /// The deployment.
     pub deployment: DeploymentId,
     /// The phase.
     pub phase: Phase,
-    /// Why it failed, if it did.
+    /// The cause of a failure.
     pub failure: Option<Failure>,
 }

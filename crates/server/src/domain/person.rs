@@ -1,5 +1,5 @@
-//! A person who asks: who they are, what they may, which robots are theirs, and from where they
-//! ask. Values only; who has which token is the store's to say.
+//! The person behind a request: name, permissions, robots, and address. These are values only; the
+//! store knows the holder of each token.
 
 use std::fmt;
 use std::net::IpAddr;
@@ -10,60 +10,61 @@ use task_proto::person::{Permission, Role, Roles};
 use task_proto::selector::Selector;
 use task_proto::{RobotId, RobotName, TokenId, UserName};
 
-/// The name that stands for whoever holds the first token, the one in the data directory. No user
-/// has it.
+/// The name that stands for the holder of the first token, the one in the data directory. No user
+/// has this name.
 const FIRST: &str = "operator.token";
 
-/// Who asks.
+/// The person behind a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Person {
     /// The user's name.
     pub name: UserName,
-    /// What the token they came with allows.
+    /// The roles that the presented token allows.
     pub roles: Roles,
-    /// Which robots are theirs.
+    /// The robots within the person's rights.
     pub scope: Scope,
-    /// The token they came with.
+    /// The presented token.
     pub token: TokenId,
-    /// Where that token came from.
+    /// The origin of that token.
     pub origin: TokenOrigin,
-    /// From where they ask; only known once they have come.
+    /// The address of the request; only known after admission.
     pub address: Option<IpAddr>,
 }
 
 impl Person {
-    /// Whoever holds `token`, the first one: an administrator of everything.
+    /// The holder of `token`, the first one: an administrator of everything.
     pub fn first(token: TokenId) -> Self {
         let (roles, scope, origin) =
             (Roles::one(Role::Admin), Scope::everything(), TokenOrigin::First);
         Self { name: first_name(), roles, scope, token, origin, address: None }
     }
 
-    /// Whether this is whoever holds the first token, and no user.
+    /// Whether this is the holder of the first token, and so no user.
     pub fn is_first(&self) -> bool {
         self.name.as_str() == FIRST
     }
 
-    /// Whether this is the same person by the same token with the same rights, wherever they are.
+    /// Whether this is the same person by the same token with the same rights, from any address.
     pub fn has_the_rights_of(&self, other: &Self) -> bool {
         let Self { name, roles, scope, token, origin, address: _ } = self;
         (name, roles, scope, token, origin)
             == (&other.name, &other.roles, &other.scope, &other.token, &other.origin)
     }
 
-    /// Whether they may. What concerns everybody is not for who is limited to some robots.
+    /// Whether the person has the permission. A person who is limited to some robots has none for
+    /// matters of all users.
     pub fn may(&self, permission: Permission) -> bool {
         self.roles.allow(permission)
             && (permission != Permission::Administer || self.scope.is_everything())
     }
 }
 
-/// The name of whoever holds the first token.
+/// The name of the holder of the first token.
 pub fn first_name() -> UserName {
     FIRST.parse().expect("it has the form of a name")
 }
 
-/// Which robots are someone's: those that every selector means, so all of them if there is none.
+/// A set of robots: those that match every selector, so all robots if there is none.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Scope(Vec<Selector>);
 
@@ -73,22 +74,22 @@ impl Scope {
         Self::default()
     }
 
-    /// The robots that all of these mean.
+    /// The robots that match all of these selectors.
     pub fn of(selectors: impl IntoIterator<Item = Selector>) -> Self {
         Self(selectors.into_iter().collect())
     }
 
-    /// Whether it has no limit.
+    /// Whether the scope has no limit.
     pub fn is_everything(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Whether this robot is in it.
+    /// Whether the scope contains this robot.
     pub fn covers(&self, id: &RobotId, name: &RobotName, labels: &Labels) -> bool {
         self.0.iter().all(|selector| selector.matches(id, name, labels))
     }
 
-    /// What it is made of.
+    /// The selectors of the scope.
     pub fn selectors(&self) -> &[Selector] {
         &self.0
     }

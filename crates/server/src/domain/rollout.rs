@@ -1,61 +1,61 @@
-//! When a deployment's next batch begins, and when it pauses. Functions of values;
-//! [`crate::orders::advance`] carries it out.
+//! Decides when a deployment's next batch begins and when the deployment pauses. These are pure
+//! functions; [`crate::orders::advance`] carries out their decisions.
 //!
 //! A batched rollout waits for robots that can act. A robot that is offline when its turn comes
-//! keeps its place and is passed over until it is back. A robot that goes offline after its batch
-//! began is waited for during [`OFFLINE_GRACE_MS`] or, where it has begun to work on the package,
-//! during [`LOST_AFTER_MS`]. After that time the rollout goes on without it. A robot that was lost
-//! while it worked on the package counts as a failure until it is back, so that a package that
-//! takes robots off the network stops at `max_failures`.
+//! keeps its place, and the rollout passes it over until the robot is back. If a robot goes offline
+//! after its batch began, the rollout waits [`OFFLINE_GRACE_MS`], or [`LOST_AFTER_MS`] if the robot
+//! has begun to work on the package. After that time the rollout goes on without the robot. A robot
+//! that was lost while it worked on the package counts as a failure until it is back. A package
+//! that takes robots off the network therefore stops at `max_failures`.
 
-/// How long a robot that has not begun may be offline before its batch goes on without it: a
+/// Time that a robot which has not begun may be offline before its batch goes on without it. A
 /// reconnect or the restart of the agent takes less.
 pub const OFFLINE_GRACE_MS: u64 = 60_000;
-/// How long a robot that has begun to work on the package may be offline before it counts as lost:
-/// a reboot takes less.
+/// Time that a robot which has begun to work on the package may be offline before it counts as
+/// lost. A reboot takes less.
 pub const LOST_AFTER_MS: u64 = 10 * 60_000;
 
-/// What the order said about its pace, and what has been decided since.
+/// The pace that the order asked for, and the decisions since.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Rollout {
     /// Robots at a time; `None`: all at once.
     pub batch: Option<u64>,
-    /// Failures it bears; `None`: any number.
+    /// The number of failures that the order tolerates; `None`: any number.
     pub max_failures: Option<u64>,
-    /// Failures that the operator has forgiven by resuming it.
+    /// Failures that the operator has accepted by resuming the deployment.
     pub forgiven: u64,
-    /// Whether it waits for the operator.
+    /// Whether the rollout waits for the operator.
     pub paused: bool,
 }
 
-/// Where a robot stands whose assignment has not settled.
+/// The progress of a robot with an unsettled assignment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Standing {
-    /// Its batch has not begun.
+    /// The robot's batch has not begun.
     Waiting,
-    /// Its batch has begun, and the robot has not begun to work on the package.
+    /// The robot's batch has begun, and the robot has not begun to work on the package.
     Released,
     /// The robot works on the package.
     Begun,
 }
 
-/// What the rollout makes of a robot whose assignment has not settled.
+/// The part of an unsettled robot in the rollout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
-    /// It may begin with the next batch.
+    /// The robot may begin with the next batch.
     Ready,
-    /// It is offline: it begins when it is back.
+    /// The robot is offline and begins when it is back.
     Offline,
-    /// The next batch waits for it.
+    /// The next batch waits for the robot.
     Busy,
-    /// It went offline while it worked on the package, and stays away.
+    /// The robot went offline while it worked on the package, and has not come back in time.
     Lost,
-    /// Nothing waits for it.
+    /// The rollout does not wait for the robot.
     Ignored,
 }
 
 impl Part {
-    /// The part of a robot that has been offline for `offline_ms`; `None`: it is online.
+    /// The part of a robot that has been offline for `offline_ms`; `None`: the robot is online.
     pub fn of(standing: Standing, offline_ms: Option<u64>) -> Self {
         match (standing, offline_ms) {
             (Standing::Waiting, None) => Self::Ready,
@@ -67,7 +67,7 @@ impl Part {
     }
 }
 
-/// How many of its robots have which part.
+/// Counts of a deployment's robots by part.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Tally {
     /// Online, and their batch has not begun.
@@ -83,7 +83,7 @@ pub struct Tally {
 }
 
 impl Tally {
-    /// Counts the robots that have not settled, beside those that have failed.
+    /// Counts the unsettled robots by part; `failed` counts those that failed.
     pub fn of(failed: u64, parts: impl IntoIterator<Item = Part>) -> Self {
         let mut tally = Self { failed, ..Self::default() };
         for part in parts {
@@ -98,27 +98,27 @@ impl Tally {
         tally
     }
 
-    /// Failures as `max_failures` counts them.
+    /// The number that `max_failures` limits.
     pub fn failures(&self) -> u64 {
         self.failed + self.lost
     }
 }
 
-/// What to do next.
+/// The next step of a rollout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Move {
-    /// Nothing, until something settles, a robot comes or goes, or the operator resumes it.
+    /// Do nothing until an assignment settles, a robot comes or goes, or the operator resumes.
     Wait,
-    /// Begin a batch of so many robots: those that are ready or, without batches, all that are
+    /// Begin a batch of this many robots: those that are ready or, without batches, all that are
     /// left.
     Release(u64),
     /// Only offline robots are left: let their time run.
     AwaitOffline,
-    /// Too many have failed: begin no more.
+    /// Begin no more robots: too many have failed.
     Pause,
 }
 
-/// The next move of a rollout.
+/// Decides the next step of a rollout.
 pub fn next_move(rollout: &Rollout, tally: &Tally) -> Move {
     let waiting = tally.ready + tally.offline;
     if rollout.paused || waiting == 0 {
@@ -142,11 +142,11 @@ mod tests {
 
     use super::*;
 
-    /// A robot of the model: how it ends, and when it is offline.
+    /// A robot of the model: its outcome, and its time offline.
     #[derive(Debug, Clone)]
     struct Robot {
         fails: bool,
-        /// Offline from the first time until the second, in minutes.
+        /// Offline from the first minute until the second.
         offline: Option<(u64, u64)>,
         standing: Standing,
         has_settled: bool,
@@ -182,7 +182,7 @@ mod tests {
     }
 
     proptest! {
-        /// A whole rollout, minute by minute: each robot that is online takes a step.
+        /// A whole rollout, minute by minute: each online robot takes a step.
         #[test]
         fn batches_of_online_robots_never_overlap_and_failures_stop_them(
             mut robots in proptest::collection::vec(any_robot(), 1..40),
@@ -190,8 +190,8 @@ mod tests {
             max_failures in proptest::option::of(0u64..6),
         ) {
             let mut rollout = Rollout { batch, max_failures, forgiven: 0, paused: false };
-            // All are back for good after three hours, and a batch of one takes two minutes and at
-            // most ten of waiting.
+            // After three hours all robots are online for good. A batch of one takes two minutes,
+            // and at most ten of waiting.
             for minute in 0..(180 + 12 * robots.len() as u64) {
                 loop {
                     let now = tally(&robots, minute);
@@ -228,12 +228,12 @@ mod tests {
                     }
                 }
             }
-            // It ends only when all have had their turn, or it was paused.
+            // The rollout only ends when all robots have had their turn, or when it was paused.
             prop_assert!(rollout.paused || robots.iter().all(|robot| robot.has_settled));
         }
 
-        /// However long the others stay away, those that are online have their turn within the hour
-        /// that the absence of one batch can cost.
+        /// However long the others stay away, online robots have their turn within the hour that
+        /// the absence of one batch can cost.
         #[test]
         fn offline_robots_never_hold_back_the_others(absent in 1u64..50, online in 1u64..50, batch in 1u64..9) {
             let rollout = Rollout { batch: Some(batch), max_failures: Some(0), forgiven: 0, paused: false };

@@ -1,6 +1,6 @@
-//! What robots say they lack of packages that are being fanned out: the newest word of each, for
-//! whoever fans out. Nobody else's is kept, so there is never more of it than robots with an
-//! assignment.
+//! Missing parts that robots report for packages in fan-out: the newest report of each robot.
+//! Reports about other packages are not kept, so the number of entries never exceeds the number of
+//! robots with an assignment.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,7 +10,7 @@ use task_proto::report::Report;
 use task_proto::{Digest, RobotId};
 use tokio::sync::Notify;
 
-/// Where reports are read for it. Clones feed the same listeners.
+/// Receives reports. Clones feed the same listeners.
 #[derive(Debug, Clone, Default)]
 pub struct PartRequests(Arc<Mutex<HashMap<Digest, Arc<Desk>>>>);
 
@@ -20,7 +20,7 @@ struct Desk {
     news: Notify,
 }
 
-/// One package's requests; dropped, they are no longer heard.
+/// One package's requests; dropping this ends the collection.
 #[derive(Debug)]
 pub struct Listening {
     digest: Digest,
@@ -29,7 +29,7 @@ pub struct Listening {
 }
 
 impl PartRequests {
-    /// Hears what is asked for of the content with this digest, for one listener.
+    /// Collects requests for the content with this digest, for one listener.
     pub fn listen(&self, digest: Digest) -> Listening {
         let desk = Arc::<Desk>::default();
         lock(&self.0).insert(digest, desk.clone());
@@ -51,12 +51,12 @@ impl PartRequests {
 }
 
 impl Listening {
-    /// All that was said since this was asked last.
+    /// All requests since the last call.
     pub fn take(&self) -> HashMap<RobotId, Vec<PartRange>> {
         std::mem::take(&mut *lock(&self.desk.requests))
     }
 
-    /// Waits until something was said. Cancel-safe.
+    /// Waits until there is a request. Cancel-safe.
     pub async fn news(&self) {
         self.desk.news.notified().await;
     }

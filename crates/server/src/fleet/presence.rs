@@ -1,6 +1,6 @@
-//! Who is there: which robot is connected over MQTT or polls over HTTP, from where and since when,
-//! and which robots have two instances that displace each other. Kept in memory only; it never
-//! talks to anyone and never reads a clock.
+//! Presence of robots: whether a robot is connected over MQTT or polls over HTTP, its address,
+//! since when, and which robots have two instances that displace each other. Kept in memory only;
+//! this module never communicates and never reads a clock.
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
@@ -8,63 +8,63 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use task_proto::{Digest, InstanceId, RobotId};
 
-/// Within this time two returns of a displaced instance mean a duplicate, and after this much quiet
-/// it is over.
+/// Two returns of a displaced instance within this time mean a duplicate. After the same time
+/// without a change the duplicate is over.
 pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
-/// For so long the start of an agent that has its robot's work must not have been heard before
-/// another one gets it. An MQTT session without a sign of life ends by then, and an agent without
-/// one polls more often.
+/// Silence of the serving instance before another instance takes over the robot's work. An MQTT
+/// session without a sign of life ends within this time, and an agent without a session polls more
+/// often.
 pub const HANDOVER_SILENCE_MS: u64 = 30 * 1000;
-/// For so long it is shown that another start has come and waits.
+/// How long we show that another instance has appeared and waits.
 const WAITING_SHOWN_MS: u64 = 60 * 1000;
-/// Robots remembered at most; beyond it whoever was silent for longest is forgotten.
+/// Maximum robots in memory; beyond the limit, the longest silent robots are forgotten.
 const MAX_ROBOTS: usize = 100_000;
-/// Changes of instance remembered for each robot.
+/// Maximum instance changes in memory for each robot.
 const MAX_CHANGES: usize = 8;
 
-/// Everyone who was seen by this process.
+/// All robots that this process has seen.
 pub struct Presence {
     window_ms: u64,
-    /// Robots that were not seen since are offline since then.
+    /// Robots not seen since then count as offline since then.
     started_ms: u64,
     robots: Mutex<HashMap<RobotId, Sightings>>,
 }
 
-/// What is known of one robot.
+/// The presence of one robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Sighting {
     /// Connected over MQTT, or heard over HTTP within the window.
     pub online: bool,
-    /// Where it was last heard from, as far as that is known.
+    /// The last known address, if any.
     pub address: Option<SocketAddr>,
-    /// Since when it is connected over MQTT, if it is.
+    /// Start of the MQTT connection, if connected.
     pub connected_since_ms: Option<u64>,
     /// The number of that connection.
     pub connection: Option<u64>,
-    /// When it was last heard.
+    /// Time of the last message or request.
     pub last_seen_ms: u64,
-    /// Two instances of it keep displacing each other.
+    /// Two instances of the robot keep displacing each other.
     pub duplicate: bool,
-    /// Another instance has come lately, and waits for the one that is known to fall silent.
+    /// Another instance has appeared recently, and waits for the known instance to fall silent.
     pub waits: bool,
 }
 
-/// What an agent says of itself.
+/// An agent's statement about itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Claim {
-    /// Its start.
+    /// The instance, which is one start of the agent.
     pub instance: InstanceId,
-    /// Where it runs; an older agent does not say.
+    /// The place where the agent runs; absent from older agents.
     pub place: Option<Digest>,
 }
 
-/// What follows from what an agent said of itself.
+/// The result of an agent's statement about itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Standing {
-    /// Whether it has its robot's work; otherwise it waits.
+    /// Whether this instance serves the robot's work; otherwise the instance waits.
     pub is_served: bool,
-    /// Whether that begins now, or begins to be known of its session: it is to be told of its
-    /// state.
+    /// Whether the instance begins to serve now, or its session has just become known: send it the
+    /// desired state.
     pub is_news: bool,
 }
 
@@ -72,17 +72,17 @@ pub struct Standing {
 struct Sightings {
     address: Option<SocketAddr>,
     connection: Option<Connection>,
-    /// `None`: it is only remembered.
+    /// `None`: the robot is only remembered.
     last_seen_ms: Option<u64>,
-    /// When it was last heard over HTTP. The end of a connection takes it back: who hangs up is
-    /// away until it asks.
+    /// Time of the last HTTP request. The end of a connection clears this field: a robot that
+    /// disconnects is offline until its next request.
     polled_ms: Option<u64>,
     instances: InstanceHistory,
-    /// The instance that has the robot's work, and when it was last heard.
+    /// The instance that serves the robot's work, and the time of its last message or request.
     served: Option<(Claim, u64)>,
-    /// Which instance has the MQTT session, once it has said so.
+    /// The instance that owns the MQTT session, once the agent has stated it.
     speaker: Option<InstanceId>,
-    /// When another instance was told last to wait.
+    /// When another instance was last told to wait.
     waited_ms: Option<u64>,
 }
 
@@ -93,7 +93,7 @@ struct Connection {
 }
 
 impl Presence {
-    /// Nobody seen yet. A robot that polls is online for `window_ms` after it was heard.
+    /// Starts with no robots. A polling robot is online for `window_ms` after its last request.
     pub fn new(window_ms: u64, now_ms: u64) -> Self {
         Self { window_ms, started_ms: now_ms, robots: Mutex::default() }
     }
@@ -115,8 +115,8 @@ impl Presence {
         }
     }
 
-    /// The robot's MQTT session number `connection` ended. An end that comes after the next
-    /// beginning changes nothing.
+    /// The robot's MQTT session number `connection` ended. An end that arrives after the next
+    /// session has begun changes nothing.
     pub fn disconnected(&self, robot: &RobotId, connection: u64, now_ms: u64) {
         if let Some(sightings) = self.robots().get_mut(robot)
             && sightings.connection.is_some_and(|known| known.number == connection)
@@ -128,14 +128,14 @@ impl Presence {
         }
     }
 
-    /// The robot was heard over HTTP.
+    /// The robot sent an HTTP request.
     pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
         heard(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
     }
 
-    /// The robot's agent said which it is, in the MQTT session number `connection` if in any.
-    /// Another one than that which has the robot's work waits for that one's end, or for its
-    /// silence.
+    /// The robot's agent identified itself, in the MQTT session number `connection` if in a
+    /// session. An instance that does not serve the robot's work waits until the serving instance
+    /// ends or falls silent.
     pub fn claimed(
         &self,
         robot: &RobotId,
@@ -159,36 +159,37 @@ impl Presence {
         }
         let is_known =
             sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
-        // The session of an older agent is told of its state without a word.
+        // The session of an older agent gets its state without identifying itself.
         let is_news = claim.place.is_some() && (is_first_word || !is_known);
         sightings.served = Some((claim, now_ms));
         Standing { is_served: true, is_news }
     }
 
-    /// An agent that was heard before this process was started, and may be heard again.
+    /// Remembers an agent that was seen before this process started, and may appear again.
     pub fn remember(&self, robot: &RobotId, claim: Claim, now_ms: u64) {
         entry(&mut self.robots(), robot).served.get_or_insert((claim, now_ms));
     }
 
-    /// Whether what asks in the robot's name has to say which agent it is: its agent does.
+    /// Whether requests in the robot's name must identify their agent, because the robot's agent
+    /// does.
     pub fn takes_a_claim(&self, robot: &RobotId) -> bool {
         self.robots().get(robot).is_some_and(Sightings::takes_a_claim)
     }
 
-    /// Whether the robot's MQTT session is that of the agent which has its work, as far as its
-    /// agents say.
+    /// Whether the robot's MQTT session belongs to the agent that serves its work, as far as its
+    /// agents have identified themselves.
     pub fn may_be_told(&self, robot: &RobotId) -> bool {
         self.robots()
             .get(robot)
             .is_none_or(|sightings| !sightings.takes_a_claim() || sightings.has_session())
     }
 
-    /// The start of its agent that has its work.
+    /// The agent instance that serves the robot's work.
     pub fn instance(&self, robot: &RobotId) -> Option<InstanceId> {
         self.robots().get(robot)?.served.as_ref().map(|(served, _)| served.instance.clone())
     }
 
-    /// What is known of the robot; `None` if it was not seen by this process.
+    /// The presence of the robot; `None` if this process has not seen the robot.
     pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<Sighting> {
         self.robots().get(robot)?.view(self.window_ms, now_ms)
     }
@@ -198,8 +199,8 @@ impl Presence {
         self.get(robot, now_ms).is_some_and(|sighting| sighting.online)
     }
 
-    /// For how long each of these robots has been offline, as far as this process knows; `None`: it
-    /// is online.
+    /// How long each of these robots has been offline, as far as this process knows; `None`: the
+    /// robot is online.
     pub fn offline_ms<'a>(
         &self,
         robots: impl IntoIterator<Item = &'a RobotId>,
@@ -219,13 +220,13 @@ impl Presence {
         robots.into_iter().map(offline_ms).collect()
     }
 
-    /// Whether it is connected over MQTT.
+    /// Whether the robot is connected over MQTT.
     pub fn is_connected(&self, robot: &RobotId) -> bool {
         self.robots().get(robot).is_some_and(|sightings| sightings.connection.is_some())
     }
 
-    /// Robots without a connection that were online at `since_ms` and no longer are at `now_ms`,
-    /// because they were not heard for the window.
+    /// Robots without a connection that were online at `since_ms` and are offline at `now_ms`,
+    /// because the window passed without a request.
     pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
         let robots = self.robots();
         let fell = robots.iter().filter(|(_, sightings)| {
@@ -242,7 +243,7 @@ impl Presence {
         self.robots().get(robot).is_some_and(|sightings| sightings.instances.is_duplicate(now_ms))
     }
 
-    /// Its other tokens have ended, so that nobody else is let in by them any more.
+    /// The robot's other tokens have ended, so no other client is admitted by them any more.
     pub fn ended_others(&self, robot: &RobotId) {
         if let Some(sightings) = self.robots().get_mut(robot) {
             sightings.instances = InstanceHistory::default();
@@ -271,7 +272,7 @@ fn heard<'a>(
     let sightings = entry(robots, robot);
     let is_elsewhere =
         address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
-    // While there is a session its port is the robot's: each HTTP request may have another one.
+    // During a session the port is that of the session: each HTTP request may have another port.
     if address.is_some() && (sightings.connection.is_none() || is_elsewhere) {
         sightings.address = address;
     }
@@ -286,7 +287,7 @@ fn entry<'a>(robots: &'a mut HashMap<RobotId, Sightings>, robot: &RobotId) -> &'
     robots.entry(robot.clone()).or_default()
 }
 
-/// Forgets the sixteenth that was silent for longest, so that the next scan is far off.
+/// Forgets the longest silent sixteenth of the robots, so that the next scan is far off.
 fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
     let mut silent: Vec<(bool, Option<u64>, RobotId)> = robots
         .iter()
@@ -301,10 +302,10 @@ fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
 }
 
 impl Sightings {
-    /// Whether the robot's work is this agent's. That is so for the agent that has it, for one that
-    /// could only begin after that one had ended, and once that one was silent for long. An older
-    /// agent does not say where it runs, so that a restart of it can't be told from a copy: the
-    /// next one follows at once, as it always did.
+    /// Whether this agent serves the robot's work. That is true for the agent that already serves,
+    /// for an agent that could only start after the serving one had ended, and once the serving one
+    /// has been silent for long enough. An older agent does not state its place, so a restart looks
+    /// like a copy. In that case the next instance takes over at once, as in earlier versions.
     fn gives_way_to(&self, claim: &Claim, now_ms: u64) -> bool {
         let Some((served, heard_ms)) = &self.served else { return true };
         let Some(place) = served.place else { return true };
@@ -317,13 +318,13 @@ impl Sightings {
         self.served.as_ref().is_some_and(|(served, _)| served.place.is_some())
     }
 
-    /// Whether the agent that has the robot's work has its session as well.
+    /// Whether the serving agent also owns the robot's session.
     fn has_session(&self) -> bool {
         let speaks = |(served, _): &(Claim, u64)| self.speaker.as_ref() == Some(&served.instance);
         self.connection.is_some() && self.served.as_ref().is_some_and(speaks)
     }
 
-    /// Whoever had the session was there until now.
+    /// The owner of the session was present until now.
     fn session_ended(&mut self, now_ms: u64) {
         if self.has_session()
             && let Some((_, heard_ms)) = &mut self.served
@@ -351,15 +352,15 @@ impl Sightings {
     }
 }
 
-/// The instances of one robot, by when each took the place of another.
+/// The instances of one robot, by the time at which each displaced another.
 ///
-/// A restarted agent is a new instance and an old one never comes back, except for a message that
-/// was late. So two *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two
+/// A restarted agent is a new instance, and an old instance never comes back, except in a late
+/// message. So two *returns* within [`DUPLICATE_WINDOW_MS`] (A, B, A again, B again) mean that two
 /// machines share the identity.
 #[derive(Debug, Clone, Default)]
 pub struct InstanceHistory {
     changes: VecDeque<Change>,
-    /// The last return that made, or kept, the robot a duplicate.
+    /// The last return that made the robot a duplicate, or kept the robot one.
     duplicate_at_ms: Option<u64>,
 }
 
@@ -371,7 +372,7 @@ struct Change {
 }
 
 impl InstanceHistory {
-    /// `instance` was heard.
+    /// Records a message or request of `instance`.
     pub fn observe(&mut self, instance: &InstanceId, now_ms: u64) {
         if self.changes.back().is_some_and(|last| last.instance == *instance) {
             return;
@@ -512,7 +513,7 @@ mod tests {
         assert!(!presence.is_duplicate(&robot, 2));
     }
 
-    /// A new start in this place.
+    /// A new instance in this place.
     fn claim(place: u8) -> Claim {
         Claim { instance: InstanceId::random(), place: Some(Digest::of(&[place])) }
     }
@@ -571,7 +572,8 @@ mod tests {
         presence.connected(&robot, None, 1, 0);
         assert!(presence.may_be_told(&robot), "nobody has said yet that it says so");
         assert!(says(&original, 1, 0) && presence.may_be_told(&robot));
-        // A copy takes the session over. What was there all the time was heard when it ended.
+        // A copy takes over the session. The earlier instance was last heard when its session
+        // ended.
         let later_ms = 10 * MINUTE_MS;
         presence.disconnected(&robot, 1, later_ms);
         presence.connected(&robot, None, 2, later_ms);
@@ -584,7 +586,7 @@ mod tests {
         presence.disconnected(&robot, 2, later_ms + 2);
         presence.connected(&robot, None, 3, later_ms + 2);
         assert!(says(&original, 3, later_ms + 3) && presence.may_be_told(&robot));
-        // As long as its session is up it is not silent.
+        // An instance with a live session is not silent.
         assert!(!presence.claimed(&robot, None, None, copy, later_ms + MINUTE_MS).is_served);
     }
 

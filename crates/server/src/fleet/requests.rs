@@ -1,6 +1,6 @@
-//! Questions to robots that are under way: each waits here for its reply, for as long as an answer
-//! is of use and no longer. Nothing is stored: who asks waits, and a question lost with a
-//! connection is asked again by whoever wants to.
+//! Pending requests to robots: each waits here for its reply, only for as long as an answer is
+//! useful. Nothing is stored: the caller waits, and may repeat a request that was lost with a
+//! connection.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,33 +14,33 @@ use tokio::sync::oneshot;
 
 use crate::broker::{Broker, NotAsked};
 
-/// Questions under way at a time, to all robots together.
+/// Maximum pending requests to all robots together.
 const MAX_UNDER_WAY: usize = 1024;
 
-/// Why there is no answer.
+/// The reason why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum RequestError {
-    /// The robot is not there to be asked.
+    /// The robot is not connected.
     #[error("the robot is not connected over MQTT, so it can't be asked")]
     NotConnected,
-    /// It, or the server, has enough to answer already.
+    /// The robot, or the server, has too many pending requests.
     #[error("too many questions are under way; try again")]
     Busy,
-    /// It said nothing in time.
+    /// The robot did not answer in time.
     #[error("the robot did not answer within {} s", .patience.as_secs_f64())]
     TimedOut {
-        /// How long it had.
+        /// The time limit.
         patience: Duration,
     },
-    /// It said why not.
+    /// The robot refused, with a reason.
     #[error("{}", .0.text)]
     Refused(Refusal),
-    /// The question could not be written.
+    /// The request could not be serialized.
     #[error("the question can't be written")]
     Unwritable(#[from] serde_json::Error),
 }
 
-/// The questions under way; clones share them.
+/// The pending requests; clones share them.
 #[derive(Clone, Default)]
 pub struct Requests {
     waiting: Arc<Mutex<HashMap<RequestId, Waiting>>>,
@@ -52,7 +52,8 @@ struct Waiting {
 }
 
 impl Requests {
-    /// Asks `robot` and waits for the answer, at most for `patience` or what the protocol allows.
+    /// Sends a request to `robot` and waits for the answer, at most for `patience` or the
+    /// protocol's limit.
     pub async fn ask(
         &self,
         broker: &Broker,
@@ -65,7 +66,7 @@ impl Requests {
         self.put(broker, robot, request, patience).await
     }
 
-    /// The same for what changes something, as it was signed.
+    /// Like `ask`, for a signed request that changes something.
     pub async fn act(
         &self,
         broker: &Broker,
@@ -101,15 +102,15 @@ impl Requests {
         }
     }
 
-    /// A reply came from `robot`. One that nobody waits for is dropped: it is late, doubled or made
-    /// up.
+    /// Handles a reply from `robot`. A reply without a pending request is dropped: it is late,
+    /// duplicate or forged.
     pub fn replied(&self, robot: &RobotId, reply: Reply) {
         let mut waiting = self.waiting();
-        // Another robot can't answer in this one's place, even if it guessed the id.
+        // Another robot can't answer in this robot's place, even with a guessed id.
         if waiting.get(&reply.id).is_some_and(|waiting| waiting.robot == *robot)
             && let Some(waiting) = waiting.remove(&reply.id)
         {
-            // Whoever asked may have gone.
+            // The caller may have gone.
             let _ = waiting.reply.send(reply.outcome);
         }
     }
@@ -140,8 +141,7 @@ fn ttl_ms(patience: Duration) -> u64 {
     u64::try_from(patience.as_millis()).unwrap_or(MAX_TTL_MS).min(MAX_TTL_MS)
 }
 
-/// Keeps a question's place; it is free again however the wait ends, also when whoever asked hangs
-/// up.
+/// A pending request's place. It is freed whenever the wait ends, also when the caller hangs up.
 struct Place {
     requests: Requests,
     id: RequestId,

@@ -1,6 +1,6 @@
-//! The last log lines of each robot, and who follows them. Only memory: what a robot published by
-//! itself is here until newer lines take its place, all of it is on the robot. It never asks a
-//! robot.
+//! The last log lines of each robot, and the robot's followers. In memory only: lines that a robot
+//! published by itself stay until newer lines replace them; the full log is on the robot. This
+//! module never sends requests to a robot.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -9,16 +9,16 @@ use task_proto::RobotId;
 use task_proto::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES, MAX_LINE_BYTES};
 use tokio::sync::{Notify, broadcast};
 
-/// Lines kept of one robot.
+/// Maximum lines in memory for one robot.
 const MAX_ROBOT_LINES: usize = 200;
-/// Bytes kept of all robots; each has an equal share, if it needs it.
+/// Maximum bytes in memory for all robots; each has an equal share, if needed.
 const MAX_BYTES: usize = 64 * 1024 * 1024;
-/// What a line takes beside its texts.
+/// Memory of a line besides its texts.
 const LINE_OVERHEAD_BYTES: usize = 160;
-/// What a robot may publish a second, and at once.
+/// A robot's publishing limit per second, and its burst.
 const BYTES_PER_S: u64 = 256 * 1024;
 const BURST_BYTES: u64 = 1024 * 1024;
-/// Batches a slow follower may fall behind before it misses some.
+/// Maximum batches that a slow follower may lag before it misses some.
 const BACKLOG: usize = 64;
 
 /// The lines of all robots; clones share them.
@@ -41,39 +41,39 @@ struct State {
 struct Kept {
     lines: VecDeque<LogLine>,
     bytes: usize,
-    /// The robot's clock and ours when the last batch came.
+    /// The robot's clock and ours when the last batch arrived.
     robot_ms: u64,
     received_ms: u64,
     suppressed: u64,
-    /// Bytes it may still publish, and since when that holds.
+    /// The robot's remaining publishing budget, and the time of that value.
     budget_bytes: u64,
     budget_ms: u64,
 }
 
-/// What the server remembers of a robot.
+/// The robot's lines that the server holds in memory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Remembered {
     /// The oldest first.
     pub lines: Vec<LogLine>,
-    /// The robot's clock when they came.
+    /// The robot's clock when the lines arrived.
     pub robot_ms: u64,
-    /// Ours.
+    /// Our clock when the lines arrived.
     pub received_ms: u64,
-    /// Lines that were left out, as long as these are remembered.
+    /// Lines that were left out, for as long as the lines around them are in memory.
     pub suppressed: u64,
 }
 
-/// What followers are told.
+/// An event for followers.
 #[derive(Debug, Clone)]
 pub enum Told {
-    /// The robot has said that it publishes.
+    /// The robot has confirmed that it publishes.
     Following {
-        /// After it did not for a while, so that lines may be missing.
+        /// Publishing had stopped for a while, so lines may be missing.
         again: bool,
     },
-    /// It can't be reached.
+    /// The robot can't be reached.
     Away(Arc<str>),
-    /// Lines came.
+    /// Lines arrived.
     Lines(Arc<LogBatch>),
 }
 
@@ -83,31 +83,31 @@ struct Followed {
     changed: Arc<Notify>,
 }
 
-/// One follower's place; it follows until this is dropped.
+/// A follower's place; following ends when this is dropped.
 pub struct Follower {
     logs: RobotLogs,
     robot: RobotId,
     number: u64,
 }
 
-/// A place that was taken, and what is to be done for it.
+/// A new follower's place, and the follow-up work.
 pub struct Joined {
     /// The place.
     pub follower: Follower,
-    /// What it is told.
+    /// The events for the follower.
     pub told: broadcast::Receiver<Told>,
-    /// Whether it is the first: then somebody has to ask the robot, for as long as there are
-    /// followers.
+    /// Whether this is the first follower. Then the caller must request publishing from the robot,
+    /// for as long as there are followers.
     pub is_first: bool,
 }
 
 impl RobotLogs {
-    /// Nothing remembered, nobody following.
+    /// Starts without lines and followers.
     pub fn new() -> Self {
         Self { state: Arc::default(), max_bytes: MAX_BYTES }
     }
 
-    /// Whether `robot` may publish so many bytes now. Ask before reading them.
+    /// Whether `robot` may publish this many bytes now. Ask before reading them.
     pub fn admits(&self, robot: &RobotId, bytes: usize, now_ms: u64) -> bool {
         let mut state = self.state();
         let kept = state.robots.entry(robot.clone()).or_insert_with(|| Kept {
@@ -123,7 +123,7 @@ impl RobotLogs {
         left.is_some()
     }
 
-    /// Takes what a robot published, and hands it to its followers.
+    /// Stores a robot's batch, and hands it to the followers.
     pub fn take(&self, mut batch: LogBatch, now_ms: u64) {
         batch.lines.truncate(MAX_BATCH_LINES);
         batch.lines.iter_mut().for_each(|line| line.text = one_line(&line.text));
@@ -141,16 +141,16 @@ impl RobotLogs {
         let after = kept.bytes;
         state.bytes = state.bytes + after - before;
         if state.bytes > self.max_bytes {
-            // A little more than needed, or it would be done again for the next line.
+            // Frees more than needed, or the next line would cause the same work again.
             state.shrink(share / 4 * 3);
         }
         if let Some(followed) = state.followed.get(&batch.robot_id) {
-            // They may just have gone.
+            // The followers may just have left.
             let _ = followed.told.send(Told::Lines(Arc::new(batch)));
         }
     }
 
-    /// What is remembered of `robot`.
+    /// The lines of `robot` in memory.
     pub fn remembered(&self, robot: &RobotId) -> Option<Remembered> {
         let state = self.state();
         let kept = state.robots.get(robot).filter(|kept| kept.received_ms > 0)?;
@@ -163,13 +163,13 @@ impl RobotLogs {
         })
     }
 
-    /// Forgets a robot that was removed. Its followers' streams end.
+    /// Forgets a removed robot. The streams of its followers end.
     pub fn forget(&self, robot: &RobotId) {
         let mut state = self.state();
         let bytes = state.robots.remove(robot).map_or(0, |kept| kept.bytes);
         state.bytes -= bytes;
         if let Some(followed) = state.followed.remove(robot) {
-            // Whoever asks the robot has nobody to ask for any more.
+            // The task that sends requests to the robot has no robot any more.
             followed.changed.notify_one();
         }
     }
@@ -195,8 +195,8 @@ impl RobotLogs {
         }
     }
 
-    /// The level that the followers of `robot` together want; `None` when nobody follows any more:
-    /// whoever asks the robot then ends, and the next follower is a first one.
+    /// The lowest level that the followers of `robot` want; `None` without followers. The task that
+    /// sends requests to the robot then ends, and the next follower is a first one.
     pub fn wanted(&self, robot: &RobotId) -> Option<LogLevel> {
         let mut state = self.state();
         let level = state.followed.get(robot)?.levels.values().min().copied();
@@ -206,22 +206,22 @@ impl RobotLogs {
         level
     }
 
-    /// Wakes when the followers of `robot` are others, or it has connected anew.
+    /// Wakes when the followers of `robot` change, or when the robot has reconnected.
     pub fn changed(&self, robot: &RobotId) -> Option<Arc<Notify>> {
         Some(self.state().followed.get(robot)?.changed.clone())
     }
 
-    /// The robot has connected anew: it may not know any more that it is followed.
+    /// The robot has reconnected: it may have forgotten that it has followers.
     pub fn connected(&self, robot: &RobotId) {
         if let Some(followed) = self.state().followed.get(robot) {
             followed.changed.notify_one();
         }
     }
 
-    /// Tells the followers of `robot`.
+    /// Sends an event to the followers of `robot`.
     pub fn tell(&self, robot: &RobotId, told: Told) {
         if let Some(followed) = self.state().followed.get(robot) {
-            // They may just have gone.
+            // The followers may just have left.
             let _ = followed.told.send(told);
         }
     }
@@ -252,7 +252,7 @@ impl Kept {
             let Some(oldest) = self.lines.pop_front() else { break };
             self.bytes -= size(&oldest);
         }
-        // A large batch leaves its room behind, which counts as much as lines do.
+        // A large batch leaves unused capacity behind, which counts as much as lines do.
         if self.lines.capacity() > 2 * self.lines.len() {
             self.lines.shrink_to_fit();
         }
@@ -274,7 +274,7 @@ fn size(line: &LogLine) -> usize {
     line.text.len() + task_bytes + node_bytes + LINE_OVERHEAD_BYTES
 }
 
-/// A text as it should have come: on one line, of a bounded length.
+/// Normalizes a text: on one line, of a bounded length.
 fn one_line(text: &str) -> String {
     let cut = &text[..text.floor_char_boundary(MAX_LINE_BYTES)];
     cut.chars().map(|c| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c }).collect()

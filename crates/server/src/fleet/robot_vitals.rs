@@ -1,5 +1,6 @@
-//! How robots' machines did in the last hour. Only memory, packed: a sample takes 16 bytes, so that
-//! ten thousand robots take about 10 MB, and none of it is ever written. It never asks a robot.
+//! Vitals of robots' machines in the last hour. In memory only, and packed: a sample takes 16
+//! bytes, so ten thousand robots take about 10 MB. Nothing is written to disk. This module never
+//! sends requests to a robot.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -7,13 +8,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use task_proto::RobotId;
 use task_proto::vitals::Vitals;
 
-/// How long a sample is kept.
+/// Retention of a sample.
 const KEPT_MS: u64 = 60 * 60 * 1000;
-/// Samples kept of a robot.
+/// Maximum samples of a robot.
 const MAX_SAMPLES: usize = 60;
-/// Samples that come sooner after the one before are shown, not kept: an hour is to fit.
+/// Samples with a shorter distance to the previous one are shown and not stored: the samples must
+/// span an hour.
 const LEAST_GAP_MS: u64 = KEPT_MS / MAX_SAMPLES as u64 * 9 / 10;
-/// Robots remembered at most; beyond it whoever was silent for longest is forgotten.
+/// Maximum robots in memory; beyond the limit, the longest silent robots are forgotten.
 const MAX_ROBOTS: usize = 50_000;
 
 /// The vitals of all robots; clones share them.
@@ -23,16 +25,16 @@ pub struct RobotVitals(Arc<Mutex<HashMap<RobotId, Kept>>>);
 #[derive(Default)]
 struct Kept {
     newest: Vitals,
-    /// When the last of the samples came.
+    /// When the last sample arrived.
     sampled_ms: u64,
     samples: VecDeque<Sample>,
 }
 
-/// A look at a machine in 16 bytes. Sizes are shares of what there is in all, which hardly ever
-/// changes.
+/// A sample of a machine's vitals in 16 bytes. Sizes are fractions of the totals, which hardly ever
+/// change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Sample {
-    /// Seconds since the sample before.
+    /// Seconds since the previous sample.
     after_s: u16,
     /// In hundredths of a percent.
     cpu: u16,
@@ -49,17 +51,18 @@ struct Sample {
 
 const _: () = assert!(size_of::<Sample>() == 16, "the last hour of ten thousand robots fits 10 MB");
 
-/// What stands for "not known".
+/// The encoding of "unknown".
 const NONE: u16 = u16::MAX;
 const NONE_8: u8 = u8::MAX;
 const COLDEST_C: f32 = -50.0;
 
-/// Bytes a second, to a part in a thousand: eleven bits, and how far they are shifted.
+/// Bytes per second, to a precision of a thousandth: eleven bits, and the number of bits by which
+/// they are shifted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Rate(u16);
 
 impl RobotVitals {
-    /// Takes what a robot said, and gives what it is shown as.
+    /// Stores a robot's vitals, and returns them as displayed.
     pub fn take(&self, robot: &RobotId, said: Vitals, now_ms: u64) -> Vitals {
         let mut robots = self.robots();
         if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
@@ -68,7 +71,7 @@ impl RobotVitals {
         let kept = robots.entry(robot.clone()).or_default();
         kept.newest = Vitals { at_ms: now_ms, ..sound(said) };
         if now_ms < kept.sampled_ms {
-            // This machine's clock was set back: what was kept lies ahead.
+            // This machine's clock was set back, so the stored samples lie in the future.
             kept.samples.clear();
         }
         let gap_ms = now_ms.saturating_sub(kept.sampled_ms);
@@ -83,12 +86,12 @@ impl RobotVitals {
         kept.newest
     }
 
-    /// The newest.
+    /// The newest vitals.
     pub fn newest(&self, robot: &RobotId) -> Option<Vitals> {
         self.robots().get(robot).map(|kept| kept.newest)
     }
 
-    /// Those of the last hour, the oldest first.
+    /// The vitals of the last hour, the oldest first.
     pub fn last_hour(&self, robot: &RobotId, now_ms: u64) -> Vec<Vitals> {
         let robots = self.robots();
         let Some(kept) = robots.get(robot) else { return Vec::new() };
@@ -118,7 +121,7 @@ impl RobotVitals {
     }
 }
 
-/// Forgets the sixteenth that was silent for longest, so that the next scan is far off.
+/// Forgets the longest silent sixteenth of the robots, so that the next scan is far off.
 fn make_room(robots: &mut HashMap<RobotId, Kept>) {
     let mut silent: Vec<(u64, RobotId)> =
         robots.iter().map(|(robot, kept)| (kept.newest.at_ms, robot.clone())).collect();
@@ -128,7 +131,7 @@ fn make_room(robots: &mut HashMap<RobotId, Kept>) {
     }
 }
 
-/// Without figures that can't be: a robot may say anything.
+/// Removes impossible figures: a robot's data is not trusted.
 fn sound(said: Vitals) -> Vitals {
     let used = |used: Option<u64>, total: Option<u64>| {
         used.zip(total).map(|(used, total)| used.min(total))
@@ -172,7 +175,7 @@ impl Sample {
         }
     }
 
-    /// As it was at `at_ms`, on a machine whose sizes are those of `newest`.
+    /// The sample as vitals at `at_ms`, on a machine with the totals of `newest`.
     fn unpack(&self, at_ms: u64, newest: &Vitals) -> Vitals {
         let used = |share: u16, total: Option<u64>| {
             total
@@ -208,7 +211,7 @@ impl Rate {
         };
         let shift = (u64::BITS - bytes_per_s.leading_zeros()).saturating_sub(Self::BITS);
         let kept = bytes_per_s >> shift;
-        // At most 11 bits above 5: it fits.
+        // At most 11 bits above 5, so the value fits.
         Self(u16::try_from(kept << 5 | u64::from(shift)).unwrap_or(NONE))
     }
 

@@ -1,5 +1,5 @@
-//! The API's one error shape: a status, a stable code for programs and a sentence for people. It
-//! never tells a caller what went wrong inside: that is logged.
+//! The API's one error shape: a status, a stable code for programs and a sentence for people.
+//! Internal causes are logged and never sent to callers.
 
 use std::io;
 
@@ -18,23 +18,23 @@ use crate::store::{Fault, StoreError};
 /// The code of [`ApiError::robot_revoked`].
 pub(super) const ROBOT_REVOKED: &str = "robot_revoked";
 
-/// The code where the database is corrupt.
+/// The code for a corrupt database.
 pub(super) const DATABASE_CORRUPT: &str = "database_corrupt";
 
-/// An answer that is not the one hoped for.
+/// An error answer of the API.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ApiError {
     /// The HTTP status.
     pub status: StatusCode,
     /// The stable code.
     pub code: &'static str,
-    /// What went wrong, naming the caller's own key.
+    /// The error message, which names the caller's own key.
     pub message: String,
-    /// Where it makes sense to try again: when, in seconds.
+    /// Seconds until a retry is useful, for statuses that allow one.
     pub retry_after_s: u64,
 }
 
-/// When to try again, where nothing better is known.
+/// Default time until a retry, in seconds.
 const RETRY_AFTER_S: u64 = 5;
 
 impl ApiError {
@@ -48,7 +48,7 @@ impl ApiError {
         Self::new(StatusCode::BAD_REQUEST, "invalid_request", message)
     }
 
-    /// 401: nobody known is asking.
+    /// 401: the caller is not authenticated.
     pub fn unauthorized(message: impl Into<String>) -> Self {
         Self::new(StatusCode::UNAUTHORIZED, "unauthorized", message)
     }
@@ -67,39 +67,39 @@ impl ApiError {
         Self::new(StatusCode::FORBIDDEN, api::AWAITS_APPROVAL, message)
     }
 
-    /// 403: whoever asks may not.
+    /// 403: the caller lacks the permission.
     pub fn forbidden(message: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "forbidden", message)
     }
 
-    /// 403: it is not one of the person's robots, or concerns none of them.
+    /// 403: the resource is outside the person's scope.
     pub fn out_of_scope(what: impl std::fmt::Display, by: &Person) -> Self {
         let message =
             format!("{what} is outside of {}'s scope {:?}", by.name, by.scope.to_string());
         Self::new(StatusCode::FORBIDDEN, "out_of_scope", message)
     }
 
-    /// 404: there is no such thing.
+    /// 404: the resource does not exist.
     pub fn not_found(message: impl Into<String>) -> Self {
         Self::new(StatusCode::NOT_FOUND, "not_found", message)
     }
 
-    /// 409: it contradicts what is there.
+    /// 409: the request conflicts with the current state.
     pub fn conflict(code: &'static str, message: impl Into<String>) -> Self {
         Self::new(StatusCode::CONFLICT, code, message)
     }
 
-    /// 429: too much of it.
+    /// 429: the caller exceeds a limit.
     pub fn too_many(message: impl Into<String>) -> Self {
         Self::new(StatusCode::TOO_MANY_REQUESTS, "too_many_requests", message)
     }
 
-    /// 503: not now; the caller is expected to try again.
+    /// 503: temporarily unavailable; the caller is expected to try again.
     pub fn unavailable(message: impl Into<String>) -> Self {
         Self::new(StatusCode::SERVICE_UNAVAILABLE, "unavailable", message)
     }
 
-    /// 500: our own failure, logged here with its causes.
+    /// 500: an internal failure, logged here with its causes.
     pub fn internal(error: &(dyn std::error::Error + 'static)) -> Self {
         tracing::error!(error, "a request failed");
         Self::new(
@@ -114,7 +114,7 @@ impl ApiError {
         Self::new(StatusCode::INSUFFICIENT_STORAGE, "disk_full", "the server's disk is full")
     }
 
-    /// Our own disk refused something; `source` is how.
+    /// The server's own disk returned an error; `source` tells its kind.
     pub fn disk(error: &(dyn std::error::Error + 'static), source: &io::Error) -> Self {
         match source.kind() {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::disk_full(),
@@ -135,8 +135,8 @@ impl ApiError {
             _ => "UNSUPPORTED",
         };
         let body = json!({ "errors": [{ "code": code, "message": self.message }] });
-        // Registry clients send the password only after a Basic challenge; a page must not see one,
-        // or the browser would ask its user.
+        // Registry clients send the password only after a Basic challenge. A page must not see a
+        // challenge, or the browser would ask its user for a password.
         self.with_headers("Basic realm=\"taskd\"", Json(body))
     }
 
@@ -174,7 +174,7 @@ impl From<BlobError> for ApiError {
     }
 }
 
-/// A fault is logged where it is noticed, not for each request that it ends.
+/// A fault is logged once where it is noticed, not for each request that it fails.
 impl From<Fault> for ApiError {
     fn from(fault: Fault) -> Self {
         match fault {

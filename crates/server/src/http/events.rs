@@ -1,6 +1,6 @@
-//! The event stream: notices of change, gathered for a moment, read once from the store and sent to
-//! every listener whose robots they concern. It never replays: whoever missed something is told so
-//! and fetches the lists again.
+//! The event stream: notices of change are gathered for a moment, read once from the store and sent
+//! to every listener with access to their robots. The stream never replays: a listener that missed
+//! events is told and fetches the lists again.
 
 use std::collections::{BTreeSet, HashSet, VecDeque};
 use std::convert::Infallible;
@@ -32,22 +32,22 @@ use crate::orders::feed::{Feed, FeedAudience};
 use crate::store::{KnownRobot, Store, StoreError, TokenHolder};
 use crate::system::clock::Clock;
 
-/// For how long notices are gathered: a robot that reports ten times in it is sent once.
+/// Window in which notices are gathered: a robot that reports ten times in one window is sent once.
 const GATHER: Duration = Duration::from_millis(200);
-/// Events a slow listener may fall behind before it misses some.
+/// Number of events a slow listener may lag behind before it misses some.
 const BACKLOG: usize = 16 * 1024;
-/// And their bytes; of more than that the oldest go, and who has not taken them yet has missed
-/// them.
+/// Total bytes of the backlog. Above this, the oldest events are dropped, and listeners that have
+/// not taken them have missed them.
 const BACKLOG_BYTES: usize = 64 << 20;
 /// The most listeners at once.
 const MOST_LISTENERS: usize = 512;
-/// Of these the most that are one person's, or one person could keep everybody else out.
+/// The most listeners of one person; otherwise one person could keep all others out.
 const MOST_OF_ONE: usize = 32;
-/// How often a stream looks whether its listener may still listen, when nobody has said anything.
+/// Interval at which a stream checks its listener's rights when no change of rights was announced.
 const RIGHTS_INTERVAL: Duration = Duration::from_secs(30);
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 
-/// An event as it goes to the listeners: written once.
+/// An event as sent to listeners, serialized once.
 #[derive(Debug, Clone)]
 struct Line {
     name: &'static str,
@@ -55,7 +55,7 @@ struct Line {
     audience: Audience,
 }
 
-/// An event's text, for as long as somebody has not taken it and there is room for it.
+/// An event's text, kept while a listener has yet to take it and the backlog has room.
 #[derive(Debug)]
 struct Text {
     text: Mutex<Option<Arc<str>>>,
@@ -80,8 +80,8 @@ impl Drop for Text {
     }
 }
 
-/// The texts that wait for listeners, the oldest first. Those that all have taken are gone from it
-/// by themselves.
+/// The texts that wait for listeners, the oldest first. A text that all listeners have taken is
+/// freed by itself.
 #[derive(Debug, Clone, Default)]
 struct Backlog {
     texts: Arc<Mutex<VecDeque<Weak<Text>>>>,
@@ -89,7 +89,7 @@ struct Backlog {
 }
 
 impl Backlog {
-    /// Keeps one more, in the place of the oldest if there are too many bytes.
+    /// Appends a text, and drops the oldest while the backlog exceeds its bytes.
     fn keep(&self, text: Arc<str>) -> Arc<Text> {
         self.kept_bytes.fetch_add(text.len(), Ordering::Relaxed);
         let kept =
@@ -110,15 +110,15 @@ impl Backlog {
     }
 }
 
-/// Whom an event is for.
+/// The listeners that an event is for.
 #[derive(Debug, Clone)]
 enum Audience {
     Everybody,
-    /// Those who may see this robot.
+    /// Listeners that may see this robot.
     Robot(Arc<KnownRobot>),
-    /// Those with exactly this scope: what they see of a deployment is their part of it.
+    /// Listeners with exactly this scope: they see only their part of a deployment.
     Scope(Scope),
-    /// Those who are limited to some robots.
+    /// Listeners with a scope limited to some robots.
     Limited,
 }
 
@@ -133,14 +133,14 @@ impl Audience {
     }
 }
 
-/// Somebody who listens.
+/// A connected listener.
 #[derive(Clone, PartialEq, Eq)]
 struct Listener {
     name: UserName,
     scope: Scope,
 }
 
-/// Those who listen, one for each place that is taken.
+/// The connected listeners, one for each place taken.
 #[derive(Clone, Default)]
 struct Listeners(Arc<Mutex<Vec<Listener>>>);
 
@@ -149,7 +149,7 @@ impl Listeners {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The limited scopes among them, each once.
+    /// The limited scopes of the listeners, without duplicates.
     fn limited_scopes(&self) -> Vec<Scope> {
         let mut scopes: Vec<Scope> = Vec::new();
         for Listener { scope, .. } in self.all().iter() {
@@ -161,7 +161,7 @@ impl Listeners {
     }
 }
 
-/// A listener's place; dropping it makes room.
+/// A listener's place; dropping the guard frees the place.
 pub(super) struct Place {
     listeners: Listeners,
     listener: Listener,
@@ -176,7 +176,7 @@ impl Drop for Place {
     }
 }
 
-/// Where listeners come to.
+/// The feed that listeners subscribe to.
 #[derive(Clone)]
 pub struct EventFeed {
     lines: broadcast::Sender<Line>,
@@ -184,19 +184,19 @@ pub struct EventFeed {
     listeners: Listeners,
 }
 
-/// What the feed reads from.
+/// The sources that the feed reads from.
 pub struct EventSource {
     /// The database.
     pub store: Store,
-    /// Who is there.
+    /// Presence of the robots.
     pub presence: Arc<Presence>,
-    /// How robots behave.
+    /// Rate-limit state of the robots.
     pub conduct: Arc<Conduct>,
-    /// How their machines do.
+    /// Vitals of the robots' machines.
     pub vitals: RobotVitals,
-    /// What happened last.
+    /// The feed of recent events.
     pub feed: Feed,
-    /// The time.
+    /// The time source.
     pub clock: Clock,
 }
 
@@ -207,7 +207,7 @@ impl EventFeed {
         Self { lines, backlog, listeners: Listeners::default() }
     }
 
-    /// A place among the listeners for a person with this scope, for as long as it is held.
+    /// Reserves a place for a person with this scope, until the guard is dropped.
     pub(super) fn place(&self, name: &UserName, scope: &Scope) -> Result<Place, ApiError> {
         let mut all = self.listeners.all();
         if all.len() >= MOST_LISTENERS {
@@ -297,7 +297,7 @@ impl EventFeed {
         Ok(())
     }
 
-    /// Sends an entry of the feed, if it is still there, to those it is for.
+    /// Sends a feed entry to its audience, if the entry still exists.
     fn send_entry(&self, source: &EventSource, number: u64) {
         let Some((entry, audience)) = source.feed.get(number) else { return };
         let event = Event::Feed { entry };
@@ -308,8 +308,8 @@ impl EventFeed {
         }
     }
 
-    /// Whoever has a limited scope gets their part of a deployment; it is read and written once for
-    /// all with that scope.
+    /// Sends deployments. Listeners with a limited scope get their part of a deployment; each part
+    /// is read and serialized once per scope.
     async fn send_deployments(
         &self,
         source: &EventSource,
@@ -350,7 +350,7 @@ impl EventFeed {
     }
 
     fn send_text(&self, name: &'static str, text: Arc<str>, audience: Audience) {
-        // Nobody listening is fine.
+        // A send error only means that there are no listeners.
         let _ = self.lines.send(Line { name, text: self.backlog.keep(text), audience });
     }
 }
@@ -372,7 +372,7 @@ fn name_of(event: &Event) -> &'static str {
     }
 }
 
-/// Streams what changes from now on, until the server stops or the session ends.
+/// Streams changes from now on, until the server stops or the session ends.
 #[utoipa::path(get, path = "/api/v1/events", tag = "events",
     responses((status = 200, description = "Server-sent events, each of which has an `Event` as its data.",
             content((Event = "text/event-stream"))),
@@ -382,7 +382,7 @@ pub(super) async fn stream(
     by: Person,
     headers: HeaderMap,
 ) -> Result<Sse<impl Stream<Item = Result<SentEvent, Infallible>>>, ApiError> {
-    // The place is free again when the stream is dropped.
+    // The place is freed when the stream is dropped.
     let place = app.events.place(&by.name, &by.scope)?;
     let lines = BroadcastStream::new(app.events.lines.subscribe());
     let mut has_missed = false;
@@ -394,7 +394,7 @@ pub(super) async fn stream(
             Ok(line) => (line.name, line.text.get()),
             Err(_) => ("missed", None),
         };
-        // Of many that were missed in a row it is said once.
+        // Several missed events in a row are announced once.
         let is_said = std::mem::replace(&mut has_missed, text.is_none()) && has_missed;
         let event = match text {
             Some(text) => SentEvent::default().event(name).data(text),
@@ -402,7 +402,8 @@ pub(super) async fn stream(
         };
         std::future::ready((!is_said).then_some(Ok(event)))
     });
-    // A first line, so that proxies pass the headers on and the page knows that it is connected.
+    // An immediate first line makes proxies pass the headers on, and tells the page that the stream
+    // is connected.
     let greeting = futures_util::stream::iter([Ok(SentEvent::default()
         .retry(Duration::from_secs(2))
         .comment("hello"))]);
@@ -410,8 +411,8 @@ pub(super) async fn stream(
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(KEEP_ALIVE)))
 }
 
-/// Whether the token still stands for the same person with the same rights, and the robot, if it is
-/// about one, is theirs.
+/// True while the token still belongs to the same person with the same rights, and `robot`, if
+/// given, is in the person's scope.
 async fn still_may(
     app: &App,
     by: &Person,
@@ -427,9 +428,9 @@ async fn still_may(
     Ok(robot.is_some_and(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels)))
 }
 
-/// Resolves when whoever sent these headers may listen no longer: their session ended (perhaps
-/// since the guard looked), or what they may has changed, or `robot` is none of theirs any more.
-/// Whoever may something else then comes again and gets that.
+/// Resolves when the sender of these headers may no longer listen: the session ended (perhaps since
+/// the guard ran), the person's rights changed, or `robot` left the person's scope. After a change
+/// of rights, the client reconnects and gets its new view.
 pub(super) fn end_of_stream(
     app: &App,
     by: Person,
@@ -450,9 +451,9 @@ pub(super) fn end_of_stream(
     };
     let (stop, app, mut rights) = (app.stop.clone(), app.clone(), app.changes.rights());
     let may_no_longer = async move {
-        // While the database does not answer nobody can change anything either.
+        // While the database does not answer, no rights can change either.
         while still_may(&app, &by, &token, robot.as_ref()).await.unwrap_or(true) {
-            // A token also ends by itself.
+            // A token can also expire without a notice.
             tokio::select! {
                 _ = rights.changed() => {}
                 () = tokio::time::sleep(RIGHTS_INTERVAL) => {}

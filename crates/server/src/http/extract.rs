@@ -1,5 +1,5 @@
-//! What handlers take out of a request: JSON bodies, path and query parameters, the idempotency
-//! key. Whatever does not parse is refused here in the API's error shape, naming the field.
+//! Extractors for handlers: JSON bodies, path and query parameters, the idempotency key. Invalid
+//! input is refused here in the API's error shape, naming the field.
 
 use std::fmt::Display;
 use std::str::FromStr;
@@ -16,11 +16,11 @@ use task_proto::api::MOST_ON_A_PAGE;
 use super::error::ApiError;
 use crate::orders::actions::IdempotencyKey;
 
-/// A JSON body from an operator. A field that this version does not know is refused: it would be an
-/// order half done.
+/// A JSON body from an operator. Unknown fields are refused: an order with an ignored field would
+/// be carried out only in part.
 pub struct JsonBody<T>(pub T);
 
-/// A JSON body from an agent, which may be newer than this server: unknown fields are passed over.
+/// A JSON body from an agent, which may be newer than this server: unknown fields are ignored.
 pub struct TolerantJson<T>(pub T);
 
 impl<S: Send + Sync, T: DeserializeOwned + Serialize> FromRequest<S> for JsonBody<T> {
@@ -76,7 +76,7 @@ pub fn parse_json<T: DeserializeOwned>(body: &[u8]) -> Result<T, ApiError> {
     Ok(value)
 }
 
-/// A field is known if the value, written out again, has it.
+/// A field is known if the value, serialized again, has it.
 fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), ApiError> {
     let given: serde_json::Map<String, Value> = parse_json(body)?;
     let known = serde_json::to_value(value).map_err(|error| ApiError::internal(&error))?;
@@ -89,8 +89,8 @@ fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), Api
     }
 }
 
-/// The path of a field that is not known, in the body or in what is in it. Inside, null and {} are
-/// the same as nothing, which is not written out again.
+/// The path of an unknown field, at any depth of the body. In nested values, null and {} are the
+/// same as an absent field, which is not serialized.
 fn unknown_field(given: &serde_json::Map<String, Value>, known: &Value) -> Option<String> {
     given.iter().find_map(|(key, value)| {
         let Some(known) = known.get(key) else { return Some(key.clone()) };
@@ -103,7 +103,7 @@ fn unknown_field(given: &serde_json::Map<String, Value>, known: &Value) -> Optio
     })
 }
 
-/// The path's one parameter, parsed. What does not parse names nothing that exists.
+/// The only parameter of the path, parsed. A value that does not parse names no existing resource.
 pub struct PathParam<T>(pub T);
 
 impl<S: Send + Sync, T: FromStr<Err: Display>> FromRequestParts<S> for PathParam<T> {
@@ -118,7 +118,7 @@ impl<S: Send + Sync, T: FromStr<Err: Display>> FromRequestParts<S> for PathParam
     }
 }
 
-/// The path's two parameters, likewise.
+/// The two parameters of the path, parsed. A value that does not parse names no existing resource.
 pub struct PathParams<A, B>(pub A, pub B);
 
 impl<S, A, B> FromRequestParts<S> for PathParams<A, B>
@@ -144,7 +144,7 @@ where
     }
 }
 
-/// The query's parameters. Only the names in the handler's struct are known; others are refused.
+/// The query's parameters. Only the fields of the handler's struct are known; others are refused.
 pub struct QueryParams<T>(pub T);
 
 impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T> {
@@ -157,7 +157,7 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
     }
 }
 
-/// How many entries a page shall have.
+/// Checks the number of entries per page.
 pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {
     match limit {
         None | Some(1..=MOST_ON_A_PAGE) => Ok(limit),
@@ -167,7 +167,7 @@ pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {
     }
 }
 
-/// The key that makes an order safe to repeat.
+/// Parses the key that makes an order safe to repeat.
 pub fn idempotency_key(value: Option<&HeaderValue>) -> Result<IdempotencyKey, ApiError> {
     let value =
         value.ok_or_else(|| ApiError::invalid("Idempotency-Key: an order needs this header"))?;

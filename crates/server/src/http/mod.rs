@@ -62,80 +62,80 @@ use orders::{deployments, tasks};
 use registry::{archives, oci, packages, upload};
 use server::{health, status, web};
 
-/// What handlers work with. Clones are the same: a request makes several on its way.
+/// State for the handlers. Clones share the same parts: a request makes several clones on its way.
 #[derive(Clone)]
 pub struct App(Arc<AppParts>);
 
-/// What an [`App`] is made of.
+/// The parts of an [`App`].
 pub struct AppParts {
-    /// The time.
+    /// The time source.
     pub clock: Clock,
     /// The database.
     pub store: Store,
-    /// The orders.
+    /// The order operations.
     pub actions: Actions,
-    /// Notices of what has changed.
+    /// Notices of changes.
     pub changes: Changes,
-    /// Where reports go.
+    /// The writer that stores reports.
     pub reports: ReportWriter,
-    /// Who is there.
+    /// Presence of the robots.
     pub presence: Arc<Presence>,
     /// The MQTT broker.
     pub broker: Broker,
-    /// Questions to robots that are under way.
+    /// Requests to robots that are under way.
     pub requests: Requests,
-    /// What robots said last, and who follows them.
+    /// The latest log lines of robots, and their followers.
     pub logs: RobotLogs,
-    /// How their machines do.
+    /// Vitals of the robots' machines.
     pub vitals: RobotVitals,
-    /// The packages' bytes.
+    /// The blob store with the packages' bytes.
     pub blobs: Blobs,
-    /// Whose turn it is to pull them.
+    /// Scheduler of package transfers.
     pub transfers: Transfers,
-    /// Where packages are packed that come as directories.
+    /// Workspace in which uploaded directories are packed.
     pub uploads: registry::upload::UploadSpace,
-    /// Who is signed in at the page.
+    /// Sessions of the web page.
     pub sessions: Arc<accounts::session::Sessions>,
-    /// Robots' requests that are under way.
+    /// Robots' HTTP requests under way.
     pub http_connections: Arc<HttpConnections>,
-    /// How robots behave.
+    /// Rate-limit state of the robots.
     pub conduct: Arc<Conduct>,
-    /// By whom people may sign in, if there is such a provider.
+    /// The OpenID provider, if one is configured.
     pub provider: Option<Arc<Provider>>,
-    /// What people ask for.
+    /// Request limits per person.
     pub people: Arc<auth::person_limits::PersonLimits>,
-    /// Failed authentications.
+    /// Failed authentications by address.
     pub attempts: Arc<auth::attempts::FailedAttempts>,
-    /// What happened last.
+    /// The feed of recent events.
     pub feed: Feed,
-    /// What holds for as long as the server runs.
+    /// Facts that are fixed while the server runs.
     pub facts: Arc<ServerFacts>,
-    /// What was found out about it last.
+    /// Cached figures that are slow to compute.
     pub slow_figures: Arc<server::status::SlowFigures>,
-    /// The long lists that are being rendered.
+    /// Long lists being rendered.
     pub lists: Arc<shared_lists::SharedLists>,
-    /// The event stream's source.
+    /// The source of the event stream.
     pub events: events::EventFeed,
     /// The key that verifies desired states.
     pub key: PublicKey,
     /// The pin of the private authority, if the listeners encrypt.
     pub ca_pin: Option<CaPin>,
-    /// Where robots reach MQTT, and with which password.
+    /// Robots' MQTT address and password.
     pub mqtt: Arc<MqttAccess>,
-    /// The addresses of reverse proxies that are believed about where a request came from.
+    /// The addresses of reverse proxies with a trusted `X-Forwarded-For`.
     pub trusted_proxies: Arc<[IpAddr]>,
-    /// What went over HTTP.
+    /// HTTP traffic totals.
     pub http_traffic: Arc<connection::traffic::HttpTotals>,
     /// The data directory.
     pub data: PathBuf,
-    /// Whether the server can do its work.
+    /// Health of the server's components.
     pub readiness: Readiness,
     /// Cancelled when the server stops.
     pub stop: CancellationToken,
 }
 
 impl App {
-    /// Of these parts.
+    /// Builds the state from these parts.
     pub fn new(parts: AppParts) -> Self {
         Self(Arc::new(parts))
     }
@@ -162,22 +162,22 @@ impl FromRef<App> for registry::oci::Registry {
     }
 }
 
-/// The largest body of most requests.
+/// The body limit of most routes, in bytes.
 const SMALL_BODY_BYTES: usize = 64 * 1024;
-/// An order has one selector.
+/// The body limit of orders, in bytes: an order has one selector.
 const ORDER_BODY_BYTES: usize = MAX_SELECTOR_BYTES + SMALL_BODY_BYTES;
-/// The largest report.
+/// The largest report, in bytes.
 pub const REPORT_BODY_BYTES: usize = task_proto::report::MAX_REPORT_BYTES;
-/// How long a request may take, from its head to its answer.
+/// Time limit from a request's head to its answer.
 const DEADLINE: Duration = Duration::from_secs(30);
 
-/// One route: what it answers to, who may call it, and its limits.
+/// One route: its method and path, its access and its limits.
 pub struct Route {
-    /// The method; GET answers HEAD as well. `None`: the handler looks at the method itself.
+    /// The method; GET answers HEAD as well. `None`: the handler checks the method itself.
     pub method: Option<Method>,
     /// The path, with `{parameters}`.
     pub path: &'static str,
-    /// Who may call it.
+    /// The callers that the route admits.
     pub access: Access,
     body_bytes: usize,
     deadline: Option<Duration>,
@@ -215,7 +215,7 @@ impl Route {
         }
     }
 
-    /// A route for every method, whose handler streams and bounds itself.
+    /// A route for every method. The handler streams and enforces its own limits.
     fn any<H, T>(path: &'static str, access: Access, handler: H, describe: fn(&mut Draft)) -> Self
     where
         H: Handler<T, App>,
@@ -238,23 +238,24 @@ impl Route {
         Self { body_bytes, ..self }
     }
 
-    /// With a deadline of its own.
+    /// Sets a deadline for this route.
     fn within(self, deadline: Duration) -> Self {
         Self { deadline: Some(deadline), ..self }
     }
 
-    /// Its answer waits for a robot's, so it does not count among what a person has under way.
+    /// Marks a route that waits for a robot's answer. Its requests are counted apart from the
+    /// person's other requests under way.
     fn waiting_for_robot(self) -> Self {
         Self { waits_for_robot: true, ..self }
     }
 
-    /// Without a deadline, for an answer that goes on.
+    /// Removes the deadline, for a streamed answer.
     fn streaming(self) -> Self {
         Self { deadline: None, ..self }
     }
 }
 
-/// A route and its description, which is the handler's: its attribute's and its types'.
+/// A route and its OpenAPI description, taken from the handler's attribute and types.
 macro_rules! route {
     (any $path:literal, $access:expr, $module:ident::$handler:ident) => {
         Route::any($path, $access, $module::$handler, route!(describe $module::$handler))
@@ -270,7 +271,7 @@ macro_rules! route {
     };
 }
 
-/// Every route there is, with who may call it. Nothing is served that is not here.
+/// Every route, with its access. The server serves no other path.
 pub fn routes() -> Vec<Route> {
     use Access::{Anyone, Enrolment, OwnRobot, Person};
     use Permission::{Administer, Maintain, Read};
@@ -332,7 +333,7 @@ pub fn routes() -> Vec<Route> {
     routes
 }
 
-/// What robots are to do, and what others than people and the page ask for.
+/// Routes for orders on robots, and for callers other than people and the page.
 fn routes_of_work() -> Vec<Route> {
     use Access::{Anyone, Person, PersonOrRobot};
     use Permission::{Operate, Publish, Read};
@@ -386,7 +387,7 @@ pub fn router(app: App) -> Router {
         let guard = middleware::from_fn_with_state(gate, guard);
         let limit = DefaultBodyLimit::max(route.body_bytes);
         let handler = match route.method {
-            // Not before what answers "method not allowed", which needs no guard.
+            // The guard is not needed before the "method not allowed" answer.
             Some(_) => route.handler.route_layer(limit).route_layer(guard),
             None => route.handler.layer(limit).layer(guard),
         };
@@ -397,7 +398,7 @@ pub fn router(app: App) -> Router {
         .method_not_allowed_fallback(method_not_allowed)
         .layer(middleware::map_response(harden))
         .layer(middleware::map_request(connection::drain::drain_unread));
-    // Nothing stands in the way of each request where nobody is to be believed.
+    // Without trusted proxies we skip this layer, so that requests pay nothing.
     let router = match trusted.is_empty() {
         true => router,
         false => router
@@ -415,11 +416,11 @@ async fn method_not_allowed(request: Request) -> Response {
     ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", message).into_response()
 }
 
-/// What a browser may do with an answer that is not the page: nothing.
+/// Content security policy of every answer that is not the page: browsers may load and run nothing.
 const ANSWER_POLICY: &str =
     "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
 
-/// Headers for browsers: nothing is ever framed or sniffed, or shown to other pages.
+/// Security headers for browsers: no framing, no content sniffing, no access for other pages.
 async fn harden(mut response: Response) -> Response {
     const HEADERS: [(header::HeaderName, &str); 5] = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),

@@ -1,6 +1,6 @@
 //! Long lists, rendered once for all requests that may share the answer. A request never gets an
-//! answer that was begun before it came: while one rendering is under way, later requests for the
-//! same list wait and share the next one.
+//! answer that was begun before the request came: while one rendering is under way, later requests
+//! for the same list wait and share the next one.
 
 use std::collections::HashMap;
 use std::marker::PhantomData;
@@ -16,7 +16,7 @@ use tokio::time::Instant;
 use super::error::ApiError;
 use crate::domain::person::Scope;
 
-/// Lists that are rendered at the same time: each holds the views of a whole fleet.
+/// Concurrent renderings: each holds the views of a whole fleet.
 const RENDERINGS: usize = 2;
 
 /// The identity of a list: requests with equal keys get equal answers.
@@ -38,7 +38,7 @@ impl ListKey {
     }
 }
 
-/// The lists that are being rendered.
+/// The lists being rendered.
 #[derive(Debug)]
 pub struct SharedLists {
     lists: Mutex<HashMap<ListKey, Arc<List>>>,
@@ -54,7 +54,7 @@ struct Rendering {
     body: Bytes,
 }
 
-/// A request's part in a list; the list is forgotten with the last one.
+/// A request's share in a list; the list is removed with its last share.
 struct Share<'a> {
     lists: &'a SharedLists,
     key: ListKey,
@@ -75,7 +75,7 @@ impl Default for SharedLists {
 
 impl SharedLists {
     /// The list with this key, from a rendering that begins after this call. If `render` fails,
-    /// this request fails, and the next one that waits renders.
+    /// this request fails, and the next waiting request renders.
     pub(super) async fn get<T: Serialize>(
         &self,
         key: ListKey,
@@ -114,7 +114,7 @@ impl SharedLists {
 impl Drop for Share<'_> {
     fn drop(&mut self) {
         let mut lists = self.lists.lists();
-        // The map has one, this has one, and others join under this lock only.
+        // The map holds one reference and this share the other; others join under this lock only.
         if Arc::strong_count(&self.list) == 2 {
             lists.remove(&self.key);
         }

@@ -1,4 +1,4 @@
-//! Views as the operator sees them: the store's rows, completed with what only presence knows.
+//! Views for the operator: the store's rows, completed with data from presence.
 
 use std::collections::HashSet;
 
@@ -11,7 +11,7 @@ use crate::fleet::presence::Presence;
 use crate::fleet::robot_vitals::RobotVitals;
 use crate::limits::conduct::Conduct;
 
-/// Adds where a robot is, how it behaves and does, and what is wrong with its identity.
+/// Adds a robot's presence, behavior, vitals and identity problems.
 pub fn complete_robot(
     view: &mut RobotView,
     presence: &Presence,
@@ -40,14 +40,14 @@ pub fn complete_robot(
     }
 }
 
-/// Says which robots of a deployment are there.
+/// Adds the presence of a deployment's robots.
 pub fn complete_deployment(view: &mut DeploymentView, presence: &Presence, now_ms: u64) {
     for assignment in view.assignments.iter_mut().flatten() {
         assignment.online = presence.is_online(&assignment.robot, now_ms);
     }
 }
 
-/// What of a deployment, which has its assignments, concerns these robots; `None` if nothing does.
+/// Narrows a deployment with its assignments to these robots; `None` if no assignment is left.
 pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<DeploymentView> {
     let assignments = view.assignments.as_mut()?;
     assignments.retain(|assignment| robots.contains(&assignment.robot));
@@ -65,12 +65,12 @@ pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<D
     Some(without_others(view))
 }
 
-/// Without what names robots and deployments that may be none of the person's.
+/// Removes the fields that could name robots and deployments outside the person's scope.
 pub fn without_others(view: DeploymentView) -> DeploymentView {
     DeploymentView { selector: None, supersedes: Vec::new(), ..view }
 }
 
-/// Says which of the robots are there.
+/// Adds the presence of the matched robots.
 pub fn complete_matched(robots: &mut [MatchedRobot], presence: &Presence, now_ms: u64) {
     for robot in robots {
         robot.online = presence.is_online(&robot.id, now_ms);

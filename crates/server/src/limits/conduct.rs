@@ -1,7 +1,7 @@
-//! How robots behave, and what follows: one that sends more than it may is slowed, on its own
-//! connection only; one that goes on with it, or does what none of ours would, is cut off and may
-//! come back after a while that doubles. What is known of a robot is in memory, and forgotten once
-//! it has behaved for long enough. It touches no socket and reads no clock.
+//! Rate limits of robots. A robot above its limits is slowed, on its own connection only. A robot
+//! that stays above them, or that breaks the protocol, is cut off for a backoff that doubles each
+//! time. Records live in memory and are forgotten after a period of good behaviour. This module
+//! touches no socket and reads no clock.
 
 use std::collections::{BTreeSet, HashMap};
 use std::fmt;
@@ -16,29 +16,29 @@ use tokio::time::Instant;
 
 use super::rate_limit::{BURST, MAX_HELD, TokenBucket};
 
-/// How often the time that a robot has to stay away doubles.
+/// Maximum doublings of the backoff.
 const MAX_DOUBLINGS: u32 = 6;
-/// How many more requests a robot may make for what it brings back: a run has up to 256 files, each
-/// of which takes some.
+/// Factor on the request rate for output uploads: a run has up to 256 files, each of which takes
+/// several requests.
 const OUTPUT_REQUESTS: u64 = 10;
-/// What beginning a session costs, in messages.
+/// Cost of beginning a session, in messages.
 pub const SESSION_COST: u64 = 10;
 
-/// What a robot may do.
+/// The limits of a robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ConductLimits {
-    /// Messages a second over MQTT, for long; acknowledgements don't count.
+    /// Sustained messages per second over MQTT; acknowledgements don't count.
     pub messages_per_s: u64,
-    /// Bytes a second over MQTT, likewise; all of them count.
+    /// Sustained bytes per second over MQTT; all bytes count.
     pub bytes_per_s: u64,
-    /// Requests a second, likewise, those for a package's bytes excepted; and ten times as many for
-    /// what it brings back.
+    /// Sustained requests per second, without requests for a package's bytes. Output uploads have a
+    /// separate limit of ten times this rate.
     pub requests_per_s: u64,
-    /// How long it is slowed before it is cut off.
+    /// How long a robot is slowed before the server cuts it off.
     pub patience: Duration,
-    /// How long it has to stay away the first time.
+    /// The first backoff after a cut.
     pub backoff: Duration,
-    /// How long it has to behave to be like any other again.
+    /// Period of good behaviour after which a robot's record is cleared.
     pub forgive_after: Duration,
 }
 
@@ -55,49 +55,51 @@ impl Default for ConductLimits {
     }
 }
 
-/// What a robot did that it should not.
+/// A robot's violation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Offence {
-    /// It sends more than it may over MQTT.
+    /// The robot exceeds its MQTT limits.
     Messages,
-    /// It asks or reports more often than it may over HTTP.
+    /// The robot exceeds its HTTP request rate.
     Requests,
-    /// It sent what is no MQTT, is too large, or is not allowed to it: says what it did.
+    /// The robot sent a packet that is not MQTT, is too large, or is not allowed; contains the
+    /// description.
     Violation(&'static str),
-    /// It sent a packet of so many bytes.
+    /// The robot sent a packet of this many bytes.
     TooLarge(usize),
 }
 
-/// By which way a robot comes. Who is cut off on one may still use the other: it must be able to
-/// hear that it should stop.
+/// The channel that a robot uses. A robot that is cut off on one channel may still use the others,
+/// because the robot must be able to receive the instruction to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Way {
-    /// A session.
+    /// An MQTT session.
     Mqtt,
-    /// Requests.
+    /// HTTP requests.
     Http,
-    /// Requests by which it brings back what its runs have made.
+    /// HTTP requests that upload the outputs of the robot's runs.
     Outputs,
 }
 
-/// What to do with whoever has just sent something.
+/// The decision about a robot that has just sent data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// Go on.
+    /// Continue.
     Fine,
-    /// Nothing more is taken from it before then.
+    /// Read nothing more from the robot before this time.
     Slow(Instant),
-    /// It has been slowed for long enough, or may not come yet: it may come back then.
+    /// Cut the robot off: it was slowed for too long, or its backoff still runs. The robot may come
+    /// back at this time.
     Cut(Instant),
 }
 
-/// All robots. One that does nothing unusual is known here only while it is connected, or was a
-/// moment ago.
+/// The records of all robots. A robot without violations has a record only while connected, or
+/// shortly after.
 #[derive(Debug)]
 pub struct Conduct {
     limits: ConductLimits,
     robots: Mutex<HashMap<RobotId, Arc<Mutex<Record>>>>,
-    /// Robots of which something else is to be shown.
+    /// Robots whose displayed state has changed.
     news: Mutex<BTreeSet<RobotId>>,
     has_news: Notify,
     slowed: AtomicU64,
@@ -105,7 +107,7 @@ pub struct Conduct {
     turned_away: AtomicU64,
 }
 
-/// One robot on one way.
+/// One robot on one channel.
 #[derive(Debug)]
 pub struct Watched {
     conduct: Arc<Conduct>,
@@ -122,24 +124,24 @@ struct Record {
     trouble: Option<Trouble>,
 }
 
-/// What a robot may still send on one way.
+/// A robot's remaining allowance on one channel.
 #[derive(Debug)]
 struct Allowance {
     messages: TokenBucket,
     bytes: Option<TokenBucket>,
-    /// Since when it is slowed, with no rest in between that would have filled half of what it may
-    /// send at once.
+    /// Start of the slowed period. A pause long enough to refill half of the burst allowance resets
+    /// this field.
     slowed_since: Option<Instant>,
     barred_until: Option<Instant>,
 }
 
-/// What was seen of a robot that misbehaves.
+/// The violations of a robot.
 #[derive(Debug)]
 struct Trouble {
     offence: Offence,
-    /// How often it was cut off.
+    /// Number of cuts.
     cuts: u32,
-    /// For how long the last time; zero: it was only slowed.
+    /// The last backoff; zero: the robot was only slowed.
     away: Duration,
     last_at: Instant,
 }
@@ -150,7 +152,8 @@ impl Allowance {
         self.bytes.as_mut().map_or(until, |bucket| until.max(bucket.take(bytes, now)))
     }
 
-    /// Whether it has been slowed for long. `until`: when what it has sent so far is due.
+    /// Whether the robot has been slowed for longer than the patience. `until`: when the data sent
+    /// so far is due.
     fn is_tried(&mut self, until: Instant, patience: Duration, now: Instant) -> bool {
         if until + BURST / 2 <= now {
             self.slowed_since = None;
@@ -194,7 +197,7 @@ impl Record {
         [&self.mqtt, &self.http, &self.outputs].into_iter()
     }
 
-    /// Notes that it was slowed. Whether that is news.
+    /// Records that the robot was slowed. Returns whether that is news.
     fn slow(&mut self, offence: Offence, now: Instant) -> bool {
         match &mut self.trouble {
             Some(trouble) => {
@@ -209,7 +212,7 @@ impl Record {
         }
     }
 
-    /// Cuts it off on one way. Says until when.
+    /// Cuts the robot off on one channel. Returns the end of the backoff.
     fn cut(&mut self, way: Way, offence: Offence, limits: &ConductLimits, now: Instant) -> Instant {
         let cuts = self.trouble.as_ref().map_or(0, |trouble| trouble.cuts).saturating_add(1);
         let away = limits.backoff * (1 << (cuts - 1).min(MAX_DOUBLINGS));
@@ -222,7 +225,7 @@ impl Record {
 }
 
 impl Conduct {
-    /// Nobody known yet.
+    /// Starts without records.
     pub fn new(limits: ConductLimits) -> Arc<Self> {
         Arc::new(Self {
             limits,
@@ -235,21 +238,21 @@ impl Conduct {
         })
     }
 
-    /// The robot, which has shown who it is, on one way.
+    /// Watches an authenticated robot on one channel.
     pub fn watch(self: &Arc<Self>, robot: &RobotId, way: Way, now: Instant) -> Watched {
         let new = || Arc::new(Mutex::new(Record::new(&self.limits, now)));
         let record = lock(&self.robots).entry(robot.clone()).or_insert_with(new).clone();
         Watched { conduct: self.clone(), robot: robot.clone(), way, record }
     }
 
-    /// What an operator is told of the robot, if it misbehaves.
+    /// A description of the robot's violations for operators, if there are any.
     pub fn trouble(&self, robot: &RobotId) -> Option<String> {
         let record = lock(&self.robots).get(robot).cloned()?;
         let record = lock(&record);
         record.trouble.as_ref().map(|trouble| trouble.to_string())
     }
 
-    /// What was done about robots so far.
+    /// Totals of the measures taken so far.
     pub fn totals(&self) -> ConductTotals {
         let read = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
         ConductTotals {
@@ -259,7 +262,7 @@ impl Conduct {
         }
     }
 
-    /// Waits until there is something else to show of robots, and says of which. Dropping the
+    /// Waits until the displayed state of some robots has changed, and returns them. Dropping the
     /// future loses none.
     pub async fn news(&self) -> BTreeSet<RobotId> {
         loop {
@@ -271,8 +274,7 @@ impl Conduct {
         }
     }
 
-    /// Forgives those that have behaved for long enough, and forgets those of which there is
-    /// nothing to know.
+    /// Clears violations after enough good behaviour, and drops empty records.
     pub fn forgive(&self, now: Instant) {
         let mut forgiven = Vec::new();
         lock(&self.robots).retain(|robot, shared| {
@@ -285,7 +287,7 @@ impl Conduct {
             let is_nothing = record.trouble.is_none()
                 && record.ways().all(|allowance| allowance.is_at_rest(now));
             drop(record);
-            // Whoever holds it would go on with a record that nobody else sees.
+            // A holder of the record would continue with a copy that is no longer in the map.
             !(is_nothing && Arc::strong_count(shared) == 1)
         });
         forgiven.iter().for_each(|robot| self.tell(robot));
@@ -298,7 +300,7 @@ impl Conduct {
 }
 
 impl Watched {
-    /// Until when it may not come; `None`: it may.
+    /// End of the backoff; `None`: the robot may connect.
     pub fn barred_until(&self, now: Instant) -> Option<Instant> {
         let until = lock(&self.record).on(self.way).barred_until.filter(|until| *until > now);
         if until.is_some() {
@@ -307,8 +309,7 @@ impl Watched {
         until
     }
 
-    /// It has sent so many messages, or requests, and bytes. What it sends is counted on all of its
-    /// connections together.
+    /// Counts messages or requests, and bytes. All connections of the robot count together.
     pub fn sent(&self, messages: u64, bytes: u64, now: Instant) -> Verdict {
         let mut record = lock(&self.record);
         let (way, limits) = (self.way, &self.conduct.limits);
@@ -330,13 +331,13 @@ impl Watched {
         Verdict::Slow(until)
     }
 
-    /// It asks for something: [`Verdict::Slow`] says until when to hold it up, [`Verdict::Cut`]
-    /// when it should ask again.
+    /// Counts a request: [`Verdict::Slow`] contains the time until which to delay the request,
+    /// [`Verdict::Cut`] the time at which the robot should retry.
     pub fn asks(&self, now: Instant) -> Verdict {
         match self.sent(1, 0, now) {
             Verdict::Slow(until) if until > now + MAX_HELD => {
-                // It is not served, so it does not count: however many it sends at once, its next
-                // turn stays in sight.
+                // A rejected request is not served and does not count. So the next permitted time
+                // stays near, however many requests the robot sends at once.
                 let mut record = lock(&self.record);
                 record.on(self.way).messages.give_back(1);
                 drop(record);
@@ -347,7 +348,7 @@ impl Watched {
         }
     }
 
-    /// It did what gets it cut off. Says until when it has to stay away.
+    /// Records a violation that gets the robot cut off. Returns the end of the backoff.
     pub fn offends(&self, offence: Offence, now: Instant) -> Instant {
         let until = lock(&self.record).cut(self.way, offence, &self.conduct.limits, now);
         self.conduct.cut.fetch_add(1, Ordering::Relaxed);
@@ -444,7 +445,7 @@ mod tests {
             watched.barred_until(at + 9 * SECOND).is_some()
                 && watched.barred_until(until).is_none()
         );
-        // What is large counts by its bytes; what is due on the other way does not count here.
+        // A large packet counts by its bytes; the allowance of the other channel is separate.
         let other = conduct.watch(&RobotId::random(), Way::Mqtt, now);
         assert_eq!(other.sent(1, 10_000, now), Verdict::Fine);
         assert_eq!(other.sent(0, 500, now), Verdict::Slow(now + SECOND / 2));
@@ -455,7 +456,7 @@ mod tests {
     fn who_rests_between_bursts_is_never_cut() {
         let (conduct, robot, mut now) = (conduct(), RobotId::random(), Instant::now());
         for _ in 0..100 {
-            // A new connection brings nothing new.
+            // A new connection brings no new allowance.
             let watched = conduct.watch(&robot, Way::Mqtt, now);
             for _ in 0..105 {
                 assert!(!matches!(watched.sent(1, 0, now), Verdict::Cut(_)));

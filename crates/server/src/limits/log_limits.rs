@@ -1,6 +1,6 @@
-//! How many lines the log gets: of one kind about one robot so many a minute, and so many of one
-//! kind in all. What robots, people or strangers cause again and again fills no disk: what is left
-//! out is counted and said once a minute.
+//! Limits log lines per minute: of one kind about one robot, and of one kind in total. So lines
+//! that robots, people or strangers cause repeatedly can't fill the disk. Suppressed lines are
+//! counted and summarized once a minute.
 
 use std::collections::HashMap;
 use std::fmt;
@@ -13,32 +13,32 @@ use tracing::field::{Field, Visit};
 use tracing::{Event, Subscriber};
 use tracing_subscriber::layer::{Context, Layer};
 
-/// The most lines of one kind about one robot in a turn.
+/// Maximum lines of one kind about one robot in a period.
 const MOST_OF_ROBOT: u64 = 10;
-/// The most lines of one kind in a turn.
+/// Maximum lines of one kind in a period.
 const MOST_OF_KIND: u64 = 300;
-/// The most robots that are named of those about which lines of one kind were left out.
+/// Maximum robots that a summary of suppressed lines names.
 const MOST_NAMED: usize = 10;
-/// A turn.
+/// The length of a period.
 const TURN: Duration = Duration::from_secs(60);
 
-/// Decides which events become lines. Clones count together.
+/// Decides which events are logged. Clones count together.
 #[derive(Debug, Clone, Default)]
 pub struct LogLimits(Arc<Mutex<HashMap<Identifier, Kind>>>);
 
-/// The lines of one statement in this turn.
+/// The lines of one statement in this period.
 #[derive(Debug, Default)]
 struct Kind {
     lines: u64,
-    /// Of each robot, how many there were: lines, and those that were left out.
+    /// For each robot, the counts of written and suppressed lines.
     robots: HashMap<String, (u64, u64)>,
-    /// Left out about robots that are not counted apart, or about none.
+    /// Lines suppressed about robots without a count of their own, or about no robot.
     left_out: u64,
-    /// What the first that was left out said.
+    /// The message of the first suppressed line.
     message: String,
 }
 
-/// Lines that did not become any.
+/// A summary of suppressed lines.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct LeftOut {
     lines: u64,
@@ -46,7 +46,7 @@ struct LeftOut {
     message: String,
 }
 
-/// An event's words that count here.
+/// The fields of an event that count here.
 #[derive(Default)]
 struct Said {
     robot: Option<String>,
@@ -64,7 +64,7 @@ impl Visit for Said {
 }
 
 impl LogLimits {
-    /// Tells once a minute what was left out, until `stop`.
+    /// Logs a summary of suppressed lines once a minute, until `stop`.
     pub async fn run(self, stop: CancellationToken) {
         let mut ticks = tokio::time::interval(TURN);
         loop {
@@ -83,7 +83,7 @@ impl LogLimits {
         }
     }
 
-    /// Begins a new turn; says what was left out in the one before.
+    /// Begins a new period; returns the lines suppressed in the previous one.
     fn turn(&self) -> Vec<LeftOut> {
         let kinds = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         let mut all = Vec::new();
@@ -154,7 +154,7 @@ mod tests {
 
     use super::*;
 
-    /// Counts the events that come through.
+    /// Counts the events that pass.
     struct Counter(Arc<AtomicU64>);
 
     impl<S: Subscriber> Layer<S> for Counter {
@@ -203,7 +203,7 @@ mod tests {
                 (left_out.len(), left_out[0].lines, &left_out[0].robot),
                 (1, 10_000 - MOST_OF_KIND, &None)
             );
-            // Without a robot it is the same.
+            // The same limit holds without a robot.
             (0..1000).for_each(|_| tracing::warn!("the database is away"));
             assert_eq!(count.load(Relaxed), MOST_OF_KIND);
             assert_eq!(limits.turn()[0].lines, 1000 - MOST_OF_KIND);

@@ -1,36 +1,37 @@
-//! How often something may be done, for each of many: at a steady rate, with some at once. It only
-//! counts; the caller refuses.
+//! Rate limits for many keys: a steady rate with a burst. This module only counts; the caller
+//! refuses.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The most that are counted apart. Beyond that the one that is nearest to its rest is forgotten.
+/// Maximum keys with a count of their own. Beyond the limit, the key closest to its rest is
+/// forgotten.
 const MOST_KEYS: usize = 10_000;
 
-/// A rate that holds for each key.
+/// A rate that applies to each key.
 #[derive(Debug)]
 pub struct Pace {
     every: Duration,
     at_once: u32,
-    /// When the next one of a key would be due if they came evenly.
+    /// The due time of a key's next action if actions were evenly spaced.
     due: Mutex<HashMap<String, Instant>>,
 }
 
 impl Pace {
-    /// One in each `every`; after a rest `at_once` of them together.
+    /// One action in each `every`; after a rest a burst of `at_once`.
     pub fn new(every: Duration, at_once: u32) -> Self {
         Self { every, at_once: at_once.max(1), due: Mutex::default() }
     }
 
-    /// So many a minute; after a rest ten seconds' worth together.
+    /// This many actions per minute; after a rest a burst of ten seconds' worth.
     pub fn per_minute(count: u64) -> Self {
         let count = u32::try_from(count.max(1)).unwrap_or(u32::MAX);
         Self::new(Duration::from_secs(60) / count, count / 6)
     }
 
-    /// Counts one of `key`, unless it has to wait: then nothing is counted, and this is for how
-    /// long.
+    /// Counts one action of `key`. If the action has to wait, nothing is counted and the error is
+    /// the wait.
     pub fn take(&self, key: &str, now: Instant) -> Result<(), Duration> {
         let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
         let at = due.get(key).map_or(now, |at| (*at).max(now));
@@ -50,7 +51,7 @@ impl Pace {
     }
 }
 
-/// A time to wait, in whole seconds, at least one.
+/// A wait in whole seconds, at least one.
 pub fn seconds(wait: Duration) -> u64 {
     wait.as_secs().max(1)
 }

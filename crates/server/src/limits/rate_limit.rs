@@ -1,5 +1,5 @@
-//! Token buckets: how often something may be done for long, and how much of it at once after a
-//! rest. They read no clock and keep nobody waiting: they say when it is somebody's turn.
+//! Token buckets: a sustained rate and a burst after a rest. They read no clock and never wait:
+//! they return the time of the next permitted action.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -8,64 +8,64 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// What may be done at once after a rest, as time at the rate.
+/// Burst after a rest, as time at the rate.
 pub const BURST: Duration = Duration::from_secs(10);
-/// The most that may have been done too much, as time at the rate: beyond that a storm would lock
-/// its sender out for hours.
+/// Maximum debt, as time at the rate: a larger debt after a storm would lock its sender out for
+/// hours.
 const MAX_DEBT: Duration = Duration::from_secs(10);
-/// How long a request may be held up; one that would wait longer is refused.
+/// Maximum delay of a request; a request that would wait longer is refused.
 pub const MAX_HELD: Duration = Duration::from_secs(2);
-/// Above this number of keys those are forgotten that have rested.
+/// Above this number of keys, rested keys are removed.
 const SWEEP_ABOVE: usize = 1_024;
 
-/// One limit. `next_at` is when the next one would be due if they came evenly; after a rest it is
-/// in the past.
+/// One limit. `next_at` is the due time of the next action if actions were evenly spaced; after a
+/// rest it is in the past.
 #[derive(Debug)]
 pub struct TokenBucket {
-    /// How long one takes at the rate.
+    /// Time for one action at the rate.
     each_ns: f64,
     next_at: Instant,
 }
 
 impl TokenBucket {
-    /// A rested one.
+    /// A rested bucket.
     pub fn new(per_s: u64, now: Instant) -> Self {
         Self { each_ns: 1e9 / per_s.max(1) as f64, next_at: now.checked_sub(BURST).unwrap_or(now) }
     }
 
-    /// Counts `number` more, and says until when that takes.
+    /// Counts `number` more actions, and returns the time when they are due.
     pub fn take(&mut self, number: u64, now: Instant) -> Instant {
         let at = self.next_at.max(now.checked_sub(BURST).unwrap_or(now));
         self.next_at = (at + self.time_of(number)).min(now + MAX_DEBT);
         self.next_at
     }
 
-    /// What was taken last was not used.
+    /// Returns actions that were taken last and not used.
     pub fn give_back(&mut self, number: u64) {
         self.next_at -= self.time_of(number);
     }
 
-    /// Whether all that may come at once may come now.
+    /// Whether the full burst is available.
     pub fn has_rested(&self, now: Instant) -> bool {
         self.next_at + BURST <= now
     }
 
     fn time_of(&self, number: u64) -> Duration {
-        // What is cut off beyond 2^64 is more than any limit.
+        // A value truncated at 2^64 still exceeds any limit.
         Duration::from_nanos((number as f64 * self.each_ns) as u64)
     }
 }
 
-/// When a request's turn is.
+/// The decision about a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Turn {
-    /// It may go on, at once or then.
+    /// The request may proceed at this time, which may be now.
     At(Instant),
-    /// That would take too long: it is refused, and may come again then.
+    /// The delay would be too long: the request is refused, and may be retried at this time.
     Refused(Instant),
 }
 
-/// A bucket for each key. A key that has rested takes no memory for long.
+/// A bucket for each key. A rested key is soon removed from memory.
 #[derive(Debug)]
 pub struct RateLimiter<K> {
     per_s: u64,
@@ -73,13 +73,13 @@ pub struct RateLimiter<K> {
 }
 
 impl<K: Eq + Hash> RateLimiter<K> {
-    /// One that lets `per_s` through for each key.
+    /// A limiter with a rate of `per_s` for each key.
     pub fn new(per_s: u64) -> Self {
         Self { per_s, buckets: Mutex::default() }
     }
 
-    /// One more comes. What is refused does not count, so however many come at once, the next turn
-    /// stays in sight.
+    /// Counts one more request. Refused requests don't count, so the next permitted time stays
+    /// near, however many arrive at once.
     pub fn ask(&self, key: K, now: Instant) -> Turn {
         self.with(key, now, |bucket| match bucket.take(1, now) {
             until if until > now + MAX_HELD => {
@@ -90,7 +90,7 @@ impl<K: Eq + Hash> RateLimiter<K> {
         })
     }
 
-    /// One that came has cost `number` more than was known when it came.
+    /// Charges a request `number` more than was known on arrival.
     pub fn charge(&self, key: K, number: u64, now: Instant) {
         self.with(key, now, |bucket| bucket.take(number, now));
     }

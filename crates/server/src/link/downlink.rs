@@ -1,6 +1,6 @@
-//! Tells robots of their desired state: the whole signed document where it fits into a message, and
-//! with it the blobs that ride along and still fit; else only its generation. A robot that can't be
-//! reached is no error, for both sides compare again when it connects.
+//! Sends robots their desired state: the whole signed document if it fits into a message, with the
+//! inline blobs that still fit; otherwise only its generation. An unreachable robot is no error,
+//! because both sides compare again when it connects.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -19,29 +19,29 @@ use crate::orders::actions::{Actions, Desired};
 use crate::orders::changes::{Changes, Rings};
 use crate::system::clock::Clock;
 
-/// States read in one go and signed without a pause.
+/// States that are read together and signed without a pause.
 const AT_ONCE: usize = 64;
-/// Blobs that are kept while many robots are rung: as a rule they all wait for the same ones.
+/// Maximum cached blobs while many robots are rung: usually all robots wait for the same ones.
 const MAX_RIDERS: usize = 32;
-/// What a blob takes up in a message beside its base64: its digest, quotes, colon and comma.
+/// Overhead of a blob in a message besides its base64: its digest, quotes, colon and comma.
 const RIDER_OVERHEAD: usize = 80;
 
-/// What ringing needs.
+/// The dependencies for ringing robots.
 pub struct Downlink {
-    /// Where desired states come from.
+    /// The source of desired states.
     pub actions: Actions,
-    /// What rides along.
+    /// The source of inline blobs.
     pub blobs: Blobs,
-    /// Who delivers them.
+    /// Delivers the messages.
     pub broker: Broker,
-    /// Who is there.
+    /// The presence of robots.
     pub presence: Arc<Presence>,
-    /// The time.
+    /// The server's clock.
     pub clock: Clock,
 }
 
 impl Downlink {
-    /// Rings whoever `changes` names, until `stop`.
+    /// Rings the robots that `changes` names, until `stop`.
     pub async fn run(self, changes: Changes, stop: CancellationToken) {
         let ringing = async {
             loop {
@@ -54,7 +54,7 @@ impl Downlink {
                 }
             }
         };
-        // Cut off half-way, the rest is rung on its next connect.
+        // If this is cut off half-way, the remaining robots are rung on their next connect.
         tokio::select! {
             () = stop.cancelled() => {}
             () = ringing => {}
@@ -74,7 +74,7 @@ impl Downlink {
         rings.robots.into_iter().collect()
     }
 
-    /// Reads a blob that is to ride along. Without it the robot pulls.
+    /// Reads an inline blob. If it is missing, the robot pulls.
     async fn fetch(&self, blob: &BlobRef, riders: &mut Riders) {
         if blob.size > MAX_DOORBELL_BYTES as u64 || riders.contains_key(&blob.digest) {
             return;
@@ -128,14 +128,14 @@ impl Downlink {
             }
             let payload = match self.presence.may_be_told(&robot) {
                 true => payload(&desired, riders),
-                // Who is there at another broker is found out by ringing; over HTTP it has to say
-                // so to get more.
+                // Only ringing shows which robots are connected to an external broker. A robot that
+                // is present over HTTP has to identify itself to get more.
                 false if self.broker.is_external() => notice(&desired),
-                // Another agent has come meanwhile, and has not said yet which it is.
+                // Another agent has appeared meanwhile, and has not identified itself yet.
                 false => continue,
             };
             match payload {
-                // It may have left meanwhile.
+                // The robot may have disconnected meanwhile.
                 Ok(payload) => drop(self.broker.ring(&robot, payload)),
                 Err(error) => {
                     tracing::error!(%robot, %error, "a desired state could not be written")
@@ -145,7 +145,7 @@ impl Downlink {
     }
 }
 
-/// Blobs that were read, by digest.
+/// Cached blobs, by digest.
 type Riders = HashMap<Digest, Bytes>;
 
 fn payload(desired: &Desired, riders: &Riders) -> Result<Bytes, serde_json::Error> {
@@ -157,7 +157,7 @@ fn payload(desired: &Desired, riders: &Riders) -> Result<Bytes, serde_json::Erro
         for blob in &desired.along {
             let Some(bytes) = riders.get(&blob.digest) else { continue };
             let taken = bytes.len().div_ceil(3) * 4 + RIDER_OVERHEAD;
-            // What finds no room is pulled.
+            // Blobs that do not fit are pulled.
             if let Some(rest) = room.checked_sub(taken) {
                 room = rest;
                 inline.insert(blob.digest, bytes.to_vec());

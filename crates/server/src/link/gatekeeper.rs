@@ -1,7 +1,6 @@
-//! Who may come in over MQTT: the broker's question, answered from the database for each
-//! connection, so that a token that was revoked a moment ago no longer opens anything. A robot that
-//! comes in by a new token thereby ends its old one, by whatever way it comes: what follows of that
-//! is said here for both.
+//! Admission over MQTT: answers the broker from the database for each connection, so that a token
+//! revoked a moment ago is no longer valid. When a robot first uses a new token, over MQTT or HTTP,
+//! its old token ends. This module performs the consequences for both channels.
 
 use std::sync::Arc;
 
@@ -18,7 +17,7 @@ use crate::orders::changes::{Change, Changes};
 use crate::store::{Admitted, Store, StoreError, TokenHolder};
 use crate::system::clock::Clock;
 
-/// Answers by the tokens in the database.
+/// Decides by the tokens in the database.
 pub struct StoreGatekeeper {
     store: Store,
     clock: Clock,
@@ -28,7 +27,8 @@ pub struct StoreGatekeeper {
 }
 
 impl StoreGatekeeper {
-    /// One that asks this database, and tells the rest when a robot goes over to a new token.
+    /// A gatekeeper on this database, which notifies the other parts when a robot switches to a new
+    /// token.
     pub fn new(
         store: Store,
         clock: Clock,
@@ -59,7 +59,8 @@ impl StoreGatekeeper {
                 }
                 Ok(Principal::Robot { robot, token_number, is_first_use })
             }
-            // Over MQTT one hears every robot, so it is not for who is limited to some.
+            // Over MQTT a person receives all robots' messages, so a person limited to some robots
+            // is refused.
             TokenHolder::Person(person)
                 if person.may(Permission::Read) && person.scope.is_everything() =>
             {
@@ -78,9 +79,9 @@ impl Gatekeeper for StoreGatekeeper {
     }
 }
 
-/// The robot has used a token for the first time, which ended its others: its connections over HTTP
-/// are cut, nobody displaces it any more, and it is told of its state. Its MQTT session is the
-/// broker's to end.
+/// The robot has used a token for the first time, which ended its other tokens. Its HTTP
+/// connections are cut, no other instance can displace the robot any more, and the robot receives
+/// its state. The broker ends its MQTT session.
 pub fn ended_others(
     presence: &Presence,
     http_connections: &HttpConnections,

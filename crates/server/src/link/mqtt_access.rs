@@ -1,6 +1,6 @@
-//! What robots are told about MQTT, and what an external broker is told about robots: their
-//! passwords and client ids there, derived from the server's secret, and the broker's files. All of
-//! it is computed; nothing is stored and nobody is asked.
+//! The MQTT endpoints for robots, and the accounts of robots at an external broker: their passwords
+//! and client ids, derived from the server's secret, and the broker's files. All of these are
+//! computed; nothing is stored and no service is asked.
 
 mod mosquitto;
 mod nats;
@@ -26,12 +26,12 @@ use crate::broker::external_route;
 use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
 use crate::store::BrokerCredential;
 
-/// How long the test of one broker may take.
+/// Time limit for the test of one broker.
 const CHECK_PATIENCE: Duration = Duration::from_secs(8);
 
-/// Where robots reach MQTT.
+/// The MQTT endpoints for robots.
 pub struct MqttAccess {
-    /// Where it is; without a password.
+    /// The endpoint, without a password.
     endpoint: MqttEndpoint,
     external: Option<External>,
 }
@@ -40,13 +40,13 @@ pub struct MqttAccess {
 struct External {
     secret: [u8; 32],
     brokers: BrokerUrls,
-    /// Where robots reach each of them.
+    /// The address at which robots reach each broker.
     places: Vec<MqttPlace>,
-    /// Which one the server was connected to last.
+    /// The broker that the server was connected to last.
     current: Arc<AtomicUsize>,
-    /// The authority behind their certificates, if it is not one that systems know.
+    /// The authority behind the brokers' certificates, unless systems already trust it.
     pin: Option<CaPin>,
-    /// One test at a time: the accounts for it would displace themselves.
+    /// Only one test at a time: the test accounts would displace each other.
     checking: tokio::sync::Mutex<()>,
 }
 
@@ -61,27 +61,27 @@ struct Account {
 enum Role {
     Server,
     Robot,
-    /// One of the two accounts that the broker is tested with. They may say and hear nothing.
+    /// One of the two accounts for testing the broker. They may neither publish nor subscribe.
     Probe,
 }
 
 impl Account {
-    /// Whether its password was derived from the server's secret.
+    /// Whether the password was derived from the server's secret.
     fn is_derived(&self) -> bool {
         self.role != Role::Server
     }
 }
 
 impl MqttAccess {
-    /// Robots come to the server's own broker, with their tokens. `tls`: it speaks that.
+    /// Robots connect to the embedded broker with their tokens. `tls`: the broker speaks TLS.
     pub fn embedded(host: Option<String>, port: u16, prefix: TopicPrefix, tls: bool) -> Self {
         let endpoint =
             MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
         Self { endpoint, external: None }
     }
 
-    /// Robots go to the external `brokers`, at `host` and `port` if these are given, and know them
-    /// by `pin` if that is. `current` is the one that the server was connected to last.
+    /// Robots connect to the external `brokers`, at `host` and `port` if given, and verify them by
+    /// `pin` if given. `current` is the one that the server was connected to last.
     pub fn external(
         brokers: BrokerUrls,
         current: Arc<AtomicUsize>,
@@ -92,7 +92,8 @@ impl MqttAccess {
         secret: [u8; 32],
     ) -> Self {
         let place = |url: &BrokerUrl| MqttPlace {
-            // A loopback host is this machine: robots elsewhere reach it at the server's host.
+            // A loopback host is this machine: robots elsewhere reach the broker at the server's
+            // host.
             host: host.clone().or_else(|| (!url.is_loopback()).then(|| url.host.clone())),
             port: port.unwrap_or(url.port),
             tls: url.tls,
@@ -108,8 +109,7 @@ impl MqttAccess {
         }
     }
 
-    /// What the robot needs to connect. With several brokers the first is the one that the server
-    /// is connected to.
+    /// The robot's connection settings. With several brokers, the server's current broker is first.
     pub fn endpoint_of(&self, credential: &BrokerCredential) -> MqttEndpoint {
         let Some(external) = &self.external else { return self.endpoint.clone() };
         let mut places = external.places.clone();
@@ -130,13 +130,13 @@ impl MqttAccess {
         }
     }
 
-    /// Whether robots go to an external broker.
+    /// Whether robots connect to an external broker.
     pub fn is_external(&self) -> bool {
         self.external.is_some()
     }
 
-    /// Mosquitto's files for the server and these robots; `None` without an external broker. Takes
-    /// a moment for each robot.
+    /// Mosquitto's files for the server and these robots; `None` without an external broker.
+    /// Computing takes a moment for each robot.
     pub fn files(&self, robots: &[BrokerCredential]) -> Option<BrokerFiles> {
         let external = self.external.as_ref()?;
         let url = external.brokers.first();
@@ -151,7 +151,7 @@ impl MqttAccess {
         })
     }
 
-    /// The same for a NATS server.
+    /// A NATS server's file for the server and these robots; `None` without an external broker.
     pub fn nats_file(&self, robots: &[BrokerCredential]) -> Option<NatsFile> {
         let external = self.external.as_ref()?;
         let authorization =
@@ -161,9 +161,9 @@ impl MqttAccess {
         Some(NatsFile { authorization: authorization.ok()? })
     }
 
-    /// Tests whether an account at each external broker can end the session of another by
-    /// connecting with its client id; `None` without such a broker. The two accounts and the client
-    /// id are there for nothing else.
+    /// Tests whether an account at each external broker can end the session of another account by
+    /// connecting with its client id; `None` without an external broker. The two accounts and the
+    /// client id exist only for this test.
     pub async fn check(&self) -> Option<Vec<BrokerCheck>> {
         let external = self.external.as_ref()?;
         let _turn = external.checking.lock().await;
@@ -193,9 +193,9 @@ impl MqttAccess {
     }
 }
 
-/// The server's client id at an external broker. It stays over restarts, so that a session that the
-/// network has lost ends when the next one begins; and since it follows from the secret nobody else
-/// can connect with it.
+/// The server's client id at an external broker. The id is stable over restarts, so a session that
+/// the network has lost ends when the next one begins. Because the id is derived from the secret,
+/// no other client can connect with it.
 pub fn server_client_id(secret: &[u8; 32]) -> String {
     format!("taskd-{}", URL_SAFE_NO_PAD.encode(&derived(secret, "client id of the server")[..16]))
 }
@@ -211,13 +211,13 @@ impl External {
         URL_SAFE_NO_PAD.encode(self.derived(&format!("password {robot} {number}")))
     }
 
-    /// Begins with the robot id, for those who read the broker's log.
+    /// Begins with the robot id, for readers of the broker's log.
     fn client_id_of(&self, BrokerCredential { robot, number }: &BrokerCredential) -> String {
         let secret = self.derived(&format!("client id {robot} {number}"));
         format!("{robot}-{}", URL_SAFE_NO_PAD.encode(&secret[..16]))
     }
 
-    /// Those of the server, of the test and of the robots.
+    /// The accounts of the server, of the test and of the robots.
     fn accounts(&self, robots: &[BrokerCredential]) -> Vec<Account> {
         let url = self.brokers.first();
         let (user_name, password) = (url.user_name.clone(), url.password.clone());
@@ -231,7 +231,7 @@ impl External {
         accounts
     }
 
-    /// The two accounts that the broker is tested with.
+    /// The two accounts for testing the broker.
     fn probes(&self) -> [Account; 2] {
         [1, 2].map(|number| Account {
             user_name: format!("{}-probe-{number}", self.brokers.first().user_name),

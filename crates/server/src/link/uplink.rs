@@ -1,7 +1,7 @@
-//! What robots say over MQTT: reports go to the writer, replies to whoever asked, log lines and
-//! vitals to memory, connections to presence. The broker has proven who speaks; what is said is
-//! checked here. It never answers by itself: robots that are behind are put on the list of those to
-//! ring.
+//! Robots' messages over MQTT: reports go to the writer, replies to their requesters, log lines and
+//! vitals to memory, connections to presence. The broker has authenticated the sender; the content
+//! is checked here. This module never answers by itself: a robot with an outdated state is put on
+//! the list of robots to ring.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -27,13 +27,13 @@ use crate::orders::changes::{Change, Changes};
 use crate::orders::report_writer::{ReportError, ReportWriter};
 use crate::system::clock::Clock;
 
-/// The largest status that is read.
+/// Maximum size of a status.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
-/// A robot that is behind is rung again no sooner, or one that refuses its state would be rung for
-/// each report.
+/// Minimum interval between rings of a robot with an outdated state. Without it a robot that
+/// refuses its state would be rung for each report.
 const RING_AGAIN_MS: u64 = 5_000;
 
-/// Receives what the broker takes in.
+/// Receives the broker's messages.
 pub struct Uplink {
     reports: ReportWriter,
     requests: Requests,
@@ -42,12 +42,13 @@ pub struct Uplink {
     presence: Arc<Presence>,
     changes: Changes,
     clock: Clock,
-    /// When connected robots were last rung for being behind; an entry ends with the connection.
+    /// When connected robots were last rung for an outdated state; an entry ends with the
+    /// connection.
     reminded_ms: Mutex<HashMap<RobotId, u64>>,
 }
 
 impl Uplink {
-    /// An uplink that feeds these.
+    /// An uplink that feeds these parts.
     pub fn new(
         reports: ReportWriter,
         requests: Requests,
@@ -82,11 +83,12 @@ impl Uplink {
         if !self
             .hear_claim(message, Claim { instance: report.instance.clone(), place: report.place })
         {
-            // It waits for the agent that is known, whose reports these are not.
+            // This agent waits for the serving agent, and its reports are not the robot's.
             return Err(NotStored);
         }
         let observed = report.observed_generation;
-        // While the database is away its sessions stay, for as long as the broker lets this take.
+        // While the database is away the robot's sessions stay, for as long as the broker permits
+        // this call to take.
         self.reports.database_there().await;
         match self.reports.submit(report, token_number).await {
             Ok(reply) => {
@@ -95,7 +97,7 @@ impl Uplink {
                 }
                 Ok(())
             }
-            // It was removed a moment ago; sending again would not help.
+            // The robot was removed a moment ago; sending again would not help.
             Err(ReportError::RobotNotFound(_)) => Ok(()),
             // The database's state was logged when it changed.
             Err(ReportError::NotStored(Some(_))) => Err(NotStored),
@@ -108,7 +110,7 @@ impl Uplink {
 
     fn take_status(&self, message: &RobotMessage) {
         let Some(status) = parsed::<Status>(message, MAX_STATUS_BYTES) else { return };
-        // Going offline is noticed by the connection's end, which can't be forged or late.
+        // A robot goes offline by the end of its connection, which can't be forged or late.
         if status.online {
             self.hear_claim(message, Claim { instance: status.instance, place: status.place });
         }
@@ -142,7 +144,7 @@ impl Uplink {
         }
     }
 
-    /// Which agent speaks in the session. Says whether it has its robot's work.
+    /// Records the agent of the session. Returns whether it serves the robot's work.
     fn hear_claim(&self, message: &RobotMessage, claim: Claim) -> bool {
         let (robot, connection) = (&message.robot, Some(message.connection));
         claimed(
@@ -213,8 +215,8 @@ impl Inbox for Uplink {
     }
 }
 
-/// An agent said which it is, in a session if in any; says whether it has its robot's work, and
-/// tells it of that.
+/// Records an agent's claim, in a session if any. Returns whether the agent serves the robot's
+/// work, and tells the agent so.
 pub fn claimed(
     presence: &Presence,
     changes: &Changes,
@@ -240,7 +242,7 @@ pub fn claimed(
     standing.is_served
 }
 
-/// A robot was heard over HTTP; if it was away, that is news.
+/// Records a robot's HTTP request; if the robot was offline, that is news.
 pub fn heard(
     presence: &Presence,
     changes: &Changes,

@@ -1,9 +1,9 @@
-//! Connections whose client has not said anything yet, by where they come from. Each address has a
-//! number of places: when they are taken, a newcomer gets the place of whoever has been silent for
-//! longest there, unless nobody has been for long. A listener that is full as a whole may ask the
-//! one of all who has. So a crowd of silent connections pushes out itself, while a fleet that comes
-//! back at once from behind one address, whose robots speak within moments, is let in whole. It
-//! never touches a socket.
+//! Limits unauthenticated connections per source address. When an address is at its limit, the
+//! connection that has been silent for longest there is closed to admit the new one, unless none
+//! has been silent for long. A listener at its total limit may close the longest silent connection
+//! of all addresses. So a crowd of silent connections only displaces itself. A fleet that
+//! reconnects at once from behind one address is fully admitted, because its robots authenticate
+//! within moments. This module never touches a socket.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::{IpAddr, Ipv6Addr};
@@ -12,11 +12,11 @@ use std::time::{Duration, Instant};
 
 use tokio_util::sync::CancellationToken;
 
-/// Nobody has to leave sooner: a client may be far away, or one of thousands that a slow machine
-/// has to serve.
+/// Minimum time before a connection is closed: a client may be far away, or one of thousands that a
+/// slow machine has to serve.
 const PATIENCE: Duration = Duration::from_secs(3);
 
-/// All who wait before one listener.
+/// All unauthenticated connections of one listener.
 pub struct Anteroom {
     places: usize,
     waiting: Mutex<Waiting>,
@@ -25,7 +25,7 @@ pub struct Anteroom {
 #[derive(Default)]
 struct Waiting {
     last_number: u64,
-    /// In the order of their coming.
+    /// In the order of arrival.
     everybody: BTreeMap<u64, Silent>,
     by_address: HashMap<IpAddr, BTreeSet<u64>>,
 }
@@ -36,7 +36,7 @@ struct Silent {
     leave: CancellationToken,
 }
 
-/// A place, given back by dropping it: the client has spoken, or is gone.
+/// A place, freed on drop: the client has authenticated, or is gone.
 pub struct Place {
     room: Arc<Anteroom>,
     number: u64,
@@ -44,13 +44,13 @@ pub struct Place {
 }
 
 impl Anteroom {
-    /// An empty room with `places` for each address.
+    /// Starts empty, with `places` for each address.
     pub fn new(places: usize) -> Arc<Self> {
         Arc::new(Self { places: places.max(1), waiting: Mutex::default() })
     }
 
-    /// Takes a place for a connection from `address`; whoever has been there for longest may have
-    /// to leave.
+    /// Takes a place for a connection from `address`; the longest silent connection of that address
+    /// may have to leave.
     pub fn enter(self: &Arc<Self>, address: IpAddr, now: Instant) -> Place {
         let address = network(address);
         let leave = CancellationToken::new();
@@ -67,8 +67,7 @@ impl Anteroom {
         Place { room: self.clone(), number, leave }
     }
 
-    /// Whoever has been here for longest has to leave, wherever it is from; false if nobody has
-    /// been here for long.
+    /// Closes the longest silent connection of any address; false if none has been silent for long.
     pub fn make_room(&self, now: Instant) -> bool {
         let mut waiting = self.waiting();
         let oldest = waiting.everybody.keys().next().copied();
@@ -83,7 +82,7 @@ impl Anteroom {
 }
 
 impl Waiting {
-    /// Asks this one to leave; false if it has not been here for long.
+    /// Asks this connection to leave; false if it has not been silent for long.
     fn send_away(&mut self, number: u64, now: Instant) -> bool {
         let is_long = |silent: &Silent| now.duration_since(silent.since) >= PATIENCE;
         if !self.everybody.get(&number).is_some_and(is_long) {
@@ -108,7 +107,7 @@ impl Waiting {
 }
 
 impl Place {
-    /// Ends when the connection has to go.
+    /// Cancelled when the connection has to close.
     pub fn leave(&self) -> &CancellationToken {
         &self.leave
     }
@@ -120,8 +119,8 @@ impl Drop for Place {
     }
 }
 
-/// What one machine can't leave: its address, and with IPv6 the network of which it may have any
-/// address.
+/// The addresses that one machine can use: its IPv4 address, or its IPv6 network, in which the
+/// machine may have any address.
 fn network(address: IpAddr) -> IpAddr {
     match address.to_canonical() {
         IpAddr::V6(address) => {

@@ -1,7 +1,7 @@
-//! The HTTP connections on which a good token was shown, by holder: the person, robot or enrolment
-//! token. A holder's connections can be cut all at once, when a robot is revoked, and a holder that
-//! has more than its share loses the oldest when connections run out. Connections on which no token
-//! was shown are the `Anteroom`'s.
+//! The authenticated HTTP connections by holder: the person, robot or enrollment token. All
+//! connections of a holder can be cut at once, when a robot is revoked. When connections run out, a
+//! holder with more than its share loses its oldest one. Unauthenticated connections belong to the
+//! `Anteroom`.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,19 +11,18 @@ use task_proto::{RobotId, UserName};
 use tokio::sync::OwnedMutexGuard;
 use tokio_util::sync::CancellationToken;
 
-/// A holder never has too many connections with this number of them: a browser opens six, an agent
-/// fewer.
+/// A holder may always have this number of connections: a browser opens six, an agent fewer.
 const ALWAYS_ALLOWED: usize = 8;
 
-/// The account that a connection is counted for. Of holders with equally many connections the last
+/// The account that a connection counts for. Among holders with equally many connections, the last
 /// in this order loses one first.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Holder {
-    /// A robot, with whichever of its tokens.
+    /// A robot, with any of its tokens.
     Robot(RobotId),
     /// A person, with all tokens and sessions.
     Person(UserName),
-    /// An enrolment token, by its id.
+    /// An enrollment token, by its id.
     Enrolment(String),
 }
 
@@ -43,19 +42,19 @@ struct Held {
     by_count: BTreeSet<(usize, Holder)>,
 }
 
-/// A connection, as its requests carry it along. Clones are the same.
+/// A connection, attached to its requests. Clones share the same state.
 #[derive(Debug, Clone, Default)]
 pub struct Connection {
     cut: CancellationToken,
     authenticated: CancellationToken,
-    /// Held while a token that was shown on it is looked up.
+    /// Locked while a token of this connection is looked up.
     lookup: Arc<tokio::sync::Mutex<()>>,
     bytes_out: Arc<AtomicU64>,
-    /// The holder of the last token that was shown on it.
+    /// The holder of the last token presented on the connection.
     registration: Arc<Mutex<Option<Registration>>>,
 }
 
-/// That a connection counts for a holder; dropping it ends that.
+/// Counts a connection for a holder until dropped.
 #[derive(Debug)]
 struct Registration {
     connections: Arc<HttpConnections>,
@@ -71,7 +70,7 @@ pub struct Arrival<'a> {
 }
 
 impl HttpConnections {
-    /// A request has come. To be called before its token is looked up.
+    /// Registers a request's arrival. Call this before looking up the request's token.
     pub fn arrival(self: &Arc<Self>) -> Arrival<'_> {
         Arrival { connections: self, robots_ended: self.robots_ended.load(Ordering::SeqCst) }
     }
@@ -98,7 +97,7 @@ impl HttpConnections {
     }
 
     /// Cuts the oldest connection of the holder with the most, if that is more than its fair share
-    /// of `limit` connections. False if no holder has more.
+    /// of `limit` connections. False if no holder exceeds its share.
     pub fn cut_oldest_of_largest(&self, limit: usize) -> bool {
         let mut held = self.held();
         let share = held.fair_share(limit);
@@ -126,12 +125,12 @@ impl HttpConnections {
 }
 
 impl Held {
-    /// What each holder may have of `limit` connections if one more holder comes.
+    /// Each holder's share of `limit` connections if one more holder comes.
     fn fair_share(&self, limit: usize) -> usize {
         (limit / (self.by_holder.len() + 1)).max(ALWAYS_ALLOWED.min(limit / 2)).max(1)
     }
 
-    /// Changes a holder's connections, and keeps the order by number in step.
+    /// Changes a holder's connections, and updates the order by number.
     fn change<T>(
         &mut self,
         holder: &Holder,
@@ -155,8 +154,8 @@ impl Held {
 }
 
 impl Arrival<'_> {
-    /// The request on `connection` is this holder's. False if a robot's tokens ended since the
-    /// request came: as this connection was not registered yet, it was not cut, and the token has
+    /// Assigns `connection` to the request's holder. False if a robot's tokens ended since the
+    /// request arrived: the connection was not yet registered and so was not cut, and the token has
     /// to be looked up again.
     pub fn identified(self, holder: &Holder, connection: &Connection) -> bool {
         self.connections.register(holder, connection);
@@ -165,42 +164,42 @@ impl Arrival<'_> {
 }
 
 impl Connection {
-    /// Counts for no holder until the next token is shown.
+    /// Removes the connection from its holder until the next token is presented.
     pub fn release(&self) {
         *self.registration.lock().unwrap_or_else(PoisonError::into_inner) = None;
     }
 
-    /// The other side took this many bytes, as far as the system can tell.
+    /// Adds bytes that the other side received, as far as the operating system can tell.
     pub fn wrote(&self, bytes: usize) {
         self.bytes_out.fetch_add(bytes as u64, Ordering::Relaxed);
     }
 
-    /// Bytes that it took so far.
+    /// Bytes that the other side received so far.
     pub fn bytes_out(&self) -> u64 {
         self.bytes_out.load(Ordering::Relaxed)
     }
 
-    /// Cuts it, in the middle of whatever it carries.
+    /// Cuts the connection, also in the middle of a response.
     pub fn end(&self) {
         self.cut.cancel();
     }
 
-    /// A good token was shown on it.
+    /// Records that a valid token was presented on the connection.
     pub fn authenticate(&self) {
         self.authenticated.cancel();
     }
 
-    /// Resolves when one was.
+    /// Resolves when a valid token was presented.
     pub async fn authenticated(&self) {
         self.authenticated.cancelled().await;
     }
 
-    /// A token that was shown on it is looked up until this is dropped.
+    /// Marks a token lookup on the connection until the guard is dropped.
     pub async fn lookup(&self) -> OwnedMutexGuard<()> {
         self.lookup.clone().lock_owned().await
     }
 
-    /// Whether a good token was shown on it, once none is looked up.
+    /// Whether a valid token was presented; waits for a pending lookup.
     pub async fn is_authenticated_after_lookup(&self) -> bool {
         let _lookup = self.lookup.lock().await;
         self.authenticated.is_cancelled()
@@ -250,8 +249,8 @@ mod tests {
         let strangers = connected(&all, &Holder::Robot(other.clone()), 1);
         all.end(&one);
         assert_eq!((cut(&own), cut(&strangers)), (vec![true; 2], vec![false]));
-        // A connection that another robot's requests come by, behind a proxy, is that one's; or
-        // nobody's.
+        // Behind a proxy, a connection that carries another robot's requests is assigned to that
+        // robot or to no holder.
         all.arrival().identified(&Holder::Robot(one.clone()), &strangers[0]);
         all.end(&other);
         strangers[0].release();

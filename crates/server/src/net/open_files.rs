@@ -1,29 +1,29 @@
-//! The process's limit on open files, and how many connections fit into it.
+//! The process's limit on open files, and the number of connections within that limit.
 
 use nix::sys::resource::{Resource, getrlimit, setrlimit};
 
 use crate::config::Config;
 
-/// Open files beside connections: the database, blobs that travel, the system's own.
+/// Open files besides connections: the database, blobs in transfer, the operating system's own.
 pub const OTHER_FILES: usize = 500;
-/// With fewer there are too few connections left to be of use.
+/// Minimum limit: with fewer files, too few connections remain to be useful.
 pub const LEAST_FILES: usize = 1024;
 
-/// The system grants too few.
+/// The operating system grants too few open files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error(
     "only {allowed} files may be open, {needed} are needed: raise the limit (LimitNOFILE={needed} or more in the unit, \
      ulimit -n {needed} in the shell)"
 )]
 pub struct TooFewFiles {
-    /// What is granted.
+    /// The granted limit.
     pub allowed: usize,
-    /// What is needed at least.
+    /// The minimum limit.
     pub needed: usize,
 }
 
-/// Lets the process have as many open files as the system grants it, usually 1,024 are free to use;
-/// says how many.
+/// Raises the process's limit to the maximum that the operating system grants, and returns it.
+/// Usually only 1,024 are available without raising.
 pub fn raise() -> nix::Result<usize> {
     let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
     if allowed < most {
@@ -32,7 +32,7 @@ pub fn raise() -> nix::Result<usize> {
     Ok(usize::try_from(most).unwrap_or(usize::MAX))
 }
 
-/// How many files it takes for all connections that the settings allow.
+/// The number of files needed for all connections that the settings permit.
 pub fn wanted(config: &Config) -> usize {
     config
         .max_http_connections
@@ -40,14 +40,14 @@ pub fn wanted(config: &Config) -> usize {
         .saturating_add(OTHER_FILES)
 }
 
-/// Refuses a limit with which the server would serve hardly anybody.
+/// Refuses a limit with which the server could serve hardly any client.
 pub fn check(config: &Config, allowed: usize) -> Result<(), TooFewFiles> {
     let needed = wanted(config).min(LEAST_FILES);
     if allowed < needed { Err(TooFewFiles { allowed, needed }) } else { Ok(()) }
 }
 
-/// Leaves room for the database and blobs, and for robots' sessions before requests, which come and
-/// go.
+/// Reserves files for the database and blobs, and prefers robots' sessions to HTTP requests, which
+/// come and go.
 pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
     check(config, allowed)?;
     if wanted(config) <= allowed {

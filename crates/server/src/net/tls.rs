@@ -1,7 +1,7 @@
-//! TLS as both listeners speak it: with the operator's own certificate, or with one by the server's
-//! private authority. Who pinned that authority always gets the latter. Certificates change while
-//! connections live; none of them notices. It accepts no connection and keeps no time for a
-//! handshake: the listeners do.
+//! TLS of both listeners: with the operator's own certificate, or with one issued by the server's
+//! private authority. A client that pinned that authority always gets the latter. Certificates
+//! change while connections live, without affecting them. This module accepts no connections and
+//! enforces no handshake timeout: the listeners do both.
 
 mod authority;
 mod client;
@@ -33,51 +33,51 @@ use crate::config::TlsSettings;
 use crate::system::clock::Clock;
 use crate::system::data_directory::{DataDirectory, DataError};
 
-/// How often the authority makes new certificates, for names and addresses that the machine has got
-/// meanwhile.
+/// Interval at which the authority issues new certificates, to include names and addresses that the
+/// machine has gained meanwhile.
 const RENEWAL: Duration = Duration::from_secs(7 * 86_400);
 
-/// Why there is no certificate to show.
+/// The reason why there is no usable certificate.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
-    /// The private authority can't be kept.
+    /// The private authority can't be stored.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// The private authority can't be made, or can't make a certificate.
+    /// The private authority can't be created, or can't issue a certificate.
     #[error("the private certificate authority can't make a certificate")]
     Authority(#[from] rcgen::Error),
-    /// The certificate that it made can't be used.
+    /// The issued certificate can't be used.
     #[error("the private certificate authority made a certificate that can't be used")]
     Unusable(#[source] rustls::Error),
-    /// A file of the operator's can't be read.
+    /// One of the operator's files can't be read.
     #[error("can't read {}", path.display())]
     Unreadable {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// It holds something else.
+    /// The file has unexpected content.
     #[error("{} does not hold {expected} in PEM", path.display())]
     Content {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// What should be in it.
+        /// The expected content.
         expected: &'static str,
     },
-    /// The two do not belong together, or are of a kind that is not known.
+    /// The certificate and the key do not belong together, or are of an unknown kind.
     #[error("the certificate in {} can't be used with the key in {}", certificate.display(), key.display())]
     Unfit {
         /// The certificate's file.
         certificate: PathBuf,
         /// The key's file.
         key: PathBuf,
-        /// Why.
+        /// The cause.
         source: rustls::Error,
     },
 }
 
-/// TLS, ready to be spoken. Clones are the same.
+/// The TLS configuration of the server. Clones share the same state.
 #[derive(Clone)]
 pub struct Tls(Arc<Parts>);
 
@@ -90,15 +90,15 @@ struct Parts {
     clock: Clock,
 }
 
-/// The certificates that hold now.
+/// The current certificates.
 #[derive(Debug)]
 struct Shown(RwLock<Certificates>);
 
 #[derive(Debug, Clone)]
 struct Certificates {
-    /// For those who ask for the pinned authority's.
+    /// For clients that request the pinned authority's certificate.
     pinned: Arc<CertifiedKey>,
-    /// For everybody else.
+    /// For all other clients.
     common: Arc<CertifiedKey>,
 }
 
@@ -116,8 +116,8 @@ impl ResolvesServerCert for Shown {
 }
 
 impl Tls {
-    /// Reads or makes what is to be shown. Own files that can't be used are an error here; later
-    /// they are not.
+    /// Reads or creates the certificates. Here an unusable operator's file is an error; later it is
+    /// not.
     pub fn open(
         settings: TlsSettings,
         data: &DataDirectory,
@@ -141,8 +141,8 @@ impl Tls {
             false => builder.with_no_client_auth(),
         };
         let mut config = builder.with_cert_resolver(shown.clone());
-        // Robots that come back all at once do so for half of the work, and the server remembers
-        // none of them.
+        // When all robots reconnect at once, resumption halves the work of a handshake, and tickets
+        // need no memory on the server.
         config.ticketer = ring::Ticketer::new().map_err(TlsError::Unusable)?;
         config.send_tls13_tickets = 1;
         let acceptor = TlsAcceptor::from(Arc::new(config));
@@ -156,8 +156,7 @@ impl Tls {
         })))
     }
 
-    /// Shakes hands; gives what the client has proven on that occasion. Waits for it for as long as
-    /// it takes.
+    /// Performs the handshake and returns the client's proof. Has no timeout.
     pub async fn accept<S: AsyncRead + AsyncWrite + Unpin>(
         &self,
         stream: S,
@@ -175,18 +174,18 @@ impl Tls {
         self.0.authority.pin()
     }
 
-    /// The pin that robots are told: none where the system's root certificates vouch for the
+    /// The pin that is announced to robots; `None` if the system's root certificates vouch for the
     /// operator's own certificate.
     pub fn told_pin(&self) -> Option<CaPin> {
         self.0.settings.tells_pin().then(|| self.pin())
     }
 
-    /// How this process connects to itself.
+    /// The configuration with which this process connects to itself.
     pub fn client_config(&self) -> Arc<ClientConfig> {
         Arc::new(Trust::Pinned(self.pin()).client_config(Clock::for_certificates()))
     }
 
-    /// Takes what is new in the operator's files. On an error all stays as it was.
+    /// Loads changes of the operator's files. On an error the certificates stay unchanged.
     pub fn reload(&self) -> Result<(), TlsError> {
         let Some(own) = &self.0.own else { return Ok(()) };
         let news = own.lock().unwrap_or_else(PoisonError::into_inner).read_news()?;
@@ -197,7 +196,7 @@ impl Tls {
         Ok(())
     }
 
-    /// Makes new certificates by the private authority.
+    /// Issues new certificates by the private authority.
     fn renew(&self) -> Result<(), TlsError> {
         let (authority, now_ms) = (&self.0.authority, self.0.clock.now_ms());
         let names = names_of_this_machine(&self.0.settings.names);
@@ -214,12 +213,12 @@ impl Tls {
         Ok(())
     }
 
-    /// Looks for new files, and renews what the authority made, until `stop`.
+    /// Checks for new files, and renews the authority's certificates, until `stop`.
     pub async fn keep_current(self, stop: CancellationToken) {
         let mut looks = tokio::time::interval(self.0.settings.look_interval);
         let mut renewals = tokio::time::interval(RENEWAL);
         looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        // The first tick comes at once, and all has just been read and made.
+        // The first tick comes at once, and all certificates are new at that time.
         renewals.tick().await;
         loop {
             let task = tokio::select! {
@@ -253,8 +252,8 @@ impl fmt::Debug for Tls {
     }
 }
 
-/// What the machine is reached by, as far as it knows, and what the operator says besides. Who
-/// trusts a pin does not look.
+/// The names and addresses of this machine, as far as known, and the operator's additional ones. A
+/// client that trusts a pin does not check names.
 fn names_of_this_machine(further: &[String]) -> Vec<String> {
     let mut names = vec!["localhost".to_owned()];
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();

@@ -1,5 +1,5 @@
-//! Moves rollouts on, inside the write that may have settled something: carries out what
-//! [`crate::domain::rollout`] decides.
+//! Advances rollouts, inside the write that may have settled an assignment: applies the decisions
+//! of [`crate::domain::rollout`].
 
 use std::collections::BTreeSet;
 
@@ -11,8 +11,9 @@ use super::chooser::Chooser;
 use crate::domain::rollout::{Move, Part, Tally, next_move};
 use crate::store::{OpenRobot, OpenRollout, StoreError, Write};
 
-/// Begins the next batch of each of `touched` that is due, or pauses it. A batch that takes another
-/// deployment's place on some robot may settle that one's batch, so that one is looked at as well.
+/// Begins the next batch of each of `touched` that is due, or pauses the rollout. A batch that
+/// replaces another deployment on some robot may settle the other deployment's batch, so the other
+/// one is checked as well.
 pub async fn advance(
     write: &mut Write,
     chooser: &Chooser,
@@ -21,8 +22,8 @@ pub async fn advance(
     consequences: &mut Consequences,
 ) -> Result<(), StoreError> {
     let mut waiting = touched;
-    // Ends, because each turn but the last of a deployment releases an assignment, and none is ever
-    // taken back.
+    // Terminates, because each turn but the last of a deployment releases an assignment, and
+    // released assignments never become unreleased.
     while let Some(deployment) = waiting.pop_first() {
         let Some(open) = write.rollout(&deployment).await? else { continue };
         let parts = parts(chooser, &open, now_ms);
@@ -40,7 +41,7 @@ pub async fn advance(
                 for (robot, mechanism) in
                     chooser.decide(write, &deployment, &released.robots, now_ms).await?
                 {
-                    // Robots that are to ask by themselves are not rung.
+                    // Robots that poll are not notified.
                     match mechanism {
                         Delivery::Poll => consequences.robots.insert(robot),
                         Delivery::PushPull | Delivery::DirectPush | Delivery::Inline => {
@@ -49,7 +50,7 @@ pub async fn advance(
                     };
                 }
                 waiting.extend(released.superseded);
-                // Should it have begun on robots only that nothing is waited for.
+                // The batch may consist only of robots that the rollout does not wait for.
                 waiting.insert(deployment.clone());
             }
         }
@@ -58,12 +59,12 @@ pub async fn advance(
     Ok(())
 }
 
-/// The part that each robot on which a deployment has not settled has in its rollout now.
+/// The current part in the rollout of each robot on which the deployment has not settled.
 pub fn parts(chooser: &Chooser, open: &OpenRollout, now_ms: u64) -> Vec<Part> {
     let offline_ms = chooser.offline_ms(open.robots.iter().map(|one| &one.robot), now_ms);
     let part =
         |(one, offline_ms): (&OpenRobot, Option<u64>)| match Part::of(one.standing, offline_ms) {
-            // A revoked robot takes its turn, and shows nothing.
+            // A revoked robot takes its turn without a result.
             Part::Offline if one.is_revoked => Part::Ready,
             Part::Busy | Part::Lost if one.is_revoked || one.has_run => Part::Ignored,
             part => part,
@@ -71,7 +72,7 @@ pub fn parts(chooser: &Chooser, open: &OpenRollout, now_ms: u64) -> Vec<Part> {
     open.robots.iter().zip(offline_ms).map(part).collect()
 }
 
-/// The offline robots whose turn would come before that of the next `count` which are ready.
+/// The offline robots whose turn would come before that of the next `count` ready robots.
 fn passed_over<'a>(open: &'a OpenRollout, parts: &[Part], count: u64) -> Vec<&'a RobotId> {
     let ready =
         parts.iter().enumerate().filter(|(_, part)| **part == Part::Ready).map(|(index, _)| index);

@@ -1,6 +1,5 @@
-//! What has changed, told to whoever listens after the commit: notices for the event stream, and
-//! the robots whose desired state is new. It holds nothing that would be missed after a crash: both
-//! sides compare again on connect.
+//! Announces changes after the commit: notices for the event stream, and the robots whose desired
+//! state is new. Nothing here has to survive a crash: both sides compare again on connect.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -12,17 +11,17 @@ use crate::domain::happening::Happening;
 use crate::fleet::part_requests::PartRequests;
 use crate::store::KnownRobot;
 
-/// Notices a slow listener may fall behind before it misses some.
+/// Capacity of a notice channel: a listener that falls further behind misses notices.
 const NOTICES: usize = 16 * 1024;
 
-/// One thing that is new, changed or gone. The listener reads the store for what it is now.
+/// One created, changed or removed object. The listener reads the current value from the store.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Change {
     /// A robot is new or has changed.
     Robot(RobotId),
     /// A robot was removed.
     RobotRemoved(Box<KnownRobot>),
-    /// A robot may have come into somebody's scope, or have left it.
+    /// A robot may have entered or left some user's scope.
     Scopes,
     /// A deployment is new or has changed.
     Deployment(DeploymentId),
@@ -32,7 +31,7 @@ pub enum Change {
     Feed(u64),
 }
 
-/// What a write has changed, collected on the way and announced after its commit.
+/// Changes of a write, collected on the way and announced after its commit.
 #[derive(Debug, Default)]
 pub struct Consequences {
     /// Robots that have changed as the operator sees them.
@@ -41,7 +40,7 @@ pub struct Consequences {
     pub rings: BTreeSet<RobotId>,
     /// Deployments that are new or have changed.
     pub deployments: BTreeSet<DeploymentId>,
-    /// What is worth a look.
+    /// Events for the feed.
     pub happenings: Vec<Happening>,
 }
 
@@ -55,19 +54,19 @@ pub struct Changes {
     part_requests: PartRequests,
 }
 
-/// Robots to ring: a set, so however often a robot's desired state changes it waits here once.
+/// Robots to notify: a set, so a robot waits here once however often its desired state changes.
 #[derive(Debug, Default)]
 struct Bells {
     waiting: Mutex<Rings>,
     rung: Notify,
 }
 
-/// Who is to be rung.
+/// The robots to notify.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Rings {
-    /// All there are, these among them.
+    /// Whether all robots are to be notified.
     pub everyone: bool,
-    /// These.
+    /// Robots to notify.
     pub robots: BTreeSet<RobotId>,
 }
 
@@ -83,7 +82,7 @@ impl Changes {
         }
     }
 
-    /// Tells whoever serves someone for longer that people or their tokens have changed.
+    /// Tells long-lived connections that users or their tokens have changed.
     pub fn announce_rights(&self) {
         self.rights.send_replace(());
     }
@@ -93,7 +92,7 @@ impl Changes {
         self.rights.subscribe()
     }
 
-    /// What robots say they lack.
+    /// The parts that robots have reported missing.
     pub fn part_requests(&self) -> &PartRequests {
         &self.part_requests
     }
@@ -103,12 +102,12 @@ impl Changes {
         self.notices.subscribe()
     }
 
-    /// Tells all listeners; nobody listening is fine.
+    /// Tells all listeners; no listener is fine.
     pub fn announce(&self, change: Change) {
         let _ = self.notices.send(change);
     }
 
-    /// Tells the feed that something has happened; nobody listening is fine.
+    /// Tells the feed about an event; no listener is fine.
     pub fn happened(&self, happening: Happening) {
         let _ = self.happenings.send(happening);
     }
@@ -130,7 +129,7 @@ impl Changes {
         self.ring(consequences.rings);
     }
 
-    /// Asks that `robots` be told of their new desired state.
+    /// Queues notifications to `robots` about their new desired state.
     pub fn ring(&self, robots: impl IntoIterator<Item = RobotId>) {
         let mut waiting = self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         waiting.robots.extend(robots);
@@ -139,13 +138,13 @@ impl Changes {
         }
     }
 
-    /// Asks that every robot be told of its desired state.
+    /// Queues notifications to all robots about their desired state.
     pub fn ring_everyone(&self) {
         self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner).everyone = true;
         self.bells.rung.notify_one();
     }
 
-    /// Waits until there are robots to ring and takes them all. Made for one caller, the downlink;
+    /// Waits until robots are queued and takes them all. Made for one caller, the downlink;
     /// dropping the future loses none.
     pub async fn take_rings(&self) -> Rings {
         loop {

@@ -1,6 +1,6 @@
 //! Decides, inside the write that begins a batch, how the bytes travel to each of its robots:
-//! gathers what is known, lets [`crate::domain::delivery`] choose, stores the choice with its
-//! reason. It never changes what was decided before.
+//! gathers the inputs, lets [`crate::domain::delivery`] choose, stores the choice with its reason.
+//! Stored decisions never change.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -17,7 +17,7 @@ use crate::domain::delivery::{Inputs, Quantity, Rules, choose};
 use crate::fleet::presence::Presence;
 use crate::store::{Decided, RobotFacts, StoreError, Write};
 
-/// Who decides. Clones decide alike.
+/// Chooses delivery mechanisms. Clones share their inputs.
 #[derive(Clone)]
 pub struct Chooser {
     rules: Arc<Rules>,
@@ -27,14 +27,14 @@ pub struct Chooser {
     load: Arc<ServerLoad>,
 }
 
-/// What the server was doing for robots when it was looked at last.
+/// The server's load at the last sample.
 #[derive(Debug, Default)]
 pub struct ServerLoad {
     transfers: AtomicU64,
     backlog: AtomicU64,
 }
 
-/// Where a robot is: what its label says, else the network its address belongs to.
+/// A robot's site: the value of its site label, otherwise the network of its address.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 enum Site {
     Label(LabelValue),
@@ -43,7 +43,7 @@ enum Site {
 }
 
 impl ServerLoad {
-    /// So many transfers are under way, and so many bytes of parts wait for their listeners.
+    /// Sets the number of running transfers, and the bytes of parts that wait for their receivers.
     pub fn set(&self, transfers: u64, backlog: u64) {
         self.transfers.store(transfers, Ordering::Relaxed);
         self.backlog.store(backlog, Ordering::Relaxed);
@@ -51,7 +51,7 @@ impl ServerLoad {
 }
 
 impl Chooser {
-    /// Decides by `settings` and by what `presence` and `load` say at the time.
+    /// Decides by `settings`, with the current `presence` and `load`.
     pub fn new(
         settings: &DeliverySettings,
         presence: Arc<Presence>,
@@ -71,7 +71,7 @@ impl Chooser {
         self.inline_bytes
     }
 
-    /// For how long each of these robots has been offline; `None`: it is online.
+    /// How long each of these robots has been offline; `None`: online.
     pub fn offline_ms<'a>(
         &self,
         robots: impl IntoIterator<Item = &'a RobotId>,
@@ -80,7 +80,7 @@ impl Chooser {
         self.presence.offline_ms(robots, now_ms)
     }
 
-    /// Decides for `batch`, robots of `deployment` that begin now.
+    /// Decides for `batch`: robots of `deployment` whose batch begins now.
     pub async fn decide(
         &self,
         write: &mut Write,
@@ -121,7 +121,7 @@ impl Chooser {
     ) -> Inputs {
         let link = facts.link.unwrap_or_default();
         let sighting = self.presence.get(&facts.robot, now_ms);
-        // A robot of which no site is known is alone on its own.
+        // A robot without a known site counts as alone on its site.
         let on_site = |sites: &HashMap<Site, u64>| {
             let site = self.site_of(
                 &facts.labels,
@@ -146,8 +146,8 @@ impl Chooser {
         }
     }
 
-    /// How many robots of `deployment` are on each site; `None` where no rule asks, for all their
-    /// labels must be read.
+    /// Number of robots of `deployment` on each site; `None` if no rule uses this number, because
+    /// counting reads all their labels.
     async fn robots_by_site(
         &self,
         write: &mut Write,
@@ -188,12 +188,12 @@ impl Chooser {
     }
 }
 
-/// The bytes of a package that travel to a robot which has none of them.
+/// The bytes of a package to transfer to a robot that has none of them.
 pub fn travelling_bytes(package: &PackageRef) -> u64 {
     package.content.size.saturating_add(package.config.size)
 }
 
-/// Those that a robot lacks which reports `has`, a task with the same content.
+/// The bytes missing on a robot that reports `has`, a task with the same content.
 fn lacking_bytes(package: &PackageRef, has: Option<&TaskReport>) -> u64 {
     let Some(has) = has else { return travelling_bytes(package) };
     let content = match has.phase {

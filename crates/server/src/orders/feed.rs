@@ -1,7 +1,6 @@
-//! The feed: the last things in the fleet that are worth a look, in memory. What happens is
-//! gathered for a moment and told together where it is much of the same, so that a restart of the
-//! server is one line and not ten thousand. It decides nothing, and what must not be lost is in the
-//! audit.
+//! The feed: the latest noteworthy events of the fleet, in memory. Similar events are gathered for
+//! a moment and reported together, so that a restart of the server is one line and not ten
+//! thousand. The feed decides nothing, and events that must not be lost are in the audit.
 
 mod pending;
 
@@ -23,27 +22,27 @@ use crate::store::{KnownRobot, Store};
 use crate::system::clock::Clock;
 use crate::system::data_directory::room;
 
-/// How often what was gathered is looked through.
+/// Interval between two passes over the gathered events.
 const TURN: Duration = Duration::from_secs(1);
-/// How often the disk is looked at, in turns.
+/// Interval between checks of the disk, in turns.
 const DISK_TURNS: u64 = 60;
 /// Of a longer text the rest is left out.
 const MOST_CHARACTERS: usize = 500;
-/// With less than this share of it free, in percent, the disk is nearly full.
+/// Below this share of free space, in percent, the disk is nearly full.
 const LEAST_FREE_PERCENT: u64 = 5;
 
-/// Whom an entry is for.
+/// The users who may see an entry.
 #[derive(Debug, Clone)]
 pub enum FeedAudience {
-    /// Everybody.
+    /// All users.
     Everybody,
-    /// Those who may see every robot: it counts some.
+    /// Users who may see every robot: the entry counts robots.
     Unlimited,
-    /// Those who may see this robot.
+    /// Users who may see this robot.
     Robot(Arc<KnownRobot>),
 }
 
-/// The last entries. Clones are the same.
+/// The latest entries. Clones share them.
 #[derive(Clone)]
 pub struct Feed(Arc<Mutex<Entries>>);
 
@@ -52,7 +51,7 @@ struct Entries {
     next: u64,
 }
 
-/// What the feed looks at.
+/// Inputs of the feed.
 pub struct FeedSource {
     /// The database, for names.
     pub store: Store,
@@ -64,7 +63,7 @@ pub struct FeedSource {
     pub data: PathBuf,
 }
 
-/// What an entry says, beside when.
+/// An entry without its number and time.
 struct Said {
     kind: FeedKind,
     level: LogLevel,
@@ -80,7 +79,7 @@ impl Feed {
         Self(Arc::new(Mutex::new(Entries { kept: VecDeque::new(), next: now_ms })))
     }
 
-    /// The entry with this number, if it is still here.
+    /// The entry with this number, if the feed still holds it.
     pub fn get(&self, number: u64) -> Option<(FeedEntry, FeedAudience)> {
         self.entries().kept.iter().rev().find(|(entry, _)| entry.number == number).cloned()
     }
@@ -111,7 +110,7 @@ impl Feed {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Gathers what happens and tells it, until `stop`.
+    /// Gathers events and reports them, until `stop`.
     pub async fn run(self, source: FeedSource, changes: Changes, stop: CancellationToken) {
         let (mut happenings, mut notices) = (changes.happenings(), changes.subscribe());
         let mut health = source.broker.health();
@@ -125,7 +124,7 @@ impl Feed {
                 () = stop.cancelled() => return,
                 happening = happenings.recv() => match happening {
                     Ok(happening) => pending.take(happening),
-                    // What is too much to be gathered is too much to be read.
+                    // Events beyond the channel's capacity are too many to read.
                     Err(RecvError::Lagged(_)) => {}
                     Err(RecvError::Closed) => return,
                 },
@@ -152,7 +151,7 @@ impl Feed {
     }
 }
 
-/// A text that a robot may have had a part in, as one line that is not too long.
+/// A text that may come from a robot, as one line of limited length.
 fn one_line(text: &str) -> String {
     let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
     let line: String = characters.by_ref().take(MOST_CHARACTERS).collect();

@@ -1,5 +1,5 @@
-//! How many reports were stored in the last minute, and how long each took: counted in bins that
-//! grow by a fifth, so that counting one is an addition. It only counts.
+//! Number and duration of the reports stored in the last minute: counted in bins that grow by a
+//! fifth, so that counting one is an addition. The meter only counts.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -7,11 +7,11 @@ use std::time::Duration;
 use task_proto::api::ReportStatus;
 use tokio::time::Instant;
 
-/// What is shown is of this long, in slots of which the oldest is dropped.
+/// The window of the figures, in slots of which the oldest is dropped.
 const SLOTS: usize = 12;
 const SLOT: Duration = Duration::from_secs(5);
-/// Bins of times, the first up to [`FIRST_MS`], each further one by [`GROWTH`] longer; the last has
-/// all that are longer.
+/// Histogram bins by duration, the first up to [`FIRST_MS`], each further one longer by [`GROWTH`];
+/// the last bin holds all longer durations.
 const BINS: usize = 64;
 const FIRST_MS: f64 = 0.1;
 const GROWTH: f64 = 1.2;
@@ -25,7 +25,7 @@ pub struct ReportMeter {
 
 #[derive(Debug, Clone, Copy)]
 struct Slot {
-    /// Which it is, counted from the beginning.
+    /// The slot's number since the start.
     number: u64,
     bins: [u32; BINS],
 }
@@ -37,7 +37,7 @@ impl ReportMeter {
         Self { began: now, slots: Arc::new(Mutex::new(slots)) }
     }
 
-    /// A report was stored, `took` after it came.
+    /// Counts a report that was stored `took` after its arrival.
     pub fn stored(&self, now: Instant, took: Duration) {
         let number = self.slot(now);
         let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
@@ -49,7 +49,7 @@ impl ReportMeter {
         slot.bins[bin.min(BINS - 1)] += 1;
     }
 
-    /// How it was in the last minute.
+    /// Figures of the last minute.
     pub fn read(&self, now: Instant) -> ReportStatus {
         let number = self.slot(now);
         let mut bins = [0u64; BINS];

@@ -1,8 +1,8 @@
-//! The one writer of reports: a bounded queue, emptied in batches, each one write to the store. A
+//! The only writer of reports: a bounded queue, emptied in batches, each one write to the store. A
 //! caller's future resolves when its report is stored. Of several reports of a robot in a batch
-//! only the last is written; the others are acknowledged with it, since each is a whole snapshot.
-//! What it wrote before it remembers ([`memory`]), so that a batch of robots that go on reporting
-//! reads nothing, and writes only what has changed.
+//! only the last is written; the others are acknowledged too, since each report is a complete
+//! snapshot. The writer caches stored rows ([`memory`]): a batch of robots that keep reporting
+//! reads nothing, and writes only changes.
 
 mod memory;
 
@@ -27,20 +27,20 @@ use crate::store::{DatabaseState, Fault, OpenAssignment, ReportedRobot, Store, S
 use crate::system::clock::Clock;
 use memory::Memory;
 
-/// Reports that may wait; beyond it callers wait for room.
+/// Queue capacity in reports; when the queue is full, callers wait for room.
 const QUEUE: usize = 16 * 1024;
-/// How long a caller waits for room.
+/// How long a caller waits for room in the queue.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// The most reports of one batch.
+/// Maximum number of reports in a batch.
 const MAX_BATCH: usize = 2048;
 /// How often a failing batch is tried.
 const TRIES: u32 = 3;
-/// The pause before the second try; it doubles.
+/// The pause before the second try; each further pause doubles.
 const FIRST_PAUSE: Duration = Duration::from_millis(50);
-/// A robot's free disk space is news again when it has changed by about this much.
+/// A change in a robot's free disk space is stored when the difference is about this large.
 const DISK_STEP_BYTES: u64 = 16 << 20;
 
-/// Where reports are handed in. Clones feed the same writer.
+/// The entry to the report queue. Clones feed the same writer.
 #[derive(Debug, Clone)]
 pub struct ReportWriter {
     queue: mpsc::Sender<Submission>,
@@ -48,20 +48,20 @@ pub struct ReportWriter {
     database: DatabaseState,
 }
 
-/// Why a report was not stored. The robot keeps it and sends it again.
+/// Why a report was not stored. The robot keeps the report and sends it again.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum ReportError {
     /// No such robot, or no longer.
     #[error("there is no robot {0}")]
     RobotNotFound(RobotId),
-    /// Another token of the robot was used since the sender showed its own: it speaks for the robot
-    /// no longer.
+    /// A newer token of the robot has been used since the sender authenticated: the sender no
+    /// longer speaks for the robot.
     #[error("robot {0} uses a newer token")]
     TokenEnded(RobotId),
     /// The queue stays full, or the server is stopping.
     #[error("reports can't be taken now")]
     Busy,
-    /// The database did not take it.
+    /// The database rejected the write.
     #[error("the report could not be stored")]
     NotStored(Option<Fault>),
 }
@@ -91,14 +91,14 @@ impl ReportWriter {
         )
     }
 
-    /// Stores `report`, as far as it is kept, whose `robot_id` the caller has authenticated by the
-    /// robot's token of this number. Resolves after the commit.
+    /// Stores the fields of `report` that are kept. The caller has authenticated the report's
+    /// `robot_id` with the robot's token of this number. Resolves after the commit.
     pub async fn submit(
         &self,
         report: Report,
         token_number: u64,
     ) -> Result<ReportReply, ReportError> {
-        // It would wait behind what was handed in before, for nothing.
+        // Otherwise the report would queue behind earlier ones, for nothing.
         if !self.database.is_there() {
             return Err(ReportError::NotStored(Some(Fault::Away)));
         }
@@ -117,7 +117,7 @@ impl ReportWriter {
         self.database.there().await;
     }
 
-    /// What counts them.
+    /// The meter of stored reports.
     pub fn meter(&self) -> &ReportMeter {
         &self.meter
     }
@@ -158,14 +158,15 @@ async fn write_all(
                     Some(answer) => Ok(answer.reply.clone()),
                 }
             });
-            // A caller that has gone away does not need to know.
+            // The caller may have gone away; its answer is then dropped.
             let _ = answer.send(reply);
         }
     }
 }
 
-/// The same for reports that differ only in what passes: times, and how far a phase has come. That
-/// is not worth writing a report again; where assignments stand is stored apart from it.
+/// Equal for reports that differ only in transient fields: times, and progress within a phase.
+/// Those are not worth another write of the report; the states of assignments are stored
+/// separately.
 fn fingerprint(report: &Report) -> u64 {
     let mut lasting = report.clone();
     (lasting.seq, lasting.uptime_ms, lasting.observed_generation) = (0, 0, Generation(0));
@@ -181,7 +182,7 @@ fn fingerprint(report: &Report) -> u64 {
 /// The last report of each robot in a batch.
 fn newest_by_robot(batch: &[Submission]) -> Vec<&Submission> {
     let mut newest: HashMap<&RobotId, &Submission> = HashMap::new();
-    // An agent that came with a newer token may count its starts from 1 again.
+    // An agent that uses a newer token may count its starts from 1 again.
     let position =
         |submission: &Submission| (submission.token_number, position(&submission.report));
     for submission in batch {
@@ -193,12 +194,12 @@ fn newest_by_robot(batch: &[Submission]) -> Vec<&Submission> {
     newest.into_values().collect()
 }
 
-/// What orders the reports of one robot.
+/// The order of one robot's reports.
 fn position(report: &Report) -> (u64, u64) {
     (report.start, report.seq)
 }
 
-/// What all that reported for a robot are answered, those by an ended token excepted.
+/// The answer to all senders that reported for a robot, except those with an ended token.
 struct Answer {
     reply: ReportReply,
     token_number: u64,
@@ -220,16 +221,15 @@ async fn write_with_retries(
             Ok(written) => return Ok(written),
             Err(error) => error,
         };
-        // What the batch was about to change is remembered already.
+        // The memory already contains the changes that the failed batch did not store.
         memory.forget();
         if tries == TRIES {
             return Err(error);
         }
         match error.fault() {
-            // Another try would find the same. Robots keep their reports and send them again.
+            // A retry would fail in the same way. Robots keep their reports and send them again.
             Some(Fault::Corrupt | Fault::Full) => return Err(error),
-            // One that was restarted is soon there again. Reports that come meanwhile do not get as
-            // far as this.
+            // A restarted database is soon back. Reports that arrive meanwhile are refused earlier.
             Some(Fault::Away) => {
                 let there = tokio::time::timeout(PATIENCE, store.state().there()).await;
                 there.map_err(|_| error)?;
@@ -244,7 +244,7 @@ async fn write_with_retries(
     }
 }
 
-/// Stores a batch and what follows from it, in one write.
+/// Stores a batch and its consequences, in one write.
 async fn write_batch(
     store: &Store,
     chooser: &Chooser,
@@ -255,8 +255,8 @@ async fn write_batch(
     let mut write = store.begin_keeping_rights().await?;
     let turn = write.turn();
     memory.learn(&mut write, reports.iter().map(|submission| &submission.report.robot_id)).await?;
-    // A report that is older than the stored one is acknowledged, so that it is not sent again, and
-    // ignored.
+    // A report older than the stored one is acknowledged, so that the robot does not send it again,
+    // and otherwise ignored.
     let is_news = |submission: &&Submission| {
         memory.get(&submission.report.robot_id).is_some_and(|known| {
             submission.token_number >= known.robot.token_number
@@ -277,7 +277,7 @@ async fn write_batch(
         .filter_map(|submission| memory.get(&submission.report.robot_id))
         .map(|known| answer(known.robot.clone()))
         .collect();
-    // A batch that has just been released may have raised generations.
+    // Releasing a batch may have raised generations.
     let rung: Vec<RobotId> =
         consequences.rings.iter().filter(|robot| answers.contains_key(*robot)).cloned().collect();
     answers.extend(write.reported_robots(&rung).await?.into_iter().map(answer));
@@ -299,8 +299,8 @@ fn answer(robot: ReportedRobot) -> (RobotId, Answer) {
     (robot.id, Answer { reply, token_number: robot.token_number })
 }
 
-/// Moves on those of the deployments that have robots whose batch has not begun. Says whether there
-/// were any: then generations and assignments may have changed.
+/// Advances those of the deployments that have robots whose batch has not begun. Returns whether
+/// there were any: then generations and assignments may have changed.
 async fn advance_waiting(
     write: &mut Write,
     chooser: &Chooser,
@@ -324,8 +324,8 @@ async fn advance_waiting(
     Ok(rolls)
 }
 
-/// Stores where the robots' assignments stand after `news`. Returns the deployments of which some
-/// phase has changed.
+/// Stores the state of the robots' assignments after `news`. Returns the deployments with a changed
+/// phase.
 async fn write_standings(
     write: &mut Write,
     memory: &mut Memory,
@@ -365,7 +365,7 @@ async fn write_standings(
     Ok(deployments)
 }
 
-/// Stores the reports; of one that says the same as the one before, only which it was.
+/// Stores the reports; for a report equal to the previous one, only its position.
 async fn write_reports(
     write: &mut Write,
     memory: &mut Memory,
@@ -386,7 +386,7 @@ async fn write_reports(
     write.store_repeated(&repeated, now_ms).await
 }
 
-/// What a robot did not say was wrong with it before.
+/// Conditions that are new in this report.
 fn newly_wrong(memory: &mut Memory, report: &Report) -> Vec<Happening> {
     let news = memory.new_conditions(&report.robot_id, &report.conditions).into_iter();
     let text =
@@ -395,7 +395,7 @@ fn newly_wrong(memory: &mut Memory, report: &Report) -> Vec<Happening> {
         .collect()
 }
 
-/// A phase that is worth a look, or that mends one.
+/// The feed event of a failed phase, or of a phase that resolves a failure.
 fn worth_a_look(robot: &ReportedRobot, assignment: &OpenAssignment) -> Option<Happening> {
     let OpenAssignment { deployment, standing, .. } = assignment;
     matches!(standing.phase, Phase::Failed | Phase::RolledBack | Phase::Running | Phase::Succeeded)

@@ -1,6 +1,6 @@
-//! The content's bytes: a tree as tar+zstd, the same for the same tree wherever and whenever it is
-//! made. Bytes stream from the files through tar, hash, zstd and hash into the output; nothing is
-//! held whole.
+//! The content's bytes: a tree as tar+zstd, byte-identical for the same tree on every machine at
+//! any time. Bytes stream from the files through tar, hash, zstd and hash into the output; no file
+//! is held in memory as a whole.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -17,11 +17,11 @@ use super::tree::{Entry, Tree};
 /// zstd's own default: half the speed of the fastest, and the next levels gain a few percent for
 /// twice the time.
 const ZSTD_LEVEL: i32 = 3;
-/// 2000-01-01: one time for all files. Not zero, because Python's zip and wheel tools refuse times
-/// before 1980.
+/// 2000-01-01: the modification time of all files. Not zero, because Python's zip and wheel tools
+/// refuse times before 1980.
 const MTIME_S: u64 = 946_684_800;
 
-/// Writes `tree` to `output`. Gives the compressed blob and what is in it.
+/// Writes `tree` to `output`. Returns the compressed blob and its description.
 pub(super) fn write(
     tree: &Tree,
     output: &mut impl Write,
@@ -29,7 +29,7 @@ pub(super) fn write(
     let output_failed =
         |source| PackageError::Io { what: "can't write the packed content".to_owned(), source };
     let mut compressed = Hashing::new(output);
-    // One thread and no checksum of zstd's own: the digest covers everything.
+    // One thread and no zstd checksum: the digest covers everything.
     let encoder = zstd::Encoder::new(&mut compressed, ZSTD_LEVEL).map_err(output_failed)?;
     let mut archive = tar::Builder::new(Hashing::new(encoder));
     for (path, entry) in &tree.entries {
@@ -78,8 +78,8 @@ fn append<W: Write>(
     }
 }
 
-/// A file that must have the size its header says: one that grows or shrinks meanwhile would spoil
-/// the archive.
+/// A file that must keep the size in its header: a file that grows or shrinks meanwhile would
+/// corrupt the archive.
 struct Exactly {
     file: File,
     left: u64,
@@ -89,7 +89,7 @@ impl Read for Exactly {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         let changed = || io::Error::other("the file changed while it was packed");
         if self.left == 0 {
-            // One byte more tells whether it has grown.
+            // Reading one byte more shows whether the file has grown.
             return match self.file.read(&mut [0])? {
                 0 => Ok(0),
                 _ => Err(changed()),
@@ -105,7 +105,7 @@ impl Read for Exactly {
     }
 }
 
-/// Hashes and counts what passes through.
+/// Hashes and counts the bytes passing through.
 struct Hashing<W> {
     inner: W,
     hasher: Sha256,

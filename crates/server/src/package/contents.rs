@@ -1,6 +1,6 @@
-//! What is in a package that was packed, and what differs between two. An archive is read as a
-//! stream and never unpacked: whoever may push can have pushed any bytes, so it is held to all that
-//! a robot holds it to, but for where links lead.
+//! Lists the contents of a package, and the differences between two packages. An archive is read as
+//! a stream and never unpacked. Any user with push rights can have pushed any bytes, so the archive
+//! must satisfy all rules of a robot except those about the targets of links.
 
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
@@ -12,10 +12,10 @@ use task_proto::Digest;
 use task_proto::api::{ChangedFile, PackageDiff, PackageFile, PackageFileKind};
 use task_proto::manifest::{ContentFacts, TaskManifest};
 
-/// All paths and link targets together, which are held in memory.
+/// Limit of all paths and link targets together, which are held in memory.
 const MAX_NAMES_BYTES: u64 = 16 << 20;
 
-/// The entries of `content`, sorted by path. Blocks, and reads all of it.
+/// The entries of `content`, sorted by path. Blocks, and reads the whole archive.
 pub fn list(
     content: impl Read,
     content_size: u64,
@@ -54,7 +54,7 @@ pub fn list(
     Ok(files.into_values().collect())
 }
 
-/// An entry without its digest, if it is a file; a second name of a file is that file.
+/// An entry; a file's digest is added later. A second name of a file is shown as that file.
 fn file(
     path: &str,
     kind: &Kind,
@@ -88,7 +88,7 @@ fn file(
     }
 }
 
-/// What differs between two lists of entries, both sorted by path.
+/// Differences between two lists of entries, both sorted by path.
 pub fn diff(from: Vec<PackageFile>, to: Vec<PackageFile>) -> PackageDiff {
     let mut diff = PackageDiff::default();
     let (mut from, mut to) = (from.into_iter().peekable(), to.into_iter().peekable());
@@ -114,7 +114,7 @@ pub fn diff(from: Vec<PackageFile>, to: Vec<PackageFile>) -> PackageDiff {
     }
 }
 
-/// Whether two manifests say the same, but for the version and what describes the files.
+/// Whether two manifests are equal apart from the version and the description of the files.
 pub fn says_the_same(one: &TaskManifest, other: &TaskManifest) -> bool {
     let TaskManifest { version, content, .. } = one.clone();
     *one == TaskManifest { version, content, ..other.clone() }

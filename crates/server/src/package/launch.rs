@@ -1,6 +1,5 @@
-//! What `taskd run` says in the place of a package's own `[run]`: another launch file, other
-//! arguments. It becomes part of the manifest, so that what ran on a robot is pinned by its digest
-//! like everything else.
+//! A launch file and arguments from `taskd run`, in place of a package's own `[run]`. They become
+//! part of the manifest, so that everything that ran on a robot is pinned by its digest.
 
 use std::collections::BTreeMap;
 
@@ -9,8 +8,8 @@ use task_proto::manifest::{Ready, Run, TaskManifest};
 /// A launch file and its arguments.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Launch {
-    /// The ROS package that has the file; absent: that of the manifest's own launch file, else the
-    /// one of its name.
+    /// The ROS package of the file; absent: that of the manifest's own launch file, otherwise the
+    /// package named like the manifest.
     pub ros_package: Option<String>,
     /// The file's name.
     pub file: String,
@@ -19,15 +18,15 @@ pub struct Launch {
 }
 
 impl Launch {
-    /// Of a manifest, what it would be with this launch file.
+    /// The manifest with this launch file.
     pub fn put_into(&self, mut manifest: TaskManifest) -> TaskManifest {
         let name = manifest.name.to_string();
         self.replace(&mut manifest.run, &mut manifest.ready, &name);
         manifest
     }
 
-    /// The package's own arguments stay where it is its own launch file, below those that are
-    /// given. What it promises of its graph it promises of that file alone.
+    /// The package's own arguments stay if the launch file is the package's own; given arguments
+    /// override them. The package's promises about its graph hold for its own launch file alone.
     pub(super) fn replace(&self, run: &mut Run, ready: &mut Ready, name: &str) {
         let own = run.launch.take();
         let ros_package =

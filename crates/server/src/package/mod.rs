@@ -1,8 +1,8 @@
 //! Owns the way from a directory to a package's bytes and back; it never knows a network or a
 //! server.
 //!
-//! What the directory says of itself, whether that can run, and the bytes that travel. It reads the
-//! directory and writes one temporary file.
+//! The directory's own description, whether that can run, and the bytes to distribute. The module
+//! reads the directory and writes one temporary file.
 
 use std::path::PathBuf;
 
@@ -27,9 +27,9 @@ pub use pack::{Described, describe, pack, pack_into, pack_to_launch};
 /// A package, ready to travel.
 #[derive(Debug)]
 pub struct Packed {
-    /// What pins it.
+    /// The reference that pins the package.
     pub package: PackageRef,
-    /// What it is and how it runs.
+    /// The package's identity and how to run the package.
     pub manifest: TaskManifest,
     /// The manifest as the OCI config blob.
     pub config_bytes: Vec<u8>,
@@ -39,20 +39,21 @@ pub struct Packed {
     pub content: NamedTempFile,
 }
 
-/// One thing that keeps a directory from being a package: the file, the key or path in it, and why.
+/// One reason why a directory is not a package: the file, the key or path in the file, and the
+/// error.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{file}: {reason}")]
 pub struct Problem {
     /// The file, relative to the package's directory.
     pub file: String,
-    /// What is wrong with it, beginning with the key where there is one.
+    /// The error, beginning with the key if there is one.
     pub reason: String,
 }
 
 /// Why a directory could not be packed.
 #[derive(Debug, thiserror::Error)]
 pub enum PackageError {
-    /// It is not a package that could run; everything that is wrong with it.
+    /// The directory is not a package that could run; lists all problems.
     #[error("{} can't be packed:\n{}", dir.display(), list(problems))]
     Invalid {
         /// The directory.
@@ -63,9 +64,9 @@ pub enum PackageError {
     /// A file could not be read or written.
     #[error("{what}")]
     Io {
-        /// What was being done, with the path.
+        /// The failed operation, with the path.
         what: String,
-        /// Why it failed.
+        /// The cause.
         source: std::io::Error,
     },
 }

@@ -1,5 +1,6 @@
-//! Makes a package of a directory: checks it, packs its files, and describes them in the OCI way.
-//! The same directory gives the same digests, whoever packs it, wherever and whenever.
+//! Makes a package of a directory: checks the directory, packs its files, and describes them as OCI
+//! blobs and manifest. The same directory gives the same digests, for every user, on every machine,
+//! at any time.
 
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
@@ -14,10 +15,10 @@ use tempfile::NamedTempFile;
 
 use super::{Launch, PackageError, Packed, Problem, archive, source};
 
-/// A manifest and the bytes that it makes, for content that there is already.
+/// A manifest and its bytes, for existing content.
 #[derive(Debug)]
 pub struct Described {
-    /// What pins it.
+    /// The reference that pins the package.
     pub package: PackageRef,
     /// The manifest as the OCI config blob.
     pub config_bytes: Vec<u8>,
@@ -45,12 +46,12 @@ pub fn pack(dir: &Path) -> Result<Packed, PackageError> {
     pack_as(dir, None, &std::env::temp_dir())
 }
 
-/// The same with the content in the directory `temporary`.
+/// Packs with the content's temporary file in the directory `temporary`.
 pub fn pack_into(dir: &Path, temporary: &Path) -> Result<Packed, PackageError> {
     pack_as(dir, None, temporary)
 }
 
-/// Packs `dir` to run as `launch` says in the place of what the directory says itself.
+/// Packs `dir` to run as `launch` says, in place of the directory's own `[run]`.
 pub fn pack_to_launch(dir: &Path, launch: &Launch) -> Result<Packed, PackageError> {
     pack_as(dir, Some(launch), &std::env::temp_dir())
 }
@@ -91,8 +92,7 @@ fn invalid(dir: &Path, file: &str, reason: String) -> PackageError {
     }
 }
 
-/// Compact JSON with the fields in the order of their declaration and maps sorted: one text for one
-/// value.
+/// Compact JSON with fields in declaration order and sorted maps: one text for each value.
 fn json<T: serde::Serialize>(value: &T) -> Result<Vec<u8>, PackageError> {
     serde_json::to_vec(value).map_err(|error| PackageError::Io {
         what: "can't write the task manifest".to_owned(),
@@ -121,7 +121,7 @@ mod tests {
         <export><build_type>ament_python</build_type></export></package>";
     const LAUNCH: &str = "[run]\nlaunch = [\"talker\", \"talker.launch.py\"]\n";
 
-    /// A file of a tree: path, content, whether it is executable.
+    /// A file of a tree: path, content, executable or not.
     type Entry<'a> = (&'a str, &'a str, bool);
 
     fn tree(entries: &[Entry<'_>]) -> TempDir {
@@ -165,7 +165,7 @@ mod tests {
         }
     }
 
-    /// Asserts that the tree is refused for exactly one reason, which has `expected` in it.
+    /// Asserts that the tree is refused for exactly one reason, which contains `expected`.
     fn refused(dir: &TempDir, expected: &str) {
         let problems = problems(dir);
         assert!(
@@ -199,7 +199,7 @@ mod tests {
             packed.package.content.digest,
             packed.package.manifest.digest,
         ];
-        // A change here means that every package changes its digest: say so in the commit.
+        // A change here means that the digest of every package changes: say so in the commit.
         assert_eq!(
             digests.map(|digest| digest.to_string()),
             [

@@ -1,5 +1,5 @@
 //! Reads a ROS `package.xml`, formats 1 to 3 (REP 127, 140, 149): the few elements that matter
-//! here, and the rules by which ROS's own tools would reject the file, because they reject it
+//! here, and the rules by which ROS's own tools would reject the file, because they reject
 //! silently.
 
 use roxmltree::{Document, Node};
@@ -7,25 +7,25 @@ use roxmltree::{Document, Node};
 /// The file's name.
 pub const FILE: &str = "package.xml";
 
-/// What the file says.
+/// Contents of the file.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct PackageXml {
-    /// `<name>`; empty if it is absent.
+    /// `<name>`; empty if absent.
     pub name: String,
-    /// `<version>`, likewise.
+    /// `<version>`; empty if absent.
     pub version: String,
-    /// What builds it.
+    /// The build type.
     pub build_type: BuildType,
-    /// Names from exec_depend, depend and run_depend, sorted, each once. Without those that have a
-    /// condition, which only a robot could judge.
+    /// Names from exec_depend, depend and run_depend, sorted, without duplicates. Conditional
+    /// dependencies are left out: only a robot can evaluate them.
     pub exec_depends: Vec<String>,
-    /// Those that have one.
+    /// Names with a condition.
     pub conditional_depends: Vec<String>,
-    /// What catkin_pkg, and with it colcon and catkin, would refuse.
+    /// Reasons for which catkin_pkg, and with it colcon and catkin, would refuse the file.
     pub invalid: Vec<String>,
 }
 
-/// What the file says about its build type.
+/// The build type in the file.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub enum BuildType {
     /// Nothing.
@@ -38,13 +38,13 @@ pub enum BuildType {
 }
 
 impl PackageXml {
-    /// Whether it says that it needs `package` to run, under whatever condition.
+    /// Whether the file declares a runtime dependency on `package`, under whatever condition.
     pub fn depends_on(&self, package: &str) -> bool {
         self.exec_depends.iter().chain(&self.conditional_depends).any(|name| name == package)
     }
 }
 
-/// Reads `text`; the error says what is wrong and where.
+/// Parses `text`; the error gives reason and position.
 pub fn parse(text: &str) -> Result<PackageXml, String> {
     let document = Document::parse(text).map_err(|error| error.to_string())?;
     let package = document.root_element();
@@ -60,8 +60,7 @@ pub fn parse(text: &str) -> Result<PackageXml, String> {
         .collect();
     types.dedup();
     let build_type = match types.len() {
-        // Before formats knew build types there was only catkin, and it had to be named as the
-        // build tool.
+        // Formats without build types knew only catkin, which had to be named as the build tool.
         0 if texts(package, "buildtool_depend").any(|name| name == "catkin") => {
             BuildType::One("catkin".to_owned())
         }
@@ -80,7 +79,7 @@ pub fn parse(text: &str) -> Result<PackageXml, String> {
     })
 }
 
-/// What is needed to run the package, with or without a condition.
+/// Runtime dependencies of the package, with or without a condition.
 fn depends(package: Node<'_, '_>, conditional: bool) -> Vec<String> {
     let tags = ["exec_depend", "depend", "run_depend"];
     let elements = tags.iter().flat_map(|tag| children(package, tag));
@@ -94,9 +93,9 @@ fn depends(package: Node<'_, '_>, conditional: bool) -> Vec<String> {
     names
 }
 
-/// The rules of catkin_pkg's `Package.validate`: a file that breaks one is no ROS package to
-/// colcon, which then builds an ament_python package as plain Python, without its ROS index
-/// entries, and says nothing.
+/// The rules of catkin_pkg's `Package.validate`: a file that breaks a rule is no ROS package to
+/// colcon, which then silently builds an ament_python package as plain Python, without its ROS
+/// index entries.
 fn invalid(package: Node<'_, '_>) -> Vec<String> {
     let mut invalid = Vec::new();
     for tag in ["name", "version", "description"] {

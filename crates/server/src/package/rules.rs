@@ -1,5 +1,5 @@
-//! Whether a package could be built and started: the manifest against the files that come with it.
-//! What only a robot can know (its underlay, its architecture) is not judged here.
+//! Checks whether a package could be built and started: the manifest against the package's files.
+//! Conditions that only a robot can check (its underlay, its architecture) are left to the robot.
 
 use task_proto::manifest::{BuildTool, TaskManifest};
 
@@ -15,7 +15,7 @@ struct RosPackage {
     xml: PackageXml,
 }
 
-/// Adds everything that keeps `manifest` and `tree` from running to `problems`.
+/// Adds every reason why `manifest` and `tree` could not run to `problems`.
 pub(super) fn check(
     manifest: &TaskManifest,
     tree: &Tree,
@@ -39,7 +39,7 @@ pub(super) fn check(
     Ok(())
 }
 
-/// Files that keep build tools out of their directory.
+/// Marker files that make build tools skip their directory.
 const IGNORED_BY: [&str; 3] = ["COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE"];
 
 /// Every package.xml in the tree, as the build tool will find them.
@@ -55,7 +55,7 @@ fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPacka
         let directory = parent(path).to_owned();
         match package_xml::parse(&text) {
             Ok(xml) => packages.push(RosPackage { directory, xml }),
-            // The one at the top has been read, and complained about, before.
+            // The package.xml at the top was read, and its errors were reported, before.
             Err(_) if directory.is_empty() => {}
             Err(reason) => problems.push(Problem { file: path.clone(), reason }),
         }
@@ -63,7 +63,7 @@ fn ros_packages(tree: &Tree, problems: &mut Vec<Problem>) -> Result<Vec<RosPacka
     Ok(packages)
 }
 
-/// Whether build tools look for a package in `directory`: not where a file says no, nor below
+/// Whether build tools search `directory` for a package: not with a marker file, and not below
 /// another package.
 fn is_looked_at(tree: &Tree, directory: &str) -> bool {
     let has = |directory: &str, file: &str| match directory {
@@ -76,7 +76,7 @@ fn is_looked_at(tree: &Tree, directory: &str) -> bool {
     above.all(|at| !is_ignored(at) && (at == directory || !has(at, package_xml::FILE)))
 }
 
-/// The directory of a path, which is "" at the top.
+/// The parent directory of a path; "" at the top.
 fn parent(path: &str) -> &str {
     path.rsplit_once('/').map_or("", |(parent, _)| parent)
 }
@@ -181,8 +181,8 @@ fn check_launch(
     }
 }
 
-/// Where an install tree has what `package` shares: it is isolated or merged, and in install/ or
-/// the directory itself.
+/// Directories of an install tree with the share files of `package`: isolated or merged, and in
+/// install/ or the directory itself.
 fn shares(package: &str) -> [String; 4] {
     let isolated = |top: &str| format!("{top}{package}/share/{package}/");
     let merged = |top: &str| format!("{top}share/{package}/");
@@ -195,8 +195,8 @@ pub(super) fn is_in_install_tree(tree: &Tree, package: &str) -> bool {
     tree.entries.keys().any(|path| shares.iter().any(|share| path.starts_with(share)))
 }
 
-/// A command with a slash comes with the package, unless it is absolute. Where it is relative to:
-/// see docs/package.md.
+/// A command with a slash is a file of the package, unless the path is absolute. docs/package.md
+/// describes the base directory of relative paths.
 fn check_exec(
     tool: BuildTool,
     tree: &Tree,

@@ -1,6 +1,6 @@
-//! What a package's directory says of itself: `task.toml`, with what it leaves out taken from
-//! `package.xml`, merged into a task manifest, and the files that belong to it. It collects
-//! everything that is wrong before it gives up.
+//! A package directory's own description: `task.toml`, with absent keys taken from `package.xml`,
+//! merged into a task manifest, and the files of the package. The reader collects all problems
+//! before it gives up.
 
 use std::fs;
 use std::io;
@@ -24,7 +24,7 @@ pub(super) struct Source {
     pub(super) tree: Tree,
 }
 
-/// Reads and checks `dir`, as what runs by `launch` if that is given.
+/// Reads and checks `dir`, with `launch` in place of its own launch file if given.
 pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, PackageError> {
     let invalid = |problems| PackageError::Invalid { dir: dir.to_owned(), problems };
     let not_a_directory =
@@ -42,7 +42,7 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
     let mut problems = Vec::new();
     let toml = read_text(dir, task_toml::FILE, &mut problems)?;
     let xml = read_text(dir, package_xml::FILE, &mut problems)?;
-    // Without task.toml it takes somebody else who says how it is run.
+    // Without task.toml, the caller has to provide the launch file.
     let is_said = launch.is_some() && xml.is_some();
     if toml.is_none() && !is_said && problems.is_empty() {
         let reason = match xml {
@@ -58,7 +58,7 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
     }
     let before = problems.len();
     let mut toml = toml.map(|text| task_toml::parse(&text, &mut problems)).unwrap_or_default();
-    // What the file gives wrongly must not be called absent as well.
+    // A key with an invalid value must not be reported as absent as well.
     let toml_is_whole = problems.len() == before;
     let xml = xml.and_then(|text| match package_xml::parse(&text) {
         Ok(xml) => Some(xml),
@@ -80,7 +80,7 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
     match manifest {
         Some(mut manifest) if toml_is_whole => {
             rules::check(&manifest, &tree, &mut problems)?;
-            // A robot looks for the others among its own.
+            // A robot looks for the others among its own packages.
             manifest.exec_depends.retain(|name| !rules::is_in_install_tree(&tree, name));
             if problems.is_empty() { Ok(Source { manifest, tree }) } else { Err(invalid(problems)) }
         }
@@ -88,7 +88,7 @@ pub(super) fn read(dir: &Path, launch: Option<&Launch>) -> Result<Source, Packag
     }
 }
 
-/// `build.tool`, or what `package.xml` implies.
+/// `build.tool`, or the build tool implied by `package.xml`.
 fn build_tool(toml: &TaskToml, xml: Option<&PackageXml>, problems: &mut Vec<Problem>) -> BuildTool {
     let (None, Some(xml)) = (toml.build_tool, xml) else {
         return toml.build_tool.unwrap_or(BuildTool::None);
@@ -112,7 +112,7 @@ fn build_tool(toml: &TaskToml, xml: Option<&PackageXml>, problems: &mut Vec<Prob
     BuildTool::None
 }
 
-/// The manifest, if there is a name and a version. `task.toml` wins.
+/// The manifest, if name and version are present. `task.toml` wins.
 fn merge(
     toml: TaskToml,
     toml_is_whole: bool,

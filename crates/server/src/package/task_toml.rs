@@ -1,5 +1,6 @@
-//! Reads `task.toml`. It is strict: a key that does not exist and a value of the wrong type are
-//! problems, and all of them are found in one go. What the keys mean together is not judged here.
+//! Reads `task.toml`. The parser is strict: an unknown key and a value of the wrong type are
+//! problems, and all problems are found in one pass. Rules that involve several keys are not
+//! checked here.
 
 use std::collections::BTreeMap;
 
@@ -13,7 +14,7 @@ use super::Problem;
 /// The file's name.
 pub const FILE: &str = "task.toml";
 
-/// What the file says; what it leaves out has its default or is `None`.
+/// Contents of the file; absent keys have their default or are `None`.
 #[derive(Debug, Default, PartialEq)]
 pub struct TaskToml {
     /// The package's name.
@@ -36,7 +37,7 @@ pub struct TaskToml {
     pub limits: Limits,
 }
 
-/// Reads `text`, adding what is wrong with it to `problems`.
+/// Parses `text`, adding errors to `problems`.
 pub fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
     let mut file = TaskToml::default();
     match text.parse::<toml::Table>() {
@@ -56,9 +57,9 @@ pub fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
     file
 }
 
-/// A table that is taken apart key by key; what is left over at the end nobody knows.
+/// A table that is read key by key; keys left over at the end are unknown.
 struct Section<'p> {
-    /// The table's own key with a dot behind it; empty at the top.
+    /// The table's own key followed by a dot; empty at the top.
     path: String,
     table: toml::Table,
     known: Vec<&'static str>,
@@ -108,7 +109,7 @@ impl Section<'_> {
         self.finish();
     }
 
-    /// Takes `key` into `slot`, which keeps its default if the key is absent or wrong.
+    /// Reads `key` into `slot`, which keeps its default if the key is absent or invalid.
     fn take<T: DeserializeOwned>(&mut self, key: &'static str, slot: &mut T) {
         self.known.push(key);
         let Some(value) = self.table.remove(key) else { return };
@@ -125,7 +126,7 @@ impl Section<'_> {
         }
     }
 
-    /// Takes the table `key` apart with `read`; it may be absent.
+    /// Reads the table `key` with `read`; the table may be absent.
     fn section(&mut self, key: &'static str, read: impl FnOnce(&mut Section<'_>)) {
         self.known.push(key);
         match self.table.remove(key) {
@@ -144,7 +145,7 @@ impl Section<'_> {
         }
     }
 
-    /// Takes `topics` apart: a table of tables, by the topics' names.
+    /// Reads `topics`: a table of tables, by the topics' names.
     fn topics(&mut self, topics: &mut BTreeMap<String, ReadyTopic>) {
         let mut tables: BTreeMap<String, toml::Table> = BTreeMap::new();
         self.take("topics", &mut tables);
@@ -207,7 +208,7 @@ impl Section<'_> {
     }
 }
 
-/// A ROS parameter's value: a truth value, number or text, or a list of one of these.
+/// A ROS parameter's value: a boolean, number or string, or a list of one of these types.
 fn parameter(value: &toml::Value) -> Result<serde_json::Value, &'static str> {
     const EXPECTED: &str = "expected a truth value, a number, a text or a list of one of these";
     match value {
@@ -227,7 +228,7 @@ fn parameter(value: &toml::Value) -> Result<serde_json::Value, &'static str> {
     }
 }
 
-/// A value as the user wrote it, more or less, short enough for a message.
+/// A value roughly as the user wrote it, short enough for a message.
 fn brief(value: &toml::Value) -> String {
     const MAX_CHARS: usize = 60;
     let text = value.to_string().replace('\n', " ");
@@ -238,14 +239,14 @@ fn brief(value: &toml::Value) -> String {
     }
 }
 
-/// The known key that `key` is probably meant to be: at most two letters away, and not all of them.
+/// The known key closest to `key`: at most two letters away, and not all of them.
 fn nearest<'k>(key: &str, known: &[&'k str]) -> Option<&'k str> {
     let (distance, best) =
         known.iter().map(|candidate| (distance(key, candidate), *candidate)).min()?;
     (distance <= 2 && distance < best.len()).then_some(best)
 }
 
-/// How many letters must be put in, taken out or changed (Levenshtein).
+/// Number of insertions, deletions and substitutions (Levenshtein distance).
 fn distance(from: &str, to: &str) -> usize {
     let to: Vec<char> = to.chars().collect();
     let mut row: Vec<usize> = (0..=to.len()).collect();

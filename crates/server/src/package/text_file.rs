@@ -10,7 +10,7 @@ use super::{PackageError, Problem};
 /// The largest text file that is read.
 const MAX_TEXT_BYTES: u64 = 1024 * 1024;
 
-/// The text file `name` in `dir`; `None` if it is not there or can't be used, which is then a
+/// The text file `name` in `dir`; `None` if the file is absent or unusable, which then is a
 /// problem.
 pub(super) fn read_text(
     dir: &Path,
@@ -19,7 +19,7 @@ pub(super) fn read_text(
 ) -> Result<Option<String>, PackageError> {
     let path = dir.join(name);
     let mut refuse = |reason: String| problems.push(Problem { file: name.to_owned(), reason });
-    // Only a regular file is opened: a FIFO would wait for ever.
+    // Only a regular file is opened: a FIFO would block forever.
     match fs::symlink_metadata(&path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         Ok(metadata) if metadata.is_file() && metadata.len() <= MAX_TEXT_BYTES => {}

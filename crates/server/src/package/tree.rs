@@ -1,5 +1,5 @@
-//! A package's files: walks the directory, leaves out what does not belong, and refuses what must
-//! not travel. It follows no link and opens no file but `.taskdignore`.
+//! A package's files: walks the directory, leaves out ignored files, and refuses files that must
+//! not be distributed. The walk follows no link and opens no file but `.taskdignore`.
 
 use std::collections::BTreeMap;
 use std::fs::{self, Metadata};
@@ -14,11 +14,11 @@ use super::{PackageError, Problem};
 
 /// The file of patterns that are left out.
 const IGNORE_FILE: &str = ".taskdignore";
-/// What never belongs to a package, at any depth.
+/// Names that are never packed, at any depth.
 const NEVER_PACKED: [&str; 3] = [".git", "__pycache__", IGNORE_FILE];
 
 /// A package's files by path, which is relative, with `/`. A map sorts paths bytewise, so a
-/// directory precedes what is in it.
+/// directory precedes its contents.
 #[derive(Debug)]
 pub(super) struct Tree {
     pub(super) root: PathBuf,
@@ -58,7 +58,7 @@ impl Tree {
         Ok(Self { root: root.to_owned(), entries: walk.entries })
     }
 
-    /// What `path` is, links in its last part followed as far as they stay in the tree.
+    /// The entry at `path`; links in the last part are followed as long as they stay in the tree.
     pub(super) fn resolve(&self, path: &str) -> Option<&Entry> {
         const MAX_LINKS: usize = 16;
         let mut path = normalised(path)?;
@@ -139,8 +139,8 @@ impl Walk<'_> {
         }
         if kind.is_file() {
             self.bytes = self.bytes.saturating_add(metadata.len());
-            // The owner's bit alone: the others depend on the umask of whoever checked the tree
-            // out.
+            // The owner's bit alone: the other bits depend on the umask of the
+            // checkout.
             let executable = metadata.permissions().mode() & 0o100 != 0;
             return Ok(Some(Entry::File { size: metadata.len(), executable }));
         }
@@ -177,8 +177,8 @@ impl Walk<'_> {
     }
 
     fn is_left_out(&self, full: &Path, path: &str, name: &str, is_directory: bool) -> bool {
-        // Beside an install tree that is the package, only what colcon itself marks as its own is
-        // no part of it.
+        // Beside an install tree that is the package, only files that colcon itself marks as its
+        // own are excluded.
         let is_product = || match path {
             "install" => self.built_on_robot,
             "build" | "log" => self.built_on_robot || full.join("COLCON_IGNORE").exists(),
@@ -215,14 +215,14 @@ fn link_refusal(path: &str, target: &str) -> Option<String> {
     if leaves {
         return Some(format!("is a link to {target:?}, which leaves the package's directory"));
     }
-    // Behind another link ".." would lead somewhere else than the text says.
+    // After another link ".." would differ from the text.
     parts[up..]
         .contains(&"..")
         .then(|| format!("is a link to {target:?}; \"..\" may only stand at its beginning"))
 }
 
-/// `path` without empty and `.` parts and with `..` resolved by the text; `None` if it leaves the
-/// tree.
+/// `path` without empty and `.` parts and with `..` resolved by the text; `None` if the path leaves
+/// the tree.
 fn normalised(path: &str) -> Option<String> {
     let mut parts = Vec::new();
     for part in path.split('/') {
@@ -239,7 +239,7 @@ fn normalised(path: &str) -> Option<String> {
 #[derive(Debug)]
 struct Pattern {
     glob: String,
-    /// It has a slash, so it is about whole paths and not about names.
+    /// The pattern has a slash, so it matches whole paths and not names.
     anchored: bool,
     only_directories: bool,
 }
@@ -279,11 +279,11 @@ fn read_patterns(root: &Path, problems: &mut Vec<Problem>) -> Result<Vec<Pattern
     Ok(patterns)
 }
 
-/// Whether `glob` describes `text`: `?` is one character of a name, `*` any number of them, `**`
+/// Whether `glob` matches `text`: `?` is one character of a name, `*` any number of them, `**`
 /// crosses directories.
 fn glob_matches(glob: &[u8], text: &[u8]) -> bool {
-    // The last star and where it was tried: one step back is enough, for `*` as for `**`, so this
-    // takes no more than the product of the lengths.
+    // The last star and its position: one step back is enough, for `*` as for `**`, so the time is
+    // bounded by the product of the lengths.
     let (mut g, mut t) = (0, 0);
     let mut star: Option<(usize, usize)> = None;
     let mut double: Option<(usize, usize)> = None;

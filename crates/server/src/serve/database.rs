@@ -1,5 +1,5 @@
-//! The database beside the service: opened, waited for where its server is away, and checked in
-//! full now and then. It holds no SQL and serves nobody.
+//! The database's lifecycle beside the service: opening, waiting while its server is away, and
+//! periodic full checks. This module contains no SQL and serves no requests.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -13,10 +13,10 @@ use crate::fleet::presence::{Claim, Presence};
 use crate::store::{Fault, ReportedBy, Store, StoreError};
 use crate::system::clock::Clock;
 
-/// The first and the longest pause before a database that is away is tried again.
+/// The first and the longest pause before an unavailable database is tried again.
 const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
-/// The first operator, whose token every server has.
+/// The first operator, whose token exists on every server.
 pub struct FirstOperator {
     /// The token.
     pub token: Token,
@@ -28,18 +28,18 @@ pub struct FirstOperator {
 pub struct Database {
     store: Store,
     operator: FirstOperator,
-    /// Learns from the database which agent each robot had last.
+    /// Receives each robot's last agent from the database.
     presence: Arc<Presence>,
-    /// The database knows the first operator, and the presence the agents.
+    /// The database contains the first operator, and the presence the agents.
     is_ready: bool,
     clock: Clock,
-    /// Why the database can't be used, once it is known.
+    /// The reason why the database can't be used, once known.
     unusable: watch::Sender<Option<String>>,
 }
 
 impl Database {
-    /// Opens the database at `url`. A Postgres that is away or has no connection left is left to
-    /// [`Self::attend`].
+    /// Opens the database at `url`. If Postgres is away or has no connection left, [`Self::attend`]
+    /// waits for it.
     pub async fn open(
         url: &str,
         operator: FirstOperator,
@@ -68,7 +68,7 @@ impl Database {
         &self.store
     }
 
-    /// Becomes the reason when the database was waited for and then can't be used.
+    /// Receives the reason if the database came back after a wait and then can't be used.
     pub fn unusable(&self) -> watch::Receiver<Option<String>> {
         self.unusable.subscribe()
     }
@@ -99,8 +99,7 @@ impl Database {
         }
     }
 
-    /// Asks the database whether it is there; does what is to be done once, if that was not done
-    /// yet.
+    /// Checks that the database answers, and performs the first-use steps if not yet done.
     async fn bring_up(&mut self) -> Result<(), StoreError> {
         if !self.store.state().is_open() {
             self.store.prepare().await?;
@@ -108,14 +107,14 @@ impl Database {
         if !self.is_ready {
             return self.make_ready().await;
         }
-        // Whatever else it answers, it is there.
+        // With any other answer the database is available.
         match self.store.ping().await {
             Err(error) if error.fault() == Some(Fault::Away) => Err(error),
             _ => Ok(()),
         }
     }
 
-    /// Does, once, the steps that precede the first use.
+    /// Performs, once, the steps that precede the first use.
     async fn make_ready(&mut self) -> Result<(), StoreError> {
         self.register_operator().await?;
         let now_ms = self.clock.now_ms();
@@ -126,7 +125,7 @@ impl Database {
         Ok(())
     }
 
-    /// Makes sure that the token in the directory opens this database, which may be new or
+    /// Ensures that the token in the directory is valid in this database, which may be new or
     /// restored.
     async fn register_operator(&self) -> Result<(), StoreError> {
         let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
@@ -143,7 +142,7 @@ impl Database {
     }
 }
 
-/// Whether the error is of a kind that passes by itself.
+/// Whether the error is transient.
 fn passes(error: &StoreError) -> bool {
     matches!(error.fault(), Some(Fault::Away | Fault::Busy))
 }

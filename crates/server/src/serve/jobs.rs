@@ -1,5 +1,5 @@
-//! Periodic jobs beside the listeners: each waits for its interval or an event, and asks another
-//! part to act.
+//! Periodic jobs beside the listeners: each waits for its interval or an event, and then calls
+//! another part of the server.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,17 +18,17 @@ use crate::orders::actions::ActionError;
 use crate::orders::changes::Change;
 use crate::orders::chooser::ServerLoad;
 
-/// How often the server looks for assignments that have expired.
+/// Interval between checks for expired assignments.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
-/// How often it looks for robots that have fallen silent.
+/// Interval between checks for robots that have fallen silent.
 const SILENCE_INTERVAL: Duration = Duration::from_secs(5);
-/// How often it looks for rollouts that go on without robots that stay away.
+/// Interval between checks for rollouts that can continue without absent robots.
 const ROLLOUT_INTERVAL: Duration = Duration::from_secs(10);
-/// The pause between two looks at rollouts, however many robots come meanwhile.
+/// Minimum interval between checks of rollouts, however many robots come meanwhile.
 const ROLLOUT_PAUSE: Duration = Duration::from_millis(250);
-/// How often it looks for robots that misbehave no longer.
+/// Interval between checks for robots whose violations have expired.
 const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
-/// How often it looks at how busy it is.
+/// Interval between measurements of the server's load.
 const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
 /// Ends assignments that were not done in time.
@@ -36,7 +36,7 @@ pub(super) async fn expire_assignments(app: App) {
     let mut ticks = ticks(EXPIRY_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {
         match app.actions.expire().await {
-            // They come back with a token that is good, if they have one.
+            // Clients reconnect with a valid token, if they have one.
             Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
             Err(ActionError::Store(error)) => {
                 error.log("assignments could not be looked through for expired ones")
@@ -49,8 +49,8 @@ pub(super) async fn expire_assignments(app: App) {
     }
 }
 
-/// Moves rollouts on where robots come or stay away: what a report or an order changes moves them
-/// on by itself.
+/// Advances rollouts when robots come online or stay away. Changes by a report or an order advance
+/// rollouts directly.
 pub(super) async fn advance_rollouts(app: App) {
     let mut ticks = ticks(ROLLOUT_INTERVAL);
     let mut happenings = app.changes.happenings();
@@ -66,7 +66,7 @@ pub(super) async fn advance_rollouts(app: App) {
                 "rollouts could not be moved on"
             );
         }
-        // Robots that come at once, as after a restart, are looked at once.
+        // Robots that come online together, as after a restart, are handled together.
         tokio::select! {
             () = app.stop.cancelled() => return,
             () = tokio::time::sleep(ROLLOUT_PAUSE) => {}
@@ -74,7 +74,7 @@ pub(super) async fn advance_rollouts(app: App) {
     }
 }
 
-/// Waits until some robot has come online. Takes all that has been said so far.
+/// Waits until a robot has come online. Consumes all pending events.
 async fn robot_came(happenings: &mut broadcast::Receiver<Happening>) {
     let mut came = false;
     while !came {
@@ -87,7 +87,7 @@ async fn robot_came(happenings: &mut broadcast::Receiver<Happening>) {
     while !matches!(happenings.try_recv(), Err(TryRecvError::Empty | TryRecvError::Closed)) {}
 }
 
-/// Shows that robots misbehave, and that they do so no longer.
+/// Displays that robots violate their limits, and when they no longer do.
 pub(super) async fn show_conduct(app: App) {
     let mut ticks = ticks(FORGIVING_INTERVAL);
     loop {
@@ -112,7 +112,7 @@ pub(super) async fn show_conduct(app: App) {
     }
 }
 
-/// Measures the server's load, by which deliveries are chosen.
+/// Measures the server's load, which influences the choice of deliveries.
 pub(super) async fn watch_load(app: App, load: Arc<ServerLoad>) {
     let mut ticks = ticks(LOAD_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {

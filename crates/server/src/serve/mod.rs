@@ -56,24 +56,24 @@ use crate::store::{Store, StoreError, sqlite_url};
 use crate::system::clock::Clock;
 use crate::system::data_directory::{Addresses, DataDirectory, DataError, room};
 
-/// How long requests under way may take to end; the whole stop is to take less than ten seconds.
+/// Time limit for running requests at a stop; the whole stop must take less than ten seconds.
 const REQUEST_PATIENCE: Duration = Duration::from_secs(5);
-/// Likewise MQTT sessions, at the same time.
+/// Time limit for MQTT sessions, at the same time.
 const SESSION_PATIENCE: Duration = Duration::from_secs(5);
-/// Then the reports that have been handed in.
+/// Time limit for storing the received reports, afterwards.
 const WRITER_PATIENCE: Duration = Duration::from_secs(3);
-/// And last the database's connections.
+/// Time limit for closing the database's connections, last.
 const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
-/// How long a TLS handshake may take before an HTTP request.
+/// Time limit of the TLS handshake before an HTTP request.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-/// What people leave free on the disk unless somebody wants it otherwise: this share of it, but no
-/// more than so many bytes.
+/// Default disk reserve that people must leave free: this share of the disk, up to an absolute
+/// maximum in bytes.
 const RESERVE_SHARE: u64 = 40;
 const MAX_RESERVE_BYTES: u64 = 1 << 30;
-/// What is kept of one robot is at most this share of the disk, unless somebody wants more.
+/// Default upper bound of one robot's stored outputs, as a share of the disk.
 const ROBOT_SHARE: u64 = 8;
 
-/// Why the server did not start.
+/// The reason why the server did not start.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// The data directory can't be used.
@@ -82,7 +82,7 @@ pub enum ServeError {
     /// The database can't be used.
     #[error(transparent)]
     Store(#[from] StoreError),
-    /// There is no certificate to encrypt with.
+    /// There is no usable certificate.
     #[error(transparent)]
     Tls(#[from] TlsError),
     /// The blob store can't be used.
@@ -91,7 +91,7 @@ pub enum ServeError {
     /// MQTT can't be served.
     #[error(transparent)]
     Broker(#[from] BrokerError),
-    /// The provider can't be asked.
+    /// The OpenID provider can't be used.
     #[error(transparent)]
     Oidc(#[from] OidcSetUpError),
     /// HTTP can't be served.
@@ -99,7 +99,7 @@ pub enum ServeError {
     Listen {
         /// The configured address.
         address: SocketAddr,
-        /// Why.
+        /// The operating system's error.
         source: std::io::Error,
     },
 }
@@ -120,7 +120,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts everything. When it returns, both listeners accept and their addresses are published.
+    /// Starts all parts. On return, both listeners accept and their addresses are published.
     pub async fn start(config: Config, clock: Clock) -> Result<Self, ServeError> {
         let data = DataDirectory::open(&config.data)?;
         let key = data.signing_key()?;
@@ -252,23 +252,22 @@ impl Server {
         })
     }
 
-    /// Where it listens.
+    /// The addresses of the listeners.
     pub fn addresses(&self) -> &Addresses {
         &self.addresses
     }
 
-    /// Its directory.
+    /// The data directory.
     pub fn data(&self) -> &DataDirectory {
         &self.data
     }
 
-    /// Takes a certificate that was put in the place of the one in use, if there is one that can be
-    /// used.
+    /// Loads a certificate that has replaced the one in use, if the new one is valid.
     pub fn reload_certificate(&self) -> Result<(), TlsError> {
         self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
 
-    /// Waits until broker or database can't be helped any more; says what was seen.
+    /// Waits until the broker or the database has failed for good; returns the observation.
     pub async fn broken(&self) -> String {
         let (mut health, mut unusable) = (self.broker.health(), self.unusable.clone());
         let broker = async {
@@ -280,7 +279,7 @@ impl Server {
         let database = async {
             match unusable.wait_for(Option::is_some).await.as_deref() {
                 Ok(Some(why)) => why.clone(),
-                // Nobody waits for the database any more.
+                // The database is no longer watched.
                 _ => std::future::pending().await,
             }
         };
@@ -290,7 +289,7 @@ impl Server {
         }
     }
 
-    /// Stops within ten seconds: listeners close, requests and sessions end, what was handed in is
+    /// Stops within ten seconds: listeners close, requests and sessions end, received reports are
     /// stored.
     pub async fn stop(self) {
         self.data.unpublish();
@@ -299,8 +298,8 @@ impl Server {
         if http.is_err() {
             tracing::error!("the HTTP listener had failed");
         }
-        // The writer ends when nobody can hand in reports any more: the broker's inbox and the
-        // routes were the last.
+        // The writer ends when no sender of reports is left: the broker's inbox and the routes were
+        // the last.
         drop(self.broker);
         self.tasks.close();
         let drained = async {
@@ -316,7 +315,7 @@ impl Server {
     }
 }
 
-/// What runs beside the listeners.
+/// Starts the tasks beside the listeners.
 fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     let downlink = Downlink {
         actions: app.actions.clone(),
@@ -366,7 +365,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     tasks.spawn(show_conduct(app.clone()));
 }
 
-/// Checks once, so that the first answer of `/readyz` is true, and goes on beside the listeners.
+/// Checks once, so that the first answer of `/readyz` is true, and continues in the background.
 async fn start_readiness(tasks: &TaskTracker, app: &App) {
     let mut check = ReadinessCheck {
         readiness: app.readiness.clone(),
@@ -391,7 +390,7 @@ async fn open_database(
     Ok(Database::open(&url, operator, presence, clock).await?)
 }
 
-/// Tells programs on this machine where the server listens, if there is room for that.
+/// Publishes the server's addresses for programs on this machine, if there is disk space.
 fn publish(
     data: &DataDirectory,
     http: SocketAddr,
@@ -430,7 +429,7 @@ fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
     }
 }
 
-/// With the host that robots are told among the certificate's names.
+/// Adds the public host of robots to the certificate's names.
 fn tls_settings(config: &Config) -> TlsSettings {
     let mut settings = config.tls.clone();
     settings.names.extend(config.public_mqtt_host.clone());
@@ -462,7 +461,7 @@ fn http_limits(config: &Config) -> listener::Limits {
     }
 }
 
-/// The broker, and what robots and an external broker are told about each other.
+/// Starts the broker, with the data that robots and an external broker are told about each other.
 async fn start_broker(
     config: &Config,
     embedded: BrokerConfig,
@@ -494,7 +493,7 @@ async fn start_broker(
     Ok((Broker::connect(external, inbox), access))
 }
 
-/// Where the server listens, as bound.
+/// The bound addresses of the listeners.
 fn listeners(http: SocketAddr, broker: &Broker, tls: bool) -> Vec<ListenerView> {
     let view = |kind: &str, address: SocketAddr| ListenerView {
         kind: kind.to_owned(),
@@ -516,7 +515,7 @@ fn broker_config(config: &Config, tls: Option<Tls>, conduct: Arc<Conduct>) -> Br
     BrokerConfig { listen: config.mqtt, tls, prefix: config.topic_prefix.clone(), limits, conduct }
 }
 
-/// An address that works from this machine: "all interfaces" is none that one could connect to.
+/// An address that works from this machine: clients can't connect to "all interfaces".
 fn reachable(mut bound: SocketAddr) -> SocketAddr {
     if bound.ip().is_unspecified() {
         bound.set_ip(if bound.is_ipv4() {

@@ -1,5 +1,5 @@
-//! How bytes travel: what is known of the robots when a batch begins, and what was decided for
-//! each.
+//! Delivery decisions: the known facts about the robots when a batch begins, and the decision for
+//! each robot.
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{DeliveryChoice, DeliveryDecision};
@@ -11,45 +11,45 @@ use task_proto::{DeploymentId, Digest, RobotId};
 use super::rows::{from_json, from_optional_json, from_word, groups, id, number, values, word};
 use super::{StoreError, Write};
 
-/// What an order says about how it travels.
+/// The part of an order that concerns delivery.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DeliveryOrder {
-    /// What the operator chose.
+    /// The operator's choice of the mechanism.
     pub choice: DeliveryChoice,
-    /// What travels.
+    /// The package to deliver.
     pub package: PackageRef,
-    /// Robots it was ordered on.
+    /// The number of robots in the order.
     pub robots: u64,
 }
 
-/// What is known of a robot that is to get a package.
+/// The known facts about a robot that is to get a package.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobotFacts {
-    /// Which.
+    /// The robot's id.
     pub robot: RobotId,
-    /// Its labels.
+    /// The robot's labels.
     pub labels: Labels,
-    /// Its way to the server, as far as it was measured.
+    /// The robot's link to the server, as far as it was measured.
     pub link: Option<LinkFacts>,
-    /// What is left of its battery, in percent.
+    /// The battery's charge, in percent.
     pub battery_percent: Option<u64>,
-    /// A task that it reports with the same content.
+    /// A task in the robot's report with the same content.
     pub has: Option<TaskReport>,
 }
 
-/// What was decided for a robot.
+/// The delivery decision for a robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Decided {
     /// The robot.
     pub robot: RobotId,
-    /// How its bytes travel, and why.
+    /// The mechanism, and the reason for it.
     pub decision: DeliveryDecision,
-    /// JSON of what was known.
+    /// The inputs of the decision, as JSON.
     pub inputs: String,
 }
 
 impl Write {
-    /// What `deployment` says about how it travels.
+    /// The part of the order of `deployment` that concerns delivery.
     pub async fn delivery_order(
         &mut self,
         deployment: &DeploymentId,
@@ -69,7 +69,7 @@ impl Write {
         })
     }
 
-    /// What is known of `robots`, which may have `content` already.
+    /// The known facts about `robots`, which may have `content` already.
     pub async fn robot_facts(
         &mut self,
         robots: &[RobotId],
@@ -113,7 +113,7 @@ impl Write {
             .collect()
     }
 
-    /// Stores what was decided for robots of `deployment`.
+    /// Stores the decisions for robots of `deployment`.
     pub async fn store_decisions(
         &mut self,
         deployment: &DeploymentId,

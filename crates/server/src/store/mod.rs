@@ -61,24 +61,25 @@ pub use timelines::{HistoryPage, HistoryQuery};
 use crate::domain::person::Person;
 use crate::limits::pace::Pace;
 
-/// What of a SQLite database the writer keeps in memory: 16 MiB.
+/// The page cache of the SQLite writer: 16 MiB.
 const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";
-/// The same of each reader; what it lacks is in the system's memory.
+/// The page cache of each SQLite reader: 4 MiB. The system's page cache holds the rest.
 const READER_CACHE: &str = "PRAGMA cache_size = -4096";
-/// Connections that read at the same time.
+/// Number of connections for concurrent reads.
 const READERS: u32 = 6;
-/// And those of them that people's reads may have at once: the rest is free for robots and orders.
+/// Number of these connections that people's reads may use at once. The rest stay free for robots
+/// and orders.
 const SHARED_READERS: u32 = 4;
-/// How long a statement waits for a connection or for another process's write.
+/// Time limit of a statement's wait for a connection or for another process's write.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// The same for a connection to Postgres: less than a request has, so that who asked is told why
-/// there is no answer.
+/// The same wait for a connection to Postgres. It is shorter than a request's time limit, so that
+/// the client is told why there is no answer.
 const POSTGRES_PATIENCE: Duration = Duration::from_secs(20);
-/// How long a connection to a database server may take; who asked has to be told in time that there
-/// is none.
+/// Time limit for connecting to a database server. It is short enough for the client to hear in
+/// time that there is no connection.
 const CONNECT: Duration = Duration::from_secs(5);
-/// Part of a SQLite URL: the file belongs to this process alone, which keeps in memory what it
-/// otherwise shares by a file.
+/// Part of a SQLite URL: the file belongs to this process alone. The process then keeps in memory
+/// the index that it would otherwise share through a file.
 const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
 
 /// The database. Clones share its connections.
@@ -101,86 +102,86 @@ impl fmt::Debug for Store {
     }
 }
 
-/// Which database it is, and how large.
+/// The kind of the database, and its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DatabaseSize {
     /// `sqlite` or `postgres`.
     pub kind: &'static str,
-    /// Its size, if it says so.
+    /// The size, if the database reports one.
     pub bytes: Option<u64>,
 }
 
-/// Why the database did not do as it was told.
+/// An error of the database.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
-    /// It can't be opened.
+    /// The database can't be opened.
     #[error("database {url} can't be opened")]
     Open {
-        /// Which, without its password.
+        /// The database, without its password.
         url: String,
-        /// Why.
+        /// The cause.
         source: sqlx::Error,
     },
-    /// Its tables can't be brought up to date.
+    /// The tables can't be brought up to date.
     #[error("database {url} can't be migrated")]
     Migrate {
-        /// Which, without its password.
+        /// The database, without its password.
         url: String,
-        /// Why.
+        /// The cause.
         source: sqlx::migrate::MigrateError,
     },
-    /// A later version of this program has brought its tables further.
+    /// A later version of this program has migrated the tables further.
     #[error(
         "database {url} was last used by a newer taskd (its tables are at {version}): install that one again"
     )]
     Newer {
-        /// Which, without its password.
+        /// The database, without its password.
         url: String,
         /// The migration that this program does not have.
         version: i64,
     },
-    /// Its pages hold something else than was written.
+    /// The integrity check found damaged pages.
     #[error(
         "database {url} is corrupt ({finding}): stop whatever uses it and put back a copy of the data directory, or save what \
          can be read with sqlite3's .recover; docs/server.md says how"
     )]
     Damaged {
-        /// Which, without its password.
+        /// The database, without its password.
         url: String,
         /// The first finding.
         finding: String,
     },
-    /// It takes a write to open it, and there is no room.
+    /// Opening the database takes a write, and the disk is full.
     #[error(
         "database {url} can't be opened on a full disk: make at least 16 MB free on its file system"
     )]
     NoRoom {
-        /// Which, without its password.
+        /// The database, without its password.
         url: String,
     },
-    /// It was found corrupt while it was in use.
+    /// The database was found corrupt while it was in use.
     #[error("the database is corrupt, so nothing is changed until it is mended")]
     Corrupt,
     /// A statement failed.
     #[error("the database refused a statement")]
     Statement(#[from] sqlx::Error),
-    /// A write that several wait for failed.
+    /// A write that serves several robots failed.
     #[error("a write for several robots failed")]
     Together(#[source] Arc<StoreError>),
-    /// Whoever asked had the right to when the request began, and has it no longer.
+    /// The caller's rights ended after the request began.
     #[error("your rights have changed since this request began; sign in, or send it again")]
     RightsEnded,
-    /// The person has done it very often.
+    /// The person has reached the limit of audited acts on their own account.
     #[error(
         "{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s"
     )]
     TooManyActs {
-        /// Who.
+        /// The person's name.
         who: String,
-        /// When the next one may be.
+        /// Seconds until the next act is allowed.
         seconds: u64,
     },
-    /// A row holds what this version can't read.
+    /// A row holds a value that this version can't read.
     #[error("column {column} of the database holds what this version of taskd can't read")]
     Unreadable {
         /// Table and column.
@@ -189,12 +190,12 @@ pub enum StoreError {
 }
 
 impl StoreError {
-    /// Whether a unique index refused the row: someone else has the name or the key.
+    /// Whether a unique index refused the row: another row has the name or the key.
     pub fn is_unique_violation(&self) -> bool {
         matches!(self, Self::Statement(sqlx::Error::Database(error)) if error.is_unique_violation())
     }
 
-    /// The fault of the database that this shows; `None` if the statement itself is wrong or
+    /// The database fault that this error shows; `None` if the statement itself is wrong or
     /// refused.
     pub fn fault(&self) -> Option<Fault> {
         match self {
@@ -219,25 +220,25 @@ impl StoreError {
     }
 }
 
-/// A write in progress: the only one, for it holds the write lock. Dropped without
-/// [`Write::commit`], it never was.
+/// A write transaction in progress. The write lock admits one at a time. Dropping the transaction
+/// without [`Write::commit`] rolls it back.
 pub struct Write {
     lent: Lent,
     turn: u64,
     ending: Ending,
-    /// Who was found to have their rights still.
+    /// The person whose rights this write has checked.
     vouched_for: Option<Person>,
-    /// How often people do what everybody may.
+    /// The rate limit for acts that every person may do.
     everybodys: Arc<Pace>,
 }
 
 impl Write {
-    /// The number of this write; a later write has a higher one.
+    /// The sequence number of this write; a later write has a higher one.
     pub fn turn(&self) -> u64 {
         self.turn
     }
 
-    /// Makes it so. Goes on to its end even if the caller does not wait for it.
+    /// Commits the write. The commit runs to its end even if the caller does not wait for it.
     pub async fn commit(self) -> Result<(), StoreError> {
         let Self { lent, ending, .. } = self;
         let committing = tokio::spawn(async move {
@@ -251,12 +252,12 @@ impl Write {
         }
     }
 
-    /// From now on this write is one that may change who may do what.
+    /// Marks this write as one that may change access rights.
     fn changes_access(&mut self) {
         self.ending.is_due = true;
     }
 
-    /// Where the store's own statements run.
+    /// The connection on which the store's own statements run.
     fn connection(&mut self) -> Statement<'_> {
         self.lent.connection()
     }
@@ -277,8 +278,8 @@ pub fn sqlite_url(path: &Path) -> String {
 }
 
 impl Store {
-    /// Opens the database at a `sqlite:` or `postgres:` URL, looks for damage and brings its tables
-    /// up to date.
+    /// Opens the database at a `sqlite:` or `postgres:` URL, checks for damage and migrates the
+    /// tables.
     pub async fn open(url: &str) -> Result<Self, StoreError> {
         match Self::open_at(url).await {
             Err(error) if error.fault() == Some(Fault::Full) && !is_postgres(url) => {
@@ -322,7 +323,7 @@ impl Store {
         }
     }
 
-    /// Looks for damage and brings the tables up to date, after which the database can be used.
+    /// Checks for damage and migrates the tables. After that the database can be used.
     pub async fn prepare(&self) -> Result<(), StoreError> {
         make_file(&self.url);
         let first = first_connection(&self.url).await.inspect_err(|error| self.state.note(error));
@@ -366,12 +367,12 @@ impl Store {
         }
     }
 
-    /// What is known of the database's state.
+    /// The known state of the database.
     pub fn state(&self) -> &DatabaseState {
         &self.state
     }
 
-    /// Ends all connections, after the writes that are under way.
+    /// Closes all connections after the writes that are under way.
     pub async fn close(&self) {
         self.writes.close().await;
         self.reads.close().await;
@@ -382,7 +383,7 @@ impl Store {
         Ok(self.reads.lend().await.map(drop)?)
     }
 
-    /// Which database it is, and how large.
+    /// The kind of the database, and its size.
     pub async fn size(&self) -> Result<DatabaseSize, StoreError> {
         let (kind, sql) = match self.is_postgres {
             true => ("postgres", "SELECT pg_database_size(current_database())"),
@@ -391,22 +392,22 @@ impl Store {
                 "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()",
             ),
         };
-        // One that must not be asked this is none the worse for it.
+        // A refusal of this query is harmless: the size stays unknown.
         let bytes: Option<i64> =
             sqlx::query_scalar(sql).fetch_optional(&self.reads).await.unwrap_or_default();
         Ok(DatabaseSize { kind, bytes: bytes.map(rows::number) })
     }
 
-    /// Begins a write. Its first statement is an update of one row that every write updates, so on
-    /// both databases a second write waits here, before it has read anything, until the first has
-    /// ended.
+    /// Begins a write. Its first statement updates one row that every write updates. On both
+    /// databases a second write therefore waits here, before it has read anything, until the first
+    /// has ended.
     pub async fn begin(&self) -> Result<Write, StoreError> {
         let mut write = self.begin_keeping_rights().await?;
         write.changes_access();
         Ok(write)
     }
 
-    /// Begins a write that changes nobody's rights, like what robots report, or that is never
+    /// Begins a write that changes no access rights, such as a robot's report, or that is never
     /// committed.
     pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
         if self.state.corruption().is_some() {
@@ -424,8 +425,8 @@ impl Store {
     }
 }
 
-/// Makes the file of a SQLite database that is to be created, so that only its owner reads it:
-/// SQLite gives the files beside it the same mode. What can't be made is said by whoever opens it.
+/// Creates the file of a new SQLite database so that only its owner can read it. SQLite gives the
+/// files beside it the same mode. A failure is reported later, by the code that opens the file.
 fn make_file(url: &str) {
     if !url.contains("mode=rwc") {
         return;
@@ -436,17 +437,17 @@ fn make_file(url: &str) {
     }
 }
 
-/// A connection of its own for what takes as long as it takes. It is asked for once, so that what
-/// is wrong is said at once.
+/// Opens a separate connection for work without a time limit. There is one attempt only, so that an
+/// error is reported at once.
 async fn first_connection(url: &str) -> Result<AnyConnection, sqlx::Error> {
     let mut connection = match is_postgres(url) {
         true => bounded(CONNECT, AnyConnection::connect(url)).await?,
         false => AnyConnection::connect(url).await?,
     };
-    // SQLite reads its file no sooner.
+    // SQLite does not read its file before the first statement.
     let first = if is_postgres(url) { POSTGRES_SESSION } else { SQLITE_SESSION };
     if let Err(error) = sqlx::raw_sql(first).execute(&mut connection).await {
-        // Its files are closed before they are opened again in another way.
+        // The files are closed before they are opened again in another mode.
         let _ = connection.close().await;
         return Err(error);
     }
@@ -457,19 +458,20 @@ fn is_postgres(url: &str) -> bool {
     url.starts_with("postgres")
 }
 
-/// What every SQLite connection begins with. FULL: a commit survives a power cut.
+/// The pragmas of every SQLite session. FULL: a commit survives a power cut.
 const SQLITE_SESSION: &str =
     "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
      PRAGMA busy_timeout = 30000;";
-/// What Postgres does by itself with a session of a server that is gone without a word, for it may
-/// hold the write lock, which the next one waits for. By default it keeps such a session for hours.
+/// Makes Postgres end a session whose server vanished without closing its connection. Such a
+/// session may hold the write lock, for which the next write waits. By default Postgres keeps it
+/// for hours.
 const POSTGRES_SESSION: &str =
     "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
      SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;";
-/// And with a statement before the server gives up waiting for its answer.
+/// Makes Postgres end a statement before the server gives up waiting for its answer.
 const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
 
-/// The terms of a store's connections.
+/// The settings of a store's connections.
 fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState) -> Terms {
     let (url, state) = (url.to_owned(), state.clone());
     if is_postgres(&url) {
@@ -478,7 +480,7 @@ fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState)
         let (connect, wait) = (CONNECT, POSTGRES_PATIENCE);
         return Terms { url, session, count, shared, answer, greeting, connect, wait, state };
     }
-    // A file does not fall silent: it is slow.
+    // A file does not stop answering: a slow answer is not a lost connection.
     let session = [SQLITE_SESSION, cache].concat();
     let forever = Duration::MAX;
     Terms {
@@ -494,8 +496,8 @@ fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState)
     }
 }
 
-/// A URL as it may be shown: `user:password@` and the query, which may hold a password too, cut
-/// out.
+/// A URL that is safe to show: without `user:password@`, and without the query, which may hold a
+/// password too.
 fn without_password(url: &str) -> String {
     let shown = match (url.find("://"), url.rfind('@')) {
         (Some(scheme), Some(at)) if scheme + 3 < at => {
@@ -523,7 +525,7 @@ mod tests {
         let directory = tempfile::tempdir().expect("a directory");
         let refused = async |name: &str| {
             let url = sqlite_url(&directory.path().join(name));
-            // Far below what a pool would wait for.
+            // Far below the time that a pool would wait.
             let opened =
                 tokio::time::timeout(PATIENCE / 3, Store::open(&url)).await.expect("at once");
             let error = opened.expect_err("refused");

@@ -1,5 +1,5 @@
-//! Between columns and types: numbers, JSON and ids, and lists of rows as one statement's `VALUES`.
-//! It knows no table.
+//! Converts between columns and types: numbers, JSON and ids, and lists of rows as one statement's
+//! `VALUES`. This module knows no table.
 
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -10,8 +10,8 @@ use task_proto::{DeploymentId, RobotId};
 
 use super::StoreError;
 
-/// The most rows one statement carries; with [`groups`], a statement comes in few lengths, so its
-/// plan is reused. More would be slower: for each parameter SQLite looks through the names of all.
+/// The most rows of one statement. With [`groups`], statements come in few lengths, so their plans
+/// are reused. More rows would be slower: for each parameter SQLite searches the names of all.
 const MAX_ROWS: usize = 64;
 
 /// A stored number, which is never negative.
@@ -19,7 +19,8 @@ pub(super) fn number(stored: i64) -> u64 {
     u64::try_from(stored).unwrap_or(0)
 }
 
-/// A number to be stored. What a robot makes up beyond 2^63 is stored as that.
+/// Converts a number to be stored. Numbers from 2^63, which only a robot can make up, are stored as
+/// 2^63 - 1.
 pub(super) fn stored(number: u64) -> i64 {
     i64::try_from(number).unwrap_or(i64::MAX)
 }
@@ -35,7 +36,7 @@ pub(super) fn json<T: Serialize>(value: &T) -> String {
     serde_json::to_string(value).expect("a wire type always has a JSON form")
 }
 
-/// JSON text of `column` read back.
+/// Parses the JSON text of `column`.
 pub(super) fn from_json<T: DeserializeOwned>(
     column: &'static str,
     text: &str,
@@ -43,7 +44,7 @@ pub(super) fn from_json<T: DeserializeOwned>(
     serde_json::from_str(text).map_err(|_| StoreError::Unreadable { column })
 }
 
-/// The same for a column that may be empty.
+/// Parses the JSON text of `column`, which may be empty.
 pub(super) fn from_optional_json<T: DeserializeOwned>(
     column: &'static str,
     text: Option<String>,
@@ -51,12 +52,12 @@ pub(super) fn from_optional_json<T: DeserializeOwned>(
     text.map(|text| from_json(column, &text)).transpose()
 }
 
-/// A wire value that is one word, without JSON's quotes.
+/// A one-word wire value as text, without JSON's quotes.
 pub(super) fn word<T: Serialize>(value: &T) -> String {
     json(value).trim_matches('"').to_owned()
 }
 
-/// The word of `column` read back.
+/// Parses the word of `column`.
 pub(super) fn from_word<T: DeserializeOwned>(
     column: &'static str,
     text: &str,
@@ -65,12 +66,12 @@ pub(super) fn from_word<T: DeserializeOwned>(
         .map_err(|_| StoreError::Unreadable { column })
 }
 
-/// An id of `column` read back.
+/// Parses the id of `column`.
 pub(super) fn id<T: FromStr>(column: &'static str, text: &str) -> Result<T, StoreError> {
     text.parse().map_err(|_| StoreError::Unreadable { column })
 }
 
-/// The same for a column that may be empty.
+/// Parses the id of `column`, which may be empty.
 pub(super) fn optional<T: FromStr>(
     column: &'static str,
     text: Option<String>,
@@ -78,7 +79,7 @@ pub(super) fn optional<T: FromStr>(
     text.map(|text| id(column, &text)).transpose()
 }
 
-/// Whose part of which deployment each row is.
+/// The deployment and the robot of each row.
 pub(super) fn parts_of(
     rows: Vec<(String, String)>,
 ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {

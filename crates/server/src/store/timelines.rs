@@ -1,7 +1,7 @@
-//! When assignments came into their phases, as a text that only grows at its end: a letter for the
-//! phase, thirteen digits for the moment, three for the try. So each step costs nothing beyond the
-//! write of the row that it comes with, and nobody has to read what is there to add to it. In the
-//! middle of a long one steps are dropped.
+//! The times at which assignments reached their phases. The text only grows at its end: a letter
+//! for the phase, thirteen digits for the moment, three for the try. Each step therefore costs
+//! nothing beyond the write of its row, and the old text need not be read first. Steps in the
+//! middle of a long timeline are dropped.
 
 use sqlx::Row as _;
 use task_proto::DeploymentId;
@@ -13,39 +13,39 @@ use task_proto::report::Phase;
 use super::rows::{from_json, from_optional_json, from_word, id, number};
 use super::{Store, StoreError, deliveries};
 
-/// Characters of a step.
+/// Length of a step in characters.
 const STEP: usize = 17;
-/// What is kept from the beginning, in steps.
+/// The number of steps kept from the beginning.
 const FIRST: usize = MAX_TIMELINE / 2;
 /// The last moment that thirteen digits hold, in the year 2286.
 const LAST_MS: u64 = 9_999_999_999_999;
 
-/// A page of what was ordered for a robot.
+/// A page of a robot's past assignments.
 #[derive(Debug)]
 pub struct HistoryPage {
-    /// The newest first.
+    /// The assignments, the newest first.
     pub assignments: Vec<PastAssignment>,
-    /// The last of them, if there are older ones.
+    /// The last assignment of this page, if there are older ones.
     pub next: Option<DeploymentId>,
 }
 
-/// Which page.
+/// Selects the page.
 #[derive(Debug, Clone, Copy)]
 pub struct HistoryQuery<'a> {
-    /// Only of this task.
+    /// Only assignments of this task.
     pub task: Option<&'a TaskName>,
-    /// Only what was ordered before this.
+    /// Only assignments older than this deployment.
     pub before: Option<&'a DeploymentId>,
-    /// At most so many.
+    /// The most assignments in the page.
     pub limit: u32,
 }
 
-/// A step, as it is stored.
+/// A step in its stored form.
 pub(super) fn step(phase: Phase, at_ms: u64, attempt: u32) -> String {
     format!("{}{:013}{:03}", letter(phase), at_ms.min(LAST_MS), attempt.min(999))
 }
 
-/// SQL for the column with a step at its end, which is SQL as well.
+/// SQL for the column with a step appended; the step is SQL as well.
 pub(super) fn grown(step: &str) -> String {
     let (most, first, after) = (MAX_TIMELINE * STEP, FIRST * STEP, (FIRST + 1) * STEP + 1);
     format!(
@@ -54,15 +54,14 @@ pub(super) fn grown(step: &str) -> String {
     )
 }
 
-/// [`grown`] by a phase into which a person or the server brought the assignment, at the moment
-/// that this parameter holds.
+/// [`grown`] by a phase that a person or the server has set, at the time in the parameter `now`.
 pub(super) fn grown_by(phase: Phase, now: &str) -> String {
     let digits = format!("CAST(CAST({now} AS BIGINT) AS TEXT)");
     let padded = format!("substr('0000000000000' || {digits}, length({digits}) + 1)");
     grown(&format!("'{}' || {padded} || '000'", letter(phase)))
 }
 
-/// What was stored, the oldest first. What can't be read is passed over.
+/// Parses a stored timeline, the oldest step first. Unreadable steps are skipped.
 pub(super) fn read(text: &str) -> Vec<TimelineEntry> {
     let entry = |step: &[u8]| {
         let step = std::str::from_utf8(step).ok()?;
@@ -76,7 +75,7 @@ pub(super) fn read(text: &str) -> Vec<TimelineEntry> {
     text.as_bytes().chunks(STEP).filter_map(entry).collect()
 }
 
-/// Stored: never to be changed.
+/// The letters are stored, so they must never change.
 fn letter(phase: Phase) -> char {
     match phase {
         Phase::Assigned => 'a',
@@ -100,8 +99,8 @@ fn letter(phase: Phase) -> char {
 }
 
 impl Store {
-    /// What was ordered for a robot, a page of it; `None`: there is no such deployment to begin
-    /// before.
+    /// A page of a robot's past assignments; `None` if the deployment to begin before does not
+    /// exist.
     pub async fn task_history(
         &self,
         robot: &RobotId,

@@ -1,5 +1,6 @@
-//! What time it is, in milliseconds since the Unix epoch. Nothing else reads the system's clock;
-//! whoever needs the time is given a `Clock` or a number. It never waits: waiting is tokio's.
+//! The current time, in milliseconds since the Unix epoch. No other module reads the system's
+//! clock; code that needs the time gets a `Clock` or a number. This module never waits: waiting is
+//! tokio's.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -21,17 +22,17 @@ impl Clock {
         Self(Source::System)
     }
 
-    /// The machine's clock as certificates are judged by it.
+    /// The machine's clock in the form that certificate checks use.
     pub fn for_certificates() -> task_transport::Clock {
         task_transport::Clock::new(|| Self::system().now_ms())
     }
 
-    /// A clock that stands at `now_ms` until it is moved with [`Clock::advance_ms`].
+    /// A clock that stands at `now_ms` until [`Clock::advance_ms`] moves it.
     pub fn fixed(now_ms: u64) -> Self {
         Self(Source::Fixed(Arc::new(AtomicU64::new(now_ms))))
     }
 
-    /// Milliseconds since the Unix epoch; zero on a machine whose clock stands before it.
+    /// Milliseconds since the Unix epoch; zero on a machine whose clock is earlier than that.
     #[expect(clippy::disallowed_methods, reason = "this is the one module that reads the time")]
     pub fn now_ms(&self) -> u64 {
         match &self.0 {
@@ -43,7 +44,7 @@ impl Clock {
         }
     }
 
-    /// Moves a fixed clock forward; the machine's own is not ours to move.
+    /// Moves a fixed clock forward; no effect on the machine's clock.
     pub fn advance_ms(&self, by_ms: u64) {
         if let Source::Fixed(now_ms) = &self.0 {
             now_ms.fetch_add(by_ms, Ordering::SeqCst);

@@ -1,7 +1,7 @@
-//! The server's directory: made on the first start, locked while a server runs, home of the signing
-//! key, the private certificate authority, the secret behind robots' passwords at an external
-//! broker, the first operator's token and the addresses that are bound. It never touches the
-//! database or the blobs in it, but for who may read and write them.
+//! The server's directory: created on the first start and locked while a server runs. It holds the
+//! signing key, the private certificate authority, the secret from which robots' passwords at an
+//! external broker are derived, the first operator's token and the bound addresses. This module
+//! never touches the database or the blobs in the directory, except for their file modes.
 
 use std::fs::{DirBuilder, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, Write as _};
@@ -25,29 +25,30 @@ const AUTHORITY_KEY: &str = "ca.key";
 const AUTHORITY_CERTIFICATE: &str = "ca.pem";
 const ADDRESSES: &str = "addresses.json";
 
-/// What may still be written on the file system that holds `path`, and its size, in bytes.
+/// Free space and size of the file system that holds `path`, in bytes.
 pub(crate) fn room(path: &Path) -> Option<(u64, u64)> {
     let stat = nix::sys::statvfs::statvfs(path).ok()?;
     let block = stat.fragment_size();
     Some((stat.blocks_available().saturating_mul(block), stat.blocks().saturating_mul(block)))
 }
 
-/// A directory that is ours until this is dropped.
+/// A directory that this process holds locked until the value is dropped.
 #[derive(Debug)]
 pub struct DataDirectory {
     path: PathBuf,
     lock: File,
 }
 
-/// What is bound, for programs on the same machine: the content of `addresses.json`, which exists
-/// while a server runs.
+/// The bound addresses, for programs on the same machine: the content of `addresses.json`, which
+/// exists while a server runs.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Addresses {
-    /// Where HTTP is reached, `host:port`.
+    /// The HTTP address, `host:port`.
     pub http: String,
-    /// Where MQTT is reached, `host:port`.
+    /// The MQTT address, `host:port`.
     pub mqtt: String,
-    /// The pin of the authority behind the certificates of both, which speak TLS if there is one.
+    /// The pin of the authority behind the certificates of both listeners; present only if they
+    /// speak TLS.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ca_pin: Option<CaPin>,
 }
@@ -59,8 +60,8 @@ impl Addresses {
         format!("{scheme}://{}", self.http)
     }
 
-    /// What was published last in the directory at `path`, by a server that may be gone: see
-    /// [`is_locked`].
+    /// The last addresses published in the directory at `path`, by a server that may have ended:
+    /// see [`is_locked`].
     pub fn published(path: &Path) -> Option<Self> {
         serde_json::from_slice(&std::fs::read(path.join(ADDRESSES)).ok()?).ok()
     }
@@ -70,7 +71,7 @@ impl Addresses {
 ///
 /// # Errors
 ///
-/// This account may not look.
+/// This account has no permission to read the directory.
 pub fn is_locked(path: &Path) -> io::Result<bool> {
     match File::open(path.join(LOCK)) {
         Ok(lock) => Ok(matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock))),
@@ -79,24 +80,24 @@ pub fn is_locked(path: &Path) -> io::Result<bool> {
     }
 }
 
-/// Why the directory can't be used.
+/// The reason why the directory can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum DataError {
-    /// Another server runs on it.
+    /// Another server runs from the directory.
     #[error("{} is in use: another taskd serves from it", path.display())]
     InUse {
         /// The directory.
         path: PathBuf,
     },
-    /// A file or the directory itself can't be made or read.
+    /// A file or the directory itself can't be created or read.
     #[error("{} can't be used", path.display())]
     Io {
-        /// Which.
+        /// The path.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: io::Error,
     },
-    /// Every account of the machine may put files into it.
+    /// Every account of the machine may put files into the directory.
     #[error(
         "{0} can be written by everybody on this machine, and belongs to somebody else: take that away (chmod o-w {0}), \
          or name another directory", path.display()
@@ -105,18 +106,18 @@ pub enum DataError {
         /// The directory.
         path: PathBuf,
     },
-    /// There is no room for a file.
+    /// There is no disk space for a file.
     #[error("{} can't be written on a full disk: make at least 16 MB free on its file system", path.display())]
     Full {
-        /// Which.
+        /// The path.
         path: PathBuf,
     },
-    /// A file holds something else than it should.
+    /// A file has unexpected content.
     #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
     Content {
-        /// Which.
+        /// The path.
         path: PathBuf,
-        /// What should be in it.
+        /// The expected content.
         expected: &'static str,
     },
 }
@@ -132,7 +133,7 @@ impl DataError {
 }
 
 impl Drop for DataDirectory {
-    /// The next server may start at once, also while a process that is just being started still has
+    /// The next server may start at once, even while a process that is just being started still has
     /// our files open.
     fn drop(&mut self) {
         let _ = self.lock.unlock();
@@ -140,8 +141,8 @@ impl Drop for DataDirectory {
 }
 
 impl DataDirectory {
-    /// Makes the directory if it is missing, and locks it. What a killed server published there is
-    /// withdrawn.
+    /// Creates the directory if missing, and locks it. Removes the addresses that a killed server
+    /// published there.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         DirBuilder::new().recursive(true).mode(0o700).create(path).map_err(DataError::io(path))?;
         let lock_path = path.join(LOCK);
@@ -160,7 +161,8 @@ impl DataDirectory {
                     data.unpublish();
                     return Ok(data);
                 }
-                // No server has it: commands do, which look whether one does, for a moment.
+                // No server holds the lock: commands take it for a moment to check whether a server
+                // runs.
                 Err(TryLockError::WouldBlock) if lock.try_lock_shared().is_ok() => {
                     std::thread::yield_now()
                 }
@@ -174,8 +176,8 @@ impl DataDirectory {
         }
     }
 
-    /// Takes from other accounts what an earlier version, an umask or a copy has given them: nobody
-    /// else writes to the directory, and nobody else reads what is in it.
+    /// Removes permissions that an earlier version, an umask or a copy has given to other accounts:
+    /// no other account writes to the directory or reads its content.
     fn close_to_others(&self) -> Result<(), DataError> {
         let io_error = |source| DataError::Io { path: self.path.clone(), source };
         let own = std::fs::metadata(&self.path).map_err(io_error)?;
@@ -193,8 +195,7 @@ impl DataDirectory {
         }
         for entry in std::fs::read_dir(&self.path).map_err(io_error)? {
             let path = entry.map_err(io_error)?.path();
-            // What a link leads to is somewhere else, and a command may take its own file away
-            // meanwhile.
+            // A link's target is elsewhere, and a command may remove its own file meanwhile.
             let Ok(found) = path.symlink_metadata() else { continue };
             if found.is_symlink() || found.mode() & 0o077 == 0 {
                 continue;
@@ -209,13 +210,13 @@ impl DataDirectory {
         Ok(())
     }
 
-    /// Where it is.
+    /// The directory's path.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// An empty directory in it; what an earlier server left there is gone. One that is there
-    /// stays, so that this takes no room.
+    /// Creates an empty directory inside; the files of an earlier server are removed. An existing
+    /// directory stays, so that this takes no disk space.
     pub fn fresh_directory(&self, name: &str) -> Result<PathBuf, DataError> {
         let path = self.path.join(name);
         let clear = || {
@@ -238,32 +239,32 @@ impl DataDirectory {
         self.path.join(OPERATOR_TOKEN)
     }
 
-    /// The key that signs desired states, made on the first start. Robots pin it, so it is never
-    /// replaced by itself.
+    /// The key that signs desired states, created on the first start. Robots pin the key, so it is
+    /// never replaced automatically.
     pub fn signing_key(&self) -> Result<SigningKey, DataError> {
         let seed = self.secret(SIGNING_KEY, "a signing key", || SigningKey::random().to_bytes())?;
         Ok(SigningKey::from_bytes(seed))
     }
 
-    /// What robots' passwords at an external broker are derived from, made when it is first needed.
-    /// With another one they all have new passwords.
+    /// The secret from which robots' passwords at an external broker are derived, created on first
+    /// use. A new secret gives all robots new passwords.
     pub fn broker_secret(&self) -> Result<[u8; 32], DataError> {
         self.secret(BROKER_SECRET, "a secret of 64 hex digits", rand::random)
     }
 
     /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin
-    /// it.
+    /// the authority.
     pub fn authority_key(&self, fresh: String) -> Result<String, DataError> {
         self.read_or_make(&self.path.join(AUTHORITY_KEY), || fresh)
     }
 
-    /// The authority's own certificate, as PEM, for those who import it; `fresh` on the first
+    /// The authority's own certificate, as PEM, for users who import it; `fresh` on the first
     /// start.
     pub fn authority_certificate(&self, fresh: String) -> Result<String, DataError> {
         self.read_or_make(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
     }
 
-    /// That one of these two files is of no use.
+    /// The error that one of these two files is unusable.
     pub fn authority_is_wrong(&self, is_key: bool) -> DataError {
         let (name, expected) = match is_key {
             true => (AUTHORITY_KEY, "a certificate authority's key"),
@@ -272,7 +273,7 @@ impl DataDirectory {
         DataError::Content { path: self.path.join(name), expected }
     }
 
-    /// The token of the first operator, made on the first start.
+    /// The token of the first operator, created on the first start.
     pub fn operator_token(&self) -> Result<Token, DataError> {
         let path = self.operator_token_path();
         let text = self.read_or_make(&path, || Token::random(TokenKind::Operator).reveal())?;
@@ -290,12 +291,13 @@ impl DataDirectory {
         self.write_new(&path, &format!("{text}\n")).map_err(DataError::io(path))
     }
 
-    /// Nobody listens there, or soon nobody will: what else does is not shown our token.
+    /// Withdraws the addresses, because the server no longer listens there or soon will not.
+    /// Otherwise our token could be shown to another program that listens there.
     pub fn unpublish(&self) {
         let _ = std::fs::remove_file(self.path.join(ADDRESSES));
     }
 
-    /// 32 bytes in a file of their own, made on the first call.
+    /// 32 bytes in a separate file, created on the first call.
     fn secret(
         &self,
         name: &str,
@@ -323,10 +325,10 @@ impl DataDirectory {
         }
     }
 
-    /// Writes a file of mode 0600 that is there whole or not at all, also after a power cut.
+    /// Writes a file of mode 0600 atomically, also across a power cut.
     fn write_new(&self, path: &Path, text: &str) -> io::Result<()> {
         let partial = path.with_extension("new");
-        // What a crash left behind would keep its mode.
+        // A file left by a crash would keep its mode.
         if let Err(error) = std::fs::remove_file(&partial)
             && error.kind() != io::ErrorKind::NotFound
         {

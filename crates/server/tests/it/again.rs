@@ -1,5 +1,5 @@
-//! Orders that follow from earlier ones, told on every database: a task run anew, what failed once
-//! more, and back.
+//! Orders that follow from earlier ones, told on every database: restarting a task, retrying
+//! failures, and rolling back.
 
 use task_proto::api::{PackageView, RetryDeployment};
 use task_proto::desired::DesiredTask;
@@ -63,7 +63,7 @@ impl Fleet {
         view
     }
 
-    /// Deletes it, whoever has it.
+    /// Deletes the version even if robots have it.
     pub async fn unpublish(&self, version: &str) {
         let digest = package(version, TaskKind::Service).package.manifest.digest;
         self.database.drop_package(task().as_str(), &digest).await;
@@ -116,7 +116,8 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     fleet.follow(&mut robots[2], Phase::Stopped).await;
     fleet.changes.take_rings().await;
     let before = fleet.desired(&robots[0]).await.expect("state");
-    // It failed on one, was stopped on one, and one never had it: there it begins.
+    // The task failed on one robot, was stopped on one, and never reached one: the retry begins
+    // there.
     let again = fleet.deploy("1", |order| order.batch = Some(3)).await;
     assert_eq!(
         fleet.phases(&again).await,
@@ -133,14 +134,14 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
         fleet.follow(robot, Phase::Running).await;
     }
     assert_eq!(fleet.deployment(&again).await.state, task_proto::api::DeploymentState::Settled);
-    // Where it runs everywhere, all is settled at once, and nothing is left to cancel.
+    // Where the task runs everywhere, all is settled at once, and nothing is left to cancel.
     let third = fleet.deploy("1", |_| ()).await;
     assert_eq!(fleet.deployment(&third).await.state, task_proto::api::DeploymentState::Settled);
     assert_eq!(
         code(fleet.actions.cancel_deployment(&fleet.operator, &third).await),
         "nothing_to_cancel"
     );
-    // It can be forced, and another version is another.
+    // A restart can be forced, and another version is another matter.
     let forced = fleet.deploy("1", |order| order.restart = true).await;
     assert_eq!(fleet.phases(&forced).await, [Phase::Assigned; 4]);
     for robot in &mut robots {
@@ -218,7 +219,7 @@ async fn package_that_came_back_after_a_failure_is_not_started_again(database: T
     }
     assert_eq!(fleet.phases(&first).await[..2], [Phase::Running; 2]);
     assert_eq!(fleet.deployment(&back).await.state, task_proto::api::DeploymentState::Settled);
-    // After another failure it can still be started anew.
+    // After another failure the task can still be started anew.
     fleet.deploy("3", |_| ()).await;
     for robot in &mut robots {
         robot.accept(&fleet.desired(robot).await.expect("not withheld"), Phase::RolledBack);
@@ -266,7 +267,7 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     for robot in &mut robots[4..] {
         fleet.follow(robot, Phase::Failed).await;
     }
-    // Somebody has seen to the last ones already.
+    // The last failures have already been handled.
     fleet.deploy("2", |order| order.selector = selector("r4")).await;
     for (order, robot) in [(TaskOrder::Stop, "r5"), (TaskOrder::Remove, "r6")] {
         let ordered = fleet
@@ -291,8 +292,7 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
         RetryDeployment { code: Some(FailureCode::DISK_FULL), ..RetryDeployment::default() };
     let reused = fleet.actions.retry_deployment(&fleet.operator, &key, &id, &other).await;
     assert_eq!(code(reused), "idempotency_key_reused");
-    // What expired or was taken back can be ordered again as well, but not once its package is
-    // gone.
+    // An expired or cancelled deployment can be retried as well, but not once its package is gone.
     fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
     fleet.unpublish("1").await;
     assert_eq!(code(fleet.retry(&fleet.operator, &new, &retry).await), "package_not_found");
@@ -436,7 +436,7 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
         fleet.deploy(version, |_| ()).await;
         fleet.follow(&mut robots[0], phase).await;
     }
-    // The same package once more is nothing to go back to, nor is what has not begun yet.
+    // The same package once more is no rollback target, nor is a deployment that has not begun yet.
     fleet.deploy("5", |_| ()).await;
     fleet.deploy("4", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Failed).await;

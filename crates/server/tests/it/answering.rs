@@ -1,5 +1,5 @@
-//! A robot on MQTT that answers what it is asked, always the same: a small graph, a few parameters,
-//! a few lines of a log.
+//! A robot on MQTT that gives fixed answers to questions: a small graph, a few parameters, a few
+//! lines of a log.
 
 use std::time::Duration;
 
@@ -15,9 +15,9 @@ use tokio::task::JoinHandle;
 use crate::cli::{Bench, Robot};
 use crate::uplink::Session;
 
-/// More than anything here takes, unless it hangs.
+/// Time limit that only a hanging test exceeds.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// What its clock shows, whenever it is asked.
+/// The fixed time of the robot's clock.
 const NOW_MS: u64 = 1_700_000_060_000;
 
 /// A robot that answers until this is dropped.

@@ -1,5 +1,5 @@
-//! The API as its clients use it: orders, their idempotency, what robots get and report, and the
-//! shapes of refusals.
+//! The API as its clients use it: orders, their idempotency, robots' desired states and reports,
+//! and the shapes of refusals.
 
 use futures_util::StreamExt as _;
 use reqwest::{Method, StatusCode};

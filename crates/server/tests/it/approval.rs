@@ -1,5 +1,5 @@
-//! Robots that wait to be approved: they have nothing, nobody can order them anything, and nobody
-//! waits for ever.
+//! Robots that wait for approval: they have nothing, they can be given no orders, and none waits
+//! for ever.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -79,7 +79,7 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
             .len(),
         1
     );
-    // Rejecting one that does not wait would be removing it.
+    // Rejecting a robot that does not wait would be a removal.
     assert_eq!(
         code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await),
         "not_pending"
@@ -164,7 +164,7 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
         assert_eq!(refused.status(), 403, "{path}");
     }
     assert_eq!(connack(&server, came.robot_id.as_str(), &came.token).await, 5);
-    // An order does not mean it, by whatever selector.
+    // No selector of an order matches the robot.
     for (selector, why) in [
         ("*", "no_robots_match"),
         ("robot-1", "unknown_robots"),

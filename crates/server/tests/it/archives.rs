@@ -11,7 +11,8 @@ use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
 
 use crate::registry::TestRegistry;
 
-/// A content, what its manifest says of it, and the words of the refusal; none: it is accepted.
+/// A content, its description in the manifest, and the words of the refusal; none: the content is
+/// accepted.
 struct Case {
     name: &'static str,
     content: Vec<u8>,
@@ -175,7 +176,7 @@ fn names() -> Vec<Case> {
     ]
 }
 
-/// Why a robot would not unpack it.
+/// The reason for which a robot would not unpack the archive.
 fn unpacked(case: &Case) -> Result<(), String> {
     let directory = tempfile::tempdir().expect("a directory");
     let size = case.content.len() as u64;
@@ -192,7 +193,7 @@ fn unpacked(case: &Case) -> Result<(), String> {
     }
 }
 
-/// Why the registry does not take it.
+/// The reason for which the registry rejects the archive.
 async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
     let task = json!({ "name": "talker", "version": "1.0.0", "run": { "exec": ["true"] }, "content": case.facts });
     let content = registry.push_blob("talker", &case.content).await;

@@ -234,7 +234,7 @@ async fn what_can_not_be_written_down_is_not_done() {
     let mut expected = before;
     for (act, request) in stage.acts() {
         let status = send(request, act, "/v2/talker/manifests/2.0.0").await;
-        // The robot that is asked is not there; that it was asked is written down.
+        // The asked robot is absent; the question is still in the audit log.
         assert!(status < 300 || act == "robot.ask", "{act}: {status}");
         // Of each robot that is removed with others there is one as well.
         expected.extend((act == "bulk.remove").then(|| "robot.remove".to_owned()));

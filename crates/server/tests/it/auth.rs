@@ -1,4 +1,4 @@
-//! Who may call what: every route of the table is called by every kind of caller.
+//! Access to routes: every route of the table is called by every kind of caller.
 
 use std::time::Duration;
 
@@ -11,7 +11,7 @@ use taskd::http::{Route, routes};
 
 use crate::harness::{TestServer, refusal};
 
-/// Everybody who could come to a route.
+/// All kinds of callers of a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Comer {
     Nobody,
@@ -131,7 +131,7 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
     let gathering = Gathering::new().await;
     for route in routes() {
         for comer in Comer::ALL {
-            // Putting the robot out would change who the later comers are.
+            // Revoking the robot would change the identity of the later callers.
             let puts_out = route.method == Some(Method::DELETE) && route.path.ends_with("{robot}");
             let is_last_word = puts_out || route.path.ends_with("/revoke");
             if is_last_word && comer.refused(route.access).is_none() {
@@ -261,7 +261,7 @@ async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
     assert!(heard.expect("a proper end").contains("hello"));
 }
 
-/// Signs the operator in, from a browser with this cookie; gives the one it has then.
+/// Signs the operator in, from a browser with this cookie; returns the new cookie.
 async fn sign_in_with(server: &TestServer, cookie: &str) -> String {
     let request = server.bare(Method::POST, "/api/v1/session").header("cookie", cookie);
     let request = request.json(&json!({ "token": server.operator.reveal() }));

@@ -1,4 +1,4 @@
-//! What is done to many robots at once: to all that are meant or to none, on every database, and
+//! Actions on many robots at once: on all the selected robots or on none, on every database, and
 //! over HTTP.
 
 use std::collections::BTreeSet;
@@ -132,7 +132,7 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     let written = fleet.database.store.audit(&one).await.expect("reads").records;
     assert!(written[0].entry.get().contains("robot.remove"), "{}", written[0].entry.get());
     assert_eq!(code(fleet.desired(&robots[5]).await), "not_found");
-    // Who is left goes on, and what waited for the others does not wait any more.
+    // The remaining robot goes on, and assignments that waited for the others wait no longer.
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert_eq!(fleet.deployment(&id).await.state, task_proto::api::DeploymentState::Settled);
     let again = fleet.actions.remove_robots(&fleet.operator, None, &others).await;

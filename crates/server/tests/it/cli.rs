@@ -22,7 +22,7 @@ pub struct Bench {
     http: reqwest::Client,
 }
 
-/// What a command left behind.
+/// The result of a finished command.
 pub struct Ran {
     pub code: i32,
     pub stdout: String,
@@ -60,7 +60,7 @@ pub fn command(arguments: &[&str]) -> std::process::Command {
     for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("TASKD_")) {
         command.env_remove(name);
     }
-    // Nobody is signed in.
+    // No user is signed in.
     command.env("XDG_CONFIG_HOME", "/nonexistent");
     command
 }
@@ -86,13 +86,13 @@ impl Bench {
         Self { server: Some(server), dir, http: reqwest::Client::new() }
     }
 
-    /// Stops the server and starts it again where it was.
+    /// Stops the server and starts it again at the same addresses.
     async fn restart(&mut self) {
         let stopped = self.stop().await;
         self.go_on(stopped).await;
     }
 
-    /// Stops the server; gives what it goes on with.
+    /// Stops the server; returns the configuration for its next start.
     pub async fn stop(&mut self) -> Config {
         let mut config = Config::with_data(self.data());
         config.http = self.server().addresses().http.parse().unwrap();
@@ -165,8 +165,8 @@ impl Bench {
         assert_eq!(push.output(&set).await, 201);
     }
 
-    /// Robot `robot` says that it has everything it was told to, and that the task of `deployment`
-    /// is in `phase`.
+    /// Reports for robot `robot` that all orders are observed, and that the task of `deployment` is
+    /// in `phase`.
     pub async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
         let mut task = json!({
             "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
@@ -178,7 +178,7 @@ impl Bench {
         self.report_tasks(robot, json!([task])).await;
     }
 
-    /// Robot `robot` says that it has done everything it was told to and has no task left.
+    /// Reports for robot `robot` that all orders are done and no task is left.
     async fn report_absence(&self, robot: &Robot) {
         self.report_tasks(robot, json!([])).await;
     }
@@ -261,7 +261,7 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let interrupted = tokio::task::spawn_blocking(move || {
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
-        // It waits as soon as it says where the robot stands.
+        // The command waits as soon as it has printed the robot's state.
         let id = lines
             .by_ref()
             .find_map(|line| Some(line.strip_prefix("deployment ")?.split(':').next()?.to_owned()));
@@ -391,7 +391,7 @@ async fn waiting_survives_a_restart_of_the_server() {
     waiting.env("TASKD_DATA", bench.data()).stdout(Stdio::null()).stderr(Stdio::piped());
     let mut waiting = waiting.spawn().unwrap();
     let mut stderr = BufReader::new(waiting.stderr.take().unwrap()).lines();
-    // From here on it only waits.
+    // From here on the command only waits.
     assert!(stderr.any(|line| line.unwrap().starts_with("deployment ")));
     bench.restart().await;
     bench.report(&robot, &deployment, "running").await;
@@ -592,7 +592,7 @@ async fn a_closed_pipe_is_no_panic() {
     assert!(!help.stderr.contains("panicked"), "{}", help.stderr);
 }
 
-/// A pipe whose reader has gone.
+/// A pipe with a closed reading end.
 pub fn closed_pipe() -> Stdio {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);

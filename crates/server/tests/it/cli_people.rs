@@ -9,8 +9,8 @@ use crate::cli::{Bench, Ran, command, run};
 
 const PASSWORD: &str = "correct horse battery";
 
-/// A person at another machine: they know the server's URL, and what they signed in to is kept in
-/// their own directory.
+/// A user at another machine, who knows the server's URL and has a directory of their own for
+/// sign-ins.
 struct Away<'a> {
     bench: &'a Bench,
 }
@@ -213,7 +213,7 @@ async fn the_audit_is_shown_exported_and_verified() {
         .expect(1, "not the one that was seen before");
     bench.taskd(&["audit", "--verify", "--expect", "x"]).await.expect(2, "what --verify prints");
 
-    // A robot is found by its name, whatever the entries call it by.
+    // A robot is found by its name, under any name in the entries.
     bench.enroll(1).await;
     bench.taskd(&["robot", "revoke", "robot-1", "--yes"]).await.expect(0, "");
     let of_robot = bench.taskd(&["audit", "--target", "robot-1"]).await.expect(0, "").stdout;

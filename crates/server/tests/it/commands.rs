@@ -1,6 +1,6 @@
-//! What the commands print, held against the files in `tests/commands`, which read like a session
-//! at a terminal; and what they leave beside the program: man pages, exported packages.
-//! `TRYCMD=overwrite` writes the files anew.
+//! The commands' output, compared with the files in `tests/commands`, which read like a session at
+//! a terminal; and the files that the commands write: man pages, exported packages.
+//! `TRYCMD=overwrite` writes the expected files anew.
 
 use std::os::unix::fs::{PermissionsExt as _, symlink};
 use std::path::{Path, PathBuf};
@@ -53,7 +53,7 @@ impl Lab {
         Self { bench, ids }
     }
 
-    /// What a command started elsewhere finds the server by.
+    /// Setting by which a command started elsewhere finds the server.
     pub fn here(&self) -> [(&'static str, String); 1] {
         [("TASKD_DATA", self.bench.data().display().to_string())]
     }
@@ -91,8 +91,8 @@ impl Lab {
         (Self { bench, ids }, answering)
     }
 
-    /// Holds the commands of one file against what it says they print. What they write they write
-    /// beside it, not into the sources.
+    /// Compares the commands of one file with their expected output. The commands write their files
+    /// beside that file, not into the sources.
     async fn holds(&self, file: &str) {
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/commands");
         let path = self.bench.dir.path().join(file);
@@ -176,7 +176,7 @@ async fn every_command_has_a_man_page() {
         assert!(read(page).contains(".SH SYNOPSIS"), "{page}");
     }
     assert!(read("taskd-push.1").contains("\\-\\-max\\-failures"));
-    // Where there is somebody who reads them, they are read without a complaint.
+    // Where a man page reader is installed, the reader accepts the pages without a complaint.
     if let Some(rendered) = rendered(&pages.join("taskd-push.1")).await {
         assert!(
             rendered.stdout.contains("--max-failures") && rendered.stderr.is_empty(),
@@ -201,7 +201,7 @@ async fn rendered(page: &Path) -> Option<Ran> {
         .then(|| ran.into())
 }
 
-/// What is in a directory: paths, and of files their bytes.
+/// A directory's content: paths, and the bytes of files.
 fn tree(dir: &Path) -> Vec<(String, Option<Vec<u8>>)> {
     let mut found = Vec::new();
     let mut left = vec![PathBuf::new()];
@@ -237,7 +237,7 @@ async fn a_package_comes_out_of_the_store_as_it_went_in() {
         .taskd(&["package", "export", name, &to("out")])
         .await
         .expect(2, "is there already and is not empty");
-    // What comes out can be pushed again, and is the same.
+    // The exported package can be pushed again, and is the same.
     bench.taskd(&["push", &to("out")]).await.expect(0, "nothing to upload");
     bench.taskd(&["package", "export", name, &to("a.tar")]).await.expect(0, "is in");
     bench.taskd(&["package", "export", name, &to("a.tar.zst")]).await.expect(0, "is in");
@@ -255,7 +255,7 @@ async fn a_package_comes_out_of_the_store_as_it_went_in() {
     bench.server.unwrap().stop().await;
 }
 
-/// A package of ROS that says nothing of how it is run.
+/// A ROS package that does not state how to run it.
 fn ros_package(bench: &Bench) -> PathBuf {
     let dir = bench.dir.path().join("say");
     std::fs::create_dir_all(dir.join("launch")).unwrap();
@@ -305,8 +305,8 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
         "the digest pins the arguments"
     );
 
-    // The same of what is stored by now: nothing new for the same arguments, another digest for
-    // others.
+    // The same with the packages stored by now: nothing new for the same arguments, another digest
+    // for other arguments.
     let stored = ["run", "robot-1", "say:1.0.0", "say.launch.py", "rate:=5", "--detach"];
     bench.taskd(&stored).await.expect(0, "nothing to upload");
     assert_eq!(runs(&bench).await.len(), 1);

@@ -1,5 +1,5 @@
-//! What shells complete, each by the script that `taskd completions` prints for it. A shell that is
-//! missing is a failure.
+//! Shell completions, each from the script that `taskd completions` prints for the shell. A missing
+//! shell is a failure.
 
 use std::path::Path;
 use std::process::Stdio;
@@ -7,19 +7,18 @@ use std::process::Stdio;
 use crate::cli::Ran;
 use crate::commands::Lab;
 
-/// What bash completes where `$@` has been typed and the last is not finished.
+/// Completions of bash where `$@` has been typed and the last word is unfinished.
 const BASH: &str = r#"source <(taskd completions bash) || exit 9
     COMP_WORDS=("$@") COMP_CWORD=$(($# - 1)) COMP_TYPE=9
     _clap_complete_taskd taskd "${@: -1}" "${@: -2:1}"
     printf '%s\n' "${COMPREPLY[@]}""#;
 
-/// What fish completes of the line `$argv[1]`: a word, and what is said of it behind a tab.
+/// Completions of fish for the line `$argv[1]`: a word, and its description behind a tab.
 const FISH: &str = r#"taskd completions fish | source; or exit 9
     complete -C $argv[1]"#;
 
-/// What zsh completes of the line `$1` where somebody types it: a zsh in a terminal of its own
-/// writes into the file `$2` what it is given to offer. A call of `compadd` with -O, -A or -D only
-/// looks which words fit.
+/// Completions of zsh for the typed line `$1`: a zsh in a terminal of its own writes the offered
+/// words into the file `$2`. A call of `compadd` with -O, -A or -D only tests which words fit.
 const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
     zpty -w terminal "PROMPT= && autoload -U compinit && compinit -u -D && source <(taskd completions zsh)"
     zpty -w terminal "compadd() {
@@ -40,9 +39,9 @@ const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
 async fn shell(environment: &[(&str, String)], program: &[&str]) -> Ran {
     let programs = Path::new(env!("CARGO_BIN_EXE_taskd")).parent().unwrap();
     let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
-    // Where a shell may keep what it likes.
+    // A home directory where a shell may keep its files.
     let home = tempfile::tempdir().unwrap();
-    // One that waits for what never comes is ended.
+    // A shell that waits for ever is ended.
     let mut command = std::process::Command::new("timeout");
     command.arg("60").args(program).env("PATH", path).env("HOME", home.path()).stdin(Stdio::null());
     for directory in ["XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_STATE_HOME"] {
@@ -63,7 +62,7 @@ fn lines(text: &str) -> Vec<String> {
     text.lines().filter(|line| !line.is_empty()).map(str::to_owned).collect()
 }
 
-/// What is offered, asked for again while it is nothing but options: a server that takes longer
+/// The offered words, requested again while only options are offered: a server that takes longer
 /// than a moment offers nothing.
 async fn offered(ask: impl AsyncFn() -> Vec<String>) -> Vec<String> {
     for _ in 0..4 {

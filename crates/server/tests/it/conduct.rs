@@ -1,5 +1,5 @@
-//! Robots that misbehave: slowed on their own connection, cut off, kept away, shown, and forgiven.
-//! Nobody else notices.
+//! Robots that misbehave: slowed on their own connection, cut off, banned, shown, and forgiven.
+//! Other clients notice nothing.
 
 use std::time::Duration;
 
@@ -38,7 +38,7 @@ async fn a_flood_is_cut_off_and_kept_away_and_others_are_served() {
     flooded.expect("the flood should be cut off");
     let text = broker.conduct.trouble(&robot).expect("it is shown");
     assert!(text.contains("more over MQTT than a robot may") && text.contains("cut off"), "{text}");
-    // A new connection makes no new robot of it, and costs nobody else anything.
+    // A new connection does not reset the robot's record, and costs no other client anything.
     broker.raw_with(&Connect::robot(&robot).packet()).await.expect(&NOT_NOW).await;
     let totals = broker.conduct.totals();
     assert_eq!((totals.slowed, totals.cut, totals.turned_away), (1, 1, 1));
@@ -70,7 +70,7 @@ async fn what_none_of_ours_would_send_cuts_its_robot_off() {
         broker.raw_with(&Connect::robot(&robot).packet()).await.expect(&NOT_NOW).await;
     }
     broker.assert_serves().await;
-    // Somebody without its token can't get it into trouble.
+    // A client without the robot's token can't cause it trouble.
     let robot = RobotId::random();
     let stranger = Connect { password: Some("pw-".to_owned()), ..Connect::robot(&robot) };
     broker
@@ -86,7 +86,8 @@ async fn server(limits: ConductLimits) -> TestServer {
         .await
 }
 
-/// Reports until it is told to wait for longer than it would be held up; gives that answer.
+/// Reports until the requested wait is longer than a slowed connection would be held; returns that
+/// answer.
 async fn report_until_refused(server: &TestServer, robot: &mut TestRobot) -> Response {
     let state = server.desired(robot).await;
     for _ in 0..1_000 {
@@ -159,7 +160,7 @@ async fn who_behaves_again_is_forgiven_by_itself() {
         requests_per_s: 2,
         patience: Duration::from_millis(1),
         backoff: Duration::from_millis(1),
-        // Events are gathered for a moment before what they are about is read.
+        // Events are collected for a moment before their subject is read.
         forgive_after: Duration::from_secs(2),
         ..ConductLimits::default()
     };
@@ -167,7 +168,7 @@ async fn who_behaves_again_is_forgiven_by_itself() {
     let mut atlas = server.enroll("atlas").await;
     let mut events = server.request(Method::GET, "/api/v1/events").send().await.expect("an answer");
     report_until_refused(&server, &mut atlas).await;
-    // Both its trouble and the end of that are told to whoever listens.
+    // Subscribers are told both of the robot's trouble and of its end.
     let mut heard = String::new();
     let forgiven = timeout(PATIENCE, async {
         loop {
@@ -175,7 +176,7 @@ async fn who_behaves_again_is_forgiven_by_itself() {
                 Ok(chunk) => heard.push_str(&String::from_utf8_lossy(
                     &chunk.expect("a stream").expect("goes on"),
                 )),
-                // Forgiven before anybody saw it.
+                // Forgiven before an observer saw the trouble.
                 Err(_) if !heard.contains("misbehaves") => {
                     drop(report_until_refused(&server, &mut atlas).await)
                 }

@@ -1,5 +1,4 @@
-//! A SQLite file with damaged pages: refused at start, noticed while it is served, never written
-//! to.
+//! A SQLite file with damaged pages: refused at start, detected while served, never written to.
 
 #![expect(clippy::disallowed_methods, reason = "which pages hold what is asked of SQLite")]
 
@@ -21,7 +20,7 @@ use tempfile::TempDir;
 use crate::cli;
 use crate::harness::{TestRobot, TestServer, answer, refusal};
 
-/// How long the server may take to notice what is checked in the background.
+/// Time limit for the server to notice damage that is checked in the background.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn database(data: &Path) -> PathBuf {
@@ -46,7 +45,7 @@ fn file(data: &Path) -> std::fs::File {
     std::fs::File::options().read(true).write(true).open(database(data)).unwrap()
 }
 
-/// Inverts the head of a page, which says what the page is.
+/// Inverts the head of a page, which holds the page's type.
 fn flip_head((at, _): (u64, usize), data: &Path) {
     let mut head = [0; 16];
     file(data).read_exact_at(&mut head, at).unwrap();
@@ -65,7 +64,7 @@ fn flip_text((at, size): (u64, usize), data: &Path, text: &str) {
     file(data).write_all_at(&[page[last] ^ 1], at + last as u64).unwrap();
 }
 
-/// A stopped server's directory, all of whose data is in the database's file, and a robot that it
+/// A stopped server's directory, with all data in the database's file, and a robot that the server
 /// knows.
 async fn stopped() -> (TempDir, TestRobot) {
     let server = TestServer::start().await;
@@ -86,7 +85,8 @@ pub async fn eventually(what: &str, mut is_so: impl AsyncFnMut() -> bool) {
     tokio::time::timeout(PATIENCE, wait).await.unwrap_or_else(|_| panic!("{what}"));
 }
 
-/// Orders and reports are refused as such and nothing is half done; what can be read still is.
+/// Orders and reports are refused with that reason and nothing is half done; intact data can be
+/// read still.
 async fn assert_nothing_is_changed(server: &TestServer, robot: &mut TestRobot) {
     let corrupt = (503, "database_corrupt".to_owned());
     let order = json!({ "selector": "*" });

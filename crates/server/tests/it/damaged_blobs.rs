@@ -1,5 +1,5 @@
-//! Blobs whose files lose their bytes while they are served, as by a failing disk: a truncated
-//! file's mapped pages raise the same signal as a sector that cannot be read.
+//! Blob files that lose their bytes while they are served, as by a failing disk: a truncated file's
+//! mapped pages raise the same signal as a sector that cannot be read.
 
 use std::fs;
 
@@ -54,7 +54,7 @@ async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_ca
         };
         assert!(broken_off && came < BLOB_BYTES, "{came} bytes came, encrypted: {encrypts}");
 
-        // The server lives. The first request that reads the file again has it checked; then the
+        // The server lives. The first request that reads the file again triggers a check; then the
         // blob counts as absent.
         eventually("the blob to be absent", async || {
             let answer = server.request(Method::GET, &path).send().await;

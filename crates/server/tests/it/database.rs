@@ -9,7 +9,7 @@ use taskd::store::{Store, sqlite_url};
 /// An empty, migrated database of one test.
 pub struct TestDatabase {
     pub store: Store,
-    /// Where it is, to open it again.
+    /// The database's URL, to open it again.
     pub url: String,
     /// Removed with the test.
     _directory: Option<tempfile::TempDir>,
@@ -45,7 +45,7 @@ pub async fn postgres() -> TestDatabase {
 }
 
 impl TestDatabase {
-    /// What was known when it was decided how a deployment travels to a robot, JSON.
+    /// The recorded inputs of the decision on how a deployment travels to a robot, as JSON.
     pub async fn inputs(&self, deployment: &DeploymentId, robot: &RobotId) -> String {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
         let query = sqlx::query_scalar(
@@ -72,7 +72,7 @@ impl TestDatabase {
         assert_eq!(query.execute(&mut connection).await.expect("drops").rows_affected(), 1);
     }
 
-    /// Takes a package's manifest away, as it could be deleted once while robots should have it.
+    /// Deletes a package's manifest, as was once possible while robots should have the package.
     pub async fn drop_package(&self, name: &str, manifest: &Digest) {
         let mut connection = sqlx::AnyConnection::connect(&self.url).await.expect("connects");
         for query in [
@@ -95,7 +95,7 @@ impl TestDatabase {
     }
 }
 
-/// Gives a table another name, so that it is not there for whoever looks for it.
+/// Renames a table, so that queries do not find the table.
 pub async fn rename(url: &str, table: &str, name: &str) {
     let mut connection = sqlx::AnyConnection::connect(url).await.expect("connects");
     let rename = sqlx::AssertSqlSafe(format!("ALTER TABLE {table} RENAME TO {name}"));

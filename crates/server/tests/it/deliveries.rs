@@ -1,5 +1,5 @@
-//! How bytes travel to each robot, told on every database: what is known decides, and the decision
-//! is kept and shown.
+//! How bytes travel to each robot, told on every database: the known facts decide, and the decision
+//! is stored and shown.
 
 use std::net::SocketAddr;
 
@@ -154,7 +154,7 @@ async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
     assert_eq!(decisions(&fleet, &id).await, [tiny.clone(), None]);
     robots[1].link = Some(LinkFacts { losses: 5, ..LinkFacts::default() });
     fleet.report(&mut robots[1]).await;
-    // What was decided stays, whatever is measured later.
+    // A decision stays, regardless of later measurements.
     robots[0].link = Some(LinkFacts { losses: 9, ..LinkFacts::default() });
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(
@@ -313,7 +313,7 @@ async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestD
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(waiting().await, [part(&robots[1])]);
     let generation = fleet.desired(&robots[1]).await.expect("a state").generation;
-    // Who has all of it is left alone, whatever is asked.
+    // A robot that has all of the parts is left alone, for any request.
     let both = [part(&robots[0]), part(&robots[1])];
     for _ in 0..2 {
         fleet.actions.pull_instead(&both, "it held up the others").await.expect("ordered");

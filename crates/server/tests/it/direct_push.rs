@@ -18,9 +18,9 @@ use tokio::time::timeout;
 
 use crate::harness::{TestRobot, TestServer, answer, archive_with};
 
-/// More than anything here takes, unless it hangs.
+/// Time limit that only a hanging test exceeds.
 const PATIENCE: Duration = Duration::from_secs(40);
-/// After which a robot that hears nothing says what it lacks.
+/// Quiet time after which a robot reports its missing parts.
 const QUIET: Duration = Duration::from_millis(500);
 const CONTENT_BYTES: usize = 4 * 1024 * 1024 + 17;
 
@@ -77,7 +77,7 @@ impl Hearer {
         }
     }
 
-    /// Asks to hear the parts, and says whether it may.
+    /// Subscribes to the parts, and returns whether the subscription is granted.
     async fn subscribe(&mut self, qos: QoS) -> bool {
         let topic = TopicPrefix::default().format(&Topic::Package(self.package.content.digest));
         self.client.subscribe(topic, qos).await.expect("queued");
@@ -90,7 +90,7 @@ impl Hearer {
         }
     }
 
-    /// The same until it may.
+    /// Subscribes until the subscription is granted.
     async fn listen(&mut self, qos: QoS) {
         while !self.subscribe(qos).await {
             tokio::task::yield_now().await;
@@ -114,7 +114,7 @@ impl Hearer {
         }
     }
 
-    /// Hears until it has all, and asks for what it lacks when nothing comes.
+    /// Receives until all parts have arrived, and requests the missing parts when nothing comes.
     async fn gather(&mut self, server: &TestServer) {
         while self.got.len() < self.count as usize {
             if self.hear().await.is_none() {
@@ -226,8 +226,8 @@ async fn only_those_it_is_meant_for_hear_it_and_only_as_long() {
         while meant.subscribe(QoS::AtLeastOnce).await {
             tokio::task::yield_now().await;
         }
-        // What was under way before has been heard; more does not come, and it is not asked for in
-        // vain.
+        // Parts that were already under way have been received; no more come, and the robot's
+        // request is not in vain.
         meant.report(&server, Phase::Fetching, Some(vec![PartRange { from: 0, to: 9 }])).await;
         assert_eq!(meant.hear().await, None);
         assert_eq!((other.hear().await, other.messages), (None, 0));

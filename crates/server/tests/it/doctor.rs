@@ -6,7 +6,7 @@ use taskd::system::clock::Clock;
 
 use crate::cli::{Bench, Ran, command, run};
 
-/// The verdict on one check, and what was found.
+/// The verdict on one check, and its findings.
 fn found(ran: &Ran, check: &str) -> Vec<(String, String)> {
     let checks = ran.json()["checks"].as_array().unwrap().clone();
     let text = |value: &Value| value.as_str().unwrap_or_default().to_owned();

@@ -1,5 +1,5 @@
-//! Enrolment tokens are listed and revoked, and so are robots: who was put out is out at once, is
-//! told so, and comes back only by an administrator's token made for it.
+//! Enrollment tokens are listed and revoked, and so are robots: a revoked robot is disconnected at
+//! once, is told the reason, and returns only by an administrator's token made for that robot.
 
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -26,7 +26,7 @@ async fn listed(server: &TestServer) -> Vec<String> {
     list.tokens.iter().map(|token| token.id.to_string()).collect()
 }
 
-/// What the audit tells of `act`, as target and detail.
+/// The audit entries of `act`, as target and detail.
 async fn audited(server: &TestServer, act: &str) -> Vec<(String, Value)> {
     let page: AuditPage = server.get(&format!("/api/v1/audit?act={act}")).await;
     let entries = page
@@ -78,7 +78,7 @@ async fn enrolment_tokens_are_listed_and_revoked_at_once() {
     assert_eq!(refusal(server.request(Method::DELETE, &path)).await, (404, "not_found".to_owned()));
     let revoked = audited(&server, "enrolment_token.revoke").await;
     assert_eq!(revoked.iter().map(|(target, _)| target).collect::<Vec<_>>(), [&all.id]);
-    // Whoever came by it stays, and another token is as good as before.
+    // A robot that enrolled with the token stays, and another token works as before.
     server.desired(&TestRobot::new(came.robot_id, came.token)).await;
     let mac = server.robot(&atlas).await.mac.to_string();
     let _: EnrollResponse = answer(enrol(&server, &one.token, &mac)).await;
@@ -139,8 +139,8 @@ async fn a_revoked_robot_is_told_so_and_comes_back_only_by_a_token_made_for_it()
         ("revoked", 1),
         "what is ordered stays"
     );
-    // Both of its tokens have ended, also once ended tokens have been cleared away, and it is told
-    // why.
+    // Both of the robot's tokens have ended, also once ended tokens have been cleared away, and the
+    // robot is told the reason.
     let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
     let mut write = store.begin().await.expect("begins");
     write.forget_ended_tokens(NOW_MS + 1).await.expect("forgotten");
@@ -149,7 +149,7 @@ async fn a_revoked_robot_is_told_so_and_comes_back_only_by_a_token_made_for_it()
         assert_eq!(refusal(own("token", token)).await, (401, "robot_revoked".to_owned()));
         assert_eq!(connack(&server, atlas.id.as_str(), token).await, 5);
     }
-    // Neither a token that anybody may use takes it back, nor one that was made for it before.
+    // Neither a general token nor one made for the robot earlier brings the robot back.
     assert_eq!(refusal(enrol(&server, &general.token, &mac)).await, (409, "mac_known".to_owned()));
     assert_eq!(refusal(enrol(&server, &early.token, &mac)).await, (401, "unauthorized".to_owned()));
     let again = token(&server, json!({ "robot": "atlas", "uses": 1 })).await;

@@ -1,4 +1,4 @@
-//! The feed: what happened is told once, together where it is much, and to whom it concerns.
+//! The feed: events are told once, grouped where there are many, and to the users they concern.
 
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ async fn told(server: &TestServer, kind: FeedKind) -> Vec<FeedEntry> {
     told_times(server, kind, 1).await
 }
 
-/// Likewise, once there are so many.
+/// The same, once there is this number of entries.
 async fn told_times(server: &TestServer, kind: FeedKind, times: usize) -> Vec<FeedEntry> {
     let asking = async {
         let mut turns = tokio::time::interval(Duration::from_millis(50));
@@ -34,7 +34,7 @@ async fn told_times(server: &TestServer, kind: FeedKind, times: usize) -> Vec<Fe
     tokio::time::timeout(PATIENCE, asking).await.expect("it is told")
 }
 
-/// The token of somebody who may see these robots.
+/// The token of a user who may see these robots.
 async fn limited_to(server: &TestServer, scope: &str) -> String {
     let carol = json!({ "name": "carol", "roles": ["viewer"], "scope": scope, "password": "correct horse battery" });
     let added =
@@ -116,7 +116,7 @@ async fn many_that_come_are_told_together_and_not_to_whom_some_are_hidden() {
     assert_eq!(gone.status(), 204);
     told(&server, FeedKind::RobotRevoked).await;
     let page: FeedPage = answer(server.bare(Method::GET, "/api/v1/feed").bearer_auth(token)).await;
-    // How full this machine's disk is concerns everybody.
+    // The fill level of this machine's disk concerns all users.
     let of_robots: Vec<_> =
         page.entries.iter().filter(|entry| entry.kind != FeedKind::Disk).collect();
     assert!(

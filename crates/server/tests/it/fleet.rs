@@ -43,7 +43,7 @@ pub struct Fleet {
     pub chooser: Chooser,
 }
 
-/// A robot's own view: what it has accepted and what it says.
+/// A robot's own view: its accepted state and its reports.
 pub struct Robot {
     pub id: RobotId,
     pub start: u64,
@@ -196,8 +196,8 @@ impl Fleet {
         Ok(serde_json::from_slice(&payload).expect("a desired state"))
     }
 
-    /// The robot takes its desired state, brings every task into `phase`, drops what is not
-    /// desired, and reports.
+    /// The robot fetches its desired state, brings every task into `phase`, drops undesired tasks,
+    /// and reports.
     pub async fn follow(&self, robot: &mut Robot, phase: Phase) {
         let desired = self.desired(robot).await.expect("not withheld");
         robot.accept(&desired, phase);

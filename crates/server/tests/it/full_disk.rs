@@ -1,5 +1,5 @@
-//! A server whose disk is full: what needs room is refused as such, everything else goes on, also
-//! over a restart.
+//! A server with a full disk: operations that need room are refused with that reason, everything
+//! else goes on, also over a restart.
 
 use std::fs::File;
 use std::io::Write as _;
@@ -37,7 +37,7 @@ fn on_small_disk(size: &str, test: impl AsyncFnOnce(TempDir) + Send) {
             Some(format!("size={size}").as_str()),
         )
     };
-    // What is mounted on it is gone with the threads that see it.
+    // File systems mounted on it vanish with the threads that see them.
     let place = TempDir::new().expect("a directory");
     std::thread::scope(|scope| {
         let running = scope.spawn(|| {
@@ -83,7 +83,7 @@ async fn use_up(server: &TestServer) {
     panic!("the disk is not full");
 }
 
-/// Whatever writes says that there is no room, and whatever reads is answered.
+/// Every write is refused for lack of room, and every read is answered.
 async fn assert_reads_only(server: &TestServer, robot: &mut TestRobot) {
     let content = vec![7; 1 << 16];
     let digest = Digest::of(&content);

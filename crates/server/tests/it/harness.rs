@@ -1,5 +1,5 @@
-//! A whole server in this process, on free ports and in a directory of its own, and the few things
-//! every test says to it.
+//! A whole server in this process, on free ports and in a directory of its own, with the requests
+//! that every test needs.
 
 use std::path::Path;
 
@@ -26,7 +26,7 @@ use tempfile::TempDir;
 /// The moment at which every test begins.
 pub const NOW_MS: u64 = 1_800_000_000_000;
 
-/// A running server and an operator who talks to it.
+/// A running server and a signed-in operator.
 pub struct TestServer {
     pub directory: TempDir,
     pub server: Server,
@@ -61,13 +61,13 @@ impl TestServer {
         Self { directory, server, clock, operator, client }
     }
 
-    /// Stops it and starts another on the same directory.
+    /// Stops the server and starts another on the same directory.
     pub async fn restart(self) -> Self {
         let directory = self.stop().await;
         Self::start_in(directory, |_| {}).await
     }
 
-    /// Stops it; the directory stays.
+    /// Stops the server; the directory stays.
     pub async fn stop(self) -> TempDir {
         self.server.stop().await;
         self.directory
@@ -81,7 +81,7 @@ impl TestServer {
         format!("{}{path}", self.server.addresses().url())
     }
 
-    /// A request by nobody.
+    /// A request without credentials.
     pub fn bare(&self, method: Method, path: &str) -> RequestBuilder {
         self.client.request(method, self.url(path))
     }
@@ -187,7 +187,7 @@ impl TestServer {
         self.get(&format!("/api/v1/robots/{}", robot.id)).await
     }
 
-    /// What the robot gets when it asks for its desired state.
+    /// The response to the robot's request for its desired state.
     pub async fn ask_desired(&self, robot: &TestRobot) -> Response {
         let path = format!("/api/v1/robots/{}/desired", robot.id);
         self.bare(Method::GET, &path).bearer_auth(&robot.token).send().await.expect("an answer")
@@ -206,7 +206,7 @@ impl TestServer {
         opened(self, &envelope).await
     }
 
-    /// The robot reports that it accepted `state` and that all of its tasks stand in `phase`.
+    /// The robot reports that it accepted `state` and that all of its tasks are in `phase`.
     pub async fn report(
         &self,
         robot: &mut TestRobot,
@@ -230,7 +230,7 @@ impl TestRobot {
         Self { id, token, instance: InstanceId::random(), seq: 0 }
     }
 
-    /// Says that it accepted `state` and that all of its tasks stand in `phase`.
+    /// A report that the robot accepted `state` and that all of its tasks are in `phase`.
     pub fn next_report(&mut self, state: &DesiredState, phase: Phase) -> Report {
         self.seq += 1;
         Report {
@@ -265,7 +265,7 @@ pub fn archive_of(size: usize, fill: u8) -> Vec<u8> {
     archive_with(&vec![fill; size - archive_with(&[]).len()])
 }
 
-/// What a manifest says of that archive.
+/// The archive's description in a manifest.
 pub fn archive_facts() -> ContentFacts {
     let tar = archive();
     ContentFacts { tar_digest: Digest::of(&tar), tar_size: tar.len() as u64, entries: 1 }
@@ -290,7 +290,7 @@ pub fn client(trust: Trust) -> Client {
     Client::builder().tls_backend_preconfigured(tls).build().expect("a client")
 }
 
-/// What an envelope holds, its signature verified.
+/// An envelope's content, after its signature is verified.
 pub async fn opened(server: &TestServer, envelope: &Envelope) -> DesiredState {
     let info: ServerInfo = server.get("/api/v1/server").await;
     let payload = envelope.open(DESIRED_STATE_TYPE, &info.key).expect("signed by this server");
@@ -301,7 +301,7 @@ fn in_phase(task: &DesiredTask, phase: Phase) -> TaskReport {
     TaskReport { kind: Some(TaskKind::Service), phase_ms: 10, ..TaskReport::of(task, phase) }
 }
 
-/// Sends it and reads a success's JSON.
+/// Sends the request and reads a success's JSON.
 pub async fn answer<T: DeserializeOwned>(request: RequestBuilder) -> T {
     let response = request.send().await.expect("an answer");
     let status = response.status();
@@ -310,7 +310,7 @@ pub async fn answer<T: DeserializeOwned>(request: RequestBuilder) -> T {
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}"))
 }
 
-/// Sends it and reads an error's status and code.
+/// Sends the request and reads an error's status and code.
 pub async fn refusal(request: RequestBuilder) -> (u16, String) {
     let response = request.send().await.expect("an answer");
     let status = response.status().as_u16();

@@ -1,5 +1,5 @@
-//! What every answer tells a browser, whatever it answers: nothing of the server is ever framed,
-//! sniffed, kept or run, but for the page's own files.
+//! Headers of every answer to a browser: nothing of the server is ever framed, sniffed, kept or
+//! run, except for the page's own files.
 
 use reqwest::{Method, Response};
 use serde_json::{Value, json};
@@ -51,7 +51,7 @@ async fn every_answer_says_that_it_is_not_a_page() {
     let package = server.push("talker", "1.0.0").await;
     let deployment = server.deploy(&package, "*", "first").await;
     let mut looked_at = 0;
-    // Whoever asks: with rights, without, and a robot.
+    // All kinds of callers: with rights, without, and a robot.
     let comers = [
         Some(server.operator.reveal()),
         None,
@@ -115,7 +115,7 @@ async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
         .await
         .expect("an answer");
     let mut manifest: Value = manifest.json().await.expect("JSON");
-    // What it says itself would contradict.
+    // The manifest's own type would contradict.
     manifest.as_object_mut().expect("an object").remove("mediaType").expect("it has one");
     let put = server
         .request(Method::PUT, "/v2/talker/manifests/2.0.0")

@@ -1,4 +1,4 @@
-//! What became of each robot's tasks and when, and what is set for robots, told on every database.
+//! The outcomes and times of each robot's tasks, and the robots' settings, told on every database.
 
 use serde_json::json;
 use task_proto::Generation;
@@ -90,8 +90,8 @@ async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
     fleet.follow(&mut robot, Phase::Running).await;
-    // Of the orders up to this one the database knows nothing; with the next it takes over what the
-    // robot has.
+    // The database knows nothing of the orders up to this one; with the next, it adopts the robot's
+    // state.
     robot.observed = Generation(7);
     fleet.report(&mut robot).await;
     let (task, all) = ("talker".parse().expect("a name"), "*".parse().expect("a selector"));

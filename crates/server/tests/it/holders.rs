@@ -1,5 +1,5 @@
-//! One person or one robot that takes as much of HTTP as it can get, by ordinary tokens: others
-//! still get their turn.
+//! One user or one robot that takes as much of HTTP as possible, by ordinary tokens: others still
+//! get their turn.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -41,16 +41,16 @@ impl TestServer {
     }
 }
 
-/// What a client of the flood does once its answer has begun.
+/// Behaviour of a client of the flood once its answer has begun.
 #[derive(Clone, Copy, PartialEq)]
 enum Afterwards {
-    /// It reads nothing more.
+    /// Reads nothing more.
     ReadsNothing,
-    /// It sends nothing more, and comes again when it is cut.
+    /// Sends nothing more, and reconnects when disconnected.
     SendsNothing,
 }
 
-/// Connections that each send one request, or the beginning of one, and leave it at that.
+/// Connections that each send one request, or the beginning of one, and then nothing.
 struct Flood {
     answered: Arc<AtomicUsize>,
     progress: Arc<Notify>,
@@ -68,7 +68,7 @@ impl Flood {
             tasks.spawn(async move {
                 loop {
                     let socket = TcpSocket::new_v4().expect("a socket");
-                    // What is not read soon blocks the server.
+                    // A small buffer, so that unread data soon blocks the server.
                     socket.set_recv_buffer_size(4096).expect("set");
                     let Ok(mut stream) = socket.connect(address).await else { continue };
                     if stream.write_all(request.as_bytes()).await.is_err()
@@ -88,7 +88,7 @@ impl Flood {
         Self { answered, progress, _tasks: tasks }
     }
 
-    /// Waits until so many connections had the beginning of an answer.
+    /// Waits until this number of connections have received the beginning of an answer.
     async fn reached(&self, answered: usize) {
         let reached = async {
             while self.answered.load(Ordering::SeqCst) < answered {
@@ -111,7 +111,7 @@ async fn crowded_server() -> (TestServer, TestRobot, String) {
     (server, robot, blob)
 }
 
-/// An operator stops the task, and the robot hears of it, by connections that have to be made now.
+/// An operator stops the task, and the robot is told, by connections that have to be made now.
 async fn is_stopped_soon(server: &TestServer, robot: &TestRobot) {
     let (operator, agent) = (server.fresh_client(), server.fresh_client());
     let stop = operator
@@ -164,8 +164,8 @@ struct Answers {
     refused: AtomicUsize,
 }
 
-/// Sends the request `times` on one connection and counts what comes back, until the server ends
-/// it.
+/// Sends the request `times` on one connection and counts the answers until the server ends the
+/// connection.
 async fn pipeline(server: &TestServer, request: &str, times: usize, answers: &Answers) {
     let stream = tokio::net::TcpStream::connect(&server.server.addresses().http)
         .await

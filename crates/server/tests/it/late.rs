@@ -1,5 +1,5 @@
-//! Orders that come too late, or for robots about which the database knows too little: nothing is
-//! taken away by them, and nothing moves again that somebody stopped.
+//! Orders that arrive too late, or for robots about which the database knows too little: nothing is
+//! removed because of them, and nothing starts again that a user stopped.
 
 use task_proto::Generation;
 use task_proto::api::DeploymentState;
@@ -25,8 +25,8 @@ on_both_databases! {
     a_robot_that_obeys_another_state_of_the_same_generation_has_diverged,
 }
 
-/// What is ordered of a task that has run, and does not reach its robot in time, takes nothing away
-/// from it.
+/// An order for a task that has run, if it does not reach its robot in time, removes nothing from
+/// the robot.
 async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
@@ -67,15 +67,15 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
         }
         assert_eq!(fleet.phases(&new).await, [phase; 2], "{late:?}");
     }
-    // A cancel of its order neither takes away what was only told to start again.
+    // Cancelling the order does not remove a task that was only told to restart either.
     order(TaskOrder::Restart).await;
     fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
     for robot in &robots {
         assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, new);
     }
-    // The robot may have begun one of those runs without saying so: it would take the next for the
-    // same one, and not run it. Who has heard of a restart, and did not come to it, does not come
-    // to it later.
+    // The robot may have begun one of those runs without reporting that: it would take the next run
+    // for the same one, and not start it. A robot that received a restart, and did not perform it,
+    // does not perform it later.
     order(TaskOrder::Restart).await;
     assert_eq!(
         fleet.desired(&robots[0]).await.expect("state").tasks[0].run,
@@ -141,7 +141,7 @@ async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase
     let mut robots = fleet.enroll(5).await;
     let first = fleet.deploy("1", |order| order.batch = Some(1)).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
-    // What the first robot ran is desired again, and it never says so.
+    // The first robot's earlier version is desired again, and the robot never reports it.
     let other = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
     fleet.actions.cancel_deployment(&fleet.operator, &other).await.expect("cancelled");
     assert_eq!(fleet.phases(&first).await[0], Phase::Assigned);
@@ -150,7 +150,7 @@ async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase
     assert!(has_it(&robots[1]).await && !has_it(&robots[2]).await);
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert!(has_it(&robots[2]).await);
-    // Nor does the next one, nor does it get anything if it is put out before its turn.
+    // The next robot does not either, nor does it get anything if it is revoked before its turn.
     fleet.actions.revoke_robot(&fleet.operator, &robots[3].id).await.expect("revoked");
     assert!(!has_it(&robots[4]).await);
     fleet.actions.revoke_robot(&fleet.operator, &robots[2].id).await.expect("revoked");
@@ -169,7 +169,7 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
     assert_eq!(code(refused), "nothing_to_cancel");
     assert_eq!(fleet.deployment(&id).await, before);
     assert_eq!(before.state, DeploymentState::Settled);
-    // Nor is one that others took the place of, and that has settled since.
+    // Nor is an assignment that later ones have replaced, and that has settled since.
     let newer = fleet.deploy("2", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Running).await;
@@ -177,7 +177,7 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
         code(fleet.actions.cancel_deployment(&fleet.operator, &id).await),
         "nothing_to_cancel"
     );
-    // Where it failed, the version before comes back.
+    // Where the deployment failed, the previous version comes back.
     let broken = fleet.deploy("3", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Failed).await;
@@ -185,7 +185,7 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, newer);
 }
 
-/// A fleet whose robots run version 1 of orders that its database has never seen.
+/// A fleet of robots that run version 1 from orders that the database has never seen.
 async fn restored(database: TestDatabase, count: u32) -> (Fleet, Vec<Robot>) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(count).await;
@@ -271,7 +271,7 @@ async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(
     database: TestDatabase,
 ) {
     let (fleet, mut robots) = restored(database, 1).await;
-    // As if it had not reported yet. One order was lost, and one is made before it does.
+    // As if the robot had not reported yet. One order was lost, and one is made before the report.
     let robot = &mut robots[0];
     (robot.start, robot.observed) = (2, Generation(0));
     let tasks = std::mem::take(&mut robot.tasks);
@@ -289,7 +289,7 @@ async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(
     let view = fleet.view(robot).await;
     assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
     assert_eq!(code(fleet.desired(robot).await), "diverged");
-    // The next order starts from what it has.
+    // The next order starts from the robot's current version.
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     fleet
         .actions

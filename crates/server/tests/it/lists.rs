@@ -1,4 +1,4 @@
-//! Lists in pages: nothing twice, nothing left out, whatever is ordered meanwhile.
+//! Lists in pages: nothing twice, nothing left out, despite orders made meanwhile.
 
 use std::collections::BTreeMap;
 
@@ -49,8 +49,8 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
         ["r11", "r2", "r3"]
     );
     assert_eq!((some.total, some.next), (10, Some("r3".parse().expect("a name"))));
-    // A page that holds all that is left is the last one; whoever is gone can still be gone on
-    // from.
+    // A page that holds all the remaining entries is the last one; a removed robot is still a valid
+    // position to continue from.
     let scope = Scope::of(["r2,r3,r9".parse().expect("a selector")]);
     let last = page(&scope, None, Some(&"r2x".parse().expect("a name")), 2).await;
     assert_eq!((last.robots.len(), last.total, last.next), (2, 3, None));
@@ -159,7 +159,7 @@ async fn lists_come_in_pages() {
     }
     let unknown = format!("/api/v1/deployments?before={}", DeploymentId::random());
     assert_eq!(refusal(get(&unknown)).await, (404, "not_found".to_owned()));
-    // What was removed is passed over.
+    // Removed entries are skipped.
     let gone = server
         .request(reqwest::Method::DELETE, "/api/v1/robots/boreas")
         .send()

@@ -1,5 +1,5 @@
 //! Log lines that robots publish: remembered, shown when the robot can't be asked, streamed to
-//! whoever follows.
+//! followers.
 
 use std::time::Duration;
 

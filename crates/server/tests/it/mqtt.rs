@@ -1,4 +1,4 @@
-//! What clients of the broker may rely on, over real TCP: admission, access, delivery, takeover,
+//! Guarantees for the broker's clients, over real TCP: admission, access, delivery, takeover,
 //! wills, time limits.
 
 use std::sync::atomic::Ordering;
@@ -84,8 +84,8 @@ async fn message_to_be_retained_ends_the_session_unless_it_is_empty() {
             packet[0] |= 1;
             packet
         };
-        // It asks to forget what is retained, which is nothing, and is passed on as any other
-        // message.
+        // The message asks the broker to forget a retained message, of which there is none, and is
+        // passed on as any other message.
         client.send(&retained(b"")).await;
         match qos {
             1 => client.expect(&[0x40, 2, 0, 9]).await,
@@ -261,7 +261,7 @@ async fn what_mqtt_permits_is_no_offence() {
     let robot = RobotId::random();
     let (report, desired) = (topic(&robot, RobotTopic::Report), topic(&robot, RobotTopic::Desired));
     let mut raw = broker.robot(&robot).await;
-    // It may release none of its messages before it has sent them all.
+    // The client may release none of its messages before all of them are sent.
     for id in 1..=1000_u16 {
         let [high, low] = id.to_be_bytes();
         raw.send(&publish(&report, 2, id, b"x")).await;
@@ -413,8 +413,8 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
     );
     assert_eq!((all.messages_refused, all.messages_dropped, all.all), (0, 0, expected));
 
-    // Others count for themselves and for all: one whose password is wrong, one that says what it
-    // may not.
+    // Other violations count for the client and for the total: a wrong password, a forbidden
+    // publication.
     let wrong = Connect { password: Some("wrong".to_owned()), ..Connect::robot(&other) }.packet();
     let mut refused = broker.raw_with(&wrong).await;
     refused.expect(&[0x20, 2, 0, 4]).await;

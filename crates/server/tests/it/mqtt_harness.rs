@@ -1,5 +1,4 @@
-//! A broker with an in-memory gatekeeper and inbox, and a client that sends any bytes it is told
-//! to.
+//! A broker with an in-memory gatekeeper and inbox, and a client that sends arbitrary bytes.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -24,16 +23,16 @@ use tokio::net::TcpStream;
 use tokio::sync::{Mutex, Notify, mpsc};
 use tokio::time::timeout;
 
-/// More than anything here takes, unless it hangs.
+/// Time limit that only a hanging test exceeds.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Lets robots in with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some
 /// passwords meet other ends.
 #[derive(Default)]
 pub struct Door {
-    /// Says that somebody with `once-<robot id>` is being let in, for the first time, which
-    /// [`Door::go_on`] ends. The second time they are not. Somebody with `new-<robot id>` waits for
-    /// that as well, and is a new token's first use.
+    /// Announces that a client with `once-<robot id>` is being admitted for the first time;
+    /// [`Door::go_on`] completes the admission. The second time the client is refused. A client
+    /// with `new-<robot id>` waits for `go_on` as well, and is a new token's first use.
     pub asked: Notify,
     pub go_on: Notify,
     was_asked: AtomicBool,
@@ -76,7 +75,7 @@ impl Gatekeeper for Door {
     }
 }
 
-/// What the inbox saw.
+/// Events received by the inbox.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Seen {
     Connected(RobotId, u64),
@@ -111,7 +110,7 @@ impl Inbox for Letterbox {
     fn everyone_may_be_there(&self) {}
 }
 
-/// Nobody is slowed or kept away.
+/// Limits under which no client is slowed or banned.
 fn lenient() -> ConductLimits {
     ConductLimits {
         messages_per_s: 1 << 40,
@@ -135,7 +134,7 @@ impl TestBroker {
         Self::with(|_| {}).await
     }
 
-    /// Nobody is slowed or kept away.
+    /// No client is slowed or banned.
     pub async fn with(change: impl FnOnce(&mut Limits)) -> Self {
         Self::start_with(None, change, lenient()).await
     }
@@ -217,7 +216,7 @@ impl TestBroker {
         raw
     }
 
-    /// An operator who is in and hears `filter`.
+    /// A connected operator subscribed to `filter`.
     pub async fn operator(&self, filter: &str, qos: u8) -> Raw {
         let mut raw = self.raw_with(&Connect::operator("").packet()).await;
         raw.expect(&[0x20, 2, 0, 0]).await;

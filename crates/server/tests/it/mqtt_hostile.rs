@@ -1,5 +1,5 @@
-//! What clients may not do to the broker: malformed, oversized, endless, rude and random bytes.
-//! After each case a healthy robot and a healthy operator still get through.
+//! Hostile clients of the broker: malformed, oversized, endless, rude and random bytes. After each
+//! case a healthy robot and a healthy operator still get through.
 
 use std::time::Duration;
 
@@ -267,8 +267,8 @@ async fn floods_are_capped() {
         many.expect(&[0x90, 3, (id >> 8) as u8, id as u8, code]).await;
     }
 
-    // Pings without end by someone who reads no answer: shown out by the write timeout, or cut off
-    // in sending.
+    // Endless pings by a client that reads no answer: disconnected by the write timeout, or cut off
+    // while sending.
     let mut deaf = broker.robot(&robot).await;
     let pings = vec![[0xc0, 0]; 32 * 1024].concat();
     let flood = async {
@@ -354,13 +354,13 @@ async fn one_person_does_not_take_all_places_of_people() {
         raw.expect_nothing().await;
     }
     drop(sessions);
-    // No filter is longer than what a session should keep of it.
+    // No filter is longer than a session should store.
     let longest = format!("taskd/v1/{}", "x".repeat(1024 - "taskd/v1/".len()));
     other.send(&subscribe(1, &[(&longest, 0), (&format!("{longest}x"), 0)])).await;
     other.expect(&[0x90, 4, 0, 1, 0, 0x80]).await;
 }
 
-/// What clients wait for who are not to be shown out for their slowness.
+/// Time limit for clients that are not to be disconnected for slowness.
 const HOUR: Duration = Duration::from_secs(3600);
 
 #[tokio::test(flavor = "multi_thread")]
@@ -370,7 +370,7 @@ async fn silent_connections_give_way_when_all_places_are_taken() {
             .await;
     let mut spoken = broker.robot(&RobotId::random()).await;
     let mut silent = broker.raw().await;
-    // Nobody has to leave in its first seconds: until then newcomers are turned away.
+    // No client is evicted in its first seconds: until then newcomers are turned away.
     let mut ticks = tokio::time::interval(Duration::from_millis(100));
     let mut newcomer = timeout(PATIENCE, async {
         loop {

@@ -1,5 +1,5 @@
-//! A package's parts, fanned out over real TCP: to whom they are granted, as long as they are, no
-//! faster than they listen.
+//! A package's parts, fanned out over real TCP: to the clients with a grant, for the duration of
+//! the grant, no faster than they receive.
 
 use bytes::Bytes;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
@@ -16,7 +16,7 @@ fn name_of(digest: Digest) -> String {
     TopicPrefix::default().format(&Topic::Package(digest))
 }
 
-/// A subscription to a package, and how it is answered.
+/// A subscription to a package, and its expected answer.
 async fn listen(raw: &mut Raw, digest: Digest, code: u8) {
     raw.send(&subscribe(9, &[(&name_of(digest), 1)])).await;
     raw.expect(&[0x90, 3, 0, 9, code]).await;
@@ -92,7 +92,8 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
     listen(&mut two, digest, 0x80).await;
     assert_eq!(fan_out.listeners(), 1);
 
-    // Who leaves, or whose grant ends with the fan-out, hears the next one only by asking again.
+    // A client that leaves, or whose grant ends with the fan-out, receives the next one only by
+    // subscribing again.
     one.send(&unsubscribe(7, &[&name_of(digest)])).await;
     one.expect(&[0xb0, 2, 0, 7]).await;
     assert_eq!(fan_out.listeners(), 0);
@@ -131,7 +132,7 @@ async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
         if round % 2 == 0 {
             fan_out.withdraw(&robot);
         } else {
-            // It asks again while its right ends: either may come first.
+            // The client subscribes again while its right ends: either may come first.
             raw.send(&subscribe(9, &[(&name_of(digest), 1)])).await;
             fan_out.withdraw(&robot);
             let mut answer = [0; 5];
@@ -142,7 +143,7 @@ async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
     }
 }
 
-/// Hears part `number`, which is the session's message of that packet id, and acknowledges it.
+/// Receives part `number`, which is the session's message of that packet id, and acknowledges it.
 async fn take(raw: &mut Raw, digest: Digest, number: u8) {
     hear(raw, digest, number, &format!("part {number}")).await;
     acknowledge(raw, number).await;

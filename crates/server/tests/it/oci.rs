@@ -1,4 +1,4 @@
-//! The distribution API: what the specification asks for.
+//! The distribution API: the requirements of the specification.
 
 use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
@@ -430,7 +430,7 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
     assert_eq!(put("v1", INDEX_TYPE, &index).await, refused(400, "MANIFEST_BLOB_UNKNOWN"));
     let name = registry.put_manifest("/v2/A/manifests/v1", MANIFEST_TYPE, &good).await;
     assert_eq!(refusal(name).await, refused(400, "NAME_INVALID"));
-    // What is not understood is kept all the same.
+    // Unknown content is kept all the same.
     let foreign = registry
         .put_manifest("/v2/a/manifests/v1", "application/x-foreign+json", &json!({ "x": 1 }))
         .await;

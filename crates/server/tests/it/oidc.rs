@@ -1,4 +1,4 @@
-//! Signing in by a provider: who comes in as whom, with which rights, and what is refused.
+//! Signing in by a provider: the resulting users, their rights, and the refused attempts.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
 use std::io::{BufRead as _, BufReader};
@@ -16,8 +16,8 @@ use crate::harness::{TestServer, answer, refusal};
 use crate::people::PASSWORD;
 use crate::provider::{CLIENT_ID, Provider, SECRET};
 
-/// What a provider and a server know of each other. The server is found by its address only when it
-/// listens, so its port is chosen before.
+/// Settings that connect a provider and a server. The provider must know the server's address
+/// before the server listens, so the port is chosen first.
 fn settings(issuer: &str, directory: &TempDir, port: u16) -> OidcSettings {
     let secret = directory.path().join("oidc.secret");
     std::fs::write(&secret, format!("{SECRET}\n")).expect("written");
@@ -38,7 +38,7 @@ fn settings(issuer: &str, directory: &TempDir, port: u16) -> OidcSettings {
     }
 }
 
-/// A port that nobody listens on now.
+/// A port without a listener at this moment.
 fn free_port() -> u16 {
     std::net::TcpListener::bind(("127.0.0.1", 0))
         .expect("binds")
@@ -58,7 +58,7 @@ async fn town() -> (TestServer, Provider) {
     (TestServer::start_in(directory, configure).await, provider)
 }
 
-/// A browser without a page: it keeps the cookies it is given, and follows no redirect by itself.
+/// A browser without a page: keeps its cookies, and follows no redirect by itself.
 struct Visitor<'a> {
     server: &'a TestServer,
     client: Client,
@@ -97,19 +97,19 @@ impl<'a> Visitor<'a> {
         response
     }
 
-    /// Goes where an answer sends it.
+    /// Follows the redirect of a response.
     async fn follow(&mut self, response: Response) -> Response {
         assert_eq!(response.status(), StatusCode::SEE_OTHER);
         self.get(&location(&response)).await
     }
 
-    /// Goes to the provider; gives where that sends it back to.
+    /// Goes to the provider; returns the URL of the redirect back.
     async fn go_to_provider(&mut self) -> String {
         let sent = self.get(&self.server.url("/api/v1/oidc/sign-in")).await;
         location(&self.follow(sent).await)
     }
 
-    /// All of it: where it ends.
+    /// The complete sign-in; returns the final location.
     async fn sign_in(&mut self) -> String {
         let back = self.go_to_provider().await;
         location(&self.get(&back).await)
@@ -187,7 +187,7 @@ async fn somebody_comes_in_and_may_what_the_rules_say() {
     assert_eq!(users["users"][0]["has_password"], false);
     assert_eq!(users["users"][0]["subject"], format!("{} 248289761001", provider.issuer));
     assert_eq!(acts(&server).await, [act("server", "user.add"), act("alice", "sign_in")]);
-    // It ends like any other.
+    // The session ends like any other.
     let out = visitor.asks(Method::DELETE, "/api/v1/session").send().await.expect("an answer");
     assert_eq!(out.status(), StatusCode::NO_CONTENT);
     assert_eq!(refusal(visitor.asks(Method::GET, "/api/v1/me")).await.0, 401);
@@ -228,7 +228,8 @@ async fn an_answer_is_good_once_and_in_one_browser() {
         (Visitor::new(&server), Visitor::new(&server), Visitor::new(&server));
     let back = mine.go_to_provider().await;
     theirs.go_to_provider().await;
-    // Somebody who is sent my answer is not signed in as me, whether they were on their way or not.
+    // A user who is sent my answer is not signed in as me, with or without a sign-in of their own
+    // under way.
     assert_eq!(location(&theirs.get(&back).await), "/#problem=expired");
     assert_eq!(location(&nobody.get(&back).await), "/#problem=expired");
     let kept = mine.cookies.clone();
@@ -242,7 +243,7 @@ async fn an_answer_is_good_once_and_in_one_browser() {
     );
     assert!(!theirs.is_signed_in() && !nobody.is_signed_in());
 
-    // The code without the verifier that belongs to it, as whoever saw it on its way has it.
+    // The code without its verifier, as an eavesdropper has it.
     let (stolen, own) = (mine.go_to_provider().await, theirs.go_to_provider().await);
     let part = |url: &str, name: &str| {
         let url = Url::parse(url).expect("a URL");
@@ -251,7 +252,7 @@ async fn an_answer_is_good_once_and_in_one_browser() {
     let own_state = part(&own, "state");
     let mixed = stolen.replace(&part(&stolen, "state"), &own_state);
     assert_eq!(location(&theirs.get(&mixed).await), "/#problem=failed");
-    // An answer that is another provider's, by its own words.
+    // An answer that names another provider as its issuer.
     let back = mine.go_to_provider().await;
     assert_eq!(location(&mine.get(&back.replace("&iss=", "&iss=x")).await), "/#problem=failed");
     provider.lets_in(false);
@@ -336,8 +337,8 @@ async fn a_name_is_no_proof_of_who_somebody_is() {
     provider.says(json!({ "preferred_username": "bob" }));
     let mut bob = Visitor::new(&server);
     assert_eq!(bob.sign_in().await, "/");
-    // Whoever has his name at the provider next is somebody else, and he stays who he is by
-    // another.
+    // The next holder of his name at the provider is another user, and he keeps his account under
+    // another name.
     provider.says(json!({ "sub": "other" }));
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=name_taken");
     provider.says(json!({ "sub": "248289761001", "preferred_username": "robert" }));
@@ -362,8 +363,8 @@ async fn what_the_provider_decides_is_not_changed_by_hand() {
         .bare(Method::POST, "/api/v1/login")
         .json(&json!({ "user": "alice", "password": PASSWORD }));
     assert_eq!(refusal(log_in).await.0, 401);
-    // A token of their own making would outlast what the provider says of them; an administrator
-    // may make one.
+    // A self-made token would outlast the provider's decisions about the user; an administrator may
+    // make one.
     let token = alice.asks(Method::POST, "/api/v1/tokens").json(&json!({}));
     assert_eq!(refusal(token).await, (403, "forbidden".to_owned()));
     let made: Value = server.post("/api/v1/tokens", &json!({ "user": "alice" })).await;
@@ -416,7 +417,7 @@ async fn a_new_key_is_found_and_a_provider_in_trouble_is_left_in_peace() {
 #[tokio::test(flavor = "multi_thread")]
 async fn failed_sign_ins_by_the_provider_are_counted_by_address() {
     let (server, provider) = town().await;
-    // What a foreign page could make its visitors ask for does not count.
+    // Requests that a foreign page could trigger in its visitors' browsers do not count.
     let foreign = server.url("/api/v1/oidc/callback?code=guess&state=guess");
     for _ in 0..60 {
         assert_eq!(location(&Visitor::new(&server).get(&foreign).await), "/#problem=expired");
@@ -434,14 +435,14 @@ async fn failed_sign_ins_by_the_provider_are_counted_by_address() {
     let blocked = ("server".to_owned(), "sign_in.blocked".to_owned(), "nobody".to_owned());
     assert_eq!(acts(&server).await, [blocked], "once");
     server.clock.advance_ms(15 * 60 * 1000);
-    // What succeeds counts for nothing.
+    // Successful sign-ins do not count.
     for _ in 0..60 {
         provider.lies(json!({}), json!({ "exp": server.clock.now_ms() / 1000 + 60 }));
         assert_eq!(Visitor::new(&server).sign_in().await, "/");
     }
 }
 
-/// A provider that others made, as a process.
+/// A third-party provider, as a process.
 struct Foreign {
     child: Child,
     issuer: String,
@@ -473,7 +474,7 @@ impl Foreign {
             BufReader::new(child.stderr.take().expect("piped")).lines().map_while(Result::ok);
         let issuer = lines
             .find_map(|line| Some(line.split_once("running on ")?.1.split_once(' ')?.0.to_owned()));
-        // Nobody reads the rest, and a full pipe would stop it.
+        // The rest is discarded, because a full pipe would stop the process.
         std::thread::spawn(move || lines.for_each(drop));
         Self { child, issuer: issuer.expect("the provider says where it is") }
     }
@@ -501,7 +502,7 @@ async fn a_provider_that_others_made_lets_people_in() {
     let server = TestServer { directory, server, clock, operator, client: Client::new() };
     let mut visitor = Visitor::new(&server);
     let sent = visitor.get(&server.url("/api/v1/oidc/sign-in")).await;
-    // The form that a person would fill in.
+    // The form that a user would fill in.
     let chosen =
         visitor.client.post(location(&sent)).form(&[("sub", "1")]).send().await.expect("an answer");
     let ended = visitor.get(&location(&chosen)).await;

@@ -1,4 +1,4 @@
-//! The API's description: whether it is one, and whether the server answers as it says.
+//! The OpenAPI description: whether it is valid, and whether the server answers accordingly.
 #![expect(clippy::disallowed_methods, reason = "a test harness starts processes")]
 
 use std::process::Stdio;
@@ -11,7 +11,7 @@ use tokio::process::Command;
 
 use crate::harness::TestServer;
 
-/// For what takes a quarter of a minute where nothing else runs.
+/// Time limit for work that takes a quarter of a minute on an idle machine.
 const PATIENCE: Duration = Duration::from_secs(240);
 
 /// A program in the environment with the tools.
@@ -27,7 +27,7 @@ fn tool(name: &str) -> Command {
     command
 }
 
-/// Runs it to its end, which has to be a good one.
+/// Runs the command to its end, which must be a success.
 async fn run(mut command: Command) {
     let output = tokio::time::timeout(PATIENCE, command.output())
         .await
@@ -63,7 +63,7 @@ async fn whatever_is_asked_is_answered_as_described() {
     let alice = json!({ "name": "alice", "roles": [Role::Viewer] });
     server.request(Method::POST, "/api/v1/users").json(&alice).send().await.expect("an answer");
     let mut schemathesis = tool("schemathesis");
-    // What it writes down of a run stays with the server's files.
+    // Its records of a run stay with the server's files.
     schemathesis.current_dir(server.directory.path());
     schemathesis.args([
         "run",
@@ -85,18 +85,17 @@ async fn whatever_is_asked_is_answered_as_described() {
         "--no-shrink",
         "--warnings",
         "off",
-        // The registry is the OCI specification's, whose conformance other tests look at; the
-        // second is no HTTP beyond its handshake; the third, and logs that are followed, stream
-        // without end.
+        // The registry follows the OCI specification, whose conformance other tests check; the
+        // second is no HTTP beyond its handshake; the third, and followed logs, stream without end.
         "--exclude-path-regex",
         "^/v2|^/mqtt$|^/api/v1/events$|/logs$",
-        // It would end the token that all other calls are made with.
+        // The call would end the token that all other calls are made with.
         "--exclude-operation-id",
         "session_sign_out",
         // Its body is an archive, which no schema tells how to make.
         "--exclude-operation-id",
         "upload_package",
-        // What robots say themselves is refused to everybody else before it is read.
+        // Robots' own routes refuse every other caller before the request is read.
         "--exclude-tag",
         "agent",
     ]);

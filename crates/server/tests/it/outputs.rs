@@ -158,7 +158,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
             assert_eq!(status, StatusCode::FORBIDDEN, "{method} {rest} in {}", push.url);
         }
     }
-    // What another repository holds is neither shown nor mounted.
+    // Blobs of another repository are neither shown nor mounted.
     let mount = own
         .ask(Method::POST, &format!("blobs/uploads/?mount={}&from=secret", secret.content.digest));
     assert_eq!(
@@ -187,7 +187,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
         StatusCode::FORBIDDEN,
         "another tag than the run's"
     );
-    // Who says no type of its own has its config's.
+    // A manifest without a type of its own has its config's type.
     let mut disguised = serde_json::to_value(set.manifest(config)).expect("json");
     disguised.as_object_mut().expect("an object").remove("artifactType");
     disguised["config"]["mediaType"] = json!(OUTPUT_TYPE);
@@ -242,7 +242,7 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
         let [announced, streamed] =
             [bytes.into(), Body::wrap_stream(futures_util::stream::iter(pieces))];
         let mut statuses = Vec::new();
-        // What is not announced is found out on the way.
+        // An unannounced excess is detected during the transfer.
         for body in [streamed, announced] {
             let answer =
                 registry.ask(Method::POST, &path).body(body).send().await.expect("an answer");
@@ -278,7 +278,7 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     assert_eq!(push(&other, 3, 500 * KB).await, StatusCode::CREATED, "another robot's has room");
     assert_eq!(push("talker", 4, 2000 * KB).await, StatusCode::CREATED, "and so has a package");
 
-    // What is on its way counts as well, and what there is no room for is not kept.
+    // Bytes under way count as well, and bytes without room are not kept.
     let upload = registry.begin(&first).await;
     let sent = registry
         .ask(Method::PATCH, &upload)
@@ -294,7 +294,7 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
     }
     assert_eq!(push(&second, 9, 1).await, full, "a small file counts 64 KB");
 
-    // Only what is on the disk no more makes room.
+    // Only deletion from the disk makes room.
     let robot = "r00000000000000a1".parse().expect("valid");
     let kept = registry.registry.store.bytes_of_robot(&robot).await.expect("a sum");
     assert_eq!(kept, (500 + 400 + 2 * 64) * KB);
@@ -338,7 +338,7 @@ async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(
         "three are too many"
     );
 
-    // Far sooner than what somebody may be about to list.
+    // Far earlier than the collection of blobs that a client may be about to list.
     registry.push_blob("talker", &vec![10; 400 * 1024]).await;
     let collect = async |now_ms: u64| {
         let Registry { store, blobs, .. } = &registry.registry;
@@ -412,7 +412,7 @@ async fn a_robots_manifests_and_links_count() {
     assert_eq!((statuses, kept().await), (vec![201, 201, 201, 201, 201, 429, 429], 10 * 64));
 }
 
-/// What a robot sends in many requests at once is not more than what it sends in one.
+/// Many requests of a robot count no more than one request with the same bytes.
 #[tokio::test]
 async fn a_file_that_was_let_in_before_another_came_is_counted_with_it() {
     const MB: usize = 1024 * 1024;

@@ -1,5 +1,5 @@
-//! What the API shows of packages: versions, what is in them, what differs, where they run; and
-//! that none is deleted which a robot should have.
+//! The API's view of packages: versions, contents, differences, the robots that run them; and that
+//! no package is deleted which a robot should have.
 
 use std::path::Path;
 
@@ -150,7 +150,7 @@ async fn a_package_in_use_is_not_deleted() {
         "{said}"
     );
 
-    // Whoever is limited to some robots is told of those, and of what is for them.
+    // A user limited to some robots is told of those robots, and of packages for them.
     let other = server.deploy(&old, "atlas", "other").await;
     let user =
         json!({ "name": "pia", "roles": ["publisher"], "scope": "boreas", "password": PASSWORD });

@@ -1,5 +1,5 @@
-//! A directory that the page brings: packed like the command packs it, and whatever else it is,
-//! refused without a trace.
+//! A directory uploaded by the page: packed as the command packs it, and any other content refused
+//! without a trace.
 
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
@@ -33,7 +33,7 @@ fn lone(path: &str, mode: u32, content: &[u8]) -> Vec<u8> {
     let mut header = tar::Header::new_gnu();
     header.set_size(content.len() as u64);
     header.set_mode(mode);
-    // Not by the builder, which would refuse what is asked for here.
+    // Not by the builder, which would refuse the path that this test needs.
     header.as_gnu_mut().expect("GNU").name[..path.len()].copy_from_slice(path.as_bytes());
     header.set_cksum();
     let mut archive = tar::Builder::new(Vec::new());
@@ -106,7 +106,7 @@ async fn an_uploaded_directory_is_the_package_that_the_command_makes() {
     let paths: Vec<&str> = files.files.iter().map(|file| file.path.as_str()).collect();
     assert_eq!(paths, ["data", "data/a", "link", "main.sh", "second", "task.toml"]);
     assert_eq!(files.files[3].mode, 0o755);
-    // It can be ordered, and it is written down who brought it.
+    // The package can be deployed, and the audit log names its uploader.
     server.enroll("atlas").await;
     server.deploy(&packed.package, "atlas", "one").await;
     let page: AuditPage = server.get("/api/v1/audit?act=manifest.push").await;
@@ -201,7 +201,7 @@ async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
             futures_util::stream::pending::<Result<Vec<u8>, std::io::Error>>(),
         )
     };
-    // Whoever finds the place taken by what asks below asks again.
+    // A caller that finds the place taken by the request below asks again.
     let endless = async |token: &str| while refusal(upload_by(token, body())).await.0 == 429 {};
     let until = async |status: u16| while refusal(upload("hello".into())).await.0 != status {};
     tokio::select! {
@@ -228,7 +228,7 @@ async fn a_refusal_reaches_who_sends_everything_before_reading() {
     let server = TestServer::start().await;
     let answer = refused_bytes(&server, "", &vec![0; REFUSED_BYTES]).await;
     assert!(answer.starts_with("HTTP/1.1 401 "), "{answer}");
-    // Who asks first whether to send it is told not to.
+    // A client that asks first whether to send the body is told not to.
     let answer = refused_bytes(&server, "expect: 100-continue\r\n", &[]).await;
     assert!(answer.starts_with("HTTP/1.1 401 "), "{answer}");
 }

@@ -1,4 +1,4 @@
-//! Packages in the registry: what is checked, who may read what, and what is collected when.
+//! Packages in the registry: validation, read permissions, and garbage collection.
 
 use std::time::Duration;
 
@@ -108,13 +108,13 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
             .expect("a list");
         assert_eq!(referrers["manifests"][0]["digest"], signature.to_string(), "{referrers}");
     }
-    // It is ordered by its own name and listed once.
+    // The package is ordered by its own name and listed once.
     let packages = store.packages().await.expect("packages");
     assert_eq!(
         packages.iter().map(|view| view.package.name.as_str()).collect::<Vec<_>>(),
         ["talker"]
     );
-    // What is wrong with it is refused there as well, and some repositories are for other things.
+    // An invalid package is refused there as well, and some repositories are for other things.
     let content = registry.push_blob("mirror/x", b"no archive").await;
     let config = registry.push_blob("mirror/x", task("talker").to_string().as_bytes()).await;
     let damaged = ImageManifest::package(config, content);
@@ -129,7 +129,7 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
         "{message}"
     );
 
-    // A copy that is deleted takes nothing with it, and one that stays is no package.
+    // Deleting a copy deletes nothing else, and a remaining copy is no package.
     let status = registry.status(Method::DELETE, &format!("/v2/walker/manifests/{own}")).await;
     assert_eq!(
         (status, store.packages().await.expect("packages").len()),
@@ -231,7 +231,7 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
         assert!(said.contains(&digest(first).to_string()) && said.contains("--force"), "{said}");
     }
     assert_eq!(is_outdated().await, (false, false));
-    // What goes by its digest alone takes no version.
+    // A manifest pushed by its digest alone takes no version.
     assert_eq!(put(&digest(second).to_string(), second).await.status(), StatusCode::CREATED);
     assert_eq!(is_outdated().await, (false, false));
     assert_eq!(put("1.0.0?force=true", second).await.status(), StatusCode::CREATED);
@@ -244,7 +244,8 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
         StatusCode::ACCEPTED
     );
     assert_eq!(put("1.0.0", second).await.status(), StatusCode::CREATED);
-    // A version that means something else than a package, and what is no package, move as ever.
+    // A version that names something other than a package, and a manifest that is no package, move
+    // as ever.
     for layer in [&b"one"[..], b"two"] {
         let image = image(config, registry.push_blob("talker", layer).await);
         let answer =
@@ -382,7 +383,7 @@ async fn what_nothing_refers_to_is_collected_after_its_grace() {
     let blob = format!("/v2/a/blobs/{loose}");
     assert_eq!(registry.collect(NOW_MS + grace_ms).await, Collected { uploads: 0, blobs: 0 });
 
-    // Somebody who is about to push asks for it: the grace begins anew.
+    // A client about to push asks for the blob: its grace period begins anew.
     registry.registry.clock.advance_ms(grace_ms);
     assert_eq!(registry.status(Method::HEAD, &blob).await, StatusCode::OK);
     assert_eq!(registry.collect(NOW_MS + grace_ms + 1).await.blobs, 0);

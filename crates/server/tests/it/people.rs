@@ -1,5 +1,5 @@
-//! The story of people, told on every database: who may what, their tokens, their passwords, and
-//! the audit of it all.
+//! The story of users, told on every database: permissions, tokens, passwords, and the audit log of
+//! all three.
 
 use std::net::IpAddr;
 
@@ -101,7 +101,7 @@ impl Fleet {
         page.records.iter().map(|record| record.read().expect("an entry")).collect()
     }
 
-    /// What was written down since there were `before` entries: who, what, to what.
+    /// Audit entries since there were `before` entries: user, action, target.
     async fn acts_since(&self, before: usize) -> Vec<(String, String, String)> {
         let entries = self.audit().await.split_off(before);
         entries.into_iter().map(|entry| (entry.who, entry.act, entry.target)).collect()
@@ -139,8 +139,8 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     assert_eq!(allowed(&dashboard), [Permission::Read, Permission::Publish]);
     assert_eq!(dashboard.scope.to_string(), "site=lab and r1,r2");
     assert_eq!(made.expires_at_ms, fleet.clock.now_ms() + 3_600_000);
-    // It makes no others, for it would never end; and nobody makes one that allows more than they
-    // may.
+    // A token creates no other tokens, because the chain would never end; and no user creates a
+    // token with more permissions than their own.
     assert_eq!(
         code(fleet.actions.create_token(&dashboard, &CreateToken::default()).await),
         "forbidden"
@@ -155,7 +155,8 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
         "invalid_request"
     );
 
-    // What the user loses, the token loses; what is left to neither is no token.
+    // The token loses every permission that the user loses; without any permission left, the token
+    // is gone.
     let edit = |may: &str| EditUser { roles: Some(roles(may)), scope: Some(selector("*")) };
     fleet
         .actions
@@ -169,7 +170,7 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
         .await
         .expect("edited");
     assert_eq!(fleet.person(&token).await, None);
-    // An administrator with a scope does not administer what concerns everybody.
+    // An administrator with a scope does not administer settings that concern all users.
     fleet.add("boss", "admin", Some("site=lab")).await;
     let boss = fleet.signed_in("boss").await;
     assert!(boss.may(Permission::Maintain) && !boss.may(Permission::Administer));
@@ -206,7 +207,7 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     );
     let own = ordered("site=lab").await.expect("ordered");
 
-    // What is there already counts like what is asked for.
+    // Existing assignments count like new ones.
     let everywhere = fleet.deploy("2", |_| ()).await;
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
@@ -301,7 +302,7 @@ async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
         fleet.person(&made.token.parse().expect("a token")).await.is_some(),
         "what was made on purpose"
     );
-    // An administrator who sets it signs everybody out.
+    // An administrator who sets the password signs out all of the user's sessions.
     fleet.actions.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
     assert_eq!(fleet.person(&token).await, None);
     assert_eq!(
@@ -310,7 +311,7 @@ async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
     );
     let first = fleet.actions.change_password(&fleet.operator, &change(PASSWORD, PASSWORD)).await;
     assert_eq!(code(first), "forbidden");
-    // Without a password nobody comes in by one.
+    // Without a password, no sign-in by password succeeds.
     let order =
         AddUser { name: name("ci"), roles: roles("publisher"), scope: None, password: None };
     assert!(!fleet.actions.add_user(&fleet.operator, &order).await.expect("added").has_password);
@@ -353,8 +354,8 @@ async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDat
     fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("likewise");
 }
 
-/// Who is known at an address signs in there whatever its neighbours do, and is told no more than
-/// they are if they fail.
+/// A user known at an address can sign in there regardless of failing neighbours, and a failed
+/// sign-in reveals no more than theirs.
 async fn neighbours_of_a_failing_address(fleet: &Fleet) {
     for n in 0..51 {
         let _ = fleet.sign_in(&format!("neighbour{n}"), "wrong", HERE).await;
@@ -432,7 +433,7 @@ async fn tokens_end_with_what_they_came_from(database: TestDatabase) {
     let lasting: Token = made.token.parse().expect("a token");
     fleet.actions.remove_user(&fleet.operator, &name("alice")).await.expect("removed");
     assert_eq!(fleet.person(&lasting).await, None);
-    // Whoever has the name next has none of it.
+    // The next user with this name inherits nothing.
     fleet.add("alice", "admin", None).await;
     assert_eq!(fleet.person(&lasting).await, None);
     // Signing in over and over leaves a bounded number of tokens.
@@ -579,7 +580,7 @@ async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDataba
     assert!(message.starts_with("vera has ") && (1..=44).contains(&retry_after_s), "{message}");
     assert!(made < 210, "{made}");
     assert_eq!(fleet.audit().await.len(), before + 2 * made);
-    // Others are not held up, nor is she for what she orders.
+    // Other users are not held up, nor are her orders.
     fleet.add("ada", "operator", None).await;
     let ada = fleet.signed_in("ada").await;
     for _ in 0..250 {

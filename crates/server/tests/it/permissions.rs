@@ -1,8 +1,8 @@
-//! Who may what, found out by trying: every HTTP route is called by everybody, every MQTT topic of
-//! a robot is spoken and heard on by everybody, and what comes of it is docs/permissions.md. After
-//! a wanted change: `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the
-//! table is tried by itself; give it a body in `body` and its parameters a value in `Town::path`,
-//! if it needs them.
+//! Determines permissions by trying: every client kind calls every HTTP route, and publishes and
+//! subscribes on every MQTT topic of a robot. The results are docs/permissions.md. After an
+//! intended change: `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the
+//! table is tried without further work; give it a body in `body` and values for its parameters in
+//! `Town::path`, if needed.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -25,7 +25,7 @@ use crate::mqtt_harness::{Connect, PATIENCE, Raw, publish, subscribe, topic};
 
 const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/permissions.md");
 
-/// Everybody who could come.
+/// All kinds of clients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Comer {
     Nobody,
@@ -33,7 +33,7 @@ enum Comer {
     Itself,
     OtherRobot,
     Person(Role),
-    /// Someone with this role, limited to another robot.
+    /// A user with this role, limited to another robot.
     Elsewhere(Role),
 }
 
@@ -63,7 +63,7 @@ impl Comer {
     }
 }
 
-/// A call to be made.
+/// A call to try.
 struct Probe {
     title: String,
     method: Method,
@@ -71,10 +71,10 @@ struct Probe {
     body: Option<Value>,
 }
 
-/// A server with one of each.
+/// A server with one client of each kind.
 struct Town {
     server: TestServer,
-    /// The same database, where people and tokens are made without hashing and signing in.
+    /// The server's database, where users and tokens are created without hashing and signing in.
     store: Store,
     robot: TestRobot,
     other_robot: TestRobot,
@@ -85,7 +85,7 @@ struct Town {
 
 impl Town {
     async fn new() -> Self {
-        // With a provider that does not answer: who may go there is what counts.
+        // The provider does not answer: only permission to go there counts.
         let issuer = "http://127.0.0.1:9".to_owned();
         let oidc = OidcSettings {
             issuer,
@@ -95,7 +95,7 @@ impl Town {
         let directory = tempfile::TempDir::new().expect("a directory");
         let configure = |config: &mut Config| {
             config.oidc = oidc;
-            // The same robot does what it may not again and again.
+            // The same robot repeats forbidden actions without a back-off.
             config.robots.backoff = Duration::ZERO;
         };
         let server = TestServer::start_in(directory, configure).await;
@@ -110,7 +110,7 @@ impl Town {
         Self { server, store, robot, other_robot, enrolment: enrolment.token, package, deployment }
     }
 
-    /// A fresh token of a user who is as they were.
+    /// A fresh token of a user with the original role and scope.
     async fn sign_in(&self, user: &str, role: Role, scope: Option<&str>) -> Token {
         let name: UserName = user.parse().expect("a name");
         let scope = scope.map(|scope| scope.parse().expect("a selector"));
@@ -152,7 +152,7 @@ impl Town {
         })
     }
 
-    /// The path with values for its parameters: things that are there, and may go.
+    /// The path with values for its parameters: existing objects that may be deleted.
     async fn path(&self, probe: &Probe) -> String {
         let mut path = probe.path.replace("{deployment}", self.deployment.id.as_str());
         if path.contains("{robot}") {
@@ -184,7 +184,7 @@ impl Town {
         path
     }
 
-    /// What comes of it: `✓`, or the status it is refused with.
+    /// The result of the call: `✓`, or the status of the refusal.
     async fn try_out(&self, probe: &Probe, comer: Comer) -> String {
         let mut request = self.server.bare(probe.method.clone(), &self.path(probe).await);
         if let Some(token) = self.token(comer).await {
@@ -205,13 +205,13 @@ impl Town {
         let is_registry = probe.path.starts_with("/v2");
         match status.as_u16() {
             refused @ (401 | 403) => refused.to_string(),
-            // In the registry nothing is hidden, it is only not there.
+            // The registry hides nothing: there, 404 means absent.
             404 if !is_registry => "404".to_owned(),
             _ => "✓".to_owned(),
         }
     }
 
-    /// A session by the comer's credentials; `None` if they do not come in.
+    /// A session with the comer's credentials; `None` if the session is refused.
     async fn connect(&self, comer: Comer) -> Option<Raw> {
         let (client_id, user_name) = match comer {
             Comer::Itself => (self.robot.id.to_string(), self.robot.id.to_string()),
@@ -259,7 +259,7 @@ impl Town {
 }
 
 impl Raw {
-    /// So many bytes; `None` if the other side closes before.
+    /// Reads exactly `count` bytes; `None` if the other side closes earlier.
     pub async fn read(&mut self, count: usize) -> Option<Vec<u8>> {
         use tokio::io::AsyncReadExt as _;
         let mut bytes = vec![0; count];
@@ -268,7 +268,7 @@ impl Raw {
     }
 }
 
-/// What a route is called with, so that it is understood as far as it matters.
+/// A request body that the route accepts as far as this test needs.
 fn body(method: &Method, path: &str) -> Option<Value> {
     Some(match (method.as_str(), path) {
         ("POST", "/api/v1/deployments") => {
@@ -506,7 +506,7 @@ async fn permissions_are_as_the_page_has_them() {
     found += &http_table(&town).await;
     found += MQTT;
     found += &mqtt_table(&mut town).await;
-    // Nothing of all that opened a way for whoever was turned away.
+    // None of these calls opened a way for a client that was refused.
     let me: Value = answer(town.server.request(Method::GET, "/api/v1/me")).await;
     assert_eq!(me["name"], "operator.token");
     if std::env::var_os("UPDATE_GOLDEN").is_some() {

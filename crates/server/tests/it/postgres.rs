@@ -1,5 +1,5 @@
-//! A Postgres that is away: the server waits for it at start, and says so to everybody while it
-//! serves.
+//! An unreachable Postgres: the server waits for the database at start, and tells all clients so
+//! while serving.
 
 #![expect(clippy::disallowed_methods, reason = "the test starts and stops a database server")]
 
@@ -35,7 +35,7 @@ fn program(name: &str) -> PathBuf {
     newest.join("bin").join(name)
 }
 
-/// Runs it as the account of Postgres, which refuses to run as root.
+/// Runs the program as the account of Postgres, which refuses to run as root.
 fn run(program: &Path, arguments: &[&str]) -> bool {
     let is_root = nix::unistd::geteuid().is_root();
     let mut command = Command::new(if is_root { Path::new("setpriv") } else { program });
@@ -110,14 +110,14 @@ async fn eventually(what: &str, mut is_so: impl AsyncFnMut() -> bool) {
     tokio::time::timeout(PATIENCE, wait).await.unwrap_or_else(|_| panic!("{what}"));
 }
 
-/// What `/readyz` says of the database.
+/// The state of the database in `/readyz`.
 async fn database(server: &TestServer) -> (StatusCode, String) {
     let response = server.bare(Method::GET, "/readyz").send().await.expect("an answer");
     let (status, body) = (response.status(), response.json::<Value>().await.expect("json"));
     (status, body["database"].as_str().unwrap_or_default().to_owned())
 }
 
-/// Whoever asks is told that it is the server, and when to ask again.
+/// Every client is told that the server is at fault, and when to ask again.
 async fn assert_away(server: &TestServer) {
     let request = |method: Method, path: &str| server.request(method, path);
     for (what, request) in [

@@ -1,5 +1,5 @@
-//! An OpenID Connect provider in this process that knows one person, keeps to the protocol as
-//! strictly as it can, and lies in its ID tokens when it is told to.
+//! An in-process OpenID Connect provider that knows one user, keeps to the protocol as strictly as
+//! possible, and forges its ID tokens on request.
 
 use std::collections::HashMap;
 use std::net::{Ipv4Addr, SocketAddr};
@@ -22,7 +22,7 @@ use crate::harness::NOW_MS;
 pub const CLIENT_ID: &str = "taskd";
 pub const SECRET: &str = "a secret & more";
 
-/// The provider; it ends with the test.
+/// The provider; ends with the test.
 pub struct Provider {
     pub issuer: String,
     inner: Arc<Mutex<Inner>>,
@@ -33,14 +33,14 @@ struct Inner {
     issuer: String,
     key: EcdsaKeyPair,
     key_id: String,
-    /// What it says of whoever comes.
+    /// Claims about every user who signs in.
     claims: Value,
-    /// What its tokens say otherwise, in the header and in the claims.
+    /// Forged values in its tokens, in the header and in the claims.
     header_lie: Value,
     claims_lie: Value,
-    /// Whether it lets people in.
+    /// Whether users can sign in.
     is_open: bool,
-    /// Whether it answers with an error to everything.
+    /// Whether every request is answered with an error.
     is_broken: bool,
     codes: HashMap<String, HashMap<String, String>>,
     /// How often each path was asked for.
@@ -92,12 +92,12 @@ impl Provider {
         self.inner.lock().expect("nobody panicked")
     }
 
-    /// What it says of whoever comes.
+    /// Changes the claims about every user who signs in.
     pub fn says(&self, changes: Value) {
         merge(&mut self.inner().claims, &changes);
     }
 
-    /// What its tokens say otherwise from now on.
+    /// Sets the forged values in its tokens from now on.
     pub fn lies(&self, header: Value, claims: Value) {
         let mut inner = self.inner();
         (inner.header_lie, inner.claims_lie) = (header, claims);
@@ -111,7 +111,7 @@ impl Provider {
         self.inner().is_broken = yes;
     }
 
-    /// Signs with another key, which is published if it is to be.
+    /// Signs with another key, and publishes the key if requested.
     pub fn changes_key(&self, id: &str) {
         let mut inner = self.inner();
         (inner.key, inner.key_id) = (new_key(), id.to_owned());

@@ -1,4 +1,4 @@
-//! A registry over a real listener, and a client that says what it wants of it.
+//! A registry over a real listener, and a client with full control over its requests.
 
 use std::sync::LazyLock;
 use std::time::Duration;
@@ -32,7 +32,7 @@ pub const GRACE: Duration = Duration::from_secs(3600);
 /// Past what any file's time can be when a test runs.
 pub const NOW_MS: u64 = 4_000_000_000_000;
 
-/// What [`operator`] comes with.
+/// The credentials of [`operator`].
 static OPERATOR: LazyLock<Token> = LazyLock::new(|| Token::random(TokenKind::Operator));
 
 pub struct TestRegistry {
@@ -43,7 +43,7 @@ pub struct TestRegistry {
 }
 
 impl TestRegistry {
-    /// A registry whose every caller is an operator.
+    /// A registry that treats every caller as an operator.
     pub async fn start() -> Self {
         Self::start_with(BlobSettings::default(), Some(operator())).await
     }
@@ -149,7 +149,7 @@ pub async fn serve(registry: Registry, caller: Option<Caller>) -> String {
 }
 
 pub fn client() -> Client {
-    // Another test may have installed it before.
+    // Another test may have installed the provider before.
     let _ = rustls::crypto::ring::default_provider().install_default();
     Client::new()
 }

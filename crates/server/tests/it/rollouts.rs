@@ -49,7 +49,7 @@ async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: Te
     assert!(!fleet.has_begun(&robots[0]).await);
     fleet.follow(&mut robots[3], Phase::Running).await;
     assert!(fleet.has_begun(&robots[0]).await);
-    // What it brings is still judged by the failures that the order bears.
+    // Its report is still judged by the number of failures that the order tolerates.
     fleet.follow(&mut robots[0], Phase::Failed).await;
     fleet.come_online(&robots[2].id);
     fleet.advance().await;
@@ -97,7 +97,7 @@ async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute
     fleet.clock.advance_ms(1);
     fleet.advance().await;
     assert!(fleet.has_begun(&robots[1]).await);
-    // It has begun, so it follows when it is back.
+    // The robot has begun, so it follows when it is back.
     fleet.come_online(&robots[0].id);
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
@@ -124,7 +124,7 @@ async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(
     fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
     assert!(fleet.has_begun(&robots[1]).await);
     fleet.follow(&mut robots[1], Phase::Running).await;
-    // It is back and goes on: the others wait for it again.
+    // The robot is back and goes on: the others wait for it again.
     fleet.come_online(&robots[0].id);
     for robot in [0, 2] {
         fleet.follow(&mut robots[robot], Phase::Running).await;

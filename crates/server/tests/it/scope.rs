@@ -1,5 +1,5 @@
-//! Someone who is limited to some robots, over HTTP and MQTT: what they see, what they are refused,
-//! and that nothing of what they lose goes on.
+//! A user limited to some robots, over HTTP and MQTT: visible data, refusals, and that losing a
+//! robot ends everything under way for that robot.
 
 use std::time::Duration;
 
@@ -52,7 +52,7 @@ impl Sites {
     }
 }
 
-/// Someone who asks by their token.
+/// A user who makes requests with their token.
 struct Asker<'a> {
     server: &'a TestServer,
     token: String,
@@ -198,7 +198,7 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
     }
     let ordered: DeploymentView = answer(order("site=lab", "three")).await;
     assert_eq!(ordered.assignments.expect("asked for").len(), 1);
-    // What she may not at all says so in other words.
+    // An action that is never permitted to her is refused in other words.
     let me = alice.ask(Method::DELETE, "/api/v1/robots/atlas").send().await.expect("an answer");
     let body: Value = me.json().await.expect("json");
     assert_eq!(body["error"]["message"], "alice has no permission to maintain (roles: operator)");
@@ -245,7 +245,7 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
         said.contains("is what 2 robots should have: atlas, …") && !said.contains("boreas"),
         "{said}"
     );
-    // The tag stays where it is as well; it may be set again to what it points to.
+    // The tag stays unchanged as well; setting it again to its current target is permitted.
     let bytes = |digest| pia.ask(Method::GET, &format!("/v2/talker/manifests/{digest}")).send();
     let moved = async |by: &Asker<'_>, digest: Digest| {
         let manifest = bytes(digest).await.expect("an answer").bytes().await.expect("a manifest");
@@ -262,8 +262,8 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
         );
     }
 
-    // Where all of them are her own she may but for the package itself, and once nobody has it that
-    // goes too.
+    // Where all the robots are her own, she may do all except delete the package itself; once no
+    // robot has the package, that is deleted too.
     sites.server.deploy(&later, "boreas", "elsewhere").await;
     assert_eq!(pia.status(Method::DELETE, &format!("/v2/talker/manifests/{manifest}")).await, 409);
     for path in &limited {
@@ -336,7 +336,7 @@ impl Events {
         events
     }
 
-    /// Reads on until what came is enough.
+    /// Reads until the received text is enough.
     async fn until(&mut self, is_enough: impl Fn(&str) -> bool) -> &str {
         while !is_enough(&self.text) {
             let chunk =
@@ -369,7 +369,7 @@ async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
     let everywhere = sites.server.deploy(&package, "atlas,boreas", "everywhere").await;
     let last = |text: &str| text.contains(everywhere.id.as_str());
     all.until(|text| last(text) && text.contains("\"boreas\"") && text.contains("\"atlas\"")).await;
-    // The feed may name it before the deployment itself comes.
+    // The feed may name the deployment before the deployment itself arrives.
     let is_counted = |text: &str| text.contains("\"counts\":");
     let seen =
         events.until(|text| last(text) && is_counted(text) && text.contains("\"atlas\"")).await;
@@ -474,7 +474,7 @@ async fn a_trusted_proxy_says_who_asks_and_nobody_else_does() {
     let _: Value = answer(create.header("x-forwarded-for", "198.51.100.1, 192.0.2.7")).await;
     let from = |audit: &Value| audit["records"][0]["entry"]["address"].clone();
     assert_eq!(from(&server.get("/api/v1/audit").await), "192.0.2.7");
-    // Addresses behind it are counted apart.
+    // Addresses behind the proxy are counted apart.
     let sign_in = |n: u8, from: &str| {
         let request = server.bare(Method::POST, "/api/v1/login").header("x-forwarded-for", from);
         request.json(&json!({ "user": format!("nobody{n}"), "password": "guess" })).send()
@@ -537,7 +537,7 @@ async fn who_was_removed_while_their_request_came_does_nothing_by_it() {
         let mut stream =
             TcpStream::connect(&sites.server.server.addresses().http).await.expect("listens");
         stream.write_all(head(request, &mallory.token, body.len()).as_bytes()).await.expect("sent");
-        // Who is asked for the body was let in.
+        // A request for the body shows that the client was admitted.
         let mut asked = [0; 25];
         tokio::time::timeout(PATIENCE, stream.read_exact(&mut asked))
             .await
@@ -580,8 +580,8 @@ async fn a_removed_persons_session_ends_also_if_nobody_waits_for_the_answer() {
         let made: Value = sites.server.post("/api/v1/tokens", &json!({ "user": name })).await;
         let (mut session, answer) = mqtt(&sites, made["token"].as_str().expect("a token")).await;
         assert_eq!(answer, [0x20, 2, 0, 0]);
-        // Nobody knows when the caller hangs up: at once, in which case nothing happens, or after
-        // this and that.
+        // The caller hangs up at an unknown moment: at once, in which case nothing happens, or
+        // after some steps.
         let mut others = number % 4;
         while is_there(&name).await {
             let mut stream =

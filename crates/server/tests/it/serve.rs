@@ -1,4 +1,5 @@
-//! Starting and stopping: what is in the directory, what survives, and what a stop waits for.
+//! Starting and stopping: the directory's content, the data that survives, and the work that a stop
+//! waits for.
 
 use std::io::{BufRead as _, BufReader};
 use std::os::unix::fs::PermissionsExt as _;
@@ -45,7 +46,7 @@ async fn readyz_asked_often_writes_seldom() {
     let probe = server.data().join(".ready");
     let mut written = 0;
     for _ in 0..100 {
-        // The background check may write it again at any time.
+        // The background check may write the file again at any time.
         written += usize::from(std::fs::remove_file(&probe).is_ok());
         let response = server.bare(Method::GET, "/readyz").send().await.expect("an answer");
         assert_eq!(response.status(), StatusCode::OK);
@@ -79,7 +80,7 @@ async fn when_all_places_are_taken_those_without_a_request_end() {
             TcpStream::connect(&server.server.addresses().http).await.expect("a connection");
         stream.write_all(request).await.expect("sent");
         let mut answer = [0; 12];
-        // Sooner than anybody is sent away for having no request.
+        // Earlier than the timeout for clients without a request.
         let read =
             tokio::time::timeout(Duration::from_secs(15), stream.read_exact(&mut answer)).await;
         read.expect("a place in time").expect("an answer");
@@ -139,7 +140,7 @@ async fn a_stop_under_load_loses_no_report_that_was_answered() {
     }
 }
 
-/// A socket that begins to send a login and goes on with it for ever.
+/// A socket that begins to send a login and never completes the login.
 async fn trickling_login(address: &str) -> TcpStream {
     let mut stream = TcpStream::connect(address).await.expect("connects");
     let head =
@@ -330,7 +331,7 @@ impl Program {
         nix::sys::signal::kill(id, signal).expect("it lives");
     }
 
-    /// Waits until it no longer accepts: the stop is under way.
+    /// Waits until the server no longer accepts connections: the stop is under way.
     async fn refuses(&self) {
         let refuses = async { while TcpStream::connect(&self.http).await.is_ok() {} };
         tokio::time::timeout(Duration::from_secs(9), refuses).await.expect("the listener closes");
@@ -442,7 +443,7 @@ async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_ser
             .await;
         raw.expect(&[0x40, 2, 0, number]).await;
     }
-    // SQLite's own files are there while it runs.
+    // SQLite's own files exist while the server runs.
     let mut looked_at = 0;
     let mut directories = vec![program.data()];
     while let Some(directory) = directories.pop() {

@@ -1,5 +1,5 @@
-//! What publishers have signed, on its way through the server: what is turned away, who is told of
-//! it and may read it.
+//! Publishers' signatures on their way through the server: refusals, notifications and read
+//! permissions.
 
 use reqwest::{Method, Response, StatusCode};
 use task_proto::api::DeploymentView;

@@ -1,4 +1,4 @@
-//! How the server says it does: figures for whoever may look, of their own robots only.
+//! The server's own status: figures for permitted users, of their own robots only.
 
 use reqwest::Method;
 use serde_json::json;
@@ -16,7 +16,7 @@ async fn the_servers_status_has_what_it_does() {
     let package = server.push("talker", "1.0.0").await;
     server.deploy(&package, "atlas", "key-1").await;
     let state = server.desired(&atlas).await;
-    // So many that the rate, which is told to a tenth, is none on no machine.
+    // Enough requests that the rate, which is rounded to a tenth, is zero on no machine.
     for _ in 0..20 {
         server.report(&mut atlas, &state, Phase::Running).await;
     }

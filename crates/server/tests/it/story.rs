@@ -264,7 +264,7 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
     let desired = fleet.desired(&robots[0]).await.expect("state");
     assert_eq!((&desired.tasks[0].deployment, desired.tasks[0].run), (&old, 1));
-    // What the robot still says of the cancelled one is late; what it says of the old one counts.
+    // The robot's report on the cancelled deployment is late; its report on the old one counts.
     fleet.report(&mut robots[0]).await;
     assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -329,7 +329,7 @@ async fn a_cancel_passes_over_what_was_deleted(database: TestDatabase) {
         let left = fleet.desired(&robots[robot]).await.expect("state").tasks;
         assert_eq!(left[0].deployment, orders[0]);
     }
-    // What is replaced is kept for whoever takes that back, also if it is deleted.
+    // A replaced version is kept for a later revert, even if the version is deleted.
     let next = fleet.deploy("4", |_| ()).await;
     fleet.unpublish("1").await;
     fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
@@ -383,7 +383,7 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
     fleet.actions.remove_robot(&fleet.operator, &robots[5].id).await.expect("removed");
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 
-    // A newer order also takes the place of what still waits for its batch.
+    // A newer order also replaces assignments that still wait for their batch.
     let slow = fleet.deploy("2", |order| order.batch = Some(1)).await;
     let fast = fleet.deploy("3", |_| ()).await;
     assert!(fleet.phases(&slow).await.iter().all(|phase| *phase == Phase::Superseded));
@@ -408,7 +408,7 @@ async fn what_is_not_done_in_time_expires(database: TestDatabase) {
     assert_eq!(fleet.phases(&new).await, [Phase::Running, Phase::Expired]);
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Settled);
-    // Seven days by default; what has run stays.
+    // Seven days by default; versions that have run stay.
     fleet.clock.advance_ms(8 * 24 * 3_600_000);
     fleet.actions.expire().await.expect("done");
     assert_eq!(fleet.phases(&new).await, [Phase::Running, Phase::Expired]);
@@ -428,7 +428,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     };
     fleet.follow(&mut robots[0], Phase::Running).await;
 
-    // A start of what runs changes nothing; who has no such task is left out.
+    // Starting a running task changes nothing; robots without the task are left out.
     let meant = order(TaskOrder::Start).await;
     assert_eq!(meant.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(), ["r0"]);
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(1));
@@ -451,7 +451,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
 
     order(TaskOrder::Remove).await;
     assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
-    // It is shown until the robot says that it is gone.
+    // The task is shown until the robot reports that the task is gone.
     fleet.report(&mut robots[0]).await;
     assert_eq!(fleet.view(&robots[0]).await.tasks.len(), 1);
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -561,7 +561,7 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
-    // One robot makes numbers up; what it says it has is taken over with the next order.
+    // One robot invents numbers; the robot's reported state is adopted with the next order.
     let liar = &mut robots[0];
     (liar.observed, liar.start) = (Generation(u64::MAX), u64::MAX);
     for task in liar.tasks.values_mut() {

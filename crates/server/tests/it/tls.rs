@@ -1,5 +1,5 @@
-//! TLS on both ports: whom clients believe, what they are shown, and that changing it or dawdling
-//! before it bothers nobody.
+//! TLS on both ports: clients' trust, the certificates they are shown, and that neither a change of
+//! certificate nor a slow handshake disturbs other clients.
 
 use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt as _;
@@ -31,9 +31,10 @@ use tokio_rustls::TlsConnector;
 use crate::harness::{NOW_MS, TestRobot, TestServer, client};
 use crate::mqtt_harness::{Connect, PATIENCE, Raw};
 
-/// Less than a handshake may take: who is served within it has waited for nobody else's to end.
+/// Shorter than the limit of a handshake: a client served within this time has not waited for
+/// another client's handshake.
 const IN_TIME: Duration = Duration::from_secs(6);
-/// The first bytes of a handshake record, whose rest does not come.
+/// The first bytes of a handshake record; the rest never arrives.
 const BEGUN: [u8; 11] = [0x16, 0x03, 0x01, 0x02, 0x00, 0x01, 0x00, 0x01, 0xfc, 0x03, 0x03];
 
 /// An authority that the operator has got certificates from.
@@ -64,7 +65,7 @@ impl Authority {
     }
 }
 
-/// A client that knows nothing but this root, and whose clock shows what the server's does.
+/// A client that knows only this root, with a clock that matches the server's.
 fn by_root(root: CertificateDer<'static>) -> Arc<ClientConfig> {
     let mut roots = RootCertStore::empty();
     roots.add(root).expect("an authority");
@@ -179,7 +180,7 @@ async fn the_websocket_has_the_doors_of_mqtts_own_port() {
         raw.send(&Connect { password, ..Connect::robot(&robot.id) }.packet()).await;
         raw.expect(&[0x20, 2, 0, 4]).await;
     }
-    // Before it has said who it is, a client gets as little room as there.
+    // Before authentication, a client gets as little room as there.
     let mut raw = Raw { stream: dial(&websocket).await.expect("connected") };
     raw.send(&[0x10, 0xff, 0xff, 0x7f]).await;
     let mut nothing = Vec::new();
@@ -358,7 +359,7 @@ async fn a_certificate_without_its_key_is_not_shown() {
     ];
     for wrong in wrong {
         put_in_place(&path, &wrong);
-        // Whoever of the two looks first says what is wrong with it; the other finds nothing new.
+        // The first of the two to check reports the fault; the other finds nothing new.
         let _ = server.server.reload_certificate();
         until_shown(&server, &authority, &first.0).await;
     }
@@ -385,7 +386,7 @@ async fn enroll_with_key(server: &TestServer, key: &ClientKey) -> TestRobot {
     TestRobot::new(enrolled.robot_id, enrolled.token)
 }
 
-/// With what HTTP and MQTT answer the robot's token when this key is shown with it.
+/// The HTTP and MQTT answers to the robot's token when presented with this key.
 async fn answers_to(server: &TestServer, robot: &TestRobot, key: Option<&ClientKey>) -> (u16, u8) {
     let mut tls = ClientConfig::clone(&pinned(pin_of(server)));
     if let Some(key) = key {
@@ -425,12 +426,12 @@ async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
     assert_eq!(answers_to(&server, &robot, None).await, (401, 4));
     assert_eq!(answers_to(&server, &robot, Some(&other)).await, (401, 4));
     assert_eq!(answers_to(&server, &robot, Some(&key)).await, (200, 0));
-    // What was let in a moment ago does not let the next one in.
+    // An earlier admission does not admit the next client.
     assert_eq!(answers_to(&server, &robot, None).await, (401, 4));
     assert_eq!(answers_to(&server, &keyless, None).await, (200, 0));
     assert_eq!(answers_to(&server, &keyless, Some(&other)).await, (200, 0));
-    // The next token is bound to the key as well; whoever else tries it does not end the one in
-    // use.
+    // The next token is bound to the key as well; another client that tries the token does not end
+    // the one in use.
     let mut tls = ClientConfig::clone(&pinned(pin_of(&server)));
     key.show_in(&mut tls).expect("a certificate");
     let client =
@@ -573,8 +574,8 @@ async fn a_silent_socket_and_a_slow_handshake_end_by_themselves() {
     .await;
     for address in [http, broker.address()] {
         for slow in [false, true] {
-            // There is one place: whoever held it beyond its time would keep the next from being
-            // accepted.
+            // There is one place: a connection that held the place beyond its time would keep the
+            // next from being accepted.
             let stream = TcpStream::connect(address).await.expect("connected");
             let (mut reading, mut writing) = stream.into_split();
             let dribbling = async {

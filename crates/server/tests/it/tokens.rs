@@ -1,5 +1,5 @@
-//! The story of tokens and of those who hold them, told on every database: enrolment, going over to
-//! a new token, answers that were lost.
+//! The story of tokens and their holders, told on every database: enrollment, rotation to a new
+//! token, lost answers.
 
 use task_proto::RobotId;
 use task_proto::api::CreateEnrollmentToken;
@@ -52,7 +52,7 @@ async fn enrolment_gives_identities_by_mac(database: TestDatabase) {
         Some(one.robot_id.clone())
     );
 
-    // With a token that was made for it, a robot comes back as itself; nobody else does.
+    // With a token made for one robot, only that robot comes back as itself.
     let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
     let bound = fleet.enrolment_token(bound).await;
     assert_eq!(code(fleet.try_enroll(&bound, mac(9), None).await), "token_for_other_robot");
@@ -163,7 +163,7 @@ async fn a_new_token_ends_the_old_one_when_it_is_first_used(database: TestDataba
     let (new_number, is_first_use) = admit(&new.token).await.expect("valid");
     assert!(is_first_use && new_number > old_number);
     assert_eq!(admit(&old.token).await, None);
-    // What the old agent had under way comes too late, and does not stand before the new one's
+    // The old agent's pending report comes too late, and does not stand before the new agent's
     // first start.
     let late = fleet.writer.submit(old_agent.next_report(), old_number);
     let mut new_agent = Robot::new(new.robot_id.clone());
@@ -233,7 +233,8 @@ async fn a_fleet_that_comes_at_once_is_let_in_whole(database: TestDatabase) {
     };
     let (impatient, patient): (Vec<_>, Vec<_>) =
         robots.iter().map(|robot| (admit(robot), admit(robot))).unzip();
-    // Whoever goes away, also in the middle of writing for the others, takes nobody along.
+    // A caller that goes away, also in the middle of writing for the others, does not cancel the
+    // others.
     impatient.iter().for_each(tokio::task::JoinHandle::abort);
     for (admitted, robot) in patient.into_iter().zip(&robots) {
         let TokenHolder::Robot { robot: holder, .. } = admitted.await.expect("let in").holder
@@ -254,7 +255,7 @@ async fn a_lost_answer_to_an_enrolment_is_mended_by_asking_again(database: TestD
     let (token, other) =
         (fleet.enrolment_token(order()).await, fleet.enrolment_token(order()).await);
     let lost = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
-    // Nobody else gets in by it: not by another token, and not under another MAC.
+    // No other robot is admitted by this: not by another token, and not under another MAC.
     assert_eq!(code(fleet.try_enroll(&other, mac(1), None).await), "mac_known");
     assert_eq!(code(fleet.try_enroll(&token, mac(2), None).await), "unauthorized");
     fleet.actions.expire().await.expect("forgets what has ended, which this token has not");

@@ -14,7 +14,7 @@ use tempfile::TempDir;
 
 use crate::harness::{TestRobot, TestServer, answer, archive_of};
 
-/// More than a new connection holds while nobody reads.
+/// More than a new connection buffers while its client does not read.
 const BLOB_BYTES: usize = 8 * 1024 * 1024;
 const ROBOTS: usize = 200;
 const LIMIT: usize = 8;
@@ -28,7 +28,7 @@ async fn get(server: &TestServer, robot: &TestRobot, blob: Digest) -> Response {
     request.send().await.expect("an answer")
 }
 
-/// Asks until it is this robot's turn, as often and as late as it is told.
+/// Repeats the request until it is this robot's turn, at the intervals that the server names.
 async fn pull(server: &TestServer, robot: &TestRobot, blob: Digest) -> (Response, u32) {
     let mut sent_away = 0;
     loop {
@@ -93,7 +93,7 @@ async fn who_waits_is_told_when_to_come_back_and_only_robots_wait() {
     let (one, two) = (server.enroll("one").await, server.enroll("two").await);
     server.deploy(&package, "*", "key-1").await;
     let blob = package.content.digest;
-    // Nobody reads it, so it stays under way.
+    // The client does not read, so the transfer stays under way.
     let first = get(&server, &one, blob).await;
     assert_eq!(first.status(), StatusCode::OK);
     let refused = get(&server, &two, blob).await;
@@ -133,7 +133,7 @@ async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_other
     let order =
         json!({ "package": package, "manifest": manifest, "selector": "hurried", "priority": 1 });
     let _: DeploymentView = answer(server.order("/api/v1/deployments", "urgent", &order)).await;
-    // Nobody reads it, so the one transfer there may be stays under way.
+    // The client does not read, so the only permitted transfer stays under way.
     let first = get(&server, &others[0], calm.content.digest).await;
     assert_eq!(first.status(), StatusCode::OK);
     let mut waiting = tokio::task::JoinSet::new();
@@ -143,13 +143,13 @@ async fn robots_of_an_order_with_priority_are_told_to_come_back_before_all_other
         waiting.spawn(async move { told(&server, &other, blob).await });
     }
     let latest = waiting.join_all().await.into_iter().max().expect("some");
-    // A second is what each is taken to last, and up to half as much again is by chance.
+    // Each transfer is assumed to last a second, plus a random delay of up to half as much.
     assert!(latest >= OTHERS as u64, "{latest}");
     let hurried = told(&server, &hurried, urgent.content.digest).await;
     assert!(hurried <= 2, "{hurried}: it came last and is next");
 }
 
-/// Two robots in the same hall get a package through `limit`, which lets all of it through in a
+/// Two robots in the same hall get a package through `limit`, which passes the whole package in a
 /// second.
 async fn two_pulls_take_two_seconds(limit: impl FnOnce(&mut taskd::config::Config, u64)) {
     const SMALL: usize = 256 * 1024;

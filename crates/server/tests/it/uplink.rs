@@ -1,5 +1,5 @@
-//! A robot on MQTT: it is told of its state, its reports are stored before they are acknowledged,
-//! and the operator sees it come and go.
+//! A robot on MQTT: the robot is told its desired state, its reports are stored before they are
+//! acknowledged, and the operator sees the robot come and go.
 
 use std::time::Duration;
 
@@ -15,7 +15,7 @@ use tokio::net::TcpStream;
 
 use crate::harness::{TestRobot, TestServer, answer, opened, refusal};
 
-/// More than anything here takes, unless it hangs.
+/// Time limit that only a hanging test exceeds.
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// A robot's MQTT session.
@@ -30,7 +30,7 @@ impl Session {
         Self::open_at(&server.server.addresses().mqtt, robot.id.as_str(), &robot.token).await
     }
 
-    /// The same with the server's address for MQTT, `host:port`, and what the robot says of itself.
+    /// The same with the server's MQTT address, `host:port`, and the robot's own details.
     pub async fn open_at(address: &str, id: &str, token: &str) -> Self {
         let mut session = Self::dial_at(address, id, token);
         session.until(|packet| matches!(packet, Packet::ConnAck(_))).await;
@@ -79,14 +79,14 @@ impl Session {
         .expect("the packet comes")
     }
 
-    /// Publishes on one of its topics, and waits for the acknowledgement.
+    /// Publishes on one of the robot's topics, and waits for the acknowledgement.
     pub async fn publish(&mut self, topic: &str, payload: Vec<u8>) {
         let topic = format!("{}/{topic}", self.topics);
         self.client.publish(topic, QoS::AtLeastOnce, false, payload).await.expect("queued");
         self.until(|packet| matches!(packet, Packet::PubAck(_))).await;
     }
 
-    /// The next question it is asked.
+    /// The next question to the robot.
     pub async fn asked(&mut self) -> Value {
         let topic = format!("{}/request", self.topics);
         self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
@@ -97,15 +97,15 @@ impl Session {
         serde_json::from_slice(&question.payload).expect("json")
     }
 
-    /// Answers each question with what `reply` makes of it, for as long as what comes back is
-    /// polled. When that comes back, the robot can be asked.
+    /// Answers each question with the result of `reply`, as long as the returned future is polled.
+    /// When this function returns, the robot can be asked.
     pub async fn answer_all(
         mut self,
         reply: impl Fn(&[u8]) -> Vec<u8>,
     ) -> impl Future<Output = ()> {
         let topic = format!("{}/request", self.topics);
         self.client.subscribe(&topic, QoS::AtLeastOnce).await.expect("queued");
-        // The broker takes one after the other: what is acknowledged comes after the subscription.
+        // The broker handles packets in order: the acknowledgement comes after the subscription.
         let status =
             json!({ "online": true, "start": 1, "instance": "i00000000000000c3", "connection": 1 });
         self.publish("status", status.to_string().into_bytes()).await;
@@ -127,13 +127,13 @@ impl Session {
         }
     }
 
-    /// Says that it goes, and is gone when the broker has hung up.
+    /// Announces that the robot leaves, and returns when the broker has closed the connection.
     pub async fn leave(mut self) {
         self.client.disconnect().await.expect("queued");
         self.hung_up().await;
     }
 
-    /// The next state it is told of, from `generation` on.
+    /// The next desired state that arrives, from `generation` on.
     async fn told(&mut self, server: &TestServer, generation: u64) -> DesiredState {
         loop {
             let Packet::Publish(publish) =
@@ -205,7 +205,7 @@ async fn the_largest_report_is_stored_and_acknowledged() {
     let mut session = Session::open(&server, &robot).await;
     let state = session.told(&server, 0).await;
     let mut report = serde_json::to_vec(&robot.next_report(&state, Phase::Running)).expect("json");
-    // Space behind a value is JSON as well.
+    // Trailing spaces behind a value are still valid JSON.
     report.resize(MAX_REPORT_BYTES, b' ');
     session.publish("report", report).await;
     assert!(server.robot(&robot).await.host.is_some());
@@ -278,7 +278,7 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
         .expect("queued");
     session.until(|packet| matches!(packet, Packet::PubAck(_))).await;
 
-    // Used over HTTP: whoever came in by the old one has to go and is not let in again.
+    // Used over HTTP: a client connected with the old token is disconnected and not admitted again.
     let old = std::mem::replace(&mut robot.token, over_http);
     server.desired(&robot).await;
     session.hung_up().await;
@@ -288,7 +288,7 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
     );
     assert!(!Session::is_let_in(&server, &robot, &old).await);
 
-    // Used over MQTT: it takes over the session of the old one.
+    // Used over MQTT: the new session takes over the old one.
     let over_mqtt = next(&robot.token).await.token;
     let mut session = Session::open(&server, &robot).await;
     session.told(&server, 0).await;
@@ -310,7 +310,7 @@ async fn a_new_token_ends_the_old_session_though_the_request_that_shows_it_first
     let next: RobotToken =
         answer(server.bare(Method::POST, &format!("{path}/token")).bearer_auth(&robot.token)).await;
     let requests = async || server.get::<ServerInfo>("/api/v1/server").await.http.requests;
-    // As long as somebody writes the token is not marked as used.
+    // During another write the token is not marked as used.
     let store = Store::open(&sqlite_url(&server.data().join("taskd.sqlite"))).await.expect("opens");
     let write = store.begin().await.expect("begins");
     let mut counted = requests().await;
@@ -320,7 +320,7 @@ async fn a_new_token_ends_the_old_session_though_the_request_that_shows_it_first
     );
     let mut line = TcpStream::connect(&server.server.addresses().http).await.expect("listens");
     line.write_all(request.as_bytes()).await.expect("sent");
-    // Until it is under way there are only these questions.
+    // Until this request is under way, only the counting requests arrive.
     while requests().await == counted + 1 {
         counted += 1;
     }
@@ -376,7 +376,7 @@ async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
     robot.token = next.token;
     let mut session = Session::open(&server, &robot).await;
     session.told(&server, 0).await;
-    // A reset is an end as well.
+    // A reset counts as an end as well.
     let _ = tokio::time::timeout(PATIENCE, line.read_to_end(&mut Vec::new()))
         .await
         .expect("the old connection is cut");
@@ -390,7 +390,7 @@ async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
             .iter()
             .all(|condition| condition.code != "duplicate_identity")
     );
-    // Nobody has put the newcomer out meanwhile.
+    // The new session has not been displaced meanwhile.
     session.publish("status", b"{}".to_vec()).await;
 }
 

@@ -1,5 +1,5 @@
-//! How robots' machines do: said over MQTT or HTTP, remembered for an hour, asked for now. Nothing
-//! of it is stored.
+//! The vitals of robots' machines: sent over MQTT or HTTP, remembered for an hour, requested on
+//! demand. None of them are stored.
 
 use reqwest::Method;
 use serde_json::json;

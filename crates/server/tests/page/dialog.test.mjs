@@ -1,5 +1,5 @@
-// What closes a question and what does not, so that nobody loses what they have typed or are shown
-// but once.
+// Actions that close a dialog and actions that do not, so that users lose no typed text and no
+// value that is shown only once.
 
 import { test } from 'node:test';
 import {
@@ -30,7 +30,7 @@ test('text that is selected to beyond the edge of a question is kept', async (t)
   await page.mouse.up();
   await settled(page);
   assert.equal(await field.inputValue(), 'site=lab');
-  // A click beside it leaves it, as ever.
+  // A click beside the dialog closes it, as ever.
   await page.mouse.click(...BESIDE);
   await page.getByRole('dialog').waitFor({ state: 'hidden' });
   assertQuiet(page);
@@ -47,7 +47,7 @@ test('what is shown but once stays until somebody says that they have it', async
   await dialog.getByRole('button', { name: 'Make it' }).click();
   const secret = dialog.locator('code', { hasText: '--token' });
   await secret.waitFor();
-  // By keys twice, because of a browser that is asked again it closes a dialog by itself.
+  // Twice by keys: at the second request, a browser closes a dialog by itself.
   await page.keyboard.press('Escape');
   await page.keyboard.press('Escape');
   await page.mouse.click(...BESIDE);

@@ -1,4 +1,4 @@
-// The API's description as a page: its calls are made as whoever is signed in.
+// The API documentation page: its calls are made as the signed-in user.
 
 import { test } from 'node:test';
 import { assertQuiet, open, Server } from './harness.mjs';

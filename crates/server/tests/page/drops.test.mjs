@@ -1,5 +1,5 @@
-// Packages that are dropped on the page, and what stands in the way of them: a server that ends
-// meanwhile, and one whose disk is full.
+// Packages that are dropped on the page, and obstacles to the upload: a server that ends meanwhile,
+// and one with a full disk.
 
 import { spawnSync } from 'node:child_process';
 import { randomBytes } from 'node:crypto';
@@ -38,8 +38,7 @@ function folder(t, name, files = {}) {
 }
 
 /**
- * Does with the pointer what somebody does who drags these from a file manager: over the page, and
- * lets go of them.
+ * Simulates dragging these files from a file manager: moves them over the page, and drops them.
  */
 async function drop(page, ...paths) {
   const debug = await page.context().newCDPSession(page);
@@ -63,7 +62,7 @@ const row = (page, name) => page.locator(`[data-package="${name}@1.0.0"]`);
 const listed = async (server) =>
   (await server.ask('GET', '/packages')).packages.map(({ package: { name } }) => name).sort();
 
-/** What the command makes of a directory is what the server has of it. */
+/** Asserts that the server's package of a directory equals the command's. */
 async function assertSame(server, path, name) {
   const {
     package: { manifest },
@@ -76,7 +75,7 @@ async function assertSame(server, path, name) {
 
 test('folders and archives that are dropped become packages', async (t) => {
   const server = await Server.start(t);
-  // More files than a browser tells of at once.
+  // More files than a browser lists at once.
   const many = Object.fromEntries(
     Array.from({ length: 130 }, (_, index) => [`maps/floor ${index}/größe.txt`, `${index}`]),
   );

@@ -1,5 +1,5 @@
-// What an operator does with a fleet of real agents: from the first robot to a task that runs,
-// fails, is followed and is taken back.
+// An operator's work with a fleet of real agents: from the first robot to a task that runs, fails,
+// is followed and is reverted.
 
 import { randomBytes } from 'node:crypto';
 import { test } from 'node:test';
@@ -40,7 +40,7 @@ test('a robot that enrols by the shown command appears by itself', async (t) => 
 });
 
 test('two robots are chosen, get a package while it is seen to come, and run it', async (t) => {
-  // So slow that the progress can be looked at.
+  // Slow enough to observe the progress.
   const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '250 KB' } });
   for (const name of ['atlas', 'borea', 'corvus']) await agent(t, server, name);
   server.push('talker', '1.0.0', {
@@ -142,7 +142,7 @@ test('the log is followed, paused and filtered', async (t) => {
   await eventually('lines to come', async () => /line 3\b/.test(await lines()));
   await page.getByRole('button', { name: 'Pause' }).click();
   const before = await lines();
-  // The button counts what waits.
+  // The button shows the number of waiting lines.
   const goOn = page.getByRole('button', { name: /Go on \([2-9]\d* wait\)/ });
   await goOn.waitFor();
   assert.equal(await lines(), before, 'nothing moves while it is paused');
@@ -203,7 +203,7 @@ test('labels are edited one by one and in bulk', async (t) => {
         JSON.stringify((await server.ask('GET', `/robots/${name}`)).labels) === '{"site":"yard"}',
     );
   }
-  // Typed wrong, it is said in the dialog, and nothing is lost.
+  // A typing error is shown in the dialog, and nothing is lost.
   await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
   await page.getByRole('textbox', { name: 'Labels' }).fill('site');
   await page.getByRole('button', { name: 'Save' }).click();

@@ -1,5 +1,5 @@
-// Starts the real programs with directories and ports of their own, and a real browser that looks
-// at them. Nothing is left behind.
+// Starts the real programs with their own directories and ports, and a real browser that shows
+// the page. Nothing is left behind.
 
 import assert from 'node:assert/strict';
 import { spawn, spawnSync } from 'node:child_process';
@@ -22,9 +22,9 @@ import { tmpdir } from 'node:os';
 import { dirname, join } from 'node:path';
 import { fileURLToPath } from 'node:url';
 
-/** How long anything that should happen may take on a busy machine. */
+/** Time limit for any expected event on a busy machine. */
 export const PATIENCE_MS = 60_000;
-/** Whom the robots' tasks run as where the tests run as root: nobody who owns anything. */
+/** User id of the robots' tasks where the tests run as root: a user that owns nothing. */
 const TASK_USER = '65534';
 
 const packages = process.env.TASKD_TEST_PAGE;
@@ -45,7 +45,7 @@ function program(name) {
   return path;
 }
 
-/** Asks again until there is an answer; fails with `what` when patience ends. */
+/** Polls until there is an answer; fails with `what` after the time limit. */
 export async function eventually(what, ask) {
   const end = Date.now() + PATIENCE_MS;
   let last;
@@ -63,7 +63,7 @@ export async function eventually(what, ask) {
 
 const endings = new WeakMap();
 
-/** Does something when the test ends: what was begun last ends first. */
+/** Registers a clean-up for the end of the test. Clean-ups run in reverse order. */
 export function atEnd(t, end) {
   if (!endings.has(t)) {
     endings.set(t, []);
@@ -74,7 +74,7 @@ export function atEnd(t, end) {
   endings.get(t).push(end);
 }
 
-/** A directory of the test's own, which goes with it. */
+/** A directory of the test's own, removed with the test. */
 export function directory(t) {
   const path = mkdtempSync(join(tmpdir(), 'taskd-page-'));
   // For the user that tasks run as.
@@ -99,9 +99,9 @@ function start(t, log, path, args, environment = {}) {
 }
 
 /**
- * A disk that holds so many bytes, for a server to be started with. It is mounted for nobody but a
- * process that does nothing else, and goes with it: the server joins that one, and others look at
- * the disk through it.
+ * A disk of `bytes` bytes, for a server to be started with. The disk is mounted in the namespace of
+ * an idle process only, and vanishes with that process: the server joins the namespace, and others
+ * look at the disk through the process.
  */
 export async function smallDisk(t, bytes) {
   const path = directory(t);
@@ -133,8 +133,8 @@ export async function smallDisk(t, bytes) {
 /** A `taskd serve` with a data directory of its own. */
 export class Server {
   /**
-   * `configuration` is what its file says, `environment` further settings, `disk` what its data is
-   * on, if not on what all is.
+   * `configuration` is the content of its file, `environment` further settings, `disk` the disk of
+   * its data, if not the usual one.
    */
   static async start(
     t,
@@ -178,7 +178,7 @@ export class Server {
     return server;
   }
 
-  /** Asks the API as the operator, or with another token; answers the body. */
+  /** Calls the API as the operator, or with another token; returns the body. */
   async ask(method, path, body, { token = this.token, headers = {} } = {}) {
     const response = await fetch(`${this.url}/api/v1${path}`, {
       method,
@@ -194,7 +194,7 @@ export class Server {
     return text ? JSON.parse(text) : null;
   }
 
-  /** Runs an operator's command that must end well; answers what it printed. */
+  /** Runs an operator's command that must succeed; returns its output. */
   operate(...args) {
     const environment = { ...process.env, TASKD_SERVER: this.url, TASKD_TOKEN: this.token };
     const { status, stdout, stderr } = spawnSync(program('taskd'), args, {
@@ -206,8 +206,8 @@ export class Server {
   }
 
   /**
-   * Puts a package there; `files` are its files by name, `more` further lines of its manifest, `to`
-   * whom it is deployed to, `force` whether its version may be another's. Answers what was printed.
+   * Pushes a package; `files` are its files by name, `more` further lines of its manifest, `to` the
+   * robots of its deployment, `force` whether its version may be another's. Returns the output.
    */
   push(
     name,
@@ -281,7 +281,7 @@ export async function agent(t, server, name, environment = {}) {
 }
 
 /**
- * The settings of an agent whose tasks find ROS, in a domain that nobody else on this machine has.
+ * The settings of an agent whose tasks find ROS, in a domain reserved on this machine.
  */
 export async function ros(t) {
   const home = process.env.TASKD_TEST_ROS;
@@ -311,13 +311,13 @@ export async function ros(t) {
   throw new Error('there is no free ROS domain');
 }
 
-/** The node of the end-to-end tests, which does as its arguments say. */
+/** The node of the end-to-end tests, which follows its arguments. */
 export const probe = readFileSync(
   join(root, 'crates/bench/tests/it/graph_probe/graph_probe/probe.py'),
   'utf8',
 );
 
-/** The control groups of an agent's runs. They outlive it, as its tasks do. */
+/** The control groups of an agent's runs. They outlive the agent, as its tasks do. */
 function groupsOf(data) {
   const tasks = join(data, 'tasks');
   const entries = existsSync(tasks) ? readdirSync(tasks, { recursive: true }) : [];
@@ -338,8 +338,8 @@ function isGone(group) {
 }
 
 /**
- * Ends every process whose command line or environment names this directory: shims, then what they
- * watched.
+ * Ends every process whose command line or environment names this directory: shims, then their
+ * tasks.
  */
 async function endProcessesOf(data) {
   const groups = groupsOf(data);
@@ -353,7 +353,7 @@ async function endProcessesOf(data) {
           readFileSync(`/proc/${pid}/environ`, 'latin1');
         if (said.includes(data)) process.kill(Number(pid), 'SIGKILL');
       } catch {
-        // It ended meanwhile, or is none of ours.
+        // The process ended meanwhile, or is none of ours.
       }
     }
   }
@@ -361,8 +361,8 @@ async function endProcessesOf(data) {
 }
 
 /**
- * A robot that says over HTTP whatever the test wants: what no real one says, or not when it is to
- * be looked at.
+ * A simulated robot that reports over HTTP on the test's command: reports that no real robot sends,
+ * or not at the moment of the test.
  */
 export class Puppet {
   #seq = 0;
@@ -384,7 +384,7 @@ export class Puppet {
     });
   }
 
-  /** What it should do. */
+  /** The robot's desired state. */
   async desired() {
     const { payload } = await this.server.ask('GET', `/robots/${this.id}/desired`, undefined, {
       token: this.token,
@@ -393,8 +393,8 @@ export class Puppet {
   }
 
   /**
-   * Says that each of its tasks is in `phase`, and what `each` adds about it, who gets what is
-   * desired of it.
+   * Reports each of its tasks in `phase`, with the additions of `each`, a function of the task's
+   * desired state.
    */
   async report(phase, { each = () => ({}), conditions = [], host = {}, link = null } = {}) {
     const state = await this.desired();
@@ -427,7 +427,7 @@ export class Puppet {
     await this.server.ask('POST', `/robots/${this.id}/report`, body, { token: this.token });
   }
 
-  /** Says how its machine does. */
+  /** Reports the vitals of its machine. */
   async vitals(sample) {
     await this.server.ask(
       'POST',
@@ -437,7 +437,7 @@ export class Puppet {
     );
   }
 
-  /** Brings files back from a task, by their paths. */
+  /** Uploads output files of a task, by their paths. */
   async bringBack(task, files) {
     const blobs = [];
     for (const [path, bytes] of files)
@@ -506,16 +506,16 @@ export async function browser(t) {
 }
 
 /**
- * What a browser says of an answer that the page expects: a robot that is not there, or knows no
- * such thing.
+ * Browser messages about answers that the page expects: an absent robot, or one that does not know
+ * the requested item.
  */
 const REFUSAL = /^Failed to load resource: .* status of (409|504) /;
-/** Contexts whose pages were opened by `open`, each with what its browser complained of. */
+/** Contexts whose pages were opened by `open`, each with its browser's complaints. */
 const complaints = new WeakMap();
 
 /**
- * A page at `hash`, signed in with the token of a link. What it asks of other hosts, and what its
- * console says, fails the test at its end.
+ * A page at `hash`, signed in with the token of a link. Requests to other hosts and messages on the
+ * console fail the test at its end.
  */
 export async function open(t, server, { on, hash = '', token = server.token, ...options } = {}) {
   const context = await (on ?? (await browser(t))).newContext({
@@ -547,28 +547,28 @@ export async function open(t, server, { on, hash = '', token = server.token, ...
   return page;
 }
 
-/** Comes by a link with a token, and signs in with it. */
+/** Opens a link with a token, and signs in with that token. */
 export async function followLink(page, server, token) {
   await page.goto(`${server.url}/#token=${token}`);
   await page.getByRole('button', { name: 'Sign in with it' }).press('Enter');
 }
 
-/** What the page's browser complained of since the last time. */
+/** Complaints of the page's browser since the last call. */
 export const takeComplaints = (page) => complaints.get(page.context()).splice(0);
 
-/** Nothing went wrong that only a developer would see, and no other host was asked. */
+/** Asserts that the console shows no error and that no other host was contacted. */
 export const assertQuiet = (page) => assert.deepEqual(takeComplaints(page), []);
 
 /** Waits until the page is live. */
 export const live = (page) => page.locator('.stream', { hasText: 'Live' }).waitFor();
 
-/** Waits until the page can say yes. */
+/** Waits until `question` is true in the page. */
 export const until = (page, question, argument) =>
   page.waitForFunction(question, argument, { timeout: PATIENCE_MS });
 
 /**
- * Waits until the page has drawn what it has to say: nothing changes any more, but for what moves
- * on each second.
+ * Waits until the page has finished drawing: nothing changes any more, except elements that change
+ * every second.
  */
 export const settled = (page) =>
   page.evaluate(
@@ -588,9 +588,9 @@ export const settled = (page) =>
       }),
   );
 
-/** What axe finds wrong with the page: nothing. */
+/** Asserts that axe finds no fault in the page. */
 export async function assertAccessible(page, what) {
-  // The page's own policy forbids scripts of others; the debugger's are not its.
+  // The page's own policy forbids foreign scripts; the debugger's scripts are exempt.
   await page.evaluate(`if (!window.axe) { ${AXE} }`);
   const { violations } = await page.evaluate(() =>
     globalThis.axe.run(document, { resultTypes: ['violations'] }),

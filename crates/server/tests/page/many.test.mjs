@@ -1,5 +1,5 @@
-// What does not depend on agents: many tabs, signing in, what robots say, keys, and that everybody
-// can use it.
+// Features that do not depend on agents: many tabs, signing in, robots' reports, keys, and
+// accessibility.
 
 import { test } from 'node:test';
 import {
@@ -61,7 +61,7 @@ test('what a robot says is text', async (t) => {
   await page.locator('dd', { hasText: '<img src=x' }).waitFor();
   assert.match(await page.title(), /taskd/);
   assertQuiet(page);
-  // And it would have been seen:
+  // A change would have been seen:
   await page.evaluate(() => document.body.setAttribute('style', 'color: red'));
   assert.equal(takeComplaints(page).length, 1);
 });
@@ -108,7 +108,7 @@ test('a restart that ended the session is said, and signing in leads back to the
   await server.process.stop();
   await Server.start(t, { data: server.data, http: server.http });
   await signedOut();
-  // Also to whom the page is loaded only now.
+  // Also to a page that is loaded only now.
   await page.reload();
   await signedOut();
   await page.getByText('With a token').click();
@@ -126,7 +126,7 @@ test('a page whose stream is refused says why, and shows what there is', async (
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
-  // The tabs' shared worker asks where a test can't answer for the server.
+  // The tabs' shared worker sends its requests where a test can't answer for the server.
   await page.addInitScript(() => delete window.SharedWorker);
   const refusal = { error: { code: 'too_many_requests', message: 'too many listen already' } };
   await page.route(/\/events$/, (route) => route.fulfill({ status: 429, json: refusal }));
@@ -191,7 +191,7 @@ test('a link with a token signs nobody in by itself', async (t) => {
       'operator.token',
     );
   };
-  // Where somebody is in, they stay: in the page that is open, and in one that the link opens.
+  // A signed-in user stays signed in: in the open page, and in one that the link opens.
   await page.goto(link);
   await page.waitForURL(/#\/settings$/);
   await isStillIn(page);
@@ -202,8 +202,8 @@ test('a link with a token signs nobody in by itself', async (t) => {
   assert.equal(another.url(), `${server.url}/`, 'the token has left the address bar');
   assert.deepEqual(sent, [], 'nothing was sent to sign in');
   assertQuiet(page);
-  // Where nobody is in, they are asked: by the page that the link opens, and by one that shows the
-  // way in already.
+  // A signed-out user is asked to sign in: by the page that the link opens, and by one that shows
+  // the sign-in already.
   const stranger = await it.newPage();
   const isAsked = async () => {
     await stranger.getByText('Use it only if you know from whom it comes.').waitFor();
@@ -262,7 +262,7 @@ test('who could not be signed out is told so, and stays in', async (t) => {
   await page.unrouteAll();
   await signOut.click();
   await page.getByLabel('Name', { exact: true }).waitFor();
-  // What has ended already needs no ending.
+  // A session that has ended already needs no ending.
   await followLink(page, server, server.token);
   await live(page);
   assert.equal(
@@ -333,7 +333,7 @@ test('everything is done by keys', async (t) => {
   await page.getByRole('heading', { name: 'Keys' }).waitFor({ state: 'hidden' });
   await page.keyboard.press('Enter');
   await page.waitForURL(/#\/robots\/borea/);
-  // What is not shown is not selected.
+  // Hidden rows are not selected.
   await page.getByRole('link', { name: 'Robots' }).click();
   await page.locator('[data-robot]', { hasText: 'borea' }).focus();
   await page.getByRole('searchbox').fill('atlas');
@@ -393,7 +393,7 @@ test('robots are chosen one by one, as a range, and all that match', async (t) =
   await box('corvus').click();
   await page.getByRole('button', { name: 'Select all 2 that match' }).click();
   await chosen('borea', 'corvus');
-  // A range back to where one is chosen already leaves it so, and its box says that.
+  // A range back to a selected row leaves the row selected, and its box shows that.
   await box('corvus').click();
   await chosen('borea');
   await box('corvus').click();
@@ -520,7 +520,7 @@ test('a question asked right after another was left stays', async (t) => {
       document.getElementById('dialog').addEventListener('close', resume),
     );
     close();
-    // In the frame that closes the browser's dialog, after it: what the browser says of that comes
+    // In the frame that closes the browser's dialog, after the closing: the browser's event comes
     // later.
     requestAnimationFrame(() => ask('Second'));
     await wasClosed;
@@ -656,7 +656,7 @@ test('what happens comes to the server page by the stream, not by asking', async
       .filter({ has: page.getByRole('link', { name }) })
       .waitFor();
   }
-  // The figures beside it are asked for again and again: requests would have been seen.
+  // The figures beside it are polled: requests would have been seen.
   await eventually('the figures to be asked for', () => asked.includes('/api/v1/server/status'));
   assert.deepEqual(
     asked.filter((path) => path !== '/api/v1/server/status'),

@@ -1,4 +1,4 @@
-// Orders are for the robots that the page has named, and for no others, whatever happens before
+// Orders are for the robots that the page has named, and for no others, despite changes before
 // they are sent.
 
 import { test } from 'node:test';
@@ -132,7 +132,7 @@ test('labels that somebody else changes while a robot’s page is edited stay', 
   assertQuiet(page);
 });
 
-/** A stream that can be broken, as by a server that is started anew. */
+/** A stream that can be broken, as by a server restart. */
 function breakableStream() {
   delete window.SharedWorker;
   const { fetch } = window;
@@ -173,7 +173,7 @@ test('what is typed outlives an upgrade of the server, and the page is loaded an
   assert.equal(await page.evaluate(() => window.isSameDocument), undefined);
 });
 
-/** A stream that is open and says nothing, as behind a proxy that keeps back what it gets. */
+/** An open stream without events, as behind a proxy that buffers its input. */
 function stallStream() {
   delete window.SharedWorker;
   const { fetch } = window;
@@ -249,7 +249,7 @@ test('an order needs a package, robots that there are, and a word of its own for
   await deploy.click();
   await isRefusedAt('order-many');
   await assertAccessible(page, 'an order for many');
-  // A name that there is not is no order for the others, and no robot is meant without one.
+  // An unknown name is no order for the other robots, and without a name no robot is meant.
   for (const [selector, said] of [
     ['r1,r77', 'No robot has the name or id r77.'],
     ['!r77', 'No robot has the name or id r77.'],
@@ -260,7 +260,7 @@ test('an order needs a package, robots that there are, and a word of its own for
     await robots.press('Enter');
     await isRefusedAt('order-selector');
   }
-  // What was said of twelve does not hold for others; of few nothing is asked.
+  // A confirmation for twelve robots does not hold for others; few robots need no confirmation.
   await robots.fill('*');
   await dialog.getByText('Yes, order it on all 12 robots').click();
   await robots.fill('half=odd');
@@ -274,7 +274,7 @@ test('an order needs a package, robots that there are, and a word of its own for
   await deploy.click();
   await page.waitForURL(/#\/deployments\/d/);
   assert.equal((await receivers(server, await newest(server))).length, 11);
-  // Nothing of it is chosen the next time.
+  // None of these choices is preset the next time.
   await page.goto(`${server.url}/#/deployments`);
   await page.getByRole('button', { name: 'New deployment…' }).click();
   await deploy.waitFor();
@@ -309,7 +309,7 @@ test('who waits for approval gets no orders, and is deleted like others', async 
     await said.waitFor();
     await page.keyboard.press('Escape');
   }
-  // Also of those that a selector means.
+  // Also of robots matched by a selector.
   await page.goto(`${server.url}/#/packages`);
   await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
   await dialog.getByLabel('Robots', { exact: true }).fill('*');

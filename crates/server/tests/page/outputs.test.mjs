@@ -1,4 +1,4 @@
-// Files that robots brought back: maps as pictures, drawn in the browser, whatever is in them.
+// Output files of robots: maps as pictures, drawn in the browser for any content.
 
 import { test } from 'node:test';
 import { assert, assertQuiet, open, Puppet, Server, until } from './harness.mjs';

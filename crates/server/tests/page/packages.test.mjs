@@ -157,7 +157,7 @@ test('two packages of one version are told apart', async (t) => {
   await page.getByRole('link', { name: /^1\.0\.0 \(/ }).click();
   await page.getByRole('row', { name: /x86_64\.so/ }).waitFor();
   await runsOn('atlas').waitFor();
-  // An older agent says which version, and not which of the two.
+  // An older agent reports the version, and not which of the two packages.
   await page.getByRole('link', { name: '1.0.0', exact: false }).first().click();
   await runsOn('borea').waitFor();
   await atlas.report(
@@ -197,7 +197,7 @@ test('what robots should have is not offered to be deleted', async (t) => {
   assert.equal(await remove.count(), 0);
   await assertAccessible(page, 'why not');
   await page.keyboard.press('Escape');
-  // The other one of the same number nobody should have.
+  // No robot should have the other package of the same version.
   await page.getByRole('link', { name: /^1\.0\.0 \(/ }).click();
   await page.getByRole('row', { name: /x86_64\.so/ }).waitFor();
   await ask();

@@ -36,7 +36,7 @@ const NAMES = [
   'nova',
 ];
 const GB = 1e9;
-/** Two nodes that do what a mapping robot's would, as far as the graph and the log show it. */
+/** Two nodes that look like a mapping robot's in the graph and the log. */
 const SLAM = `import math
 import rclpy
 from nav_msgs.msg import OccupancyGrid, Odometry
@@ -139,7 +139,7 @@ async function story() {
       name === 'echo'
         ? [{ code: 'held', text: 'held at the robot: a wheel is being changed' }]
         : [];
-    // Its other task runs on, whatever becomes of this one.
+    // Its other task runs on, for any outcome of this one.
     const says = (phase, more = () => ({})) =>
       report(name, 'running', {
         conditions,
@@ -210,7 +210,7 @@ async function story() {
   const it = await browser(t);
   for (const colorScheme of ['light', 'dark']) {
     const page = await open(t, server, { on: it, colorScheme, viewport: SIZE });
-    // The server counts an hour by its own clock, and nobody waits that long for a picture.
+    // The server counts an hour by its own clock, which is too long to wait for a picture.
     await page.route('**/api/v1/robots/*/vitals', (route) =>
       route.fulfill({ json: { samples: hour() } }),
     );
@@ -239,7 +239,7 @@ const running = (pid) => ({
   }),
 });
 
-/** How a machine does that works in bursts. */
+/** Vitals of a machine that works in bursts. */
 const sample = (at_ms, turn) => ({
   at_ms,
   cpu_percent: 22 + 14 * Math.sin(turn / 5) + (turn % 7) * 3,

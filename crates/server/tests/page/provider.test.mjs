@@ -35,7 +35,7 @@ async function provider(t) {
   for await (const line of createInterface({ input: child.stderr })) {
     const [, address] = line.match(/running on (\S+) /) ?? [];
     if (address) {
-      // Nobody reads the rest, and a full pipe would stop it.
+      // The rest is discarded, because a full pipe would stop the process.
       child.stderr.resume();
       return address;
     }
@@ -43,7 +43,7 @@ async function provider(t) {
   throw new Error('the provider did not say where it is');
 }
 
-/** A port that nobody listens on now. */
+/** A port without a listener at this moment. */
 async function freePort() {
   const listener = createServer().listen(0, '127.0.0.1');
   await once(listener, 'listening');
@@ -69,7 +69,7 @@ test('the page offers the provider, and says what went wrong there', async (t) =
     roles = "admin"`;
   const server = await Server.start(t, { configuration, http: `127.0.0.1:${port}` });
   const context = await (await browser(t)).newContext();
-  // What the provider's own page would like to load from elsewhere.
+  // Resources that the provider's own page would load from elsewhere.
   await context.route(
     (url) => url.hostname !== '127.0.0.1',
     (route) => route.abort(),

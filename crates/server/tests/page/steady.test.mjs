@@ -1,4 +1,4 @@
-// What stands on the page stays where it is while robots say one thing after the other.
+// The page's elements keep their positions while robots send one report after the other.
 
 import { test } from 'node:test';
 import { assert, assertQuiet, eventually, open, Puppet, Server, settled } from './harness.mjs';
@@ -20,8 +20,8 @@ const fails = (index) => index % 3 === 0;
 const held = (index) => ({ conditions: index % 4 === 3 ? [HELD] : [] });
 
 /**
- * What twenty robots say one after the other, and what one of them is then seen with: on all pages,
- * or on the robots' page alone.
+ * Successive reports of twenty robots, and the text then shown for one of them: on all pages, or on
+ * the robots' page alone.
  */
 const STORY = [
   { says: () => ['fetching', progress(9.9)], seen: ['robot19', '9.9 of 400.0 MB'] },
@@ -52,7 +52,7 @@ const STORY = [
   },
 ];
 
-/** From now on counts how far what stands on the page is pushed aside while nobody touches it. */
+/** From now on measures the page's layout shifts without user input. */
 const watchShifts = (page) =>
   page.evaluate(() => {
     const begun = performance.now();
@@ -95,7 +95,7 @@ test('nothing jumps while data streams', async (t) => {
     robots.push(await Puppet.enroll(server, `robot${index}`));
   const { id } = server.push('talker', '1.0.0', { to: '*' });
   for (const robot of robots) await robot.report('assigned');
-  // A window each, with room for all of them: what is hidden is not drawn.
+  // A window each, with room for all of them: hidden windows are not drawn.
   const wide = await open(t, server, { viewport: { width: 1280, height: 1200 } });
   const narrow = await open(t, server, { viewport: { width: 375, height: 2700 } });
   const deployment = await open(t, server, {
@@ -125,7 +125,7 @@ test('nothing jumps while data streams', async (t) => {
   // retry. The robots stay where they are.
   const ofDeployment = await shifts(deployment);
   assert.ok(ofDeployment.sum < 0.01 && ofDeployment.rows === 0, JSON.stringify(ofDeployment.all));
-  // And it would have been seen:
+  // A shift would have been seen:
   for (const page of pages)
     await page.evaluate(() => document.getElementById('main').prepend('This pushes all the rest.'));
   for (const page of pages)

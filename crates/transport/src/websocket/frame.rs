@@ -1,15 +1,13 @@
-//! WebSocket frames (RFC 6455, section 5), both ways. What a frame carries is handed out as it
-//! comes and never gathered, so whoever sends a frame of any length makes nobody keep it. It does
-//! no I/O.
+//! WebSocket frames (RFC 6455, section 5), both ways. Payload bytes are passed on as they arrive
+//! and never gathered, so a long frame takes no memory. The module does no I/O.
 
 use bytes::{Buf as _, BufMut as _, BytesMut};
 
 /// The most a frame of control carries.
 const MAX_CONTROL_BYTES: usize = 125;
-/// The most an encoded header takes.
+/// Maximum size of an encoded header.
 const MAX_HEADER_BYTES: usize = 14;
-/// Why a connection is closed: all is said, the protocol was broken, or this is not what is
-/// exchanged here.
+/// Close codes: the normal end, a protocol error, and a type of data that is not accepted.
 pub(super) const NORMAL: u16 = 1000;
 const PROTOCOL_ERROR: u16 = 1002;
 const UNSUPPORTED_DATA: u16 = 1003;
@@ -17,19 +15,19 @@ const FIN: u8 = 0x80;
 const RESERVED: u8 = 0x70;
 const MASKED: u8 = 0x80;
 
-/// Which end of a connection this is: the client masks what it sends.
+/// Which end of a connection this is: the client masks its frames.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
-    /// It asked for the connection.
+    /// The end that requested the connection.
     Client,
-    /// It granted it.
+    /// The end that granted the connection.
     Server,
 }
 
-/// What a frame is for.
+/// The type of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Opcode {
-    /// More of the message before it.
+    /// Further bytes of the current message.
     Continuation,
     /// Bytes.
     Binary,
@@ -41,20 +39,20 @@ pub enum Opcode {
     Pong,
 }
 
-/// What came.
+/// A decoded part of the input.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Piece {
-    /// Bytes for whoever reads.
+    /// Payload bytes for the reader.
     Data(BytesMut),
     /// To be answered with the same bytes.
     Ping(BytesMut),
-    /// An answer, which nobody has asked for.
+    /// An unsolicited pong.
     Pong,
-    /// Nothing follows. With why, if the other end says so (RFC 6455, section 7.4).
+    /// A close frame, with its code if the other end sent one (RFC 6455, section 7.4).
     Close(Option<u16>),
 }
 
-/// The other end does not keep to the protocol.
+/// The other end violated the protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("not a WebSocket frame that may stand there: {reason}")]
 pub struct Violation {
@@ -67,13 +65,13 @@ impl Violation {
         Self { reason, code: PROTOCOL_ERROR }
     }
 
-    /// What the frame that closes the connection says of it.
+    /// The code for the close frame.
     pub fn code(&self) -> u16 {
         self.code
     }
 }
 
-/// Takes frames apart as their bytes come.
+/// Decodes frames incrementally.
 #[derive(Debug)]
 pub struct Decoder {
     /// Of this end.
@@ -99,7 +97,7 @@ impl Decoder {
         Self { role, frame: None, is_in_message: false }
     }
 
-    /// Takes the next piece from the front of `input`; `None` until more has come.
+    /// Decodes the next piece from the front of `input`; `None` until more bytes arrive.
     pub fn decode(&mut self, input: &mut BytesMut) -> Result<Option<Piece>, Violation> {
         let frame = match &mut self.frame {
             Some(frame) => frame,
@@ -193,7 +191,7 @@ fn read_header(
     Ok(Some(Frame { opcode, mask, passed: 0, left }))
 }
 
-/// Why the other end closes the connection; it need not say.
+/// The close code of the other end; absent if its close frame has none.
 fn close_code(payload: &[u8]) -> Result<Option<u16>, Violation> {
     let &[high, low, ..] = payload else {
         return if payload.is_empty() { Ok(None) } else { Err(Violation::new("half of a code")) };
@@ -204,7 +202,7 @@ fn close_code(payload: &[u8]) -> Result<Option<u16>, Violation> {
     if is_one { Ok(Some(code)) } else { Err(Violation::new("a code that nobody sends")) }
 }
 
-/// Appends a whole frame to `output`. `mask` is random where a client sends.
+/// Appends a whole frame to `output`. `mask` is random for a client.
 pub fn encode(opcode: Opcode, payload: &[u8], mask: Option<[u8; 4]>, output: &mut BytesMut) {
     output.reserve(MAX_HEADER_BYTES + payload.len());
     output.put_u8(
@@ -236,7 +234,7 @@ pub fn encode(opcode: Opcode, payload: &[u8], mask: Option<[u8; 4]>, output: &mu
     apply_mask(&mut output[begin..], mask.unwrap_or_default(), 0);
 }
 
-/// Masks, or takes the mask away; `passed` bytes of the same payload came before these.
+/// Masks or unmasks `bytes`; `passed` bytes of the same payload came before.
 fn apply_mask(bytes: &mut [u8], mask: [u8; 4], passed: u64) {
     if mask == [0; 4] {
         return;

@@ -1,9 +1,8 @@
-//! One HTTP answer with a blob's bytes: asks for a range, judges what answered, and yields no more
-//! than that. It never touches the disk.
+//! One HTTP answer with a blob's bytes: requests a range, checks the answer, and yields exactly
+//! that range. This module never touches the disk.
 //!
-//! There is no If-Range: the URL names the bytes by their digest, so they can't change between two
-//! requests, and a cache in between with entity tags of its own would only make every resumption
-//! start over.
+//! There is no If-Range: the URL names the bytes by their digest, so the bytes can't change between
+//! two requests. A cache with its own entity tags would only make every resumption start over.
 
 use std::ops::Range;
 use std::time::Duration;
@@ -19,33 +18,33 @@ use tokio::time::Instant;
 use super::FetchError;
 use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryWords};
 
-/// What must come within each stall timeout.
+/// Fewest bytes that must arrive within each stall timeout.
 const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
-/// Overrides whatever limit the client has for whole requests: a large package on a bad link takes
-/// its time, and the stall timeout watches over it.
+/// Overrides the client's limit for whole requests: a large package on a bad link takes its time,
+/// and the stall timeout detects a dead connection.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(7 * 24 * 3600);
-/// No server may keep a robot away for longer.
+/// Upper bound on the wait that a server may request.
 pub(crate) const MAX_RETRY_AFTER: Duration = Duration::from_secs(3600);
 
 /// An answer that is being read.
 pub(super) struct Download {
     response: reqwest::Response,
-    /// Where the last byte asked for ends.
+    /// End of the requested range in the blob.
     end: u64,
-    /// Where the next byte handed out lies in the blob.
+    /// Offset in the blob of the next byte to return.
     position: u64,
-    /// Bytes at the answer's start that are there already: the server did not honour the range.
+    /// Leading bytes of the answer to skip, because the server ignored the range.
     skip: u64,
     stall_timeout: Duration,
-    /// Time spent waiting since the last [`MIN_PROGRESS_BYTES`], and what came in it. Only waiting
-    /// counts: a slow disk is not the server's fault.
+    /// Time spent waiting since the last [`MIN_PROGRESS_BYTES`], and the bytes received in that
+    /// time. Only waiting counts: a slow disk is not the server's fault.
     waited: Duration,
     progressed: u64,
     asked_at: Instant,
 }
 
 impl Download {
-    /// Asks for a range of `blob`, which is empty only if the blob is.
+    /// Requests a range of `blob`. The range is empty only if the blob is empty.
     pub(super) async fn start(
         request: reqwest::RequestBuilder,
         repository: &RepositoryName,
@@ -88,18 +87,17 @@ impl Download {
         })
     }
 
-    /// Where the next byte lies in the blob.
+    /// Offset in the blob of the next byte.
     pub(super) fn position(&self) -> u64 {
         self.position
     }
 
-    /// When it was asked for.
+    /// Time of the request.
     pub(super) fn asked_at(&self) -> Instant {
         self.asked_at
     }
 
-    /// Sends all that comes to `sender`, until all that was asked for has passed or nobody takes it
-    /// any more.
+    /// Sends all received bytes to `sender`, until the range is complete or the receiver is gone.
     pub(super) async fn pass_on(&mut self, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
         while let Some(chunk) = self.next().await? {
             if sender.send(chunk).await.is_err() {
@@ -109,7 +107,7 @@ impl Download {
         Ok(())
     }
 
-    /// The next `length` bytes, which are held in memory.
+    /// Collects the next `length` bytes in memory.
     pub(super) async fn collect(mut self, length: u64) -> Result<Vec<u8>, FetchError> {
         let mut bytes = Vec::with_capacity(length as usize);
         while (bytes.len() as u64) < length
@@ -121,8 +119,8 @@ impl Download {
         Ok(bytes)
     }
 
-    /// The next bytes; `None` when all that was asked for has been handed out, whatever the server
-    /// would still send.
+    /// The next bytes; `None` once the requested range is complete, even if the server would send
+    /// more.
     pub(super) async fn next(&mut self) -> Result<Option<Bytes>, FetchError> {
         while self.position < self.end {
             let began = Instant::now();
@@ -150,7 +148,7 @@ impl Download {
     }
 }
 
-/// How many bytes of the answer to skip, if it is one to read at all.
+/// Number of bytes of the answer to skip, or an error if the answer is not usable.
 fn judge(
     response: &reqwest::Response,
     repository: &RepositoryName,
@@ -222,8 +220,8 @@ fn judge(
     Ok(offset - offered.start)
 }
 
-/// Whether a refusal is the server's own. A proxy in front of one that restarts refuses as well,
-/// and passes.
+/// Whether the refusal comes from the server itself. A proxy in front of a restarting server also
+/// refuses, but only for a while.
 async fn has_registrys_words(response: &mut reqwest::Response, patience: Duration) -> bool {
     tokio::time::timeout(patience, RegistryWords::read(response))
         .await
@@ -235,13 +233,13 @@ fn other_bytes(blob: BlobRef, reason: String) -> FetchError {
 }
 
 fn busy(status: StatusCode, headers: &HeaderMap) -> FetchError {
-    // Its other form is a date, which a robot whose clock is wrong can't use.
+    // The header's other form is a date, which a robot with a wrong clock can't use.
     let seconds = header(headers, &RETRY_AFTER).and_then(|value| value.trim().parse().ok());
     let retry_after = seconds.map(|seconds| Duration::from_secs(seconds).min(MAX_RETRY_AFTER));
     FetchError::Busy { status: status.as_u16(), retry_after }
 }
 
-/// First byte and, if it is told, whole size, of `bytes FIRST-LAST/SIZE`.
+/// First byte, and total size if present, of `bytes FIRST-LAST/SIZE`.
 fn content_range(headers: &HeaderMap) -> Option<(u64, Option<u64>)> {
     let (range, total) =
         header(headers, &CONTENT_RANGE)?.strip_prefix("bytes ")?.split_once('/')?;

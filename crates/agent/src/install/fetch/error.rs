@@ -1,4 +1,4 @@
-//! Why a pull ends without the package in its place, and what follows from it.
+//! Errors of a pull, and the reaction to each.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -10,30 +10,31 @@ use task_proto::{Digest, RepositoryName};
 
 use crate::system::disk::{self, DiskFull, Need};
 
-/// How long a server is left alone whose bytes stay others than the ordered ones.
+/// Pause before the next request to a server that repeatedly sends bytes with a wrong digest.
 const OTHER_BYTES_PAUSE: Duration = Duration::from_secs(60);
 
-/// Why a pull did not end with the package in its place.
+/// Reasons why a pull did not put the package in its place.
 #[derive(Debug, thiserror::Error)]
 pub enum FetchError {
-    /// The caller took it back.
+    /// The caller cancelled the pull.
     #[error("the pull was cancelled")]
     Cancelled,
-    /// No connection, or it broke.
+    /// The connection failed or broke.
     #[error("the server can't be reached, or the connection broke")]
     Unreachable(#[source] reqwest::Error),
     /// The answer ended before the blob's last byte.
     #[error("the answer ended after {received} of {size} bytes")]
     Interrupted {
-        /// Bytes there are now.
+        /// Bytes present so far.
         received: u64,
         /// The blob's size.
         size: u64,
     },
-    /// Too little came for too long.
+    /// Too few bytes arrived within the stall timeout.
     #[error("the server sent next to nothing for {} s", .0.as_secs())]
     Stalled(Duration),
-    /// Something answered that is not a taskd server or a registry: a captive portal, a proxy.
+    /// The answer does not come from a taskd server or a registry, but from a captive portal or a
+    /// proxy.
     #[error("something else answers in the server's place: {0}")]
     NotTheServer(String),
     /// The server is overloaded, restarting or broken.
@@ -41,61 +42,61 @@ pub enum FetchError {
     Busy {
         /// The HTTP status.
         status: u16,
-        /// When it wants to be asked again.
+        /// Wait that the server requests.
         retry_after: Option<Duration>,
     },
     /// The token is not accepted.
     #[error("the server does not accept this robot's token")]
     Unauthorized,
-    /// The server will not give this blob to this robot.
+    /// The server does not provide this blob to this robot.
     #[error("the server answers {status} for blob {digest} of {repository}")]
     Unavailable {
         /// The HTTP status.
         status: u16,
-        /// What was asked for.
+        /// The requested blob.
         digest: Digest,
-        /// Where: that of its package.
+        /// Repository of the blob's package.
         repository: RepositoryName,
     },
-    /// More bytes are announced than such a blob may have.
+    /// The announced size exceeds the limit for such a blob.
     #[error("blob {digest} is said to have {size} bytes, {most} are possible")]
     TooLarge {
-        /// What was asked for.
+        /// The requested blob.
         digest: Digest,
-        /// What is announced.
+        /// The announced size.
         size: u64,
-        /// What is possible.
+        /// The limit.
         most: u64,
     },
-    /// The bytes are not the ordered ones, also when they were fetched again.
+    /// The bytes do not match the ordered digest, even when fetched again.
     #[error("the server's bytes for {digest} are others: {reason}")]
     DigestMismatch {
         /// The ordered digest.
         digest: Digest,
-        /// What was found.
+        /// The observed difference.
         reason: String,
     },
-    /// The bytes are the ordered ones, but no task manifest for this package.
+    /// The bytes match the digest, but are not a task manifest for this package.
     #[error("the package's task manifest can't be used: {0}")]
     ManifestInvalid(String),
-    /// The bytes are the ordered ones, but hold what a package must not.
+    /// The bytes match the digest, but hold entries that a package must not contain.
     #[error(transparent)]
     ArchiveRefused(#[from] Refusal),
-    /// There is not enough room.
+    /// The disk has too little free space.
     #[error(transparent)]
     DiskFull(#[from] DiskFull),
-    /// The disk fails in another way.
+    /// The disk failed in another way.
     #[error("cannot use {}", path.display())]
     Disk {
-        /// What was being read or written.
+        /// The path being read or written.
         path: PathBuf,
-        /// What the system said.
+        /// The operating system's error.
         source: io::Error,
     },
 }
 
 impl FetchError {
-    /// The code that a report gives; `None` for a pull that was cancelled, which is no failure.
+    /// The failure code in a report. `None` for a cancelled pull, which is not a failure.
     pub fn code(&self) -> Option<FailureCode> {
         match self {
             Self::Cancelled => None,
@@ -116,7 +117,7 @@ impl FetchError {
         }
     }
 
-    /// Whether the same pull may succeed later without anyone's doing.
+    /// Whether the same pull may succeed later without intervention.
     pub fn is_retryable(&self) -> bool {
         self.is_cut()
             || matches!(
@@ -129,14 +130,14 @@ impl FetchError {
             )
     }
 
-    /// Whether what was gathered is to go: it is of no use, or takes up the room that is missing.
+    /// Whether to delete the collected bytes: they are useless, or they take up the space that is
+    /// missing.
     pub(super) fn spoils_gathered(&self) -> bool {
         matches!(self, Self::DiskFull(_) | Self::DigestMismatch { .. })
             || !self.is_retryable() && !matches!(self, Self::Cancelled)
     }
 
-    /// How long the server wants this robot to stay away, if all that is wrong is that it has no
-    /// room for it now.
+    /// Wait that the server requests, if its only problem is a lack of capacity for this robot now.
     pub fn told_to_wait(&self) -> Option<Duration> {
         match self {
             Self::Busy { status: 429 | 503, retry_after } => *retry_after,
@@ -144,7 +145,7 @@ impl FetchError {
         }
     }
 
-    /// How long to wait at least before it is tried again.
+    /// Shortest wait before the next attempt.
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Busy { retry_after, .. } => *retry_after,
@@ -154,7 +155,7 @@ impl FetchError {
         }
     }
 
-    /// Whether it is the connection that failed, and not an answer.
+    /// Whether the connection failed, as opposed to an answer with an error.
     pub(super) fn is_cut(&self) -> bool {
         matches!(self, Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_))
     }
@@ -163,7 +164,7 @@ impl FetchError {
         Self::DigestMismatch { digest, reason: format!("they hash to {found}") }
     }
 
-    /// A mismatch that is left after all that heals one on the way says so: what the server has is
+    /// Marks a digest mismatch that survived all repairs of transfer faults: the server's copy is
     /// damaged.
     pub(super) fn confirmed(self) -> Self {
         match self {
@@ -180,8 +181,8 @@ impl FetchError {
         Self::Disk { path: path.to_owned(), source }
     }
 
-    /// A write that failed because the disk is full is told with the figures of the file system
-    /// that holds `path`.
+    /// Turns a write error on a full disk into one with the figures of the file system that holds
+    /// `path`.
     pub(crate) fn for_want_of_room(self, path: &Path, need: Need) -> Self {
         match self {
             Self::Disk { source, .. }

@@ -1,6 +1,6 @@
-//! The blocking half of a pull: replays the `.part`, takes new bytes from the connection, and on
-//! their way to the unpacker hashes them and adds them to the `.part`. It alone decides whether the
-//! tree gets its place.
+//! The blocking half of a pull: replays the `.part`, receives new bytes from the connection, hashes
+//! them, appends them to the `.part` and unpacks them. Only this module decides whether the tree
+//! moves to its place.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read, Write};
@@ -21,7 +21,7 @@ use super::{FetchError, Fetcher};
 use crate::system::disk::Need;
 use crate::system::durable;
 
-/// One try to get a package's content unpacked.
+/// One attempt to unpack a package's content.
 pub(super) struct Intake {
     blob: BlobRef,
     part: PathBuf,
@@ -32,8 +32,8 @@ pub(super) struct Intake {
     receiver: mpsc::Receiver<Bytes>,
     progress: watch::Sender<Progress>,
     stop: CancellationToken,
-    /// Held until nothing of this try is going on any more, which may be after the pull was
-    /// dropped.
+    /// Lock on the content, held until all work of this attempt has ended, possibly after the pull
+    /// was dropped.
     _turn: Arc<OwnedMutexGuard<()>>,
 }
 
@@ -71,8 +71,8 @@ impl Intake {
         let (part, staging) = (self.part.clone(), self.staging.clone());
         let result = self.unpack(facts).and_then(|()| place(&staging, src));
         let cleaned = match &result {
-            // The bytes have done their work, or are worth nothing. Those with another digest may
-            // be mended.
+            // The bytes are unpacked or useless. Bytes with another digest stay, because a repair
+            // may mend them.
             Ok(()) | Err(FetchError::ArchiveRefused(_)) => durable::remove_file(&part),
             Err(_) => Ok(()),
         };
@@ -93,8 +93,8 @@ impl Intake {
         if let Err(UnpackError::Disk { path, source }) = unpacked {
             return Err(FetchError::Disk { path, source });
         }
-        // Read on even when the archive is refused: only the digest tells whether to blame the
-        // package or the way here.
+        // Read to the end even after a refusal: only the digest tells whether the package or the
+        // network is at fault.
         if bytes.failure.is_none() {
             let _ = io::copy(&mut bytes, &mut io::sink());
         }
@@ -115,7 +115,7 @@ impl Intake {
     }
 }
 
-/// Brings the tree to the disk, then to its place.
+/// Syncs the tree to the disk, then moves the tree to its place.
 fn place(staging: &Path, src: &Path) -> Result<(), FetchError> {
     let version = src.parent().unwrap_or(src);
     durable::create_dir_all(version).map_err(|source| FetchError::disk(version, source))?;
@@ -123,7 +123,7 @@ fn place(staging: &Path, src: &Path) -> Result<(), FetchError> {
     durable::rename(staging, src).map_err(|source| FetchError::disk(src, source))
 }
 
-/// All bytes of the blob in order: those of the `.part`, then those that arrive.
+/// All bytes of the blob in order: first the `.part`, then the new bytes.
 struct Bytestream {
     intake: Intake,
     file: File,
@@ -131,7 +131,7 @@ struct Bytestream {
     done: u64,
     current: Bytes,
     hasher: Sha256,
-    /// Why there are no more bytes, when there should be.
+    /// Reason why the bytes ended early.
     failure: Option<FetchError>,
 }
 

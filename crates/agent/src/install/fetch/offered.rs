@@ -1,5 +1,5 @@
-//! Blobs that came with the order itself, so that they need not be pulled. They are kept in memory
-//! until they are used or others come: what is lost is pulled.
+//! Blobs that came with the order itself and need no pull. They stay in memory until used or
+//! replaced; lost blobs are pulled.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -8,22 +8,22 @@ use bytes::Bytes;
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
 
-/// The blobs that came with the newest order that had any.
+/// The blobs of the newest order that carried any.
 #[derive(Default)]
 pub(super) struct Offered(Mutex<HashMap<Digest, Bytes>>);
 
 impl Offered {
-    /// Takes these in the place of those before. Their bytes must be what their digests say.
+    /// Replaces the stored blobs. The bytes must match their digests.
     pub(super) fn replace(&self, blobs: impl IntoIterator<Item = (BlobRef, Bytes)>) {
         *self.lock() = blobs.into_iter().map(|(blob, bytes)| (blob.digest, bytes)).collect();
     }
 
-    /// The bytes of a blob, if it came.
+    /// The bytes of a blob, if an order carried them.
     pub(super) fn get(&self, blob: &BlobRef) -> Option<Bytes> {
         self.lock().get(&blob.digest).filter(|bytes| bytes.len() as u64 == blob.size).cloned()
     }
 
-    /// It has done its work.
+    /// Drops a blob after its use.
     pub(super) fn forget(&self, digest: &Digest) {
         self.lock().remove(digest);
     }

@@ -1,9 +1,9 @@
-//! Which parts of a blob are there, and which of the others were asked for. Pure bookkeeping,
-//! bounded by the number of parts a blob may have; it never sees a byte of them.
+//! Tracks which parts of a blob are present and which missing parts were requested. The memory is
+//! bounded by the number of parts that a blob may have. This module never sees a part's bytes.
 
 use task_proto::part::{Cut, PartRange};
 
-/// What a note begins with: its format.
+/// Format marker at the start of a note.
 const NOTE_FORMAT: [u8; 4] = *b"pt1\n";
 
 /// The parts of one blob.
@@ -16,7 +16,7 @@ pub(super) struct PartMap {
 }
 
 impl PartMap {
-    /// Of a blob of which the first `prefix` bytes are there.
+    /// A map of a blob whose first `prefix` bytes are present.
     pub(super) fn new(cut: Cut, prefix: u64) -> Self {
         let mut map =
             Self { cut, there: Bits::new(cut.count()), asked: Bits::new(cut.count()), bytes: 0 };
@@ -26,22 +26,22 @@ impl PartMap {
         map
     }
 
-    /// How the blob is cut.
+    /// The blob's division into parts.
     pub(super) fn cut(&self) -> Cut {
         self.cut
     }
 
-    /// The bytes that are there.
+    /// Number of bytes present.
     pub(super) fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Whether the part is there.
+    /// Whether the part is present.
     pub(super) fn has(&self, index: u32) -> bool {
         self.there.has(index)
     }
 
-    /// The part is there; false if it was before.
+    /// Marks the part as present; false if the part was present before.
     pub(super) fn take(&mut self, index: u32) -> bool {
         let is_new = index < self.cut.count() && self.there.set(index);
         if is_new {
@@ -51,18 +51,18 @@ impl PartMap {
         is_new
     }
 
-    /// Whether all parts are there.
+    /// Whether all parts are present.
     pub(super) fn is_whole(&self) -> bool {
         self.lacking().next().is_none()
     }
 
-    /// How many bytes are there without a gap from the first on.
+    /// Number of bytes before the first gap.
     pub(super) fn prefix(&self) -> u64 {
         let first_gap = self.lacking().next().unwrap_or(self.cut.count());
         self.cut.range(first_gap).start
     }
 
-    /// Asks for all parts below `index` that are not there; whether there are any.
+    /// Requests all missing parts below `index`; true if there are any.
     pub(super) fn ask_below(&mut self, index: u32) -> bool {
         let lacking: Vec<u32> = self.lacking().take_while(|&lacking| lacking < index).collect();
         lacking.iter().for_each(|&lacking| {
@@ -71,23 +71,23 @@ impl PartMap {
         !lacking.is_empty()
     }
 
-    /// Asks for no part any more.
+    /// Cancels all requests.
     pub(super) fn ask_nothing(&mut self) {
         self.asked = Bits::new(self.cut.count());
     }
 
-    /// What was asked for and has not come.
+    /// Requested parts that are still missing.
     pub(super) fn asked(&self) -> Vec<PartRange> {
         PartRange::runs(self.lacking().filter(|&index| self.asked.has(index)))
     }
 
-    /// What a later agent has to know.
+    /// Encodes the parts that are present, for a later agent process.
     pub(super) fn note(&self) -> Vec<u8> {
         let words = self.there.0.iter().flat_map(|word| word.to_be_bytes());
         NOTE_FORMAT.into_iter().chain(self.cut.part_bytes().to_be_bytes()).chain(words).collect()
     }
 
-    /// Reads a note about a blob of `size` bytes; `None` if it is none.
+    /// Decodes a note about a blob of `size` bytes; `None` if the note is not valid.
     pub(super) fn of_note(note: &[u8], size: u64) -> Option<Self> {
         let (part_bytes, words) = note.strip_prefix(&NOTE_FORMAT)?.split_first_chunk::<4>()?;
         let mut map = Self::new(Cut::new(size, u32::from_be_bytes(*part_bytes)).ok()?, 0);
@@ -103,8 +103,8 @@ impl PartMap {
     }
 
     fn lacking(&self) -> impl Iterator<Item = u32> {
-        // Whole words first: a large blob has a million parts, most of them there or most of them
-        // not.
+        // Skip full words first: a large blob has a million parts, and usually most of them are
+        // present or most are missing.
         let words = self.there.0.iter().zip(0u32..).filter(|(word, _)| **word != u64::MAX);
         let indexes = words.flat_map(|(word, at)| {
             (0..64).filter(move |bit| word >> bit & 1 == 0).map(move |bit| at * 64 + bit)
@@ -113,7 +113,7 @@ impl PartMap {
     }
 }
 
-/// A bit for each part.
+/// One bit per part.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Bits(Vec<u64>);
 
@@ -126,7 +126,7 @@ impl Bits {
         self.0.get((index / 64) as usize).is_some_and(|word| word >> (index % 64) & 1 == 1)
     }
 
-    /// Sets a bit; whether it was not set before.
+    /// Sets a bit; true if the bit was clear before.
     fn set(&mut self, index: u32) -> bool {
         let Some(word) = self.0.get_mut((index / 64) as usize) else { return false };
         let before = *word;

@@ -1,11 +1,11 @@
-//! Gathers a content that the server pushes as parts over MQTT, until all of it is there or it is
-//! better pulled. Parts go into a file with holes, beside it a note of those that are on the disk,
-//! so that a later agent goes on from there.
+//! Collects a content that the server pushes as parts over MQTT, until it is complete or a pull is
+//! the better choice. Parts go into a sparse file. A note beside the file lists the parts on the
+//! disk, so that a restarted agent resumes from there.
 //!
-//! Nothing here trusts a part: each must fit the size that the signed state names, the first of
-//! them decides how the content is cut, and the whole is held against its digest by the same intake
-//! as a pull. What does not fit is counted and passed over; what is torn or wrong is found by the
-//! digest and pulled.
+//! Parts are untrusted. Each must fit the size that the signed state names, and the first part
+//! determines the part size. The intake of a pull checks the complete content against its digest.
+//! Parts that do not fit are counted and ignored; torn or wrong bytes fail the digest check and are
+//! pulled.
 
 use std::fs::{self, File, OpenOptions};
 use std::io;
@@ -30,25 +30,24 @@ use crate::system::layout::DataDir;
 use crate::transfer::parts::Asks;
 use crate::transfer::parts::{Arrived, Ear, Hearing};
 
-/// The largest note: a bit for each of the most parts, and its head.
+/// Largest note: its header and one bit per part, for the most parts that a blob may have.
 const MAX_NOTE_BYTES: u64 = 256 * 1024;
-/// Parts that are written together.
+/// Most parts written in one batch.
 const WRITTEN_TOGETHER: usize = 4;
-/// A note is written when so much has come since the last one, or after this time.
+/// A note is written after this many new bytes, or after [`NOTED_AFTER`].
 const NOTED_BYTES: u64 = 16 << 20;
 const NOTED_AFTER: Duration = Duration::from_secs(5);
-/// How soon what was asked for and has come is not asked for any more.
+/// Delay after which parts that have arrived are removed from the request for missing parts.
 const TAKEN_BACK_AFTER: Duration = Duration::from_millis(100);
 
-/// How long parts are waited for.
+/// Timeouts for pushed parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PartPatience {
-    /// Without a part for so long, the lacking ones are asked for; the next time after twice as
-    /// long.
+    /// After this long without a part, the missing parts are requested. The timeout then doubles.
     pub silence: Duration,
-    /// Without a subscription for so long, the content is pulled.
+    /// After this long without a subscription, the content is pulled.
     pub deaf: Duration,
-    /// Likewise without a part.
+    /// After this long without a new part, the content is pulled.
     pub starved: Duration,
 }
 
@@ -62,7 +61,7 @@ impl Default for PartPatience {
     }
 }
 
-/// Why a content that is pushed is pulled after all.
+/// Reasons to pull a content that the server pushes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum GaveUp {
     #[error("there is no MQTT session")]
@@ -75,7 +74,7 @@ pub(super) enum GaveUp {
     Replaced,
 }
 
-/// The files that parts gather in.
+/// The files in which parts are collected.
 #[derive(Clone)]
 struct Files {
     part: PathBuf,
@@ -87,44 +86,45 @@ pub(super) struct Gathering<'a> {
     content: BlobRef,
     files: Files,
     file: Arc<File>,
-    /// `None` until a part has said how the content is cut.
+    /// `None` until a part has shown the part size.
     map: Option<PartMap>,
-    /// Whether a part has come to this agent, and not only to one before.
+    /// Whether this agent process has received a part. An earlier process may have received others.
     is_cut: bool,
     patience: PartPatience,
     progress: &'a watch::Sender<Progress>,
     asks: &'a watch::Sender<Asks>,
-    /// Held until nothing of this is going on any more, also by writes that outlive it.
+    /// Lock on the content, held until all work has ended, including writes that outlive this
+    /// struct.
     turn: Arc<OwnedMutexGuard<()>>,
-    /// Messages that were no part of this content, and parts that were there already.
+    /// Counts messages that were not parts of this content, and duplicate parts.
     foreign: u64,
     double: u64,
     noted_bytes: u64,
     noted_at: Instant,
-    /// A note that is being written. Parts go on meanwhile: the server takes a robot that does not
-    /// acknowledge for one that can't keep up.
+    /// The note being written. Parts are accepted meanwhile: the server would judge a robot that
+    /// does not acknowledge as too slow.
     noting: Option<JoinHandle<io::Result<()>>>,
 }
 
-/// When what came last.
+/// Times of the latest events.
 struct Times {
-    /// A part of this content, whether it was there or not, or the subscription, or the last
-    /// asking.
+    /// Time of the last part of this content, new or duplicate, of the subscription, or of the last
+    /// request for missing parts, whichever is latest.
     quiet_since: Instant,
-    /// How long the next silence may be.
+    /// Silence after which missing parts are requested next.
     silence: Duration,
-    /// The last part that was not there, or the subscription.
+    /// Time of the last new part, or of the subscription.
     starved_since: Instant,
-    /// `Some` while there is no subscription.
+    /// `Some` while the subscription is missing.
     deaf_since: Option<Instant>,
-    /// Whether no part has come by this subscription.
+    /// Whether this subscription has not delivered a part yet.
     is_fresh: bool,
-    /// The first part that came since what is asked for was last looked through.
+    /// Time of the first part since the last update of the request for missing parts.
     came_at: Option<Instant>,
 }
 
 impl<'a> Gathering<'a> {
-    /// Opens what earlier tries have gathered.
+    /// Opens the parts and the note that earlier attempts left.
     pub(super) fn open(
         fetcher: &Fetcher,
         package: &PackageRef,
@@ -154,8 +154,8 @@ impl<'a> Gathering<'a> {
         })
     }
 
-    /// Gathers until all is there, and then lies where a pull looks for it, or until it is better
-    /// pulled.
+    /// Collects parts until the content is complete and in the file that a pull reads, or until a
+    /// pull is the better choice.
     pub(super) async fn run(
         mut self,
         mut ear: Ear,
@@ -208,7 +208,7 @@ impl<'a> Gathering<'a> {
         let mut batch = Vec::with_capacity(WRITTEN_TOGETHER);
         loop {
             tokio::select! {
-                // Cancel-safe: a message stays in the channel until it is received.
+                // Cancel-safe: a message stays in the channel until received.
                 count = ear.parts.recv_many(&mut batch, WRITTEN_TOGETHER) => {
                     if count == 0 {
                         return Ok(Err(GaveUp::Replaced));
@@ -218,9 +218,9 @@ impl<'a> Gathering<'a> {
                         return Ok(Ok(()));
                     }
                 }
-                // Cancel-safe: a watch remembers that it changed.
+                // Cancel-safe: a watch remembers a change.
                 Ok(()) = ear.hearing.changed() => self.hear(*ear.hearing.borrow_and_update(), &mut times),
-                // Cancel-safe: a timer that is made anew each time.
+                // Cancel-safe: the timer is recreated on each iteration.
                 () = tokio::time::sleep_until(self.next_look(&times)) => {
                     if let Some(gave_up) = self.look(&mut times) {
                         return Ok(Err(gave_up));
@@ -230,7 +230,7 @@ impl<'a> Gathering<'a> {
         }
     }
 
-    /// Takes messages off the session: writes those that are parts, and lets go of them, which
+    /// Takes messages from the session, writes the valid parts, and drops the messages, which
     /// acknowledges them.
     async fn take(&mut self, batch: Vec<Arrived>, times: &mut Times) -> Result<(), FetchError> {
         let now = Instant::now();
@@ -241,7 +241,8 @@ impl<'a> Gathering<'a> {
             times.silence = self.patience.silence;
             let Some(map) = &mut self.map else { continue };
             if std::mem::take(&mut times.is_fresh) && map.ask_below(index) {
-                // It joined late: what went out before does not come by itself.
+                // The subscription came late: parts published earlier are sent again only on
+                // request.
                 self.say();
             }
             let is_there = self.map.as_ref().is_some_and(|map| map.has(index));
@@ -261,7 +262,7 @@ impl<'a> Gathering<'a> {
         .await?;
         let Some(map) = &mut self.map else { return Ok(()) };
         for (index, ..) in &written {
-            // The same part may have come twice in one batch.
+            // A batch may hold the same part twice.
             self.double += u64::from(!map.take(*index));
         }
         times.starved_since = now;
@@ -276,7 +277,8 @@ impl<'a> Gathering<'a> {
         Ok(())
     }
 
-    /// Index and place of a part; `None` if the message is no part of this content, cut as it is.
+    /// Index and offset of a part. `None` if the message is not a part of this content with the
+    /// known part size.
     fn judge(&mut self, message: &[u8]) -> Option<(u32, u64)> {
         let fits = Part::decode(message, self.content.size).and_then(|part| {
             let cut = Cut::new(self.content.size, part.part_bytes)?;
@@ -298,7 +300,7 @@ impl<'a> Gathering<'a> {
                 self.foreign += 1;
                 return None;
             }
-            // The server may cut it in another way than it did for an agent before this one.
+            // The part size may differ from the one that an earlier agent process saw.
             earlier => {
                 self.map = Some(PartMap::new(cut, earlier.as_ref().map_or(0, PartMap::prefix)))
             }
@@ -337,7 +339,7 @@ impl<'a> Gathering<'a> {
         times.came_at.map_or(next, |at| next.min(at + TAKEN_BACK_AFTER))
     }
 
-    /// Asks for what is lacking, or gives up.
+    /// Requests the missing parts, or gives up.
     fn look(&mut self, times: &mut Times) -> Option<GaveUp> {
         let now = Instant::now();
         if times.came_at.take_if(|at| now >= *at + TAKEN_BACK_AFTER).is_some() {
@@ -363,15 +365,15 @@ impl<'a> Gathering<'a> {
     fn say(&self) {
         let missing = match &self.map {
             Some(map) => map.asked(),
-            // Nobody has said yet how many parts there are.
+            // The number of parts is still unknown.
             None => vec![PartRange { from: 0, to: u32::MAX }],
         };
         self.asks
             .send_modify(|asks| *asks = Asks { missing: Some(missing), times: asks.times + 1 });
     }
 
-    /// Asks no longer for what has come, so that whatever makes the robot report does not ask for
-    /// it again.
+    /// Removes the parts that have arrived from the request, so that a report sent for another
+    /// reason does not request them again.
     fn take_back(&self) {
         let asked = |asks: &Asks| asks.missing.as_ref().is_some_and(|missing| !missing.is_empty());
         if let Some(map) = self.map.as_ref().filter(|_| asked(&self.asks.borrow())) {
@@ -379,7 +381,7 @@ impl<'a> Gathering<'a> {
         }
     }
 
-    /// The bytes that are there.
+    /// Number of bytes received.
     pub(super) fn bytes(&self) -> u64 {
         self.map.as_ref().map_or(0, PartMap::bytes)
     }
@@ -388,7 +390,7 @@ impl<'a> Gathering<'a> {
         self.progress.send_replace(Progress { done: self.bytes(), total: self.content.size });
     }
 
-    /// Begins to bring what is there to the disk and then to say so in the note.
+    /// Starts to sync the received parts to the disk and then to write the note.
     fn begin_note(&mut self) {
         let Some(map) = &self.map else { return };
         let (note, file, path, turn) =
@@ -400,7 +402,7 @@ impl<'a> Gathering<'a> {
         }));
     }
 
-    /// Waits until no note is being written.
+    /// Waits until the current note is written.
     async fn noted(&mut self) -> Result<(), FetchError> {
         match self.noting.take() {
             Some(noting) => finished(&self.files.note, noting).await,
@@ -409,7 +411,7 @@ impl<'a> Gathering<'a> {
     }
 }
 
-/// Runs what may wait for the disk where nothing else waits for it.
+/// Runs blocking disk work on a blocking thread.
 pub(super) async fn on_disk<T: Send + 'static>(
     path: &Path,
     work: impl FnOnce() -> io::Result<T> + Send + 'static,
@@ -422,8 +424,8 @@ async fn finished<T>(path: &Path, work: JoinHandle<io::Result<T>>) -> Result<T, 
     done.flatten().map_err(|source| FetchError::disk(path, source))
 }
 
-/// Makes the gathered parts up to the first gap the beginning that a pull goes on from, if that is
-/// more than it has.
+/// Turns the parts up to the first gap into the `.part` that a pull resumes from, if they are more
+/// than the `.part` already holds.
 pub(super) fn hand_over(data: &DataDir, content: BlobRef) -> io::Result<()> {
     let files = Files::of(data, &content.digest);
     let Some(map) = files.read_note(content.size) else { return files.discard() };
@@ -432,13 +434,13 @@ pub(super) fn hand_over(data: &DataDir, content: BlobRef) -> io::Result<()> {
     if prefix <= pulled {
         return files.discard();
     }
-    // A file without its note is of no account: from here on nobody takes the holes for bytes.
+    // The file is ignored without its note. From here on no reader takes the holes for data.
     durable::remove_file(&files.note)?;
     OpenOptions::new().write(true).open(&files.parts)?.set_len(prefix)?;
     durable::rename(&files.parts, &files.part)
 }
 
-/// Deletes what was gathered of a content's parts.
+/// Deletes the collected parts of a content.
 pub(super) fn discard(data: &DataDir, content: &Digest) -> io::Result<()> {
     Files::of(data, content).discard()
 }
@@ -452,7 +454,7 @@ impl Files {
         }
     }
 
-    /// The file, and what the note says of it; without a note it is empty.
+    /// Returns the file and the map of parts in its note. Without a note the file is new and empty.
     fn open(&self, size: u64) -> io::Result<(File, Option<PartMap>)> {
         if let Some(map) = self.read_note(size) {
             return Ok((OpenOptions::new().write(true).open(&self.parts)?, Some(map)));
@@ -466,7 +468,7 @@ impl Files {
         Ok((file, None))
     }
 
-    /// The note, if it is one about the file that is there.
+    /// Reads the note if it fits the file.
     fn read_note(&self, size: u64) -> Option<PartMap> {
         let is_small =
             fs::metadata(&self.note).is_ok_and(|metadata| metadata.len() <= MAX_NOTE_BYTES);
@@ -478,7 +480,7 @@ impl Files {
         }
     }
 
-    /// All parts are there.
+    /// Makes the complete file the `.part` that a pull reads.
     fn whole(&self) -> io::Result<()> {
         durable::remove_file(&self.note)?;
         durable::rename(&self.parts, &self.part)

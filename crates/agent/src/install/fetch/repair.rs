@@ -1,7 +1,7 @@
-//! Mends bytes that came with another digest than the ordered one. A digest of the whole does not
-//! say where the fault is, so each range is fetched anew over connections of its own until two
-//! copies agree on each byte; the copy that came first counts as one. What comes of it is held
-//! against the digest by the caller. Nothing here decides when to mend.
+//! Repairs bytes whose digest differs from the ordered one. The digest of the whole does not locate
+//! the fault, so each range is fetched again over separate connections until two copies agree on
+//! each byte. The first received copy counts as one. The caller checks the result against the
+//! digest, and decides when to repair.
 
 use std::fs::OpenOptions;
 use std::os::unix::fs::FileExt as _;
@@ -14,21 +14,20 @@ use tokio::sync::OwnedMutexGuard;
 use super::pushed::on_disk;
 use super::{FetchError, Fetcher};
 
-/// The shortest range: of a small content few are needed.
+/// Shortest range: a small content needs few ranges.
 const MIN_RANGE_BYTES: u64 = 256 * 1024;
-/// The longest, of which a few copies are held in memory.
+/// Longest range. Several copies of a range are held in memory.
 const MAX_RANGE_BYTES: u64 = 4 * 1024 * 1024;
-/// Into how many ranges a content is cut.
+/// Number of ranges of a content.
 const RANGES: u64 = 64;
-/// How often a range is fetched. With the copy that came first, two of which are to agree.
+/// Most fetches of a range. Two copies must agree, and the first received copy counts.
 const MAX_COPIES: usize = 8;
-/// Up to how many bytes before its range a copy begins. A fault that damages the same place of each
-/// answer then damages another byte each time.
+/// Most bytes before its range at which a copy begins. A fault at a fixed offset of each answer
+/// then damages a different byte each time.
 const MAX_LEAD_BYTES: u64 = 4096;
 
 impl Fetcher {
-    /// Mends the `.part` of a content, all of whose bytes are there. The turn is held by writes
-    /// that outlive this.
+    /// Repairs a complete `.part` of a content. Writes that outlive this call hold the turn.
     pub(super) async fn repair_content(
         &self,
         package: &PackageRef,
@@ -52,7 +51,7 @@ impl Fetcher {
         Ok(())
     }
 
-    /// The same of a blob that is held in memory.
+    /// Repairs a blob in memory.
     pub(super) async fn repaired(
         &self,
         repository: &RepositoryName,
@@ -70,7 +69,7 @@ impl Fetcher {
         Ok(bytes)
     }
 
-    /// What copies of a range agree on; `None` if that is what came `first`.
+    /// Bytes of a range on which copies agree; `None` if they equal `first`.
     async fn agreed(
         &self,
         repository: &RepositoryName,
@@ -84,7 +83,8 @@ impl Fetcher {
             match self.copy_of(repository, blob, from, copies[0].len()).await {
                 Ok(copy) if copies.len() == 1 && copy == copies[0] => return Ok(None),
                 Ok(copy) => copies.push(copy),
-                // A damaged head of an answer reads as one about other bytes, a cut is a cut.
+                // A damaged header of an answer looks like an answer with other bytes, and a cut is
+                // a cut. Both are tried again.
                 Err(error @ FetchError::DigestMismatch { .. }) => failure = Some(error),
                 Err(error) if error.is_cut() => failure = Some(error),
                 Err(error) => return Err(error),
@@ -112,7 +112,7 @@ impl Fetcher {
         if lead <= from {
             return Ok(piece(from - lead, end).await?.split_off(lead as usize));
         }
-        // Nothing is before it: what comes first is asked for by itself.
+        // Too few bytes precede the range, so its first bytes are requested separately.
         let middle = (from + lead).min(end);
         let mut bytes = piece(from, middle).await?;
         if middle < end {
@@ -122,15 +122,15 @@ impl Fetcher {
     }
 }
 
-/// Where the ranges of `size` bytes begin, and how long each is.
+/// Start and length of each range of `size` bytes.
 fn ranges(size: u64) -> impl Iterator<Item = (u64, usize)> {
     let length = size.div_ceil(RANGES).clamp(MIN_RANGE_BYTES, MAX_RANGE_BYTES);
     (0..size.div_ceil(length))
         .map(move |index| (index * length, length.min(size - index * length) as usize))
 }
 
-/// The bytes that at least two of the copies have, and more of them than have anything else; `None`
-/// while one has not got as many.
+/// For each byte, the value that most copies have, and at least two. `None` while a byte has no
+/// such value.
 fn majority(copies: &[Vec<u8>]) -> Option<Vec<u8>> {
     let (first, others) = copies.split_first()?;
     let mut agreed = first.clone();

@@ -1,7 +1,7 @@
-//! Pulls until the bytes have the ordered digest: a way that flips a byte is a fault of the network
-//! like a cut, and TCP does not notice all of them. Other bytes are pulled again as a whole, a few
-//! times, and then mended range by range. What is wrong even then is the server's fault, and said
-//! so.
+//! Pulls until the bytes match the ordered digest. A network that flips bytes is a network fault
+//! like a cut, and TCP does not detect every flip. Bytes with another digest are pulled again as a
+//! whole a few times, and then repaired range by range. If the digest still differs, the server is
+//! at fault, and the error says so.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -15,13 +15,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::{FetchError, Fetcher};
 
-/// How often bytes with another digest are fetched again as a whole. After that ranges of them are
-/// compared.
+/// Number of full repeats for bytes with another digest. After that, ranges are compared.
 const MAX_WHOLE_AGAIN: u32 = 2;
 
 impl Fetcher {
-    /// Pulls a content. A `.part` that a power cut spoiled, or parts that were pushed and are
-    /// wrong, are pulled again as well.
+    /// Pulls a content. A `.part` damaged by a power cut and wrong pushed parts are pulled again as
+    /// well.
     pub(super) async fn pull_until_verified(
         &self,
         package: &PackageRef,
@@ -56,8 +55,7 @@ impl Fetcher {
             .map_err(FetchError::confirmed)
     }
 
-    /// Pulls a blob that is held in memory, again when the bytes have another digest, as for a
-    /// content.
+    /// Pulls a blob into memory. Bytes with another digest are pulled again, as for a content.
     pub(super) async fn pull_whole(
         &self,
         repository: &RepositoryName,

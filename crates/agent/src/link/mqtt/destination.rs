@@ -1,5 +1,5 @@
-//! The places that the server names for MQTT sessions: its own broker, or external ones in the
-//! order in which they are tried. It opens nothing.
+//! The places that the server names for MQTT sessions: its own broker, or external brokers in the
+//! order of attempts. This module opens no connection.
 
 use std::time::Duration;
 
@@ -10,12 +10,12 @@ use tokio::sync::watch;
 use super::MqttAccess;
 use crate::link::state::Shared;
 
-/// The longest wait before the server is asked for its place for the first time in a session.
+/// Longest wait before the session's first question to the server about its place.
 const FIRST_QUESTION: Duration = Duration::from_secs(10);
-/// The longest wait before it is asked again.
+/// Longest wait before a repeated question.
 const MAX_QUESTION: Duration = Duration::from_secs(5 * 60);
 
-/// Where one session goes, and as whom.
+/// Address and credentials of one session.
 #[derive(Clone, PartialEq, Eq)]
 pub(super) struct Destination {
     pub(super) host: String,
@@ -23,12 +23,12 @@ pub(super) struct Destination {
     pub(super) prefix: TopicPrefix,
     /// Whether the port speaks TLS.
     pub(super) is_encrypted: bool,
-    /// What is otherwise there than at the server's own broker.
+    /// Credentials and CA pin of an external broker; `None` at the server's own broker.
     pub(super) external: Option<ExternalBroker>,
 }
 
 impl MqttAccess {
-    /// The place with this number among those that the server names, beginning with 0.
+    /// The place with this index among the places that the server names, starting at 0.
     pub(super) fn destination(
         &self,
         endpoint: Option<&MqttEndpoint>,
@@ -59,18 +59,19 @@ impl MqttAccess {
     }
 }
 
-/// How many places the server names.
+/// Number of places that the server names.
 pub(super) fn place_count(endpoint: Option<&MqttEndpoint>) -> usize {
     1 + endpoint.map_or(0, |endpoint| endpoint.alternatives.len())
 }
 
-/// Waits until the server names another place first than `there`, where a session is or is tried.
+/// Waits until the server's first place is no longer `there`, the place of the current session or
+/// attempt.
 pub(super) async fn moved(
     endpoint: &mut watch::Receiver<Option<MqttEndpoint>>,
     access: &MqttAccess,
     there: &Destination,
 ) {
-    // Cancel-safe: a watch remembers that it changed.
+    // Cancel-safe: a watch remembers a change.
     while endpoint.changed().await.is_ok() {
         if access.destination(endpoint.borrow_and_update().as_ref(), 0) != *there {
             return;
@@ -79,9 +80,10 @@ pub(super) async fn moved(
     std::future::pending().await
 }
 
-/// Asks the server from time to time for its place, until that place is not `there`. A server and a
-/// robot that look for a broker at the same time may find different ones; while the server's answer
-/// stays the same, [`moved`] does not return. `asked` counts the questions: each doubles the wait.
+/// Asks the server for its place from time to time, until that place differs from `there`. A server
+/// and a robot that search for a broker at the same time may find different ones; while the
+/// server's answer stays the same, [`moved`] does not return. `asked` counts the questions, and
+/// each doubles the wait.
 pub(super) async fn named_elsewhere(
     shared: &Shared,
     access: &MqttAccess,
@@ -90,12 +92,12 @@ pub(super) async fn named_elsewhere(
 ) -> Destination {
     let mut answers = shared.endpoint_answers.subscribe();
     loop {
-        // Cancel-safe: a timer that is made anew each time.
+        // Cancel-safe: the timer is recreated on each iteration.
         tokio::time::sleep(wait_before_question(*asked, rand::random())).await;
         *asked = asked.saturating_add(1);
         answers.borrow_and_update();
         shared.find.notify_one();
-        // Cancel-safe: a watch remembers that it changed. Without an answer the session stays.
+        // Cancel-safe: a watch remembers a change. Without an answer the session stays.
         if answers.changed().await.is_err() {
             return std::future::pending().await;
         }
@@ -106,7 +108,7 @@ pub(super) async fn named_elsewhere(
     }
 }
 
-/// The wait before the next question. `jitter`, even from 0 to 1, spreads the second half of it.
+/// The wait before the next question. `jitter`, uniform from 0 to 1, randomizes its second half.
 fn wait_before_question(asked: u32, jitter: f64) -> Duration {
     let longest = FIRST_QUESTION.saturating_mul(1 << asked.min(10)).min(MAX_QUESTION);
     longest.mul_f64(0.5 + jitter.clamp(0.0, 1.0) / 2.0)

@@ -1,5 +1,5 @@
-//! What a session is subscribed to: the robot's own topics, and the parts of the contents that
-//! somebody gathers. A refused subscription is tried again: the server may not have got so far yet.
+//! The subscriptions of a session: the robot's own topics, and the parts of contents that are being
+//! collected. A refused subscription is repeated: the server may not be ready yet.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -11,20 +11,20 @@ use tokio::time::Instant;
 
 use crate::transfer::parts::{Hearing, Listening, Wish};
 
-/// How long to wait on average after a refusal: a little at first, because the server may just be
-/// about to begin, then twice as long each time, up to the most.
+/// Average wait after a refusal: short at first, because the server may be about to begin, then
+/// doubled each time up to [`RETRY`].
 const FIRST_RETRY: Duration = Duration::from_millis(50);
 const RETRY: Duration = Duration::from_secs(1);
-/// How far a timer is set when there is nothing to wait for.
+/// Timer delay when no retry is due.
 const LONG: Duration = Duration::from_secs(3600);
 
 /// The subscriptions of one session.
 #[derive(Default)]
 pub(super) struct Subscriptions {
     contents: BTreeMap<Digest, Subscription>,
-    /// Handed to rumqttc, which has not given them a packet id yet.
+    /// Requests passed to rumqttc, but without a packet id so far.
     unsent: VecDeque<Whose>,
-    /// Sent under this packet id, and when.
+    /// Packet id, request and time of each subscription that was sent.
     sent: Vec<(u16, Whose, Instant)>,
 }
 
@@ -37,7 +37,7 @@ struct Subscription {
 enum Stands {
     Asked,
     Granted,
-    /// To be tried at this time.
+    /// Scheduled for this time.
     Due(Instant),
 }
 
@@ -49,24 +49,25 @@ enum Whose {
 }
 
 impl Subscriptions {
-    /// One of the robot's own topics was asked for.
+    /// Records a subscription request for one of the robot's own topics.
     pub(super) fn asked_for_own(&mut self) {
         self.unsent.push_back(Whose::Own);
     }
 
-    /// A subscription that was asked for went out under this packet id.
+    /// Records the packet id of the oldest request that was passed to rumqttc.
     pub(super) fn sent(&mut self, id: u16) {
         if let Some(whose) = self.unsent.pop_front() {
             self.sent.push((id, whose, Instant::now()));
         }
     }
 
-    /// Takes the broker's answer; how long it took where that says something of the link.
+    /// Handles the broker's answer. Returns the round-trip time if it is a useful measurement of
+    /// the link.
     pub(super) fn answered(&mut self, answer: &SubAck, listening: &Listening) -> Option<Duration> {
         let at = self.sent.iter().position(|(id, ..)| *id == answer.pkid)?;
         let (_, whose, sent_at) = self.sent.swap_remove(at);
         let Whose::Content(wish) = whose else { return Some(sent_at.elapsed()) };
-        // It may be wanted anew since it was asked for.
+        // The content may have been requested anew since this subscription was sent.
         let subscription =
             self.contents.get_mut(&wish.digest).filter(|subscription| subscription.wish == wish)?;
         if matches!(answer.return_codes[..], [SubscribeReasonCode::Success(_)]) {
@@ -82,7 +83,7 @@ impl Subscriptions {
         None
     }
 
-    /// When to [`Self::tune`] although nothing else is wanted than before.
+    /// Time of the next [`Self::tune`] if the wanted contents stay the same.
     pub(super) fn next_try(&self) -> Instant {
         let due = self.contents.values().filter_map(|subscription| match subscription.stands {
             Stands::Due(at) => Some(at),
@@ -91,7 +92,7 @@ impl Subscriptions {
         due.min().unwrap_or_else(|| Instant::now() + LONG)
     }
 
-    /// Asks for what is wanted, and ends what is not wanted any more.
+    /// Subscribes to the wanted contents and unsubscribes from the others.
     pub(super) fn tune(
         &mut self,
         client: &AsyncClient,
@@ -103,7 +104,7 @@ impl Subscriptions {
         let topic = |digest: &Digest| prefix.format(&Topic::Package(*digest));
         self.contents.retain(|digest, subscription| {
             let is_wanted = wanted.iter().any(|wish| wish.digest == *digest);
-            // Requests go out in good time: when there is no room for one, it is tried again.
+            // Requests are rare. If the queue is full, the request is repeated later.
             let is_over = !is_wanted && client.try_unsubscribe(topic(digest)).is_ok();
             if !is_wanted {
                 subscription.stands = Stands::Due(now + RETRY);
@@ -118,8 +119,8 @@ impl Subscriptions {
                 continue;
             }
             subscription.wish = wish;
-            // With the highest quality of service each part comes with the one that it was sent
-            // with.
+            // A subscription with the highest quality of service delivers each part with the one
+            // that its publisher chose.
             subscription.stands = match client.try_subscribe(topic(&wish.digest), QoS::ExactlyOnce)
             {
                 Ok(()) => {

@@ -1,6 +1,6 @@
-//! The ways an MQTT session may take to the server: over the broker's own port, or as a WebSocket
-//! over the HTTP port, which is open wherever a robot can reach its server at all. One that fails
-//! is given up for the other. It opens nothing.
+//! Routes of an MQTT session to the server: the broker's own port, or a WebSocket over the HTTP
+//! port, which is open wherever a robot can reach its server at all. When one route fails, the
+//! other is tried. This module opens no connection.
 
 use std::sync::Arc;
 
@@ -12,20 +12,20 @@ use task_transport::{Route, Trust};
 use crate::config::MqttTransport;
 use crate::system::clock;
 
-/// Which ways there are, and which is tried next.
+/// The available routes, and the next one to try.
 #[derive(Clone)]
 pub struct Ways {
     transport: MqttTransport,
-    /// How TLS is spoken, to whichever port.
+    /// TLS configuration for either port.
     tls: Arc<ClientConfig>,
-    /// The WebSocket at the server.
+    /// WebSocket route to the server.
     websocket: Route,
-    /// Whether the broker's own port is passed over.
+    /// Whether to skip the broker's own port.
     is_turned: bool,
 }
 
 impl Ways {
-    /// To the server at `base`.
+    /// Routes to the server at `base`.
     pub fn new(base: &Url, tls: Arc<ClientConfig>, transport: MqttTransport) -> Self {
         let websocket = Route {
             host: base.host_str().map(str::to_owned).unwrap_or_default(),
@@ -36,8 +36,8 @@ impl Ways {
         Self { transport, tls, websocket, is_turned: false }
     }
 
-    /// The next way. A broker that is not the server's own has nothing but its port, and a
-    /// certificate by somebody else.
+    /// The next route. An external broker offers only its own port, with a certificate from another
+    /// issuer.
     pub(super) fn next(
         &self,
         host: &str,
@@ -61,12 +61,13 @@ impl Ways {
         Route { host: host.to_owned(), port, tls, websocket: None }
     }
 
-    /// No session came about.
+    /// Switches to the other route after a failed attempt.
     pub(super) fn turn(&mut self) {
         self.is_turned = !self.is_turned;
     }
 
-    /// The server names another place: it may be reached there.
+    /// Returns to the broker's own port, because the server named another place that may be
+    /// reachable.
     pub(super) fn begin_anew(&mut self) {
         self.is_turned = false;
     }
@@ -83,7 +84,7 @@ mod tests {
         Ways::new(&base.parse().expect("a URL"), Arc::new(tls), transport)
     }
 
-    /// Host, port, path of the WebSocket, and whether it encrypts.
+    /// Host, port, WebSocket path, and whether the route is encrypted.
     fn shown(route: Route) -> (String, u16, Option<String>, bool) {
         (route.host, route.port, route.websocket, route.tls.is_some())
     }

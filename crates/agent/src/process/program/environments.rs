@@ -1,7 +1,7 @@
-//! Looks into the environments of many processes. The kernel keeps who reads one waiting for as
-//! long as that process's memory is locked, which a driver or a network file system that hangs, or
-//! anybody with a file system of their own, makes for ever. So somebody else reads here, and a
-//! process whose environment does not come holds up one look, once.
+//! Reads the environments of many processes. The kernel blocks the reader for as long as the memory
+//! of the other process is locked. A hanging driver, a hanging network file system, or any user
+//! with a file system of their own can make this permanent. So a separate thread does the reading,
+//! and a process whose environment does not arrive delays one look, once.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -10,19 +10,19 @@ use std::time::Duration;
 
 use super::ProcessEntry;
 
-/// How long one environment may take to come.
+/// Maximum time for one environment to arrive.
 const PATIENCE: Duration = Duration::from_millis(500);
-/// As many that do not come are waited for in one look; what is left is not looked into.
+/// Maximum number of missing environments per look; the remaining processes are not examined.
 const MAX_WAITS: usize = 10;
 
-/// A process: its pid and when it started.
+/// A process: its pid and its start time.
 type Key = (u32, u64);
 
-/// Those that are still waited for, by whoever read them when it was too late.
+/// Processes that an abandoned reader thread still waits for.
 static SILENT: Silent = Silent(Mutex::new(None));
 
-/// What `read` finds in the environment of each of `entries`, but for those that do not come.
-/// `read` may wait for ever.
+/// Results of `read` on the environment of each of `entries`, except those that do not arrive.
+/// `read` may block forever.
 pub fn look<T: Send + 'static>(
     entries: Vec<ProcessEntry>,
     read: impl Fn(&ProcessEntry) -> T + Clone + Send + 'static,
@@ -32,11 +32,11 @@ pub fn look<T: Send + 'static>(
 
 struct Silent(Mutex<Option<HashMap<Key, Reader>>>);
 
-/// Who reads processes one after another, and how many it has read.
+/// A thread that reads processes one after another, and the number of processes it has read.
 #[derive(Clone)]
 struct Reader {
     read: Arc<AtomicUsize>,
-    /// Which of them it was at when nobody waited any longer.
+    /// Index of the process at which the reader was abandoned.
     at: usize,
 }
 
@@ -61,8 +61,8 @@ impl Silent {
                     }
                 }
             };
-            // Where no thread can be had, as when a task has taken them all, what there is has to
-            // do it.
+            // Where no thread is available, for example because a task has taken them all, the
+            // calling thread does the work.
             match std::thread::Builder::new().name("environments".to_owned()).spawn(work.clone()) {
                 Ok(_) => drop(work),
                 Err(_) => work(),
@@ -83,7 +83,7 @@ impl Silent {
         found
     }
 
-    /// Without those that somebody is still waiting for; what is not there any more is forgotten.
+    /// Filters out processes that a reader still waits for, and forgets those that no longer exist.
     fn without_silent(&self, entries: Vec<ProcessEntry>) -> Vec<ProcessEntry> {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(known) = known.as_mut() else { return entries };
@@ -118,7 +118,7 @@ mod tests {
         let read = move |entry: &ProcessEntry| {
             if entry.pid == 2 {
                 counting.fetch_add(1, Ordering::SeqCst);
-                // Until it is released, which is when nobody can say more.
+                // Blocks until the test drops `release`.
                 let _ = held.lock().expect("sound").recv();
             }
             entry.pid * 10

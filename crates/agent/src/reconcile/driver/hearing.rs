@@ -1,4 +1,4 @@
-//! What the driver makes of what it hears from the server: desired states, confirmations, refusals.
+//! Handles messages from the server: desired states, confirmations, refusals.
 
 use bytes::Bytes;
 use task_proto::api::ReportReply;
@@ -14,11 +14,11 @@ use crate::system::error_chain::chain;
 use crate::task::effects::Effects;
 use crate::task::ledger::Accepted;
 
-/// The condition of a robot that does not obey what it was sent.
+/// The condition of a robot that refuses the state sent to it.
 const STATE_REFUSED: &str = "state_refused";
 /// The conditions that end once a state is accepted.
 pub(super) const REFUSALS: [&str; 2] = [STATE_REFUSED, Report::STATE_CONTRADICTED];
-/// How much of the server's reason for refusing the token is kept.
+/// The maximum length of the server's reason for refusing the token.
 const MOST_REASON_CHARS: usize = 300;
 
 impl<E: Effects> Driver<E> {
@@ -58,8 +58,8 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// The server has answered this robot, or signed something new for it: it has not removed it,
-    /// or not for good.
+    /// Clears a removal. The server has answered this robot or signed something new for it, so the
+    /// robot was not removed, or not for good.
     fn known_by_server(&mut self) {
         self.withheld = None;
         if self.ledger.removed {
@@ -68,7 +68,7 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Accepts a desired state or says why not.
+    /// Accepts a desired state or reports the reason of its refusal.
     fn consider(&mut self, envelope: Envelope, inline: &Inline) {
         let Speaker { server_key, robot_id, .. } = &self.speaker;
         let wall_ms = self.effects.now().wall_ms;
@@ -93,8 +93,9 @@ impl<E: Effects> Driver<E> {
                     tracing::info!(generation = %state.generation, tasks = state.tasks.len(), "accepted a desired state");
                     self.ledger.accepted =
                         Some(Accepted { generation: state.generation, envelope });
-                    // The order may be for a label that the robot was given just before it: ask
-                    // again. Likewise for what a person has installed since the last one.
+                    // The order may depend on a label that the robot was given just before, or on
+                    // software that a person has installed since the last order. Look up both
+                    // again.
                     (self.robot.labels, self.robot.installations) = (None, None);
                     if self
                         .views
@@ -120,7 +121,7 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// What the server holds wins; what the robot's own settings say otherwise is reported.
+    /// The server's values win; differences from the robot's own settings are reported.
     fn settle_settings(&mut self, reply: &ReportReply) {
         let mut differences = Vec::new();
         if let Some(own) = self.speaker.name.as_ref().filter(|own| **own != reply.name) {

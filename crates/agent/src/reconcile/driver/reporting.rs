@@ -1,5 +1,4 @@
-//! What the driver reports: a snapshot of the ledger in the wire's types, published when it says
-//! something new.
+//! The driver's report: a snapshot of the ledger in wire types, published when its content changes.
 
 use std::sync::Arc;
 
@@ -19,11 +18,11 @@ use crate::task::observed::{Health, ProcessState, Vouched};
 use crate::task::plan::Lane;
 use crate::transfer::link_meter;
 
-/// A battery that has lost less is no news.
+/// Battery changes within one step of this size are not reported.
 const BATTERY_STEP_PERCENT: u8 = 5;
 
 impl<E: Effects> Driver<E> {
-    /// Publishes a snapshot, if it says anything that the last one did not.
+    /// Publishes a snapshot if its content differs from the last one.
     pub(super) fn publish_report(&mut self) {
         let report = self.report();
         let again = std::mem::take(&mut self.asks_again);
@@ -99,9 +98,9 @@ impl<E: Effects> Driver<E> {
         conditions
     }
 
-    /// Whether the server need not send what it has sent before: not once half of the state's
-    /// lifetime is over, so that the server sends it signed anew, and not while the robot refuses
-    /// what it was sent.
+    /// Whether the server may skip sending the state again. The answer is no after half of the
+    /// state's lifetime, so that the server sends the state newly signed, and no while the robot
+    /// refuses a state.
     fn is_settled(&self) -> bool {
         let Some(state) = &self.desired else { return false };
         let half_ms =
@@ -111,7 +110,7 @@ impl<E: Effects> Driver<E> {
     }
 }
 
-/// Whether two snapshots differ only in what always changes.
+/// Whether two snapshots differ only in fields that always change.
 fn says_the_same(last: &Report, next: &Report) -> bool {
     let without_times = |report: &Report| {
         let mut report = report.clone();
@@ -127,8 +126,8 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
         && !link_meter::is_news(last.link.as_ref(), next.link.as_ref())
 }
 
-/// Why the run that is kept alive is not as it should be: something is missing that it once had, or
-/// the robot does not let an older one than ordered start again, or its files do not come back.
+/// Why the active run is degraded: something that was there is missing, the robot does not allow an
+/// older run than ordered to start again, or the run's output files cannot be uploaded.
 fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
     let ready = record
         .active
@@ -150,7 +149,7 @@ fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
     }
 }
 
-/// That what runs would not be started again.
+/// Reports that the running version would not be started again.
 fn distrusted(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
     let active = record.active.as_ref().filter(|active| active.package == record.order.package)?;
     let vouched = view?.prepared.as_ref()?.vouched;
@@ -174,7 +173,7 @@ fn task_report(
         _ => None,
     };
     let progress = lane.and_then(|lane| view?.progress.get(&lane).copied());
-    // All bytes are there: what is left of a pull is unpacking.
+    // All bytes are there: the rest of the pull is unpacking.
     let unpacking = phase == Phase::Fetching
         && progress.is_some_and(|progress| progress.done >= progress.total);
     let active = record.active.as_ref();

@@ -1,5 +1,5 @@
-//! The steps under way: begun, interrupted when they serve nothing any more, and what their end
-//! means for the ledger. Which step is next is the plan's to say.
+//! The steps under way: how they begin, how unneeded steps are interrupted, and how their outcomes
+//! change the ledger. The plan decides which step is next.
 
 use std::time::Duration;
 
@@ -49,7 +49,7 @@ impl<E: Effects> Driver<E> {
                     }
                     Step::PullContent { package, is_pushed: true } => {
                         let gathering = effects.gather_content(package, &progress, &asks, &stop);
-                        // Cancel-safe: what is dropped only notices changes.
+                        // Cancel-safe: the dropped future only notices changes.
                         tokio::select! {
                             done = gathering => done,
                             () = notify(asked, &news) => unreachable!("it lasts as long as who asks"),
@@ -73,7 +73,7 @@ impl<E: Effects> Driver<E> {
         self.under_way.insert((task, lane), UnderWay { step, handle, cancel, drop_at: None });
     }
 
-    /// Tells steps to end that serve nothing any more, and drops those that do not listen.
+    /// Cancels steps that are no longer needed, and drops those that do not end.
     pub(super) fn interrupt_unwanted(&mut self) {
         let now = Instant::now();
         let unwanted: Vec<(TaskName, Lane)> = self
@@ -133,13 +133,14 @@ impl<E: Effects> Driver<E> {
         }
         let transfer = view.transfers.remove(&lane).map(|transfer| *transfer.borrow());
         match transfer.filter(|_| matches!(outcome, Ok(Done::ToldToWait { .. }))) {
-            // What was gathered stays, and is shown while the robot waits for its turn.
+            // The gathered bytes stay, and their progress is shown while the robot waits for its
+            // turn.
             Some(progress) if progress.total > 0 => view.progress.insert(lane, progress),
             _ => view.progress.remove(&lane),
         };
         if under_way.cancel.is_cancelled() {
             view.prepared = None;
-            // It may have gathered more after its order was taken back.
+            // The step may have gathered more after its order was withdrawn.
             self.kept_parts = None;
             return;
         }
@@ -173,10 +174,10 @@ impl<E: Effects> Driver<E> {
         if let (Step::Prune { kept }, Some(prepared)) =
             (step, &mut self.views.entry(task.clone()).or_default().prepared)
         {
-            // Should deleting have failed, it is not tried again before the next look at the disk.
+            // If the deletion failed, we do not retry before the next inspection of the disk.
             prepared.versions.retain(|version| kept.contains(version));
         } else if step.lane() == Lane::Prepare || matches!(step, Step::Start(_)) {
-            // A start deletes what was changed on the disk.
+            // A start deletes files that were changed on the disk.
             self.views.entry(task.clone()).or_default().prepared = None;
         }
         if matches!(step, Step::Start(_) | Step::Stop(_)) {
@@ -186,7 +187,7 @@ impl<E: Effects> Driver<E> {
     }
 }
 
-/// Passes on that something is to be said.
+/// Notifies `news` each time the gathering step asks for missing parts.
 async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
     let mut times = asked.borrow().times;
     while let Ok(asks) = asked.wait_for(|asks| asks.times != times).await {
@@ -196,7 +197,8 @@ async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
     std::future::pending().await
 }
 
-/// A step that did not end in time. It is tried again: nothing is known of how far it came.
+/// The failure of a step that did not end in time. The step is retried, because its progress is
+/// unknown.
 fn late(deadline: Duration) -> StepFailure {
     let text = format!("the step did not end within {} s", deadline.as_secs());
     StepFailure {

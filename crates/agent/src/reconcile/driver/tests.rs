@@ -1,4 +1,4 @@
-//! The driver's logic, with a robot whose effects only take notes.
+//! Tests of the driver's logic, with a robot whose effects only record calls.
 
 mod fake;
 mod hanging;
@@ -16,7 +16,7 @@ use super::*;
 use crate::task::ledger::GateStep;
 use crate::task::observed::Missing;
 
-/// How long a test waits for what should come at once.
+/// How long a test waits for an event that should come at once.
 const PATIENCE: Duration = Duration::from_secs(20);
 
 fn order(version: &str) -> DesiredTask {
@@ -34,7 +34,7 @@ fn order(version: &str) -> DesiredTask {
     }
 }
 
-/// A driver at work, and the server's side of it.
+/// A running driver, and the server's side of it.
 struct Bench {
     fake: Arc<Fake>,
     shared: Shared,
@@ -92,7 +92,7 @@ impl Bench {
         self.heard.send(message).await.expect("the driver listens");
     }
 
-    /// The first report of which `expected` is true.
+    /// The first report that satisfies `expected`.
     async fn report(&self, expected: impl Fn(&Report) -> bool) -> Report {
         let mut reports = self.shared.reports.subscribe();
         let found =
@@ -147,7 +147,7 @@ async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_i
     let list = "lacks what talker 1.0 requires: ROS package nav2_bringup, ROS package slam_toolbox";
     assert!(failure.text.contains(list), "{failure}");
     assert!(bench.fake.state(|state| state.contents.is_empty()), "nothing was pulled");
-    // A person installs them; the same package is ordered again.
+    // A person installs the missing packages; the same package is ordered again.
     bench.fake.state(|state| {
         state.ros_packages.extend(["nav2_bringup", "slam_toolbox"].map(str::to_owned))
     });
@@ -174,7 +174,8 @@ async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
     });
     bench.order(2, vec![signed.clone()]).await;
     bench.phase(Phase::Running).await;
-    // Its publisher is revoked: it goes on, and the report says what that is worth.
+    // Its publisher is revoked: the task continues, and the report says that it would not start
+    // again.
     bench.fake.state(|state| {
         state.untrusted.insert(signed.package.manifest.digest);
         state.trust = TrustFacts {
@@ -285,7 +286,7 @@ async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
     assert_eq!((&task.deployment, task.run), (&new.deployment, 1));
     assert_eq!(task.failure.as_ref().expect("why").to_string(), "lifecycle_failed: it will not");
     assert_eq!(task.active.as_ref().expect("the old one").deployment, old.deployment);
-    // Neither a report nor a new agent makes it try again; a new run does.
+    // Neither a report nor a new agent triggers a retry; a new run does.
     let (fake, key, robot) =
         (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
     let ledger = bench.end().await;
@@ -336,7 +337,7 @@ async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
         |report: &Report| report.tasks[0].progress == Some(Progress { done: 1, total: 2 });
     let report = bench.report(sending).await;
     assert_eq!((report.tasks[0].phase, &report.tasks[0].active), (Phase::Running, &None));
-    // The agent dies meanwhile: the job is not run again, its files are sent again, and this time
+    // The agent dies meanwhile: the job does not run again, its files are sent again, and this time
     // refused.
     let (fake, key, robot) =
         (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
@@ -376,7 +377,8 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
     let report = bench.report(|report| has(report, "state_refused")).await;
     assert_eq!((report.observed_generation, report.tasks.len()), (Generation(6), 1));
     assert_eq!(report.reached_generation(), Generation(6));
-    // What a server orders that was put back to an older copy and has forgotten its sixth.
+    // The order of a server that was restored from an older copy and has forgotten its sixth
+    // generation.
     bench.order(6, Vec::new()).await;
     let report = bench.report(|report| has(report, Report::STATE_CONTRADICTED)).await;
     assert_eq!((report.reached_generation(), report.tasks.len()), (Generation(7), 1));
@@ -453,8 +455,8 @@ async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
     bench.order(2, vec![order("2.0")]).await;
     bench.phase(Phase::Deferred).await;
     bench.fake.state(|state| (state.disk_full, state.held) = (true, false));
-    // The new version's start would have to be written down: the old one is not stopped for what
-    // may never come.
+    // The new version's start would have to be recorded: the old version is not stopped for a start
+    // that may never come.
     bench.report(|report| has(report, "ledger_unwritable")).await;
     assert_eq!(bench.fake.state(|state| (state.alive.len(), state.started.len())), (1, 1));
     bench.order(3, Vec::new()).await;
@@ -522,8 +524,8 @@ async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
     let task = &report.tasks[0];
     assert_eq!((task.phase, task.attempts, &task.failure), (Phase::Fetching, 1, &None));
     assert_eq!(task.progress, Some(Progress { done: 1, total: 2 }));
-    // It waits in its record, so that a new agent of this boot waits on, and another order need
-    // not.
+    // The wait is in the record, so that a new agent in this boot continues to wait, and another
+    // order does not.
     let ledger = bench.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger");
     let preparation = &ledger.tasks.values().next().expect("a task").preparation;
     assert!(
@@ -580,7 +582,7 @@ async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
         .report(|report| report.seq > second.seq && missing(report).as_ref() == Some(&ranges))
         .await;
     assert!(first.seq < second.seq && second.seq < third.seq);
-    // The server says that it should pull instead: what it gathers by is ended, and it pulls.
+    // The server switches to a pull: the gathering step ends, and the robot pulls.
     bench.order(2, vec![DesiredTask { delivery: Delivery::PushPull, ..pushed }]).await;
     let report = bench.phase(Phase::Running).await;
     assert_eq!(missing(&report), None);
@@ -597,8 +599,8 @@ async fn tasks_of_higher_priority_are_prepared_first() {
         order.package.manifest.digest = Digest::of(name.as_bytes());
         DesiredTask { priority, ..order }
     };
-    // Two at a time are prepared; these wait on a person, so that only the order of the pulls is
-    // seen.
+    // Two versions are prepared at a time. The tasks wait for a person, so that only the order of
+    // the pulls is seen.
     bench.fake.state(|state| state.held = true);
     let tasks = [("a", -5), ("b", 0), ("c", 7), ("d", 100), ("e", 0), ("f", 7)];
     bench.order(1, tasks.map(|(name, priority)| named(name, priority)).into()).await;

@@ -1,5 +1,5 @@
-//! The watchers of live processes: two for each, one for its end and one for what ROS says of it.
-//! They only tell the driver what they see; what is made of it is the plan's to say.
+//! The watchers of live processes. Each process has two: one for its end and one for its health on
+//! the ROS graph. Watchers only report to the driver; the plan decides.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,11 +13,11 @@ use crate::task::effects::Effects;
 use crate::task::ledger::ActiveRun;
 use crate::task::observed::{Health, ProcessState};
 
-/// After what time ROS is asked again when that has ended by itself.
+/// Delay before health is watched again after a watch has ended by itself.
 const WATCH_AGAIN: Duration = Duration::from_secs(5);
 
 impl<E: Effects> Driver<E> {
-    /// Sees to it that each live process is watched.
+    /// Ensures that each live process is watched.
     pub(super) fn watch_processes(&mut self) {
         for (task, record) in &self.ledger.tasks {
             let Some(view) = self.views.get_mut(task) else { continue };
@@ -45,7 +45,7 @@ impl<E: Effects> Driver<E> {
                 _until_dropped: until_dropped.clone().drop_guard(),
             });
             tokio::spawn(async move {
-                // Cancel-safe: whatever was not sent is of no use any more.
+                // Cancel-safe: an observation that was not sent is of no further use.
                 tokio::select! {
                     () = watcher.watch_end() => {}
                     () = watcher.watch_health() => {}
@@ -56,7 +56,7 @@ impl<E: Effects> Driver<E> {
         }
     }
 
-    /// Takes what a watcher has seen, unless it is of a process that another has followed.
+    /// Takes a watcher's observation, unless the observed process has been replaced.
     pub(super) fn see(&mut self, seen: Seen) {
         let Some(view) = self.views.get_mut(&seen.task) else { return };
         if view.watched.as_ref().is_none_or(|watched| watched.dir != seen.dir) {
@@ -69,7 +69,7 @@ impl<E: Effects> Driver<E> {
     }
 }
 
-/// Who watches one process.
+/// The watchers of one process.
 struct Watcher<E> {
     effects: Arc<E>,
     task: TaskName,
@@ -85,7 +85,7 @@ impl<E: Effects> Watcher<E> {
         }
     }
 
-    /// Passes on what ROS says, until nobody asks it any more.
+    /// Forwards health changes until the watch ends.
     async fn watch_health(&self) {
         let mut health = self.effects.watch(&self.task, &self.run);
         loop {
@@ -100,7 +100,7 @@ impl<E: Effects> Watcher<E> {
         tokio::time::sleep(WATCH_AGAIN).await;
     }
 
-    /// The driver no longer listens when the agent ends.
+    /// Sends an observation to the driver. The driver stops listening when the agent ends.
     async fn tell(&self, what: Sight) {
         let _ =
             self.sights.send(Seen { task: self.task.clone(), dir: self.dir.clone(), what }).await;

@@ -1,5 +1,5 @@
-//! The robot's ROS graph, for those who only look: whoever answers questions about it and listens
-//! to what nodes say.
+//! Read access to the robot's ROS graph, for the modules that answer questions about the graph and
+//! collect the nodes' log messages.
 
 use std::collections::BTreeMap;
 
@@ -15,28 +15,28 @@ use crate::setup::installation::RosVersion;
 use crate::setup::launch;
 
 impl Robot {
-    /// The graph, opened if need be, once it can show who is there.
+    /// The graph, opened if necessary, once discovery can show its participants.
     pub async fn graph(&self) -> Result<Graph, Failure> {
         self.graph.settled(self.ros_facts().as_ref()).await
     }
 
-    /// Takes part in the graph that `facts` say while this version runs, if it is one of ROS 2, so
-    /// that what its nodes say is kept also where the package promises nothing about them.
+    /// Joins the ROS 2 graph in `facts` while this version runs, so that the log messages of its
+    /// nodes are kept even if the package promises nothing about them.
     pub(super) fn listen_to(&self, package: &PackageRef, facts: Option<&RosFacts>) {
         let Some(manifest) = fetch::stored_manifest(&self.data, package) else { return };
         let is_ros_2 = match launch::of(&manifest).ros {
             Some(version) => version == RosVersion::Ros2,
-            // An install tree names what it needs; other programs need nothing of ROS.
+            // An install tree lists its dependencies; other programs need no ROS.
             None => !manifest.exec_depends.is_empty(),
         };
         if let Some(facts) = facts.filter(|facts| is_ros_2 && facts.domain_id.is_some()).cloned() {
             let graph = self.graph.clone();
-            // A graph that can't be opened has been logged; the task runs all the same.
+            // A failure to open the graph has been logged; the task runs all the same.
             tokio::spawn(async move { graph.open(Some(&facts)).await.is_ok() });
         }
     }
 
-    /// The processes of each task that has any.
+    /// The process ids of each task with live processes.
     pub async fn task_pids(&self) -> BTreeMap<TaskName, Vec<u32>> {
         let mut processes = BTreeMap::new();
         for task in self.data.task_names().unwrap_or_default() {

@@ -1,5 +1,5 @@
-//! The settings that hold now, as the effects use them: made anew when the server says something
-//! else.
+//! The effective settings, in the form that the effects use. They are rebuilt when the server sends
+//! other settings.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, PoisonError};
@@ -18,16 +18,16 @@ use crate::setup::environment;
 use crate::setup::installation::Installation;
 use crate::setup::underlay;
 
-/// How many bytes a run may bring back, unless the robot's settings say otherwise.
+/// The maximum bytes of output files per run, unless the robot's settings say otherwise.
 const OUTPUT_BYTES: u64 = 4 << 30;
 
-/// What holds.
+/// The effective settings, and the values derived from them.
 pub(super) struct Held {
-    /// What was set at the server.
+    /// The settings made at the server.
     pub(super) set: RobotSettings,
-    /// All settings.
+    /// The combined settings.
     pub(super) config: Config,
-    /// As they are reported.
+    /// The settings as reported.
     pub(super) effective: Option<EffectiveSettings>,
     pub(super) environment: BTreeMap<String, String>,
     pub(super) build_limits: BuildLimits,
@@ -36,7 +36,7 @@ pub(super) struct Held {
 }
 
 impl Held {
-    /// Of a robot's `own` settings and what was `set` for it.
+    /// Combines a robot's `own` settings with those `set` at the server.
     pub(super) fn of(own: &Config, set: RobotSettings) -> Arc<Self> {
         let Settled { config, effective } = settle(own, &set);
         let mut variables: BTreeMap<String, String> = environment::ROS_VARIABLES
@@ -67,14 +67,14 @@ impl Held {
         })
     }
 
-    /// The ROS there is, by these settings.
+    /// The ROS installations found by these settings.
     pub(super) fn installations(&self) -> Vec<Installation> {
         underlay::by_settings(&self.config.underlays, self.config.workspace.as_deref())
     }
 }
 
 impl Robot {
-    /// Which log lines go to the server by themselves, now and from now on.
+    /// The settings for forwarding log lines to the server, now and after each change.
     pub fn forward(&self) -> watch::Receiver<ForwardSettings> {
         self.forward.subscribe()
     }
@@ -83,7 +83,7 @@ impl Robot {
         self.held.read().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Takes on what is set for this robot. What runs goes on as it was started.
+    /// Adopts the settings made at the server. Running tasks keep the settings of their start.
     pub(super) fn adopt(&self, set: &RobotSettings) {
         let before = self.held();
         if before.set == *set {

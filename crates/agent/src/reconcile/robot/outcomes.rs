@@ -1,5 +1,5 @@
-//! What the plan is told of how a step ended: each module's error as a failure's code and text, and
-//! whether to try again.
+//! Step outcomes for the plan: each module's error as a failure code and text, and whether to
+//! retry.
 
 use std::error::Error;
 use std::path::Path;
@@ -24,7 +24,7 @@ pub(super) fn pulled(outcome: Result<(), FetchError>) -> Result<Done, StepFailur
     }
 }
 
-/// Does work on the disk in a thread that may block; a failure is tried again.
+/// Does disk work in a thread that may block; a failure is retried.
 pub(super) async fn on_disk(
     work: impl FnOnce() -> std::io::Result<()> + Send + 'static,
 ) -> Result<(), StepFailure> {
@@ -37,7 +37,7 @@ pub(super) fn millis(duration: Duration) -> u64 {
 }
 
 pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
-    // A cancelled pull is no failure: the driver lets go of its outcome.
+    // A cancelled pull is not a failure: the driver discards its outcome.
     let code = error.code().unwrap_or(FailureCode::INTERRUPTED);
     if error.is_retryable() || matches!(error, FetchError::Cancelled) {
         let least_ms = error.retry_after().map_or(0, millis);
@@ -46,8 +46,8 @@ pub(super) fn fetch_failure(error: FetchError) -> StepFailure {
     finally(code, &error)
 }
 
-/// A build that failed on a disk without room, which holds `root`, says little of the package: it
-/// is tried again.
+/// The failure of a build. On a full disk, the one that holds `root`, a failed build says little
+/// about the package, so the build is retried.
 pub(super) fn build_failure(error: BuildError, root: &Path) -> StepFailure {
     let Some(code) = error.code() else { return later(FailureCode::BUILD_FAILED, &error, 0) };
     match disk::room(root) {

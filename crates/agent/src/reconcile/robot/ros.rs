@@ -1,5 +1,5 @@
-//! The ROS that the robot has, as it was last seen: found by the settings that hold, and known
-//! better once somebody has looked into it.
+//! The robot's ROS installations as last seen. They are found by the effective settings, and known
+//! in more detail after a probe has run their setup files.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -23,12 +23,11 @@ use crate::system::task_user::TaskUser;
 use crate::task::ledger::ActiveRun;
 use crate::task::plan::StepFailure;
 
-/// Where looking into ROS installations has its files.
+/// The directory for the files of the ROS probe.
 const SURVEY_DIR: &str = "survey";
 
-/// The variable by which nodes find where to write logs of their own, which begin anew: ROS makes
-/// new files at each start and deletes none. What of them can't be deleted is no reason not to
-/// start.
+/// The variable with the directory for the nodes' own logs. The directory is emptied first: ROS
+/// makes new files at each start and deletes none. If the deletion fails, the task still starts.
 pub(super) async fn node_logs(
     version: &VersionDir,
     user: Option<&TaskUser>,
@@ -37,7 +36,7 @@ pub(super) async fn node_logs(
     let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
     let empty = move || {
         durable::remove_dir_all(&logs)?;
-        // The version's directory is root's: who writes there needs one of its own.
+        // The version's directory belongs to root, so a task user needs a log directory of its own.
         user.map_or(Ok(()), |user| user.make_home(&logs))
     };
     let emptied = tokio::task::spawn_blocking(empty).await;
@@ -48,21 +47,22 @@ pub(super) async fn node_logs(
 }
 
 impl Robot {
-    /// How tasks that are started now meet ROS.
+    /// The ROS facts for tasks that are started now.
     pub(super) fn ros_facts(&self) -> Option<RosFacts> {
         self.ros_facts_in(&self.held().environment)
     }
 
-    /// How tasks with this environment do.
+    /// The ROS facts for tasks with this environment.
     pub(super) fn ros_facts_in(&self, environment: &BTreeMap<String, String>) -> Option<RosFacts> {
         environment::ros_facts(&self.installations(), environment)
     }
 
-    /// How the run does whose directory is `dir`: it stays in the domain that it was started in.
+    /// The ROS facts of the run in the directory `dir`: a run stays in the domain that it was
+    /// started in.
     pub(super) fn ros_facts_of(&self, dir: &Path) -> Option<RosFacts> {
         match RunDir::at(dir).spec() {
             Ok(Some(spec)) => self.ros_facts_in(&spec.environment),
-            // It was not started, or is not readable any more.
+            // The run was not started, or its specification is no longer readable.
             Ok(None) | Err(_) => self.ros_facts(),
         }
     }
@@ -78,9 +78,9 @@ impl Robot {
         found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
     }
 
-    /// The same for a run that is to be started. What is not there is looked for once more; for a
-    /// run that was ready before it may come back, as a disk that is mounted late or a package that
-    /// is being upgraded.
+    /// The setup files for a run that is to be started. If one is missing, the installations are
+    /// searched once more. For a run that was ready before, the failure is retried: the file may
+    /// come back with a disk that is mounted late or a package that is being upgraded.
     pub(super) fn setup_files_of(
         &self,
         run: &ActiveRun,
@@ -96,15 +96,14 @@ impl Robot {
             .map_err(|error| StepFailure { retry_after_ms, ..error })
     }
 
-    /// Takes what can be found by the settings that hold for what there is, until somebody has
-    /// looked into it. What has been started already may have to be started again before anybody
-    /// does.
+    /// Adopts the installations found by the effective settings, until a probe has inspected them.
+    /// Tasks that were started already may have to be restarted before the probe runs.
     pub(super) fn find_ros(&self) {
         let found = self.held().installations();
         *self.ros.write().unwrap_or_else(PoisonError::into_inner) = found;
     }
 
-    /// Looks into it; anew, if other settings hold by then.
+    /// Probes the installations, and repeats the probe if the settings have changed meanwhile.
     pub(super) async fn survey(&self) {
         let dir = self.data.root().join(SURVEY_DIR);
         loop {
@@ -112,10 +111,11 @@ impl Robot {
             let found = held.installations();
             let seen = match &self.task_user {
                 Ok(user) => probe::survey(found, &held.environment, &dir, user.as_ref()).await,
-                // Setup files may be anybody's: they are never sourced as root for want of a user.
+                // Setup files may belong to any user, so they are never sourced as root for want of
+                // a task user.
                 Err(_) => found,
             };
-            // Whoever changes the settings does that before they write here.
+            // A change of the settings happens before its write to this field.
             let mut ros = self.ros.write().unwrap_or_else(PoisonError::into_inner);
             if Arc::ptr_eq(&held, &self.held()) {
                 *ros = seen;

@@ -1,4 +1,5 @@
-//! The run directories that a task has: what may still run of them is ended before they go.
+//! The run directories of a task. Leftover processes of a run are ended before its directory is
+//! deleted.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -14,8 +15,8 @@ use crate::task::ledger::{ActiveRun, ProcessRecord};
 use crate::task::plan::StepFailure;
 
 impl Robot {
-    /// Ends what runs of every run directory in `runs` but one: a start that seemed to fail may
-    /// have come about after all, and there are never two processes of a task. Gives these
+    /// Ends the processes of every run directory in `runs` except `kept`: a start that seemed to
+    /// fail may have succeeded after all, and a task never has two processes. Returns the other
     /// directories.
     pub(super) async fn end_other_runs(
         &self,
@@ -36,7 +37,7 @@ impl Robot {
         Ok(others)
     }
 
-    /// Deletes every run directory but one.
+    /// Deletes every run directory except `kept`, after ending its processes.
     pub(super) async fn forget_runs(
         &self,
         runs: &Path,
@@ -48,18 +49,18 @@ impl Robot {
     }
 }
 
-/// Whether the machine was started again since: then nothing is left of the process, whatever its
-/// files say.
+/// Whether the machine was restarted after the start of the process. If so, the process is gone,
+/// whatever its files say.
 pub(super) fn went_down_with_its_boot(process: &ProcessRecord) -> bool {
     clock::boot_id().is_ok_and(|boot_id| boot_id != process.boot_id)
 }
 
-/// What the ledger said of the process of a run directory before its start.
+/// The process in the copy of the ledger's record that was written before the start.
 fn recorded(dir: &Path) -> Option<ProcessRecord> {
     serde_json::from_slice::<ActiveRun>(&std::fs::read(dir.join(RUN_RECORD)).ok()?).ok()?.process
 }
 
-/// Every run directory but one.
+/// Every run directory except `kept`.
 pub(super) fn other_runs(runs: &Path, kept: Option<&Path>) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(runs).into_iter().flatten().flatten();
     entries.map(|entry| entry.path()).filter(|path| Some(path.as_path()) != kept).collect()

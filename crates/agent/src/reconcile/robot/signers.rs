@@ -1,5 +1,5 @@
-//! Who has signed a package, as the robot's steps ask for it: before anything is fetched, once more
-//! at each step that fetches, builds or starts, whatever was planned.
+//! Signature checks for the robot's steps: before the first fetch, and again at each step that
+//! fetches, builds or starts, whatever was planned.
 
 use task_proto::desired::PackageRef;
 use tokio_util::sync::CancellationToken;
@@ -11,7 +11,7 @@ use crate::install::signature_policy::NotVouched;
 use crate::task::plan::StepFailure;
 
 impl Robot {
-    /// That the package may be used so, by what was signed about it, which is fetched if need be.
+    /// Checks that the signatures permit this use of the package. Missing evidence is fetched.
     pub(super) async fn vouched(
         &self,
         package: &PackageRef,
@@ -25,8 +25,8 @@ impl Robot {
         })
     }
 
-    /// The same for what was found to be so a moment ago. If it is no more, that is looked into
-    /// first.
+    /// Checks again that a package found trusted a moment ago still is. If not, the step is retried
+    /// after a full check.
     pub(super) fn still_vouched(&self, package: &PackageRef) -> Result<(), StepFailure> {
         let Some(vouching) = &self.vouching else { return Ok(()) };
         let judged = vouching.judge(package, Use::Begin);
@@ -37,7 +37,8 @@ impl Robot {
     }
 }
 
-/// Only a list of publishers comes by itself: other signatures come with another order.
+/// The failure for a distrusted package. A retry helps only with the list of publishers, which is
+/// updated by itself: other signatures come with another order.
 fn refusal(distrust: &Distrust, package: &PackageRef) -> StepFailure {
     StepFailure {
         failure: distrust.failure(package),
@@ -62,7 +63,8 @@ mod tests {
     use crate::system::durable::own_mounts::with_own_mounts;
     use crate::task::effects::Effects as _;
 
-    /// Does `step` without room for one more file, which fails and passes, and again with room.
+    /// Runs `step` without room for one more file, expecting a failure that may pass, and again
+    /// with room.
     async fn try_full(dir: &Path, step: impl AsyncFn() -> Result<(), StepFailure>) {
         let files = dir.join("files");
         std::fs::create_dir(&files).expect("made");
@@ -127,7 +129,7 @@ mod tests {
                 Some("nr_inodes=64"),
             )
             .expect("mounted");
-            // Only this thread sees what is mounted.
+            // The mounts are visible only to this thread.
             let runtime = tokio::runtime::Builder::new_current_thread()
                 .enable_all()
                 .build()

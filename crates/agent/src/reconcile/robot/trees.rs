@@ -1,5 +1,6 @@
-//! What lies on the disk of a version, and whose it is: unpacked and built trees belong to root and
-//! are compared with their seal before each start, the directory beside them is the task's.
+//! The files of a version on the disk, and their owners. Unpacked and built trees belong to root
+//! and are compared with their seal before each start. The working directory beside them belongs to
+//! the task.
 
 use std::io;
 use std::os::unix::fs::MetadataExt as _;
@@ -22,7 +23,7 @@ use crate::system::layout::VersionDir;
 use crate::system::task_user::{self, TaskUser};
 use crate::task::plan::{Done, StepFailure};
 
-/// Why a version is not started or built.
+/// Why a version cannot be started or built.
 #[derive(Debug, thiserror::Error)]
 enum Unfit {
     #[error(
@@ -33,16 +34,16 @@ enum Unfit {
     Io(#[from] io::Error),
 }
 
-/// What a version is verified for.
+/// The purpose of a verification.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Purpose {
-    /// To be built.
+    /// The version is to be built.
     Build,
-    /// To be started.
+    /// The version is to be started.
     Start,
 }
 
-/// A version on the disk, and where its seal is.
+/// A version on the disk, and the path of its seal.
 #[derive(Debug, Clone)]
 struct Trees {
     version: VersionDir,
@@ -51,7 +52,7 @@ struct Trees {
 }
 
 impl Robot {
-    /// The accounts of a task; `None`: it runs as whoever the agent is.
+    /// The accounts of a task; `None`: the task runs as the agent's user.
     pub(super) fn accounts_of(&self, task: &TaskName) -> Result<Option<AccountPair>, StepFailure> {
         let base =
             self.task_user.as_ref().map_err(|error| later(FailureCode::NO_TASK_USER, error, 0))?;
@@ -64,7 +65,7 @@ impl Robot {
         Trees { version: self.version(package), seal, tool }
     }
 
-    /// Notes what lies on the disk of this version, which was unpacked or built just now.
+    /// Seals the files of this version, which were just unpacked or built.
     pub(super) async fn seal(
         &self,
         package: &PackageRef,
@@ -75,7 +76,7 @@ impl Robot {
             .await
     }
 
-    /// The same once it was pulled; a pull that was put off has left nothing.
+    /// Seals the version after a pull. A pull that was put off has left no files.
     pub(super) async fn seal_pulled(
         &self,
         package: &PackageRef,
@@ -88,8 +89,8 @@ impl Robot {
         Ok(done)
     }
 
-    /// That this version is what was unpacked and, for a start, what was built of it. One that is
-    /// not is deleted.
+    /// Verifies that the unpacked files and, for a start, the built files of this version are
+    /// unchanged. A changed version is deleted.
     pub(super) async fn verify(
         &self,
         package: &PackageRef,
@@ -104,7 +105,8 @@ impl Robot {
         .await
     }
 
-    /// Makes the directory that a version runs in, for `user`, and lets it to what it is to run.
+    /// Makes the working directory of a version for `user`, and gives `user` access to the
+    /// version's files.
     pub(super) async fn make_work_dir(
         &self,
         package: &PackageRef,
@@ -119,8 +121,8 @@ impl Robot {
         fit(self.data.root(), made).await
     }
 
-    /// Where a run of this version has written, and whom it ran as: an agent before this one let
-    /// tasks run among their package's own files.
+    /// The directory that a run of this version wrote to, and the user of that run. Earlier agents
+    /// let tasks run among their package's own files.
     pub(super) fn written_in(
         &self,
         package: &PackageRef,
@@ -138,7 +140,8 @@ impl Robot {
         Ok((trees.former_work_dir(), user))
     }
 
-    /// Whether tasks have rights of their own, so that what they run can be kept from them.
+    /// Whether tasks run as users of their own, so that their program files can be protected from
+    /// them.
     pub(super) fn protects(&self) -> bool {
         matches!(self.task_user, Ok(Some(_)))
     }
@@ -149,7 +152,8 @@ impl Trees {
         Ok(Seal::of(&self.version)?.write(&self.seal)?)
     }
 
-    /// Trees that a task may change are not sealed: Python alone writes its caches there.
+    /// Deletes the seal. Trees that a task may change are not sealed: Python alone writes its
+    /// caches there.
     fn forget_seal(&self) -> Result<(), Unfit> {
         Ok(durable::remove_file(&self.seal)?)
     }
@@ -159,15 +163,16 @@ impl Trees {
             self.adopt()?;
         }
         let broken = match Seal::read(&self.seal)? {
-            // It was unpacked before there were seals, or a moment ago by an agent that ended then.
+            // The version was unpacked before seals existed, or a moment ago by an agent that ended
+            // before sealing.
             None if self.version.src().is_dir() => return self.note(),
             None | Some(Err(_)) => Some(Broken::Source),
             Some(Ok(seal)) => seal.broken(&self.version)?,
         };
-        // A build begins with what an interrupted one has left.
+        // A build begins with the leftovers of an interrupted build.
         let matters = |broken: &Broken| purpose == Purpose::Start || *broken == Broken::Source;
         let Some(broken) = broken.filter(matters) else { return Ok(()) };
-        // The seal goes last: until then nothing of this is taken for whole.
+        // The seal goes last: until then no remaining file is taken for intact.
         durable::remove_file(&self.version.root().join(BUILT_MARKER))?;
         durable::remove_dir_all(&self.version.install())?;
         durable::remove_dir_all(&self.version.src())?;
@@ -175,8 +180,8 @@ impl Trees {
         Err(Unfit::Changed(broken))
     }
 
-    /// Takes over what an earlier agent had given to the account of all tasks, with what the task
-    /// wrote into it.
+    /// Takes over trees that an earlier agent had given to the account of all tasks, including the
+    /// files that the task wrote there.
     fn adopt(&self) -> Result<(), Unfit> {
         let owner = std::fs::symlink_metadata(self.version.root())?.uid();
         let since = work_dir::handed_over(&self.version)?;
@@ -197,7 +202,7 @@ impl Trees {
     }
 }
 
-/// Does blocking work on the disk, which holds `root`.
+/// Does blocking work on the disk that holds `root`.
 async fn fit(
     root: &Path,
     work: impl FnOnce() -> Result<(), Unfit> + Send + 'static,

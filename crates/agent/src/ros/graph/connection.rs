@@ -1,7 +1,7 @@
-//! The agent's end of the pipes to the program that takes part in the graph: it passes requests on,
-//! keeps what the program said last, and ends the program when nobody wants it any more, when it
-//! hangs, or when it does not keep to the protocol. The program reads what strangers send, so
-//! whatever it says is bounded here, and decides nothing.
+//! The agent's end of the pipes to the program that takes part in the graph. It forwards requests,
+//! keeps the program's last state, and ends the program when the graph is no longer needed, when
+//! the program hangs, or when the program violates the protocol. The program reads bytes from
+//! untrusted senders, so its output is bounded here and decides nothing.
 
 use std::collections::HashMap;
 use std::pin::pin;
@@ -24,23 +24,25 @@ use super::rate::{Rate, RateMeter};
 use super::snapshot::Snapshot;
 use super::{GraphError, GraphSettings};
 
-/// How long the program may take until it takes part.
+/// Maximum time for the program to join the graph.
 const JOIN_TIMEOUT: Duration = Duration::from_secs(20);
-/// How long it may be silent.
+/// Maximum silence of the program.
 const SILENCE_TIMEOUT: Duration = ALIVE_INTERVAL.saturating_mul(7);
-/// How much later than asked for an answer may come: a call for all parameters is several.
+/// Extra time for an answer beyond the requested limit: a call for all parameters consists of
+/// several calls.
 const CALL_SLACK: Duration = Duration::from_secs(5);
-/// How many calls one request may need. The time of a request is for each of them.
+/// Maximum number of calls to a node that one request may need. The time limit of a request applies
+/// to each of them.
 const CALLS_PER_REQUEST: u32 = 40;
-/// How long the program may take to leave the graph.
+/// Maximum time for the program to leave the graph.
 const LEAVE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Requests that wait to be written.
+/// Maximum number of requests that wait to be written.
 const QUEUED_REQUESTS: usize = 512;
-/// The most calls that are under way, and the most topics that are counted.
+/// Maximum number of pending calls, and of topics that are counted.
 const MAX_CALLS: usize = 256;
 const MAX_METERS: usize = 1024;
 
-/// See the module.
+/// A connection to the program; see the module.
 pub(super) struct Connection {
     pid: u32,
     requests: mpsc::Sender<Request>,
@@ -49,7 +51,7 @@ pub(super) struct Connection {
     routes: Mutex<Routes>,
 }
 
-/// Where what the program says goes to. Nothing is left of it once the program has ended.
+/// Destinations of the program's events. All of them are dropped once the program has ended.
 #[derive(Default)]
 struct Routes {
     closed: bool,
@@ -62,8 +64,8 @@ struct Routes {
 type Events = Lines<BufReader<ChildStdout>>;
 
 impl Connection {
-    /// Starts the program and waits until it takes part. It ends with `closing`, which is cancelled
-    /// if it ends before.
+    /// Starts the program and waits until it takes part in the graph. The connection ends with
+    /// `closing`, and cancels `closing` if the program ends first.
     pub async fn open(
         settings: GraphSettings,
         program: &GraphProgram,
@@ -109,8 +111,8 @@ impl Connection {
         Ok((connection, snapshot))
     }
 
-    /// Passes messages both ways until one side ends. The program's input ends with this, and the
-    /// program with its input.
+    /// Forwards messages both ways until one side ends. The program's input ends with this call,
+    /// and the program ends with its input.
     async fn speak(
         &self,
         closing: &CancellationToken,
@@ -121,14 +123,14 @@ impl Connection {
         let mut hearing = pin!(self.hear(events, snapshots));
         let mut saying = pin!(write(input, queued));
         tokio::select! {
-            // Nothing follows: what was not sent or heard is of no use any more.
+            // Nothing follows: unsent and unread messages are of no use any more.
             () = closing.cancelled() => Spoken::Over,
             why = &mut hearing => Spoken::Lost(why),
             why = &mut saying => Spoken::Lost(why),
         }
     }
 
-    /// Takes in what the program says; says why it ends.
+    /// Processes the program's events; returns the reason for their end.
     async fn hear(&self, mut events: Events, snapshots: watch::Sender<Arc<Snapshot>>) -> String {
         loop {
             match tokio::time::timeout(SILENCE_TIMEOUT, events.next::<Event>()).await {
@@ -149,7 +151,7 @@ impl Connection {
             Event::Unchanged { age_ms } => {
                 let now = Instant::now();
                 let at = now.checked_sub(Duration::from_millis(age_ms)).unwrap_or(now);
-                // Nobody is woken: it shows what it did.
+                // No receiver is woken: the graph has not changed.
                 snapshots.send_if_modified(|current| {
                     Arc::make_mut(current).at = at;
                     false
@@ -159,7 +161,7 @@ impl Connection {
             Event::Refused { id, error } => self.answered(id, Err(error)),
             Event::Rosout(line) => {
                 let listeners = self.routes().rosout.clone();
-                // Nobody listens just now: it is not for later.
+                // Without a current listener the line is dropped, not kept for later.
                 listeners.map(|listeners| listeners.send(Arc::new(line)));
             }
             Event::Diagnostic(status) => {
@@ -176,18 +178,18 @@ impl Connection {
                     known.send_replace((rate, Instant::now()));
                 }
             }
-            // Said once, at the beginning.
+            // These events come only once, at the beginning.
             Event::Joined | Event::Failed { .. } => {}
         }
     }
 
     fn answered(&self, id: u64, answer: Result<Answer, GraphError>) {
         let asked = self.routes().calls.remove(&id);
-        // Whoever asked may have gone.
+        // The caller may have gone.
         let _ = asked.map(|asked| asked.send(answer));
     }
 
-    /// Whoever waits for something waits no longer.
+    /// Ends all waits for answers and events.
     fn end(&self) {
         *self.routes() = Routes { closed: true, ..Routes::default() };
     }
@@ -197,12 +199,12 @@ impl Connection {
         self.pid
     }
 
-    /// How many messages of feeds the program could not pass on.
+    /// Number of feed messages that the program could not forward.
     pub fn missed_messages(&self) -> u64 {
         self.missed.load(Ordering::Relaxed)
     }
 
-    /// Says this to the program, without waiting.
+    /// Queues a request for the program, without waiting.
     pub fn say(&self, request: Request) -> Result<(), GraphError> {
         self.requests.try_send(request).map_err(|error| match error {
             mpsc::error::TrySendError::Full(_) => GraphError::Busy,
@@ -210,14 +212,15 @@ impl Connection {
         })
     }
 
-    /// Has the program make a call. `within` is for each of the calls to a node that this takes.
+    /// Has the program make a call. `within` applies to each of the calls to a node that this
+    /// takes.
     pub async fn call(&self, call: Call, within: Duration) -> Result<Answer, GraphError> {
         let (id, within_ms) =
             (self.number(), u64::try_from(within.as_millis()).unwrap_or(u64::MAX));
         let (answer, answered) = oneshot::channel();
         {
             let mut routes = self.routes();
-            // Those whose caller has gone are not waited for.
+            // Calls without a waiting caller are removed.
             routes.calls.retain(|_, asked| !asked.is_closed());
             if routes.closed {
                 return Err(GraphError::Closed);
@@ -238,7 +241,7 @@ impl Connection {
         }
     }
 
-    /// A listener to what nodes log.
+    /// Subscribes to the log lines of nodes.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let mut routes = self.routes();
         if routes.closed {
@@ -247,7 +250,7 @@ impl Connection {
         Ok(routes.rosout.get_or_insert_with(|| broadcast::channel(CAPACITY).0).subscribe())
     }
 
-    /// A listener to what nodes say about the robot's parts.
+    /// Subscribes to the diagnostics that nodes publish about the robot's parts.
     pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
         let mut routes = self.routes();
         if routes.closed {
@@ -278,7 +281,7 @@ impl Connection {
         }
         let (connection, ending) = (Arc::downgrade(this), CancellationToken::new());
         let dropped = ending.clone();
-        // Nobody waits for it: whoever has the meter may keep it longer than there is a graph.
+        // This task is detached: the meter's owner may keep it longer than the graph exists.
         tokio::spawn(async move {
             // Cancel-safe: either way it is over.
             tokio::select! {
@@ -299,16 +302,16 @@ impl Connection {
     }
 
     fn routes(&self) -> MutexGuard<'_, Routes> {
-        // Maps of senders are sound whatever a panic left.
+        // Maps of senders stay valid after a panic.
         self.routes.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// How a conversation ended.
+/// Reasons for the end of a conversation.
 enum Spoken {
-    /// Nobody wants the graph any more.
+    /// The graph is no longer needed.
     Over,
-    /// The program has ended, or must.
+    /// The program has ended, or must be ended.
     Lost(String),
 }
 
@@ -319,7 +322,7 @@ async fn join(
 ) -> Result<(), GraphError> {
     let failed = |error: std::io::Error| GraphError::Start { reason: error.to_string() };
     let line = Request::Join(settings).line().map_err(failed)?;
-    // A program that ends at once may have said why.
+    // A program that ends at once may have written its reason.
     let written = input.write_all(&line).await;
     loop {
         match events.next().await.map_err(failed)? {
@@ -334,7 +337,7 @@ async fn join(
     }
 }
 
-/// Writes requests; says why it ends.
+/// Writes requests; returns the reason for the end.
 async fn write(mut input: ChildStdin, mut queued: mpsc::Receiver<Request>) -> String {
     while let Some(request) = queued.recv().await {
         let written = match request.line() {
@@ -351,7 +354,7 @@ async fn write(mut input: ChildStdin, mut queued: mpsc::Receiver<Request>) -> St
     "nobody asks any more".to_owned()
 }
 
-/// Waits until the program has ended, which the end of its input has it do, and makes sure of it.
+/// Waits until the program has ended, which it does when its input ends, and kills it otherwise.
 async fn leave(mut child: Child, spoken: Spoken) {
     let ended = match spoken {
         Spoken::Over => tokio::time::timeout(LEAVE_TIMEOUT, child.wait()).await.ok(),

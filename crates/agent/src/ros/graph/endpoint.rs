@@ -1,5 +1,5 @@
-//! Readers and writers of DDS topics, whose messages are CDR bytes: this is where the graph meets
-//! the DDS library. What the bytes mean is for others.
+//! Readers and writers of DDS topics, whose messages are CDR bytes. This module is the interface to
+//! the DDS library. Other modules interpret the bytes.
 
 use std::convert::Infallible;
 
@@ -22,25 +22,25 @@ use serde::de::DeserializeOwned;
 
 use super::{EndpointId, GraphError};
 
-/// The most bytes of one message that are read; a longer one is dropped.
+/// Maximum size of a message in bytes; a longer one is dropped.
 pub const MAX_MESSAGE_BYTES: usize = 1024 * 1024;
-/// How long a writer may wait for room.
+/// Maximum time that a writer waits for room.
 const WRITE_WAIT: Duration = Duration::from_millis(100);
 
-/// How messages are kept and passed on.
+/// QoS of a reader or writer: how messages are kept and delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
-    /// All arrive, those from before only if somebody kept them: services.
+    /// Reliable delivery without history for late joiners: services.
     Reliable {
-        /// How many are kept.
+        /// Number of messages kept.
         depth: i32,
     },
-    /// All arrive, the last ones from before as well: the graph, `/rosout`.
+    /// Reliable delivery, including the last messages from before: the graph, `/rosout`.
     Lasting {
-        /// How many are kept.
+        /// Number of messages kept.
         depth: i32,
     },
-    /// What arrives, arrives; understood by every publisher.
+    /// Best-effort delivery, compatible with every publisher.
     BestEffort,
 }
 
@@ -52,16 +52,16 @@ pub struct Cdr {
     pub body: Bytes,
 }
 
-/// A message with where it came from.
+/// A message with its origin.
 #[derive(Debug)]
 pub struct Sample<M> {
     /// The message.
     pub message: M,
-    /// Its writer.
+    /// The message's writer.
     pub writer: EndpointId,
-    /// Its place among the writer's messages.
+    /// Sequence number of the message at its writer.
     pub number: i64,
-    /// For an answer: the request it belongs to.
+    /// For an answer: the identity of its request.
     pub answers: Option<SampleIdentity>,
 }
 
@@ -107,8 +107,8 @@ impl Delivery {
 }
 
 impl Cdr {
-    /// `value` in little-endian CDR, after `header`, which must end where eight-byte values may
-    /// begin.
+    /// `value` in little-endian CDR, after `header`, which must end at an offset where eight-byte
+    /// values may begin.
     pub fn of(header: &[u8], value: &impl Serialize) -> Result<Self, GraphError> {
         let mut body = header.to_vec();
         let mut message = Vec::new();
@@ -128,7 +128,7 @@ impl Cdr {
         self.encoding == RepresentationIdentifier::CDR_LE
     }
 
-    /// The value that is `skipped` bytes into the body; `None`: there is none.
+    /// The value at offset `skipped` of the body; `None`: there is none.
     pub fn value<T: DeserializeOwned>(&self, skipped: usize) -> Option<T> {
         let bytes = self.body.get(skipped..)?;
         deserialize_from_cdr_with_rep_id(bytes, self.encoding).ok().map(|(value, _read)| value)
@@ -183,13 +183,13 @@ impl Endpoints {
 }
 
 impl<M: Received> Reader<M> {
-    /// Its id.
+    /// The reader's id.
     pub fn id(&self) -> EndpointId {
         EndpointId::of(self.reader.guid())
     }
 
-    /// What arrives. Messages that cannot be read are left out; it never ends. Dropping it between
-    /// two messages loses none.
+    /// The messages that arrive. Unreadable messages are left out. The stream never ends. Dropping
+    /// it between two messages loses none.
     pub fn samples(&self) -> impl Stream<Item = Sample<M>> + Send + '_ {
         self.reader
             .as_async_stream()
@@ -207,17 +207,17 @@ impl<M> Sample<M> {
 }
 
 impl Writer {
-    /// Its id.
+    /// The writer's id.
     pub fn id(&self) -> EndpointId {
         EndpointId::of(self.writer.guid())
     }
 
-    /// Its id as the DDS library has it.
+    /// The writer's id as the DDS library's type.
     pub fn guid(&self) -> GUID {
         self.writer.guid()
     }
 
-    /// Sends one message; `related` says what it belongs to, where that is asked for.
+    /// Sends one message; `related` is the identity of the related request, where one is needed.
     pub async fn write(
         &self,
         message: Cdr,
@@ -230,7 +230,7 @@ impl Writer {
             .map_err(|error| GraphError::Write { reason: format!("{error:?}") })
     }
 
-    /// Sends one message without waiting; for writers that keep only the last.
+    /// Sends one message without waiting; for writers that keep only the last message.
     pub fn put(&self, message: Cdr) {
         if let Err(error) = self.writer.write(message, None) {
             tracing::warn!(?error, "the graph was not told about this node");
@@ -238,9 +238,9 @@ impl Writer {
     }
 }
 
-/// What a reader makes of a message's bytes.
+/// Conversion of a message's bytes by a reader.
 pub trait Received: Send + Sized + 'static {
-    /// The encodings it takes; messages in others are left out.
+    /// The accepted encodings; messages in other encodings are left out.
     const ENCODINGS: &'static [RepresentationIdentifier];
 
     /// The message.
@@ -252,7 +252,7 @@ impl Received for Cdr {
         &[RepresentationIdentifier::CDR_LE, RepresentationIdentifier::CDR_BE];
 
     fn from_body(encoding: RepresentationIdentifier, body: &[u8]) -> Self {
-        // An empty body is no message of any type that is read here.
+        // An empty body is no valid message of any type that is read here.
         let body = if body.len() <= MAX_MESSAGE_BYTES {
             Bytes::copy_from_slice(body)
         } else {
@@ -262,10 +262,10 @@ impl Received for Cdr {
     }
 }
 
-/// A message of which only the length is kept: it is counted, not read.
+/// A message of which only the length is kept: the message is counted, not decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Counted {
-    /// Bytes of its body.
+    /// Length of the body in bytes.
     pub bytes: usize,
 }
 

@@ -1,20 +1,20 @@
-//! `rmw_dds_common/msg/ParticipantEntitiesInfo`, by which each participant says which nodes it
-//! holds and which readers and writers belong to them. Its form changed: a gid is 24 bytes up to
-//! Humble and 16 from Iron on, and nothing in the message says which; only one of the two adds up.
-//! Bytes come from strangers: every count and length has a limit, and what does not add up is
-//! refused whole.
+//! `rmw_dds_common/msg/ParticipantEntitiesInfo`, in which each participant lists its nodes and
+//! their readers and writers. The message format changed: a gid is 24 bytes up to Humble and 16
+//! from Iron on. No field of the message names the format, but only one of the two lengths fits the
+//! message. The bytes come from untrusted senders: every count and length has a limit, and a
+//! message that does not fit is refused as a whole.
 
 use task_proto::ros::GraphName;
 
 use super::{EndpointId, ParticipantId};
 
-/// The most nodes of one participant.
+/// Maximum number of nodes of one participant.
 pub const MAX_NODES: usize = 256;
-/// The most readers, and the most writers, of one node.
+/// Maximum number of readers, and of writers, of one node.
 pub const MAX_ENDPOINTS: usize = 2048;
-/// The most bytes a message may have.
+/// Maximum size of a message in bytes.
 pub const MAX_BYTES: usize = 1024 * 1024;
-/// The longest namespace and the longest name, in bytes.
+/// Maximum length of a namespace and of a name, in bytes.
 const MAX_NAME_BYTES: usize = 256;
 
 /// The two lengths a gid can have.
@@ -26,41 +26,42 @@ pub enum GidForm {
     Bytes16,
 }
 
-/// What a participant says about itself.
+/// A participant's message about itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ParticipantEntities {
-    /// The participant it is about.
+    /// The sending participant.
     pub participant: ParticipantId,
     /// Its nodes.
     pub nodes: Vec<NodeEntities>,
-    /// Nodes with a name that ROS does not allow, which were left out.
+    /// Number of nodes that were left out because ROS does not allow their names.
     pub misnamed: usize,
 }
 
 /// One node of a participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NodeEntities {
-    /// Its full name.
+    /// The node's full name.
     pub name: GraphName,
-    /// Its readers.
+    /// The node's readers.
     pub readers: Vec<EndpointId>,
-    /// Its writers.
+    /// The node's writers.
     pub writers: Vec<EndpointId>,
 }
 
-/// A message that is none.
+/// Reasons why bytes are not a valid message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum EntitiesError {
-    /// Too long to be looked at.
+    /// The message exceeds the size limit.
     #[error("{0} bytes, the limit is {MAX_BYTES}")]
     TooLong(usize),
-    /// With neither length of gid does the message add up.
+    /// The message fits neither length of gid.
     #[error("not a ParticipantEntitiesInfo with gids of 16 or 24 bytes, or one beyond the limits")]
     Malformed,
 }
 
 impl GidForm {
-    /// The form that nodes of this distribution speak; an unknown one is taken for a new one.
+    /// The form that nodes of this distribution use; an unknown distribution is treated as a new
+    /// one.
     pub fn of_distro(distro: Option<&str>) -> Self {
         match distro {
             Some("dashing" | "eloquent" | "foxy" | "galactic" | "humble") => Self::Bytes24,
@@ -77,7 +78,7 @@ impl GidForm {
 }
 
 impl ParticipantEntities {
-    /// Reads the CDR body (without its 4-byte header), whichever form it has.
+    /// Reads the CDR body (without its 4-byte header) in either form.
     pub fn decode(body: &[u8], little_endian: bool) -> Result<(Self, GidForm), EntitiesError> {
         if body.len() > MAX_BYTES {
             return Err(EntitiesError::TooLong(body.len()));
@@ -117,7 +118,8 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    /// The whole message; `None` also if bytes are left over, for that is how the other form shows.
+    /// The whole message; `None` also if bytes are left over, because leftover bytes indicate the
+    /// other form.
     fn message(mut self) -> Option<ParticipantEntities> {
         let participant = self.gid()?.participant();
         let mut misnamed = 0;
@@ -159,7 +161,7 @@ impl Reader<'_> {
         self.number().filter(|count| *count <= most)
     }
 
-    /// A text: its length with the closing zero, then its bytes.
+    /// A string: its length including the closing zero, then its bytes.
     fn text(&mut self) -> Option<String> {
         let length = self.count(MAX_NAME_BYTES + 1)?;
         let (last, text) = self.take(length)?.split_last()?;
@@ -169,13 +171,13 @@ impl Reader<'_> {
 
     fn gid(&mut self) -> Option<EndpointId> {
         let length = self.form.bytes();
-        // What fills the longer form up says nothing, whatever it is.
+        // The bytes that pad the longer form are ignored.
         let id = self.take(length)?.first_chunk()?;
         Some(EndpointId(*id))
     }
 
-    /// Gids, all of this participant: nobody speaks for another, and a wrong form does not get past
-    /// this.
+    /// Gids, all of this participant: no participant may speak for another, and a wrong form fails
+    /// this check.
     fn gids(&mut self, of: ParticipantId) -> Option<Vec<EndpointId>> {
         let count = self.count(MAX_ENDPOINTS)?;
         (0..count).map(|_| self.gid().filter(|gid| gid.participant() == of)).collect()
@@ -317,8 +319,7 @@ mod tests {
             assert!(ParticipantEntities::decode(&padded, true).is_ok());
             assert_eq!(ParticipantEntities::decode(&whole, false), Err(EntitiesError::Malformed));
         }
-        // A gid of another participant, a count that nothing stands behind, and a message without
-        // end.
+        // A gid of another participant, a count without elements, and a truncated message.
         let mut stranger = fixture(16);
         stranger[48] ^= 1;
         assert_eq!(ParticipantEntities::decode(&stranger, true), Err(EntitiesError::Malformed));

@@ -1,6 +1,6 @@
-//! What nodes say to everybody: log lines on `/rosout` and statuses on `/diagnostics`. Each is read
-//! once, when somebody first wants it, and passed on to all who listen; whoever is too slow is told
-//! how many messages it missed.
+//! Feeds of messages from all nodes: log lines on `/rosout` and statuses on `/diagnostics`. Each
+//! topic is read once, from the first subscription on, and forwarded to all subscribers. A
+//! subscriber that is too slow is told how many messages it missed.
 
 use std::collections::BTreeMap;
 use std::pin::pin;
@@ -19,52 +19,52 @@ use super::endpoint::{Cdr, Delivery, Endpoints, Reader, Sample};
 use super::names::{self, Role};
 use super::{EndpointId, GraphError, ParticipantId, Snapshot};
 
-/// How many messages wait for a slow listener.
+/// Maximum number of messages that wait for a slow subscriber.
 pub const CAPACITY: usize = 1024;
-/// The longest text of a message, in bytes; a longer one is cut.
+/// Maximum length of a message's text in bytes; a longer one is cut.
 pub const MAX_TEXT_BYTES: usize = 8 * 1024;
-/// The most statuses of one message on `/diagnostics`, and the most values of one status.
+/// Maximum number of statuses in one message on `/diagnostics`, and of values in one status.
 pub const MAX_STATUSES: usize = 256;
-/// The most bytes that the values of one status may have together: many statuses wait for a slow
-/// listener.
+/// Maximum total size of the values of one status, in bytes: many statuses may wait for a slow
+/// subscriber.
 const MAX_VALUES_BYTES: usize = 16 * 1024;
-/// How many writers' numbers are remembered.
+/// Maximum number of writers with a remembered sequence number.
 const MAX_WRITERS: usize = 4096;
 
 /// A log line of a node.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RosoutLine {
-    /// When, by the node's clock: milliseconds since the Unix epoch.
+    /// Time of the line by the node's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
-    /// How serious.
+    /// Severity of the line.
     pub level: LogLevel,
-    /// The node, where the logger is one's.
+    /// The node, if the logger belongs to one.
     pub node: Option<GraphName>,
-    /// The logger, which bears the node's name with dots, and maybe more.
+    /// The logger's name: the node's name with dots, possibly with a suffix.
     pub logger: String,
-    /// What it says.
+    /// Text of the line.
     pub text: String,
-    /// Where in the program.
+    /// Source file of the log statement.
     pub file: String,
-    /// Its line there.
+    /// Line number in the source file.
     pub line: u32,
-    /// Who said it.
+    /// The participant that sent the line.
     pub participant: ParticipantId,
-    /// Messages of the same writer that were lost right before.
+    /// Number of messages of the same writer that were lost right before this one.
     pub lost: u64,
 }
 
-/// How a part of the robot is.
+/// Condition of a part of the robot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DiagnosticLevel {
-    /// Well.
+    /// The part is in order.
     Ok,
-    /// Not quite well.
+    /// The part reports a warning.
     Warn,
-    /// Not well.
+    /// The part reports an error.
     Error,
-    /// Nothing was heard of it, or something this version does not know.
+    /// No data about the part has come, or the level is unknown to this version.
     #[serde(other)]
     Stale,
 }
@@ -72,19 +72,19 @@ pub enum DiagnosticLevel {
 /// A status on `/diagnostics`.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DiagnosticStatus {
-    /// When, by the node's clock: milliseconds since the Unix epoch.
+    /// Time of the status by the node's clock: milliseconds since the Unix epoch.
     pub at_ms: u64,
-    /// How it is.
+    /// Condition of the part.
     pub level: DiagnosticLevel,
-    /// What it is about.
+    /// Subject of the status.
     pub name: String,
-    /// In words.
+    /// Description of the condition.
     pub message: String,
-    /// The part.
+    /// Id of the part.
     pub hardware_id: String,
     /// Values with their names.
     pub values: Vec<(String, String)>,
-    /// Who said it.
+    /// The participant that sent the status.
     pub participant: ParticipantId,
 }
 
@@ -106,7 +106,7 @@ struct Status {
     values: Vec<(String, String)>,
 }
 
-/// The feeds that somebody listens to.
+/// The feeds with at least one subscriber.
 #[derive(Default)]
 pub struct Feeds {
     rosout: Mutex<Option<broadcast::Sender<Arc<RosoutLine>>>>,
@@ -117,8 +117,8 @@ pub struct Feeds {
 type Running = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
 impl Feeds {
-    /// A listener to `/rosout`, and what reads it, where nobody did. The first listener gets the
-    /// last lines from before.
+    /// A subscription to `/rosout`, and the reading task if there was none. The first subscriber
+    /// gets the last lines from before.
     pub fn rosout(
         &self,
         endpoints: &Endpoints,
@@ -144,7 +144,7 @@ impl Feeds {
         listen(&self.rosout, closing, read)
     }
 
-    /// A listener to `/diagnostics`, and what reads it, where nobody did.
+    /// A subscription to `/diagnostics`, and the reading task if there was none.
     pub fn diagnostics(
         &self,
         endpoints: &Endpoints,
@@ -182,7 +182,7 @@ fn reader(
     endpoints.reader(&names::to_dds(Role::Topic, &topic), &kind, delivery)
 }
 
-/// Joins what is being read, or begins to.
+/// Joins the feed that is being read, or starts one.
 fn listen<T, M>(
     feed: &Mutex<Option<broadcast::Sender<Arc<T>>>>,
     closing: &CancellationToken,
@@ -204,7 +204,7 @@ where
         let mut samples = pin!(reader.samples());
         while let Some(Some(sample)) = closing.run_until_cancelled(samples.next()).await {
             for message in messages(sample).into_iter().flatten() {
-                // Nobody listens just now: it is not for later.
+                // Without a current subscriber the message is dropped, not kept for later.
                 let _ = sender.send(Arc::new(message));
             }
         }
@@ -212,7 +212,7 @@ where
     Ok((receiver, Some(Box::pin(running))))
 }
 
-/// Finds gaps in writers' numbers.
+/// Finds gaps in writers' sequence numbers.
 #[derive(Default)]
 struct Lost {
     last: BTreeMap<EndpointId, i64>,
@@ -284,8 +284,8 @@ impl DiagnosticStatus {
     }
 }
 
-/// The participant's node whose logger this is: `/robot/talker` has `robot.talker`, and all below
-/// it.
+/// The participant's node that owns this logger: `/robot/talker` owns `robot.talker`, and all
+/// loggers below it.
 fn node_of(logger: &str, participant: ParticipantId, snapshot: &Snapshot) -> Option<GraphName> {
     let is_of = |node: &GraphName| {
         let name = node.as_str().trim_start_matches('/').replace('/', ".");
@@ -293,7 +293,8 @@ fn node_of(logger: &str, participant: ParticipantId, snapshot: &Snapshot) -> Opt
     };
     let nodes =
         snapshot.nodes.iter().filter(|node| node.participant == participant && is_of(&node.name));
-    // A line may come before its node is known; what a whole name looks like is taken for one.
+    // A line may come before its node is known; a logger that looks like a whole node name counts
+    // as one.
     let known = nodes.map(|node| node.name.clone()).max_by_key(|name| name.as_str().len());
     known.or_else(|| format!("/{}", logger.replace('.', "/")).parse().ok())
 }

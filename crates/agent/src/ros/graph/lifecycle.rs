@@ -1,4 +1,4 @@
-//! Managed nodes: their state and their transitions, by the services every lifecycle node has.
+//! Managed nodes: their state and their transitions, by the services that every lifecycle node has.
 
 use std::time::Duration;
 
@@ -35,7 +35,7 @@ struct Changed {
     success: bool,
 }
 
-/// Makes the clients for this node, before it is there.
+/// Creates the clients for this node, before the node exists.
 pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), GraphError> {
     for (name, kind) in [GET_STATE, CHANGE_STATE] {
         clients.prepare(&service_of(node, name)?, kind).await?;
@@ -43,7 +43,7 @@ pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), G
     Ok(())
 }
 
-/// The state the node is in.
+/// The node's current state.
 pub(super) async fn state(
     clients: &Clients,
     node: &GraphName,
@@ -56,7 +56,7 @@ pub(super) async fn state(
     Ok(of_id(state.id))
 }
 
-/// Asks for the transition; says whether the node made it.
+/// Requests the transition; returns whether the node made it.
 pub(super) async fn change(
     clients: &Clients,
     node: &GraphName,
@@ -81,8 +81,8 @@ fn of_id(id: u8) -> LifecycleState {
     }
 }
 
-/// The numbers are those of `lifecycle_msgs/msg/Transition`. Shutdown has another number in every
-/// state, but one label, which nodes look at first.
+/// The numbers are those of `lifecycle_msgs/msg/Transition`. Shutdown has a different number in
+/// every state, but one label, which nodes check first.
 fn request_of(transition: Transition) -> Change {
     match transition {
         Transition::Configure => Change { id: 1, label: "" },

@@ -1,26 +1,27 @@
-//! How ROS writes its names in DDS: `/chatter` is the DDS topic `rt/chatter`, a service is the pair
-//! `rq/…Request` and `rr/…Reply`, `std_msgs/msg/String` is the DDS type
-//! `std_msgs::msg::dds_::String_`. Both ways, and nothing else.
+//! Conversion between ROS names and DDS names: `/chatter` is the DDS topic `rt/chatter`, a service
+//! is the pair `rq/…Request` and `rr/…Reply`, `std_msgs/msg/String` is the DDS type
+//! `std_msgs::msg::dds_::String_`. Both directions, and nothing else.
 
 use task_proto::ros::GraphName;
 
-/// What a DDS topic is to ROS.
+/// Role of a DDS topic in ROS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// A topic.
     Topic,
-    /// The way of a service's requests.
+    /// The request topic of a service.
     Request,
-    /// The way of a service's answers.
+    /// The answer topic of a service.
     Reply,
 }
 
-/// The DDS topic that carries every participant's nodes. It has no prefix.
+/// The DDS topic on which every participant lists its nodes. The topic has no prefix.
 pub const DISCOVERY_TOPIC: &str = "ros_discovery_info";
-/// Its type.
+/// DDS type of the discovery topic.
 pub const DISCOVERY_TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 
-/// What the DDS topic `dds` is; `None`: not ROS's, or with a name that ROS does not allow.
+/// The role and name of the DDS topic `dds`; `None`: the topic is not from ROS, or ROS does not
+/// allow its name.
 pub fn from_dds(dds: &str) -> Option<(Role, GraphName)> {
     let (prefix, rest) = dds.split_once('/')?;
     let (role, name) = match prefix {
@@ -70,7 +71,7 @@ pub fn type_to_dds(role: Role, ros: &str) -> Option<String> {
         Role::Reply => "_Response",
     };
     let dds = format!("{package}::{kind}::dds_::{name}{suffix}_");
-    // Only what reads back as the same is a type.
+    // A type is valid only if the reverse conversion gives the same name.
     (type_from_dds(role, &dds).as_deref() == Some(ros)).then_some(dds)
 }
 

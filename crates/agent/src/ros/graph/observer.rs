@@ -1,10 +1,10 @@
-//! The one task that listens to discovery. It owns what participants said about their nodes and
-//! which remote endpoints are matched with ours; it publishes snapshots, and wakes whoever waits
-//! for a change.
+//! The single task that listens to discovery. It owns the participants' messages about their nodes
+//! and the matches of remote endpoints with ours. It publishes snapshots and wakes the tasks that
+//! wait for a change.
 //!
-//! Where the DDS library's events are not enough: a killed process says nothing, so its participant
-//! is lost only when its lease ends (Fast DDS: 20 s), and events are dropped when too many come at
-//! once; so everything is also looked at every few seconds.
+//! The DDS library's events are not enough. A killed process sends nothing, so its participant is
+//! lost only when its lease ends (Fast DDS: 20 s), and events are dropped when too many come at
+//! once. So the observer also examines everything every few seconds.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
@@ -28,33 +28,34 @@ use crate::system::clock;
 
 /// Changes within this time become one snapshot.
 const DEBOUNCE: Duration = Duration::from_millis(50);
-/// How often everything is looked at without an event.
+/// Interval between full examinations without an event.
 const AUDIT: Duration = Duration::from_secs(3);
-/// How long a participant may have no endpoints and is remembered.
+/// Time for which a participant without endpoints is remembered.
 const NEWCOMER: Duration = Duration::from_secs(60);
-/// The most readers, and the most writers, that are looked at.
+/// Maximum number of readers, and of writers, that are examined.
 const MAX_DISCOVERED: usize = 20_000;
-/// The most participants of which something is remembered.
+/// Maximum number of participants about which data is remembered.
 const MAX_PARTICIPANTS: usize = 1024;
-/// How far the wall clock may fall back between two looks: further is a step, and no correction.
+/// Maximum backward correction of the wall clock between two examinations: a larger one counts as a
+/// step.
 const MAX_FALL_MS: u64 = 1000;
-/// The most addresses of one endpoint.
+/// Maximum number of addresses of one endpoint.
 const MAX_LOCATORS: usize = 16;
 
-/// Which remote endpoints each of ours is matched with.
+/// The remote endpoints that are matched with each of ours.
 #[derive(Debug, Default)]
 pub struct Matches {
     remotes: BTreeMap<EndpointId, BTreeSet<EndpointId>>,
 }
 
-/// What the clocks show, in milliseconds.
+/// Readings of the clocks, in milliseconds.
 #[derive(Debug, Clone, Copy)]
 struct Clocks {
     wall_ms: u64,
     boot_ms: u64,
 }
 
-/// See the module.
+/// The observer; see the module.
 pub struct Observer {
     participant: DomainParticipant,
     own: ParticipantId,
@@ -65,7 +66,8 @@ pub struct Observer {
 }
 
 impl Matches {
-    /// The participants matched with both of ours: they can hear the request, and we their answer.
+    /// The participants matched with both of our endpoints: they can receive the request, and we
+    /// their answer.
     pub fn with_both(&self, writer: EndpointId, reader: EndpointId) -> BTreeSet<ParticipantId> {
         let participants = |own| -> BTreeSet<_> {
             self.remotes
@@ -78,7 +80,7 @@ impl Matches {
         &participants(writer) & &participants(reader)
     }
 
-    /// Forgets one of ours that is gone.
+    /// Forgets one of our endpoints that is gone.
     pub fn forget(&mut self, own: EndpointId) {
         self.remotes.remove(&own);
     }
@@ -96,7 +98,7 @@ impl Clocks {
 }
 
 impl Observer {
-    /// For this participant; it sees nothing before it runs.
+    /// An observer for this participant; it sees nothing before [`Self::run`].
     pub fn new(
         participant: DomainParticipant,
         snapshot: watch::Sender<Arc<Snapshot>>,
@@ -113,9 +115,10 @@ impl Observer {
         }
     }
 
-    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back:
-    /// the library then keeps to itself what it hears by best effort, which is who is new, until
-    /// the clock shows the former time again. Another participant knows nothing of that time.
+    /// Listens until `closing`, until the DDS library ends, or until the wall clock is set back.
+    /// After such a step the library withholds data that it receives by best effort, such as
+    /// announcements of new participants, until the clock shows the former time again. A new
+    /// participant is not affected by that time.
     pub async fn run(mut self, discovery: Reader<Cdr>, closing: CancellationToken) {
         let listener = self.participant.status_listener();
         let mut events = pin!(listener.as_async_status_stream());
@@ -124,7 +127,7 @@ impl Observer {
         audit.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let (mut due, mut clocks): (Option<Instant>, _) = (None, Clocks::read());
         loop {
-            // Each branch may be dropped while it waits: streams and timers keep what they have.
+            // Each branch may be dropped while it waits: streams and timers keep their data.
             tokio::select! {
                 () = closing.cancelled() => return,
                 event = events.next() => {
@@ -153,7 +156,7 @@ impl Observer {
         }
     }
 
-    /// Takes in an event of the DDS library; says whether the graph may look different now.
+    /// Processes an event of the DDS library; returns whether the graph may have changed.
     fn heard(&mut self, event: Event) -> bool {
         match event {
             Event::RemoteReaderMatched { local_writer: own, remote_reader: remote }
@@ -196,7 +199,7 @@ impl Observer {
         });
     }
 
-    /// Takes in what a participant says about its nodes. Nobody speaks for another.
+    /// Processes a participant's message about its nodes. No participant may speak for another.
     fn said(&mut self, sample: &Sample<Cdr>) {
         let from = sample.writer.participant();
         if from == self.own {
@@ -217,7 +220,7 @@ impl Observer {
         }
     }
 
-    /// Looks at everything discovery has, forgets what is gone and publishes what it shows.
+    /// Examines all data of discovery, forgets lost entities and publishes the resulting snapshot.
     fn look(&mut self) {
         let readers = self.participant.discovered_readers();
         let writers = self.participant.discovered_writers();
@@ -254,8 +257,8 @@ impl Observer {
         });
     }
 
-    /// Whether an endpoint is of another's ROS: the agent's own and DDS's built-in ones are not
-    /// looked at.
+    /// Whether an endpoint belongs to another ROS participant: the agent's own and DDS's built-in
+    /// endpoints are ignored.
     fn is_ros(&self, endpoint: &Discovered) -> bool {
         endpoint.id.participant() != self.own
             && (endpoint.topic == super::names::DISCOVERY_TOPIC
@@ -314,7 +317,7 @@ mod tests {
         assert!(!fell_back(9_000_000, 53_000), "set forward");
         assert!(fell_back(1_001_000, 53_000));
         assert!(fell_back(0, 53_000));
-        // Suspended in between: both went on.
+        // The machine was suspended in between: both clocks went on.
         assert!(!fell_back(8_203_000, 7_253_000));
     }
 }

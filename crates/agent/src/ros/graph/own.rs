@@ -1,5 +1,5 @@
-//! The agent's own node, as others see it: it says which readers and writers it has, and takes back
-//! what is gone.
+//! The agent's own node, as other participants see it: it announces its readers and writers, and
+//! withdraws those that are gone.
 
 use std::collections::BTreeSet;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -8,7 +8,7 @@ use super::endpoint::{Cdr, Writer};
 use super::entities::{GidForm, NodeEntities, ParticipantEntities};
 use super::{EndpointId, ParticipantId};
 
-/// Tells the graph about the agent's node.
+/// Announces the agent's node on the graph.
 pub struct OwnNode {
     name: task_proto::ros::GraphName,
     participant: ParticipantId,
@@ -24,13 +24,13 @@ struct Held {
 }
 
 impl OwnNode {
-    /// A node without endpoints, which nobody has been told of.
+    /// A node without endpoints, not announced yet.
     pub fn new(name: task_proto::ros::GraphName, form: GidForm, announcer: Writer) -> Self {
         let participant = announcer.id().participant();
         Self { name, participant, form, announcer, endpoints: Mutex::default() }
     }
 
-    /// Takes these among the node's endpoints and says so.
+    /// Adds these endpoints to the node and announces the change.
     pub fn add(&self, readers: &[EndpointId], writers: &[EndpointId]) {
         let mut held = self.held();
         held.readers.extend(readers);
@@ -38,7 +38,7 @@ impl OwnNode {
         self.announce(&held);
     }
 
-    /// Takes these from the node's endpoints and says so.
+    /// Removes these endpoints from the node and announces the change.
     pub fn remove(&self, readers: &[EndpointId], writers: &[EndpointId]) {
         let mut held = self.held();
         held.readers.retain(|id| !readers.contains(id));
@@ -47,7 +47,7 @@ impl OwnNode {
     }
 
     fn held(&self) -> MutexGuard<'_, Held> {
-        // Two sets of ids are sound whatever a panic left.
+        // Two sets of ids stay valid after a panic.
         self.endpoints.lock().unwrap_or_else(PoisonError::into_inner)
     }
 

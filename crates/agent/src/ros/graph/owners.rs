@@ -1,12 +1,12 @@
-//! Whose a participant is. DDS does not say which process a participant lives in, but every
-//! participant announces the UDP addresses it listens at, and on this host the kernel knows whose
-//! sockets those are. That works with every vendor; where it cannot tell (another network
-//! namespace, no permission, an address that other hosts have too, no UDP at all) it says so, and
-//! [`Participant::first_seen`] is what is left.
+//! Determines the owner of a participant. DDS does not name the process of a participant, but every
+//! participant announces the UDP addresses that it listens at, and on this host the kernel knows
+//! the owners of those sockets. This works with every vendor. Where the owner can't be determined
+//! (another network namespace, no permission, an address that other hosts have too, no UDP at all),
+//! the result is unknown, and [`Participant::first_seen`] is the only evidence left.
 //!
-//! A killed process's participant stays on the graph until its lease ends, and its ports may be
-//! another's by then. So a participant that was seen before a process was started is never that
-//! process's.
+//! A killed process's participant stays on the graph until its lease ends, and another process may
+//! have its ports by then. So a participant that was seen before a process was started never
+//! belongs to that process.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, SocketAddr};
@@ -21,43 +21,45 @@ use nix::ifaddrs::getifaddrs;
 use super::snapshot::{Participant, ParticipantId};
 use crate::process::program::ProcessIdentity;
 
-/// How exactly the kernel says when a process was started, and how long ago that is.
+/// Resolution of the kernel's process start times, and of the age computed from them.
 const CLOCK_STEP: Duration = Duration::from_millis(20);
-/// Addresses of this host that are remembered; beyond it all are forgotten.
+/// Maximum number of former addresses of this host that are remembered; beyond that, all are
+/// forgotten.
 const MAX_FORMER: usize = 256;
-/// The most open files of one process that are looked at.
+/// Maximum number of open files of one process that are examined.
 const MAX_FILES: usize = 65_536;
 
-/// Participants, by whether they live in the processes that were asked about.
+/// Participants, grouped by whether they live in the given processes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Owners {
-    /// In one of these processes.
+    /// Participants in one of these processes.
     pub theirs: BTreeSet<ParticipantId>,
-    /// In another process, here or elsewhere.
+    /// Participants in another process, on this host or elsewhere.
     pub others: BTreeSet<ParticipantId>,
-    /// In no process any more: its addresses are all this host's, and nobody listens there who
-    /// could be it. Discovery knows of it until its lease ends.
+    /// Participants in no living process: all their addresses belong to this host, and no possible
+    /// owner listens there. Discovery knows of them until their lease ends.
     pub gone: BTreeSet<ParticipantId>,
-    /// It cannot be told.
+    /// Participants with an unknown owner.
     pub unknown: BTreeSet<ParticipantId>,
 }
 
-/// What this host says about UDP sockets and about the processes in question.
+/// This host's data about UDP sockets and about the processes in question.
 #[derive(Debug, Default)]
 struct Host {
     addresses: BTreeSet<IpAddr>,
-    /// Those that it had before. What was started then goes on announcing them.
+    /// Former addresses of this host. Processes that were started then go on announcing them.
     former: BTreeSet<IpAddr>,
     /// Sockets by the port they are bound to.
     sockets: BTreeMap<u16, BTreeSet<u64>>,
-    /// The sockets that the processes hold, with the age of the oldest that does.
+    /// The sockets that the processes hold, with the age of the oldest holder.
     held: BTreeMap<u64, Duration>,
-    /// Whether every process could be looked at, and shares the agent's network.
+    /// Whether every process could be examined and shares the agent's network.
     complete: bool,
 }
 
 impl Owners {
-    /// Asks the kernel. It reads `/proc`, so it belongs on a thread that may block.
+    /// Reads the data from the kernel. This reads `/proc`, so it belongs on a thread that may
+    /// block.
     pub(super) fn of(participants: &BTreeMap<ParticipantId, Participant>, pids: &[u32]) -> Self {
         let host = Host::look(Path::new("/proc"), pids).unwrap_or_else(|error| {
             tracing::warn!(error = %error, "cannot tell whose DDS participants are");
@@ -66,8 +68,8 @@ impl Owners {
         host.judge(participants)
     }
 
-    /// The process on this host that a participant lives in, where it can be told. It looks at
-    /// every process.
+    /// The process on this host that contains the participant, if it can be determined. This
+    /// examines every process.
     pub(super) fn process_of(participant: &Participant) -> Option<u32> {
         let host = Host::look(Path::new("/proc"), &[]).ok()?;
         host.holder(Path::new("/proc"), &participant.locators)
@@ -97,7 +99,7 @@ impl Host {
                     *oldest = age.max(*oldest);
                 }),
                 Ok(None) => host.complete = false,
-                // It has ended, and its sockets with it.
+                // The process has ended, and its sockets with it.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 Err(error) => {
                     tracing::debug!(pid, error = %error, "cannot see a process's sockets");
@@ -124,7 +126,7 @@ impl Host {
     }
 
     /// Whether one of the processes listens at these addresses, and did when they were first seen;
-    /// `None`: it cannot be told.
+    /// `None`: unknown.
     fn holds(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> Option<bool> {
         let ports =
             locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
@@ -138,8 +140,8 @@ impl Host {
                 _ => shared = true,
             }
         }
-        // Whoever has the address now may listen at the same port, so that it is held here proves
-        // nothing.
+        // The address may have a new owner that listens at the same port, so a local holder of the
+        // port proves nothing.
         let former = locators.iter().filter(|locator| self.former.contains(&locator.ip()));
         let may_be_here =
             former.filter_map(|locator| self.sockets.get(&locator.port())).flatten().any(is_held);
@@ -154,9 +156,9 @@ impl Host {
         }
     }
 
-    /// Whether all these addresses are this host's, and at one of them nobody listens who did when
-    /// they were first seen. One is enough: a participant listens at all that it announces, and
-    /// some of its ports are shared with others.
+    /// Whether all these addresses belong to this host, and one of them has no listener that
+    /// existed when they were first seen. One is enough: a participant listens at all addresses
+    /// that it announces, and some of its ports are shared with others.
     fn is_deserted(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> bool {
         let is_too_young =
             |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP < seen_for);
@@ -168,7 +170,7 @@ impl Host {
         !self.sockets.is_empty() && all_here && locators.iter().any(is_left)
     }
 
-    /// The process that listens at one of these addresses alone; `None`: it can't be told.
+    /// The one process that listens at one of these addresses; `None`: unknown.
     fn holder(&self, proc: &Path, locators: &BTreeSet<SocketAddr>) -> Option<u32> {
         let here = locators.iter().filter(|locator| self.is_here(locator.ip()));
         let ports = here.filter_map(|locator| self.sockets.get(&locator.port()));
@@ -179,7 +181,7 @@ impl Host {
             .ok()?
             .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
         processes.into_iter().find(|pid: &u32| {
-            // One that another user hides stays without a name.
+            // A process that another user hides stays unnamed.
             let held = held_by(*pid, &proc.join(pid.to_string()), network).ok().flatten();
             held.is_some_and(|(_, sockets)| !sockets.is_disjoint(&own))
         })
@@ -190,7 +192,7 @@ impl Host {
     }
 }
 
-/// The addresses that this host had when somebody looked, since the agent was started, and has no
+/// The addresses that this host had at an earlier call since the agent was started, and has no
 /// longer.
 fn former(now: &BTreeSet<IpAddr>) -> BTreeSet<IpAddr> {
     static EVER: Mutex<BTreeSet<IpAddr>> = Mutex::new(BTreeSet::new());
@@ -216,7 +218,8 @@ fn socket_of(line: &str) -> Option<(u16, u64)> {
     Some((u16::from_str_radix(port, 16).ok()?, inode.parse().ok()?))
 }
 
-/// How old a process is and the sockets it holds; `None`: it has another network than this.
+/// The age of a process and the sockets it holds; `None`: the process has another network than this
+/// one.
 fn held_by(
     pid: u32,
     process: &Path,
@@ -282,13 +285,13 @@ mod tests {
             (&["192.168.1.7:7413", "172.17.0.1:7413"], true, Some(false)),
             (&["192.168.1.5:7413"], false, None),
             (&["192.168.1.7:7411"], false, None),
-            // A port that two processes share says nothing, and two that contradict each other no
-            // more.
+            // A port that two processes share proves nothing, and neither do two ports that
+            // contradict each other.
             (&["192.168.1.5:7417"], true, None),
             (&["192.168.1.5:7417", "192.168.1.5:7411"], true, Some(true)),
             (&["192.168.1.5:7411", "192.168.1.5:7413"], true, None),
-            // It announces an address that this host has lost; who has that now may be meant as
-            // well.
+            // It announces an address that this host has lost; the participant may also belong to
+            // the address's new owner.
             (&["192.168.1.4:7411"], true, None),
             (&["192.168.1.4:7413"], true, Some(false)),
             (&["192.168.1.4:7411", "192.168.1.5:7411"], true, None),
@@ -312,10 +315,10 @@ mod tests {
         for (locators, seen_for_s, expected) in [
             (&["192.168.1.5:7415"][..], 1, true),
             (&["192.168.1.5:7413"], 1, false),
-            // Its port was taken over by a process that was started later.
+            // A process that was started later took over its port.
             (&["192.168.1.5:7411"], 11, true),
             (&["192.168.1.5:7411"], 1, false),
-            // Of two ports that it had, one is shared with others who live.
+            // One of its two ports is shared with other living participants.
             (&["192.168.1.5:7415", "192.168.1.5:7413"], 1, true),
             (&["192.168.1.7:7415"], 1, false),
             (&["192.168.1.4:7415"], 1, false),

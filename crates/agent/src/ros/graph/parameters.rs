@@ -1,5 +1,5 @@
-//! Parameters of nodes: list, get and set, by the services every node has unless it was told not
-//! to.
+//! Parameters of nodes: list, get and set, by the services that every node has unless they were
+//! disabled.
 
 use std::time::Duration;
 
@@ -15,9 +15,9 @@ use task_proto::ros::GraphName;
 use super::services::{Clients, Repeat};
 use super::{GraphError, service_of};
 
-/// The most parameters of one node that are read or set at once.
+/// Maximum number of parameters of one node that are read or set at once.
 pub const MAX_PARAMETERS: usize = 4096;
-/// How many are asked for in one request.
+/// Number of parameters per request.
 const BATCH: usize = 128;
 
 const LIST: (&str, &str) = ("list_parameters", "rcl_interfaces/srv/ListParameters");
@@ -28,7 +28,7 @@ const SET: (&str, &str) = ("set_parameters", "rcl_interfaces/srv/SetParameters")
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ParameterValue {
-    /// Declared without a value, or not declared.
+    /// A parameter declared without a value, or not declared.
     NotSet,
     /// A truth value.
     Bool(bool),
@@ -50,18 +50,18 @@ pub enum ParameterValue {
     Strings(Vec<String>),
 }
 
-/// What became of one parameter that was set.
+/// Result of setting one parameter.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SetResult {
     /// The parameter.
     pub name: String,
-    /// Whether it has the new value.
+    /// Whether the parameter has the new value.
     pub successful: bool,
-    /// The node's reason where it has not.
+    /// The node's reason for a rejection.
     pub reason: String,
 }
 
-/// Makes the clients for this node, before it is there.
+/// Creates the clients for this node, before the node exists.
 pub(super) async fn prepare(clients: &Clients, node: &GraphName) -> Result<(), GraphError> {
     for (name, kind) in [LIST, GET, SET] {
         clients.prepare(&service_of(node, name)?, kind).await?;
@@ -103,7 +103,7 @@ pub(super) async fn get(
         let request = GetParametersRequest { names: batch.to_vec() };
         let answer: GetParametersResponse =
             clients.call(&service, GET.1, &request, within, Repeat::WhileThereIsTime).await?;
-        // A node that does not know one of them may answer with nothing at all.
+        // A node that does not know one of them may answer with no values at all.
         if answer.values.is_empty() {
             values.extend(batch.iter().map(|_| ParameterValue::NotSet));
         } else if answer.values.len() == batch.len() {
@@ -115,7 +115,7 @@ pub(super) async fn get(
     Ok(values)
 }
 
-/// Sets these parameters, each for itself; says what became of each, in their order.
+/// Sets these parameters, each independently; returns the result of each, in their order.
 pub(super) async fn set(
     clients: &Clients,
     node: &GraphName,
@@ -148,7 +148,7 @@ pub(super) async fn set(
 }
 
 impl ParameterValue {
-    /// The value that people write as this; `None`: no parameter can have it.
+    /// The parameter value for a JSON value; `None`: no parameter can have this value.
     pub fn from_json(value: &Value) -> Option<Self> {
         let number = |number: &Number| match number.as_i64() {
             Some(integer) => Some(Self::Integer(integer)),
@@ -185,8 +185,8 @@ impl ParameterValue {
         }
     }
 
-    /// The same value in the type that `current` has, where it can be said in it: people write `1`
-    /// for a double, and an empty list for any list.
+    /// The same value in the type of `current`, where that type can express it: users write `1` for
+    /// a double, and an empty list for any list.
     #[must_use]
     pub fn fitting(self, current: &Self) -> Self {
         #[expect(
@@ -216,7 +216,7 @@ impl ParameterValue {
         }
     }
 
-    /// The value as people read it. Numbers that JSON does not have are texts.
+    /// The value in JSON for users. Numbers that JSON does not have become strings.
     pub fn to_json(&self) -> Value {
         let double = |value: &f64| {
             Number::from_f64(*value).map_or_else(|| Value::from(value.to_string()), Value::from)

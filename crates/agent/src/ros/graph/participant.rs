@@ -1,5 +1,5 @@
-//! Takes part in the ROS graph with a DDS participant of this process: it says what the graph
-//! shows, and performs calls. Only the program that [`super::serve`] is runs it.
+//! Takes part in the ROS graph with a DDS participant of this process: publishes the graph's state
+//! and performs calls. Only the program in [`super::serve`] runs this module.
 
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr};
@@ -25,12 +25,13 @@ use super::services::Clients;
 use super::snapshot::{ParticipantId, Snapshot};
 use super::{GraphError, GraphSettings, lifecycle};
 
-/// Of each participant's list of nodes only the last counts; this many wait to be read.
+/// Number of unread participant messages that are kept. Only the last list of nodes of each
+/// participant counts.
 const DISCOVERY_DEPTH: i32 = 200;
-/// The kernel's buffers for each socket of the participant.
+/// Size of the kernel's buffers for each socket of the participant.
 const SOCKET_BUFFER_BYTES: usize = 1024 * 1024;
 
-/// A handle on the graph; when the last one is dropped the node leaves.
+/// A handle on the graph. When the last handle is dropped, the node leaves.
 #[derive(Clone)]
 pub struct LocalGraph {
     shared: Arc<Shared>,
@@ -44,11 +45,12 @@ struct Shared {
     tasks: Tasks,
 }
 
-/// What runs for the graph. It ends when this is dropped.
+/// The background tasks of the graph. They end when this value is dropped.
 struct Tasks {
     closing: CancellationToken,
     tracker: TaskTracker,
-    /// Taken when it is dropped, for that blocks until the library's threads have ended.
+    /// Taken on drop, because dropping the participant blocks until the library's threads have
+    /// ended.
     participant: Option<DomainParticipant>,
 }
 
@@ -61,8 +63,8 @@ impl LocalGraph {
         opened.unwrap_or(Err(GraphError::Closed))
     }
 
-    /// Opens sockets and starts the library's threads; it must run inside the runtime, on a thread
-    /// that may block.
+    /// Opens sockets and starts the library's threads. Call it inside the runtime, on a thread that
+    /// may block.
     fn join(settings: &GraphSettings) -> Result<Self, GraphError> {
         let domain_id = settings.domain_id;
         let mut builder = DomainParticipantBuilder::new(domain_id)
@@ -96,7 +98,7 @@ impl LocalGraph {
         let observer = Observer::new(participant, snapshots, matches.clone());
         let closing = tasks.closing.clone();
         tasks.tracker.spawn(async move {
-            // Without it nothing would ever change or match again.
+            // Without the observer no change or match would ever be noticed again.
             let _closed = closing.clone().drop_guard();
             observer.run(discovery, closing).await;
         });
@@ -112,22 +114,23 @@ impl LocalGraph {
         })
     }
 
-    /// Wakes when the graph shows something else, many changes at once as one. It ends when the
+    /// Wakes when the graph changes; several changes may arrive as one. The channel ends when the
     /// graph is closed.
     pub fn changes(&self) -> watch::Receiver<Arc<Snapshot>> {
         self.shared.snapshot.clone()
     }
 
-    /// Makes what [`Self::lifecycle_state`], [`Self::change_state`] and the parameter calls need
-    /// for this node. A node that starts later finds it there, and answers the sooner.
+    /// Creates the client endpoints that [`Self::lifecycle_state`], [`Self::change_state`] and the
+    /// parameter calls need for this node. A node that starts later finds them there and answers
+    /// sooner.
     pub async fn prepare(&self, node: &GraphName) -> Result<(), GraphError> {
         lifecycle::prepare(&self.shared.clients, node).await?;
         parameters::prepare(&self.shared.clients, node).await
     }
 
-    /// Waits until a server of this service would hear a request, and its answer would be heard;
-    /// says which participants have one. Without `kind` the service's type is taken from what the
-    /// graph shows.
+    /// Waits until a server of this service would receive a request and its answer would be
+    /// received. Returns the participants that have such a server. Without `kind` the service's
+    /// type is taken from the graph.
     pub async fn service_answers(
         &self,
         service: &GraphName,
@@ -172,7 +175,7 @@ impl LocalGraph {
         }
     }
 
-    /// The state this lifecycle node is in.
+    /// The state of this lifecycle node.
     pub async fn lifecycle_state(
         &self,
         node: &GraphName,
@@ -181,8 +184,9 @@ impl LocalGraph {
         self.while_open(lifecycle::state(&self.shared.clients, node, within)).await
     }
 
-    /// Asks this lifecycle node for a transition, once; says whether it made it. After
-    /// [`GraphError::NoAnswer`] it may have: ask for its state.
+    /// Requests a transition of this lifecycle node, once; returns whether the node made the
+    /// transition. After [`GraphError::NoAnswer`] the node may have made the transition: ask for
+    /// its state.
     pub async fn change_state(
         &self,
         node: &GraphName,
@@ -192,7 +196,7 @@ impl LocalGraph {
         self.while_open(lifecycle::change(&self.shared.clients, node, transition, within)).await
     }
 
-    /// All parameters of this node. `within` is for each of the calls that takes.
+    /// All parameters of this node. `within` applies to each of the calls that this takes.
     pub async fn parameters(
         &self,
         node: &GraphName,
@@ -204,7 +208,7 @@ impl LocalGraph {
         Ok(names.into_iter().zip(values).collect())
     }
 
-    /// One parameter of this node; [`ParameterValue::NotSet`] where it has none of that name.
+    /// One parameter of this node; [`ParameterValue::NotSet`] where the node has none of that name.
     pub async fn parameter(
         &self,
         node: &GraphName,
@@ -217,7 +221,7 @@ impl LocalGraph {
         Ok(values.into_iter().next().unwrap_or(ParameterValue::NotSet))
     }
 
-    /// Sets these parameters, each for itself; says what became of each, in their order.
+    /// Sets these parameters, each independently; returns the result of each, in their order.
     pub async fn set_parameters(
         &self,
         node: &GraphName,
@@ -227,8 +231,8 @@ impl LocalGraph {
         self.while_open(parameters::set(&self.shared.clients, node, parameters, within)).await
     }
 
-    /// What nodes log, from now on; the first who asks also gets the last lines from before, for
-    /// nodes keep them. A listener that is too slow is told how many lines it missed.
+    /// Log lines of nodes, from now on. The first subscriber also gets the last lines from before,
+    /// because nodes keep them. A receiver that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let Shared { feeds, endpoints, snapshot, tasks, .. } = &*self.shared;
         let (receiver, running) = feeds.rosout(endpoints, snapshot.clone(), &tasks.closing)?;
@@ -236,7 +240,7 @@ impl LocalGraph {
         Ok(receiver)
     }
 
-    /// What nodes say about the robot's parts, from now on.
+    /// Diagnostics that nodes publish about the robot's parts, from now on.
     pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
         let Shared { feeds, endpoints, tasks, .. } = &*self.shared;
         let (receiver, running) = feeds.diagnostics(endpoints, &tasks.closing)?;
@@ -244,8 +248,8 @@ impl LocalGraph {
         Ok(receiver)
     }
 
-    /// Counts the messages of this topic, whose type is `kind`, whatever its publishers' settings
-    /// are.
+    /// Counts the messages of this topic with the type `kind`, whatever the QoS settings of its
+    /// publishers.
     pub fn rate(&self, topic: &GraphName, kind: &str) -> Result<Counter, GraphError> {
         let dds_kind = names::type_to_dds(Role::Topic, kind)
             .ok_or_else(|| GraphError::Kind(kind.to_owned()))?;
@@ -256,7 +260,7 @@ impl LocalGraph {
         Ok(counter)
     }
 
-    /// What `call` gives, or an error as soon as the graph is closed.
+    /// The result of `call`, or an error as soon as the graph is closed.
     async fn while_open<T>(
         &self,
         call: impl Future<Output = Result<T, GraphError>>,
@@ -264,12 +268,12 @@ impl LocalGraph {
         self.shared.tasks.closing.run_until_cancelled(call).await.unwrap_or(Err(GraphError::Closed))
     }
 
-    /// Leaves the graph. Other handles see nothing any more.
+    /// Leaves the graph. Other handles receive no more changes.
     pub async fn close(self) {
         self.shared.tasks.closing.cancel();
         self.shared.tasks.tracker.close();
         self.shared.tasks.tracker.wait().await;
-        // If this was the last handle the rest goes here, where it may block.
+        // If this was the last handle, the graph is dropped here, where blocking is allowed.
         let _ = tokio::task::spawn_blocking(move || drop(self)).await;
     }
 }
@@ -342,7 +346,8 @@ mod tests {
         }
         writer.put(Cdr::little_endian(vec![0xff; 2 * MAX_MESSAGE_BYTES]));
         says(&writer, stolen, "/stolen", GidForm::Bytes16);
-        // Messages of one writer keep their order: what came before was dealt with when this shows.
+        // Messages of one writer keep their order: once this message shows, the earlier ones have
+        // been processed.
         for (node, form) in
             [("/old", GidForm::Bytes24), ("/new", GidForm::Bytes16), ("/older", GidForm::Bytes24)]
         {

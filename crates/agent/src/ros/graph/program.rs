@@ -1,5 +1,5 @@
-//! The program that takes part in the graph for the agent, and what it is kept in: an account
-//! without rights, little memory, no capabilities, no way to more of them, nothing of the agent's
+//! The program that takes part in the graph for the agent, and its confinement: an account without
+//! rights, little memory, no capabilities, no way to gain more rights, and nothing of the agent's
 //! but two pipes.
 
 use std::collections::BTreeMap;
@@ -13,30 +13,31 @@ use crate::process::confinement::Confinement;
 use crate::process::program;
 use crate::system::task_user::TaskUser;
 
-/// The account that the program has where the robot has it.
+/// The program's account, if the robot has it.
 pub const ACCOUNT: &str = "taskd-graph";
-/// The memory it may have. Idle it takes 10 MB; a graph of thousands of nodes takes tens.
+/// The program's memory limit. An idle program takes 10 MB; a graph of thousands of nodes takes
+/// tens.
 pub const MEMORY_BYTES: u64 = 256 << 20;
-/// Its threads: a dozen belong to the DDS library.
+/// Maximum number of threads: a dozen belong to the DDS library.
 const MAX_THREADS: u64 = 64;
-/// Added to the agent's niceness: what strangers send must not keep the robot from its tasks.
+/// Added to the agent's niceness: data from untrusted senders must not slow down the robot's tasks.
 const NICE: i32 = 5;
-/// Who it is where there is no other account: `nobody`.
+/// Id of the user `nobody`, for robots without another account.
 const NOBODY: u32 = 65_534;
-/// The one variable of the agent's that it is given.
+/// The only variable that the program gets from the agent.
 const LOG_VARIABLE: &str = "TASK_AGENT_LOG";
 
-/// How the program is started.
+/// Settings for starting the program.
 #[derive(Debug, Clone)]
 pub struct GraphProgram {
     path: PathBuf,
     account: Option<TaskUser>,
-    /// Where groups are made, and the directory that its own is named for.
+    /// Parent of the program's control group, and the directory that its group is named for.
     group: Option<(Cgroups, PathBuf)>,
 }
 
 impl GraphProgram {
-    /// The agent's own program, for the agent whose data is in `data` and whose tasks run as
+    /// The agent's own program, for the agent with the data in `data` and with tasks that run as
     /// `task_user`.
     pub fn of_this_agent(
         data: &Path,
@@ -47,7 +48,7 @@ impl GraphProgram {
         Self { path: "/proc/self/exe".into(), account: account(task_user), group }
     }
 
-    /// The agent's program at `path`, with the rights that an agent's has, but without a control
+    /// The agent's program at `path`, with the same rights as for an agent, but without a control
     /// group.
     pub fn at(path: impl Into<PathBuf>) -> Self {
         Self { path: path.into(), account: account(None), group: None }
@@ -65,7 +66,7 @@ impl GraphProgram {
             made.inspect_err(|error| tracing::warn!(%error, "the ROS graph has no control group"))
                 .ok()
         });
-        // The threads are limited by the group alone: the account may have other processes.
+        // Only the group limits the threads: the account may have other processes.
         let limits = RunLimits { pids: None, ..limits };
         let confinement =
             Confinement::new(&self.path, group.as_ref(), &limits, self.account.as_ref())?;
@@ -77,7 +78,7 @@ impl GraphProgram {
         program::spawn_graph(&self.path, &environment, NICE, MEMORY_BYTES, confinement)
     }
 
-    /// Removes what was made for it, once it has ended.
+    /// Removes the program's control group, once the program has ended.
     pub(super) async fn clean_up(&self) {
         let Some((cgroups, dir)) = self.group.clone() else { return };
         let removed = tokio::task::spawn_blocking(move || cgroups.group(&dir).remove()).await;
@@ -87,7 +88,7 @@ impl GraphProgram {
     }
 }
 
-/// Who the program is: never root. An agent that is not root has no choice.
+/// The program's account: never root. An agent that is not root has no choice.
 fn account(task_user: Option<&TaskUser>) -> Option<TaskUser> {
     if !nix::unistd::geteuid().is_root() {
         return None;
@@ -96,6 +97,6 @@ fn account(task_user: Option<&TaskUser>) -> Option<TaskUser> {
     let nobody =
         || TaskUser { name: NOBODY.to_string(), uid: NOBODY, gid: NOBODY, groups: Vec::new() };
     let user = own.or_else(|| task_user.cloned()).unwrap_or_else(nobody);
-    // It opens no device.
+    // The program opens no device.
     Some(TaskUser { groups: Vec::new(), ..user })
 }

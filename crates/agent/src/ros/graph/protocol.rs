@@ -1,10 +1,10 @@
-//! What the agent and the program that takes part in the ROS graph for it say to each other: one
-//! JSON object a line, on the program's standard input and output. `task-agent graph` is one such
-//! program; another need only speak the same.
+//! The protocol between the agent and the program that takes part in the ROS graph for it: one JSON
+//! object a line, on the program's standard input and output. `task-agent graph` is one such
+//! program; any other program that speaks this protocol can replace it.
 //!
 //! Both sides ignore fields and lines that they do not know, so either may be older. A line has a
-//! limit: an event that is longer ends the program, a request that is longer is refused where it is
-//! made. Times are ages in milliseconds, because two programs need not have one clock.
+//! limit: an event above the limit ends the program, and a request above the limit is refused by
+//! the agent. Times are ages in milliseconds, because two programs need not share a clock.
 //!
 //! ```text
 //! agent                                    program
@@ -41,40 +41,41 @@ use super::{GraphError, GraphSettings};
 pub const MAX_REQUEST_BYTES: usize = 1 << 20;
 /// The longest event, in bytes: a graph of thousands of nodes.
 pub const MAX_EVENT_BYTES: usize = 8 << 20;
-/// What a buffer for lines keeps from one to the next.
+/// Capacity that a line buffer keeps from one line to the next.
 const KEPT_BUFFER_BYTES: usize = 64 << 10;
-/// The most participants of a snapshot.
+/// Maximum number of participants in a snapshot.
 const MAX_PARTICIPANTS: usize = 4096;
-/// How often the program says something at least. One that is silent for much longer hangs.
+/// Maximum interval between two events of the program. A program that is silent for much longer
+/// hangs.
 pub const ALIVE_INTERVAL: Duration = Duration::from_secs(3);
 
-/// What the agent says.
+/// Requests of the agent.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Request {
-    /// Take part in the graph. It comes first, and once.
+    /// Take part in the graph. This request comes first, and once.
     Join(GraphSettings),
-    /// Call a node, and say what came of it.
+    /// Call a node and return the result.
     Call {
-        /// By which the answer is known.
+        /// Identifies the answer.
         id: u64,
-        /// How long it may take.
+        /// Time limit of the call.
         within_ms: u64,
         /// The call.
         call: Call,
     },
-    /// Pass on what nodes say from now on.
+    /// Forward messages of a feed from now on.
     Listen(Feed),
     /// Count the messages of a topic.
     Count {
-        /// By which the rate is known.
+        /// Identifies the rate.
         meter: u64,
         /// The topic.
         topic: GraphName,
         /// Its type, `package/msg/Type`.
         kind: String,
     },
-    /// Count them no longer.
+    /// Stop counting the messages of a topic.
     StopCounting {
         /// The meter.
         meter: u64,
@@ -85,16 +86,16 @@ pub enum Request {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Call {
-    /// Make what the calls to this node need, before it is there.
+    /// Create the endpoints that calls to this node need, before the node exists.
     Prepare {
         /// The node.
         node: GraphName,
     },
-    /// Wait until a server of the service would hear a request.
+    /// Wait until a server of the service would receive a request.
     Servers {
         /// The service.
         service: GraphName,
-        /// Its type; without it the one that the graph shows.
+        /// The service's type; absent: the type that the graph shows.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         kind: Option<String>,
     },
@@ -103,14 +104,15 @@ pub enum Call {
         /// The node.
         node: GraphName,
     },
-    /// Ask a lifecycle node for a transition, once.
+    /// Request a transition of a lifecycle node, once.
     ChangeState {
         /// The node.
         node: GraphName,
         /// The transition.
         transition: Transition,
     },
-    /// Ask a node for all its parameters. The time is for each of the calls that takes.
+    /// Ask a node for all its parameters. The time limit applies to each of the calls that this
+    /// takes.
     Parameters {
         /// The node.
         node: GraphName,
@@ -122,7 +124,7 @@ pub enum Call {
         /// Its name.
         name: String,
     },
-    /// Set parameters of a node, each for itself.
+    /// Set parameters of a node, each independently.
     SetParameters {
         /// The node.
         node: GraphName,
@@ -131,64 +133,64 @@ pub enum Call {
     },
 }
 
-/// What nodes say to everybody.
+/// Feeds of messages from all nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Feed {
     /// Log lines.
     Rosout,
-    /// Statuses of the robot's parts.
+    /// Diagnostic statuses of the robot's parts.
     Diagnostics,
 }
 
-/// What the program says.
+/// Events of the program.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Event {
-    /// It takes part in the graph.
+    /// The program takes part in the graph.
     Joined,
-    /// It does not, and ends.
+    /// The program could not join, and ends.
     Failed {
-        /// Why.
+        /// The cause.
         error: GraphError,
     },
-    /// What the graph shows.
+    /// The new state of the graph.
     Snapshot(Shown),
-    /// The graph shows what it did.
+    /// The graph has not changed.
     Unchanged {
-        /// How long ago it was looked at.
+        /// Age of the last look at the graph.
         age_ms: u64,
     },
     /// A call was answered.
     Answer {
-        /// The call's.
+        /// Id of the call.
         id: u64,
-        /// What was answered.
+        /// The result of the call.
         answer: Answer,
     },
-    /// A call was not.
+    /// A call failed.
     Refused {
-        /// The call's.
+        /// Id of the call.
         id: u64,
-        /// Why.
+        /// The cause.
         error: GraphError,
     },
     /// A node logged something.
     Rosout(RosoutLine),
-    /// A node said how a part is.
+    /// A node published the status of a part.
     Diagnostic(DiagnosticStatus),
-    /// Messages of a feed came too fast to be passed on.
+    /// Messages of a feed came too fast to be forwarded.
     Missed {
-        /// How many.
+        /// Number of lost messages.
         count: u64,
     },
-    /// How often a topic carries a message.
+    /// Message rate of a topic.
     Rate {
         /// The meter.
         meter: u64,
         /// Messages a second.
         hz: f64,
-        /// Since the last one; without it there was none.
+        /// Age of the last message; absent: no message has come.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         since_last_ms: Option<u64>,
         /// Messages since the meter was made.
@@ -196,11 +198,11 @@ pub enum Event {
     },
 }
 
-/// What a call gave.
+/// Results of calls.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Answer {
-    /// Done.
+    /// The call succeeded and has no result.
     Done,
     /// The participants with such a server.
     Servers(BTreeSet<ParticipantId>),
@@ -212,14 +214,14 @@ pub enum Answer {
     Parameters(Vec<(String, ParameterValue)>),
     /// One parameter's value.
     Parameter(ParameterValue),
-    /// What became of each parameter that was set.
+    /// The result for each parameter that was set.
     Set(Vec<SetResult>),
 }
 
-/// A snapshot on its way.
+/// A snapshot in the form in which it is sent.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Shown {
-    /// How long ago it was so.
+    /// Age of the snapshot.
     age_ms: u64,
     nodes: Vec<Node>,
     participants: Vec<ShownParticipant>,
@@ -232,12 +234,12 @@ struct ShownParticipant {
     id: ParticipantId,
     #[serde(default)]
     locators: BTreeSet<SocketAddr>,
-    /// How long ago it was first seen.
+    /// Time since the participant was first seen.
     seen_ms: u64,
 }
 
 impl Shown {
-    /// As it is sent `now`.
+    /// The form of the snapshot for sending at `now`.
     pub fn of(snapshot: &Snapshot, now: Instant) -> Self {
         let participant = |(id, participant): (&ParticipantId, &Participant)| ShownParticipant {
             id: *id,
@@ -257,7 +259,7 @@ impl Shown {
         }
     }
 
-    /// Leaves out the second half of the nodes; false: there is only one or none.
+    /// Drops the second half of the nodes; false when there is at most one node.
     fn halve(&mut self) -> bool {
         let kept = self.nodes.len() / 2;
         self.omitted += self.nodes.len() - kept;
@@ -265,9 +267,8 @@ impl Shown {
         kept > 0
     }
 
-    /// The snapshot, as it was received `now`. `before` is the one that was received before: since
-    /// when a participant has been seen stays what it was, however long this message was on its
-    /// way.
+    /// The snapshot as received at `now`. `before` is the previously received one: a participant
+    /// keeps its first-seen time from there, however long this message was on its way.
     pub fn received(self, now: Instant, before: &Snapshot) -> Snapshot {
         let ago = |age_ms| now.checked_sub(Duration::from_millis(age_ms)).unwrap_or(now);
         let mut nodes = self.nodes;
@@ -290,7 +291,7 @@ impl Shown {
 }
 
 impl Event {
-    /// The line that says it. A graph that is too large for one is cut.
+    /// The event as one line. A graph that is too large for one line is cut.
     pub fn line(self) -> io::Result<Vec<u8>> {
         let mut event = self;
         loop {
@@ -308,7 +309,7 @@ impl Event {
 }
 
 impl Request {
-    /// The line that says it.
+    /// The request as one line.
     pub fn line(&self) -> io::Result<Vec<u8>> {
         line_of(self).and_then(|line| {
             let fits = line.len() <= MAX_REQUEST_BYTES;
@@ -341,7 +342,7 @@ impl<R: AsyncBufRead + Unpin> Lines<R> {
         Self { from, max_bytes, line: Vec::new() }
     }
 
-    /// The next message that can be read; `None`: there are no more. Not cancel-safe.
+    /// The next message that can be parsed; `None`: there are no more. Not cancel-safe.
     pub async fn next<M: DeserializeOwned>(&mut self) -> io::Result<Option<M>> {
         loop {
             self.line.clear();

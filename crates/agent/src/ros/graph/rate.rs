@@ -1,4 +1,4 @@
-//! How often a topic carries a message, of whatever type: samples are counted, not read.
+//! The message rate of a topic of any type: samples are counted, not read.
 
 use std::collections::VecDeque;
 use std::pin::pin;
@@ -11,9 +11,9 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 
 use super::endpoint::{Counted, Reader};
 
-/// How far back samples count.
+/// Time span over which samples are counted.
 pub const WINDOW: Duration = Duration::from_secs(5);
-/// The most samples that are remembered; of a faster topic the window is shorter.
+/// Maximum number of samples that are remembered; for a faster topic the window is shorter.
 const MAX_SAMPLES: usize = 4096;
 
 /// Counts the messages of one topic until it is dropped.
@@ -22,7 +22,7 @@ pub struct Counter {
     _ends_with_this: DropGuard,
 }
 
-/// How often a topic carries a message, as it was said last, until it is dropped.
+/// The last reported message rate of a topic. Counting ends when the meter is dropped.
 pub struct RateMeter {
     last: watch::Receiver<(Rate, Instant)>,
     _ends_with_this: DropGuard,
@@ -33,14 +33,14 @@ pub struct RateMeter {
 pub struct Rate {
     /// Messages a second over the last [`WINDOW`], or since the meter was made if that is shorter.
     pub hz: f64,
-    /// Since the last message; `None`: there was none.
+    /// Time since the last message; `None`: there was none.
     pub since_last: Option<Duration>,
     /// Messages since the meter was made.
     pub samples: u64,
 }
 
 impl Rate {
-    /// Of a topic of which nothing is known yet.
+    /// The rate of a topic without data.
     pub(super) const NONE: Self = Self { hz: 0.0, since_last: None, samples: 0 };
 }
 
@@ -52,7 +52,7 @@ struct Arrivals {
 }
 
 impl Counter {
-    /// Counts what this reader gets; the future does it.
+    /// Counts the samples of this reader; the returned future does the work.
     pub(super) fn new(
         reader: Reader<Counted>,
         closing: &CancellationToken,
@@ -71,7 +71,8 @@ impl Counter {
 }
 
 impl RateMeter {
-    /// Of what `last` says, and when it was said. `ending` is cancelled when it is dropped.
+    /// A meter for the rate in `last`, with the time of its report. `ending` is cancelled when the
+    /// meter is dropped.
     pub(super) fn new(last: watch::Receiver<(Rate, Instant)>, ending: CancellationToken) -> Self {
         Self { last, _ends_with_this: ending.drop_guard() }
     }
@@ -105,7 +106,7 @@ impl Arrivals {
 
     fn rate(&self, now: Instant) -> Rate {
         let window = WINDOW.min(now.duration_since(self.since));
-        // With more samples than are remembered, the window is what they span.
+        // With more samples than are remembered, the window is the time that they span.
         let window = match self.recent.front() {
             Some(first) if self.recent.len() == MAX_SAMPLES => {
                 window.min(now.duration_since(*first))

@@ -1,5 +1,5 @@
-//! The program that takes part in the graph: it does what it reads on its input, says on its output
-//! what comes of it, and ends with its input. It has no other ties to the agent.
+//! The program that takes part in the graph: it executes the requests from its input, writes the
+//! results to its output, and ends with its input. It has no other connection to the agent.
 
 use std::collections::HashMap;
 use std::io;
@@ -19,16 +19,16 @@ use super::protocol::{
 };
 use super::rate::{Counter, Rate};
 
-/// Events that wait to be written.
+/// Maximum number of events that wait to be written.
 const QUEUED_EVENTS: usize = 64;
-/// Calls that are under way at a time.
+/// Maximum number of concurrent calls.
 const MAX_CALLS: usize = 256;
-/// Topics that are counted.
+/// Maximum number of topics that are counted.
 const MAX_COUNTERS: usize = 1024;
-/// How often rates are said while they change.
+/// Interval between rate events while the rates change.
 const RATE_INTERVAL: Duration = Duration::from_millis(250);
 
-/// Does what is read from `input` until that ends, or until the graph is closed.
+/// Executes the requests from `input` until its end, or until the graph is closed.
 pub async fn serve(
     input: impl AsyncRead + Unpin + Send + 'static,
     output: impl AsyncWrite + Unpin,
@@ -51,7 +51,8 @@ pub async fn serve(
         }
     };
     let serving = tokio::spawn(serving);
-    // The last of what there is to say is why it could not take part; after it the queue is closed.
+    // The last event is the reason why the program could not take part; after it the queue is
+    // closed.
     write(output, queued).await?;
     serving.await.map_err(io::Error::other)?
 }
@@ -128,7 +129,7 @@ async fn take_part(
     served
 }
 
-/// Says what the graph shows whenever that changes, and now and then that it does not.
+/// Sends the graph's state whenever it changes, and regularly an event that it has not changed.
 async fn show(graph: LocalGraph, events: mpsc::Sender<Event>) {
     let mut changes = graph.changes();
     changes.mark_changed();
@@ -147,7 +148,7 @@ async fn show(graph: LocalGraph, events: mpsc::Sender<Event>) {
     }
 }
 
-/// Says the rates of the topics that are counted, whenever one is another than was said last.
+/// Sends the rates of the counted topics, each whenever it differs from the last one sent.
 async fn say_rates(
     mut meters: mpsc::Receiver<(u64, Option<Counter>)>,
     events: mpsc::Sender<Event>,
@@ -157,7 +158,7 @@ async fn say_rates(
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         tokio::select! {
-            // Cancel-safe: what was not received is still in the channel.
+            // Cancel-safe: a meter that was not received is still in the channel.
             meter = meters.recv() => match meter {
                 Some((meter, Some(counter))) if counters.len() < MAX_COUNTERS => {
                     counters.insert(meter, (counter, Rate::NONE));
@@ -166,7 +167,7 @@ async fn say_rates(
                 Some((meter, None)) => drop(counters.remove(&meter)),
                 None => return,
             },
-            // Cancel-safe: a tick is not lost. Without counters nobody is woken.
+            // Cancel-safe: a tick is not lost. Without counters this branch is disabled.
             _ = ticks.tick(), if !counters.is_empty() => {
                 for (meter, (counter, said)) in &mut counters {
                     let rate = counter.rate();

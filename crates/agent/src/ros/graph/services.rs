@@ -1,6 +1,6 @@
-//! Calls to services. A request before both sides have found each other is lost without a word, so
-//! a call waits for that first; no call waits without a limit; and only what may be done twice is
-//! asked again.
+//! Calls to services. A request is lost without notice if client and server have not discovered
+//! each other yet, so a call first waits for discovery. Every call has a time limit. Only calls
+//! that may be repeated are sent again.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::pin::pin;
@@ -23,22 +23,23 @@ use super::observer::Matches;
 use super::own::OwnNode;
 use super::{EndpointId, GraphError, ParticipantId};
 
-/// The most services that are kept ready to be called; beyond it the one that was not used for the
-/// longest time goes.
+/// Maximum number of services with a ready client; beyond that, the least recently used client is
+/// removed.
 pub const MAX_CLIENTS: usize = 256;
-/// How long one try of a call that may be repeated waits for its answer.
+/// Answer timeout of one attempt of a repeatable call.
 const TRY: Duration = Duration::from_secs(2);
-/// Services: what ROS calls its default profile for them.
+/// QoS of services: ROS's default profile for them.
 const DELIVERY: Delivery = Delivery::Reliable { depth: 10 };
-/// The length of what Cyclone puts before requests and answers: half the client's id and a number.
+/// Length of Cyclone's header before requests and answers: half the client's id and a number.
 const CYCLONE_HEADER: usize = 16;
 
 /// Whether a call may reach the service twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Repeat {
-    /// It changes nothing, or sets what it says: it is asked again while there is time.
+    /// Repeatable: the call changes nothing, or sets absolute values. The request is sent again
+    /// while there is time.
     WhileThereIsTime,
-    /// Once.
+    /// The request is sent once.
     Never,
 }
 
@@ -59,14 +60,14 @@ struct Kept {
 struct Client {
     requests: Writer,
     replies: Mutex<Reader<Cdr>>,
-    /// Of the requests' writer and the answers' reader.
+    /// Ids of the request writer and the answer reader.
     ids: (EndpointId, EndpointId),
-    /// Cyclone's numbers of requests.
+    /// Counter for Cyclone's request numbers.
     number: AtomicI64,
 }
 
 impl Clients {
-    /// None yet.
+    /// An empty set of clients.
     pub fn new(
         endpoints: Arc<Endpoints>,
         own: Arc<OwnNode>,
@@ -75,13 +76,13 @@ impl Clients {
         Self { endpoints, own, matches, kept: Mutex::default() }
     }
 
-    /// Makes the client of this service, so that a server that appears later finds it there.
+    /// Creates the client of this service, so that a server that appears later finds the client.
     pub async fn prepare(&self, service: &GraphName, kind: &str) -> Result<(), GraphError> {
         self.client(service, kind).await.map(drop)
     }
 
-    /// The participants with a server of this service that hears requests and whose answers are
-    /// heard; waits until there is one.
+    /// The participants with a server of this service that receives our requests and reaches us
+    /// with its answers; waits until there is one.
     pub async fn servers(
         &self,
         service: &GraphName,
@@ -104,7 +105,7 @@ impl Clients {
         let deadline = Instant::now() + within;
         let client = self.client(service, kind).await?;
         let no_answer = || GraphError::NoAnswer { service: service.clone(), within };
-        // One call at a time: whoever reads the answers reads everybody's.
+        // One call at a time: the reader of the answers receives the answers to all calls.
         let replies = timeout_at(deadline, client.replies.lock()).await.map_err(|_| no_answer())?;
         loop {
             let servers = self.matched(&client, service, deadline, within).await?;
@@ -191,14 +192,14 @@ impl Client {
         };
         let (request_topic, request_kind) = dds(Role::Request)?;
         let (reply_topic, reply_kind) = dds(Role::Reply)?;
-        // The reader first: a server that finds the writer can answer.
+        // The reader is created first: a server that finds the writer can then answer.
         let replies = endpoints.reader(&reply_topic, &reply_kind, DELIVERY)?;
         let requests = endpoints.writer(&request_topic, &request_kind, DELIVERY)?;
         let ids = (requests.id(), replies.id());
         Ok(Self { requests, replies: Mutex::new(replies), ids, number: AtomicI64::new(0) })
     }
 
-    /// Sends the request and waits for its answer, passing over answers to others.
+    /// Sends the request and waits for its answer, skipping answers to others.
     async fn ask(
         &self,
         replies: &Reader<Cdr>,
@@ -229,7 +230,7 @@ impl Client {
         Err(GraphError::Closed)
     }
 
-    /// What a server on Cyclone sends back as it got it.
+    /// The header that a Cyclone server returns unchanged.
     fn cyclone_header(&self) -> Vec<u8> {
         let number = self.number.fetch_add(1, Ordering::Relaxed) + 1;
         [&self.requests.id().0[8..], &number.to_le_bytes()].concat()

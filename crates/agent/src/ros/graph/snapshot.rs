@@ -1,6 +1,6 @@
-//! What the graph shows at one moment: participants and nodes with their endpoints, put together
-//! from what participants say about their nodes and what discovery says about readers and writers.
-//! Values only; it asks nobody.
+//! The state of the graph at one moment: participants and nodes with their endpoints. It combines
+//! the participants' messages about their nodes with discovery's data about readers and writers.
+//! This module has values only and makes no queries.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -14,48 +14,49 @@ use task_proto::ros::{Endpoint, GraphName};
 use super::entities::ParticipantEntities;
 use super::names::{self, Role};
 
-/// The most nodes in a snapshot; the rest are counted.
+/// Maximum number of nodes in a snapshot; further nodes are counted.
 pub const MAX_NODES: usize = 2048;
 
-/// A DDS participant: a process has one, or a few.
+/// Id of a DDS participant: a process has one, or a few.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ParticipantId(pub [u8; 12]);
 
-/// A reader or writer of a participant.
+/// Id of a reader or writer of a participant.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct EndpointId(pub [u8; 16]);
 
 /// The graph at one moment.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
-    /// When it was known to be so.
+    /// Time at which this state was known to be current.
     pub at: Instant,
-    /// The nodes, sorted by name. Names are not unique: two nodes may have the same. The agent's
-    /// own node is not among them.
+    /// The nodes, sorted by name. Names are not unique: two nodes may have the same name. The
+    /// agent's own node is not included.
     pub nodes: Vec<Node>,
-    /// The participants, also those without nodes, without the agent's own.
+    /// The participants, including those without nodes, without the agent's own.
     pub participants: BTreeMap<ParticipantId, Participant>,
-    /// Nodes that were left out: beyond the limit, or with a name that ROS does not allow.
+    /// Number of nodes that were left out: beyond the limit, or with a name that ROS does not
+    /// allow.
     pub omitted: usize,
 }
 
 /// A node of the graph.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Node {
-    /// Its full name.
+    /// The node's full name.
     pub name: GraphName,
-    /// The participant it is in.
+    /// The participant of the node.
     pub participant: ParticipantId,
-    /// The topics it publishes.
+    /// The topics that the node publishes.
     #[serde(default)]
     pub publishers: Vec<Endpoint>,
-    /// The topics it subscribes to.
+    /// The topics that the node subscribes to.
     #[serde(default)]
     pub subscriptions: Vec<Endpoint>,
-    /// The services it offers.
+    /// The services that the node offers.
     #[serde(default)]
     pub services: Vec<Endpoint>,
-    /// The services it calls.
+    /// The services that the node calls.
     #[serde(default)]
     pub clients: Vec<Endpoint>,
 }
@@ -63,27 +64,27 @@ pub struct Node {
 /// A participant of the graph.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Participant {
-    /// Where it listens: the UDP addresses it announces.
+    /// The UDP addresses that the participant announces and listens at.
     pub locators: BTreeSet<SocketAddr>,
-    /// When the agent first saw it: what was there before a process was started is none of that
-    /// process's.
+    /// Time at which the agent first saw the participant: one that was seen before a process was
+    /// started does not belong to that process.
     pub first_seen: Instant,
 }
 
-/// A reader or writer as discovery has it.
+/// A reader or writer in discovery's data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Discovered {
-    /// Its id.
+    /// The endpoint's id.
     pub id: EndpointId,
-    /// Its DDS topic.
+    /// The endpoint's DDS topic.
     pub topic: String,
-    /// Its DDS type.
+    /// The endpoint's DDS type.
     pub kind: String,
-    /// Where it listens.
+    /// The addresses that the endpoint listens at.
     pub locators: Vec<SocketAddr>,
 }
 
-/// Which way an endpoint's data goes.
+/// The direction of an endpoint's data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Direction {
     Reads,
@@ -91,13 +92,13 @@ enum Direction {
 }
 
 impl Snapshot {
-    /// An empty one.
+    /// An empty snapshot.
     pub fn empty(at: Instant) -> Self {
         Self { at, nodes: Vec::new(), participants: BTreeMap::new(), omitted: 0 }
     }
 
-    /// Put together from what participants said, and what discovery has. A participant that
-    /// discovery has lost, and nodes of which nobody speaks, are not in it.
+    /// Combines the participants' messages with discovery's data. The snapshot leaves out
+    /// participants that discovery has lost, and nodes that no participant announces.
     pub fn of(
         at: Instant,
         said: &BTreeMap<ParticipantId, ParticipantEntities>,
@@ -132,7 +133,7 @@ impl Snapshot {
         snapshot
     }
 
-    /// Whether it shows the same as `other`, at whatever time.
+    /// Whether the snapshot shows the same graph as `other`, regardless of the time.
     pub fn shows_the_same_as(&self, other: &Self) -> bool {
         self.nodes == other.nodes
             && self.participants == other.participants
@@ -180,7 +181,7 @@ impl Node {
         for (direction, endpoint) in ids.filter_map(|id| endpoints.get(id)) {
             let Some((role, name)) = names::from_dds(&endpoint.topic) else { continue };
             let Some(kind) = names::type_from_dds(role, &endpoint.kind) else { continue };
-            // Of a service's two ways the requests' shows who is who.
+            // Of a service's two topics, the request topic tells client and server apart.
             let list = match (role, direction) {
                 (Role::Topic, Direction::Writes) => &mut node.publishers,
                 (Role::Topic, Direction::Reads) => &mut node.subscriptions,
@@ -199,8 +200,8 @@ impl Node {
         node
     }
 
-    /// Whether it can be asked for its lifecycle state. A node that has just appeared may not have
-    /// said so yet.
+    /// Whether the node offers the service for its lifecycle state. A node that has just appeared
+    /// may not have announced the service yet.
     pub fn has_lifecycle(&self) -> bool {
         let wanted = format!("{}/get_state", self.name);
         self.services.iter().any(|service| {
@@ -210,7 +211,7 @@ impl Node {
 }
 
 impl ParticipantId {
-    /// Its id as an endpoint's, as in gids.
+    /// The participant's id in the form of an endpoint id, as in gids.
     pub fn of_participant(self) -> EndpointId {
         let mut id = [0; 16];
         id[..12].copy_from_slice(&self.0);
@@ -218,14 +219,14 @@ impl ParticipantId {
         EndpointId(id)
     }
 
-    /// Whether its DDS is Eclipse Cyclone, which frames services in its own way.
+    /// Whether the participant's DDS is Eclipse Cyclone, which frames services in its own way.
     pub fn is_cyclone(self) -> bool {
         self.0.starts_with(&[0x01, 0x10])
     }
 }
 
 impl EndpointId {
-    /// The participant it belongs to.
+    /// The participant of the endpoint.
     pub fn participant(self) -> ParticipantId {
         let mut id = [0; 12];
         id.copy_from_slice(&self.0[..12]);

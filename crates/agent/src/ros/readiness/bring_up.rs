@@ -1,5 +1,6 @@
 //! Brings one promised node up: its parameters are set, then it is configured and activated, from
-//! whichever state it is in. Pure: it says what to ask the node next and takes the answers in.
+//! any lifecycle state. Pure: the module returns the next question for the node and takes the
+//! answers in.
 //!
 //! ```text
 //! seen ─► parameters ─► configure ─► parameters ─► activate ─► parameters ─► up: only looked at from now on
@@ -14,69 +15,71 @@ use task_proto::ros::{GraphName, LifecycleState, Transition};
 
 use crate::ros::graph::ParticipantId;
 
-/// When to ask again where no answer came, or one that will be another soon.
+/// Pause before a question is repeated, when no answer came or the answer is expected to change
+/// soon.
 const ASK_AGAIN_MS: u64 = 500;
-/// How often a lifecycle node that is up is asked for its state.
+/// Interval between queries for the state of a lifecycle node that is up.
 const LOOK_EVERY_MS: u64 = 2000;
-/// How long a node that is up may declare parameters before those it did not declare count as
+/// Time that a node that is up has to declare parameters before the undeclared ones count as
 /// rejected.
 const UNDECLARED_PATIENCE_MS: u64 = 3000;
 
-/// Something to ask a node.
+/// A question for a node.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Question {
     /// The node.
     pub node: GraphName,
-    /// The participant it is in; an answer of a later one is no answer.
+    /// The participant of the node; answers of a later participant do not count.
     pub instance: ParticipantId,
-    /// What.
+    /// The question.
     pub ask: Ask,
 }
 
-/// What a node can be asked.
+/// Questions for nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ask {
-    /// To answer at all: a question for no parameter.
+    /// Any answer at all: a query for no parameter.
     Anything,
-    /// Its lifecycle state.
+    /// The node's lifecycle state.
     State,
-    /// A lifecycle transition.
+    /// Make a lifecycle transition.
     Transition(Transition),
-    /// To take these parameters.
+    /// Set these parameters.
     Set(Vec<(String, Value)>),
 }
 
-/// What it answered.
+/// Answers of nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// It answers.
+    /// The node answered.
     Something,
-    /// Its lifecycle state.
+    /// The node's lifecycle state.
     State(LifecycleState),
     /// Whether it made the transition.
     Transition(bool),
-    /// For each parameter, in the order asked, whether it was taken, or why not.
+    /// For each parameter, in the order asked: accepted, or the reason for the rejection.
     Set(Vec<Result<(), String>>),
-    /// Nothing, within the time for it.
+    /// No answer within the time limit.
     None,
 }
 
-/// A promised node on its way up.
+/// A promised node that is being brought up.
 #[derive(Debug, Clone)]
 pub(super) struct BringUp {
     node: GraphName,
     is_lifecycle: bool,
-    /// Whether it offers services that are only known to answer when the node does.
+    /// Whether the node offers services whose availability can only be tested by a question to the
+    /// node.
     is_asked: bool,
     instance: ParticipantId,
-    /// Parameters it has not taken yet, each with what it last said.
+    /// Parameters that the node has not accepted yet, each with its last rejection.
     pending: BTreeMap<String, (Value, Option<String>)>,
-    /// In which state they were last tried; a node without lifecycle counts as active.
+    /// The state in which they were last tried; a node without lifecycle counts as active.
     tried_in: Option<LifecycleState>,
-    /// Since when nothing but undeclared parameters is left.
+    /// Start of the time in which only undeclared parameters are left.
     undeclared_since_ms: Option<u64>,
     state: Option<LifecycleState>,
-    /// It was brought up once, or by an earlier agent: it is only looked at.
+    /// The node was brought up once, or by an earlier agent: it is only observed.
     is_up: bool,
     failed: Option<Transition>,
     refused: Option<Failure>,
@@ -86,14 +89,14 @@ pub(super) struct BringUp {
     ask_at_ms: u64,
 }
 
-/// Whether a rejection only says that the node does not know the parameter yet: rclcpp and rclpy
-/// have words of their own.
+/// Whether a rejection only means that the node has not declared the parameter yet: rclcpp and
+/// rclpy have their own texts for this.
 fn is_undeclared(reason: &str) -> bool {
     reason.contains("not declared") || reason.contains("undeclared")
 }
 
 impl BringUp {
-    /// Of a node that has just been seen; `is_up`: an earlier agent brought it up.
+    /// A node that has just been seen; `is_up`: an earlier agent brought it up.
     pub(super) fn new(
         node: GraphName,
         instance: ParticipantId,
@@ -125,12 +128,12 @@ impl BringUp {
         self.instance
     }
 
-    /// It is to show that it answers.
+    /// Requires that the node answers a question.
     pub(super) fn must_answer(&mut self) {
         self.is_asked = true;
     }
 
-    /// Whether it answered once, if it is to.
+    /// Whether the node answered once, if an answer is required.
     pub(super) fn answers(&self) -> bool {
         self.answered || !self.is_asked
     }
@@ -139,7 +142,7 @@ impl BringUp {
         self.refused.as_ref()
     }
 
-    /// Whether it was brought up, so that it is only looked at.
+    /// Whether the node was brought up, so that it is only observed.
     pub(super) fn is_up(&self) -> bool {
         self.is_up
     }
@@ -148,17 +151,18 @@ impl BringUp {
         self.pending.is_empty()
     }
 
-    /// The state it is in, as far as is known; `None`: it has not said, or does not say any more.
+    /// The node's state, as far as known; `None`: the node has not told its state, or no longer
+    /// answers.
     pub(super) fn state(&self) -> Option<LifecycleState> {
         self.state
     }
 
-    /// Since when it has answered nothing.
+    /// Start of the time in which the node has answered nothing.
     pub(super) fn silent_since_ms(&self) -> Option<u64> {
         self.silent_since_ms
     }
 
-    /// What to ask it now, if anything.
+    /// The next question for the node, if any.
     pub(super) fn question(&mut self, now_ms: u64) -> Option<Question> {
         if self.in_flight || self.refused.is_some() || now_ms < self.ask_at_ms {
             return None;
@@ -188,7 +192,7 @@ impl BringUp {
         }
     }
 
-    /// Takes an answer in.
+    /// Records an answer.
     pub(super) fn answered(&mut self, question: &Question, answer: Answer, now_ms: u64) {
         if question.instance != self.instance {
             return;
@@ -199,7 +203,8 @@ impl BringUp {
             self.silent_since_ms.get_or_insert(now_ms);
             self.ask_at_ms = now_ms + ASK_AGAIN_MS;
             if matches!(question.ask, Ask::Transition(_)) {
-                // It may have been made all the same: look before asking again.
+                // The node may have made the transition all the same: query the state before asking
+                // again.
                 self.state = None;
             }
             return;
@@ -222,8 +227,8 @@ impl BringUp {
 
     fn is_in(&mut self, state: LifecycleState, now_ms: u64) {
         self.state = Some(state);
-        // Until it is known where the other attempt led, nothing has failed: somebody else may
-        // bring it up as well.
+        // Until the result of the other attempt is known, nothing has failed: another program may
+        // bring the node up as well.
         let failed = if state == LifecycleState::Changing { None } else { self.failed.take() };
         if let Some(transition) = failed.filter(|transition| !leads_to(*transition, state)) {
             let text = format!(
@@ -281,7 +286,7 @@ impl BringUp {
     }
 }
 
-/// Whether a node in this state has what a transition was asked for.
+/// Whether a node in this state has reached the goal of a transition.
 fn leads_to(transition: Transition, state: LifecycleState) -> bool {
     let is_passed = transition == Transition::Configure && state == LifecycleState::Active;
     is_passed || state == goal(transition)

@@ -1,17 +1,17 @@
-//! How often messages come on a topic, from a count that only grows. Pure.
+//! The message rate of a topic, computed from a count that only grows. Pure.
 
 use std::collections::VecDeque;
 
-/// The shortest stretch of time over which messages are counted.
+/// Shortest window over which messages are counted.
 const MIN_WINDOW_MS: u64 = 2000;
-/// The longest, for topics on which a message is rare.
+/// Longest window, for topics with rare messages.
 const MAX_WINDOW_MS: u64 = 120_000;
-/// So many messages should fall into a stretch.
+/// Desired number of messages in a window.
 const MESSAGES: f64 = 4.0;
-/// The most counts that are kept.
+/// Maximum number of counts that are kept.
 const MAX_COUNTS: usize = 256;
 
-/// The counts of one topic over a stretch of time.
+/// The counts of one topic over a window of time.
 #[derive(Debug, Clone)]
 pub(super) struct Rate {
     min_hz: f64,
@@ -20,9 +20,9 @@ pub(super) struct Rate {
 }
 
 impl Rate {
-    /// Of a topic that must carry `min_hz` messages a second.
+    /// The rate of a topic that must carry `min_hz` messages a second.
     pub(super) fn of(min_hz: f64) -> Self {
-        // A rate is above zero, and what does not fit is cut off by the clamp.
+        // A rate is above zero, and the clamp limits values out of range.
         let window_ms = (MESSAGES / min_hz * 1000.0) as u64;
         Self {
             min_hz,
@@ -35,7 +35,7 @@ impl Rate {
         self.min_hz
     }
 
-    /// Takes in that `count` messages have come until now.
+    /// Records that `count` messages have come until now.
     pub(super) fn counted(&mut self, count: u64, now_ms: u64) {
         if self.counts.back().is_some_and(|(_, last)| *last > count) {
             self.counts.clear();
@@ -52,15 +52,16 @@ impl Rate {
         }
     }
 
-    /// Messages a second over the last stretch; `None`: it has not been watched for so long.
+    /// Messages a second over the last window; `None`: the topic has not been watched for that
+    /// long.
     pub(super) fn hz(&self) -> Option<f64> {
         let ((first_ms, first), (last_ms, last)) = (self.counts.front()?, self.counts.back()?);
         let elapsed_ms = last_ms - first_ms;
         (elapsed_ms >= self.window_ms).then(|| (last - first) as f64 * 1000.0 / elapsed_ms as f64)
     }
 
-    /// Whether the topic carries what it must; `None`: that can't be said yet. Where the stretch
-    /// begins and ends between two messages one may fall outside, so one is given away.
+    /// Whether the topic has its minimum rate; `None`: not known yet. One message is tolerated,
+    /// because where the window begins and ends between two messages, one may fall outside.
     pub(super) fn suffices(&self) -> Option<bool> {
         let ((first_ms, first), (last_ms, last)) = (self.counts.front()?, self.counts.back()?);
         let wanted = self.min_hz * (last_ms - first_ms) as f64 / 1000.0;

@@ -1,4 +1,4 @@
-//! Stories of runs on a made-up graph, and what holds of every story.
+//! Scenarios of runs on a simulated graph, and properties that hold in every scenario.
 
 use std::time::Instant;
 
@@ -20,7 +20,7 @@ fn names(texts: &[&str]) -> BTreeSet<GraphName> {
     texts.iter().map(|text| name(text)).collect()
 }
 
-/// A made-up graph on which time passes.
+/// A simulated graph on which time passes.
 struct Stage {
     snapshot: Snapshot,
     ours: BTreeSet<ParticipantId>,
@@ -44,7 +44,7 @@ impl Stage {
         }
     }
 
-    /// With a lifecycle node that has said in which state it is.
+    /// A stage with a lifecycle node that has told its state.
     fn managed(state: LifecycleState) -> Self {
         let mut stage = Self::new(lifecycle(&[]), false);
         stage.add(OURS, "/mapper", &[], &[]);
@@ -91,7 +91,7 @@ impl Stage {
         self.readiness.questions(self.now_ms)
     }
 
-    /// The one question that is asked now, answered.
+    /// Checks that exactly this question is pending, and answers it.
     fn answers(&mut self, ask: &Ask, answer: Answer) {
         let questions = self.asked();
         assert_eq!(questions.iter().map(|question| &question.ask).collect::<Vec<_>>(), [ask]);
@@ -163,7 +163,7 @@ fn a_name_that_a_living_stranger_has_is_taken() {
     assert_eq!(failure.code, FailureCode::NODE_NAME_TAKEN);
     assert!(failure.text.contains("a neighbour has a node of that name"), "{failure}");
     assert!(failure.text.contains("`/mapper` of a neighbour offers that service"), "{failure}");
-    // What a process left behind that is gone takes nothing.
+    // The remains of a process that is gone take no name.
     assert_eq!(promise.taken(&stage.snapshot, &BTreeMap::new()), None);
 
     stage.add(OURS, "/mapper", &["/map"], &[]);
@@ -174,7 +174,7 @@ fn a_name_that_a_living_stranger_has_is_taken() {
     );
     missing(&stage.after(FOREIGN_MS - 1));
     assert!(refused(&stage.after(1)).starts_with("node_name_taken"));
-    // It stays refused, also once the stranger has left.
+    // The run stays refused, even after the other node has left.
     stage.remove(OTHER);
     refused(&stage.after(5000));
 }
@@ -205,7 +205,7 @@ fn what_has_held_for_its_time_was_ready_whenever_that_is_seen() {
     let mut stage = Stage::new(nodes(&["/mapper"]), false);
     stage.add(OURS, "/mapper", &[], &[]);
     assert!(matches!(stage.after(0), Health::Holds { .. }));
-    // It breaks after its time and before the next look.
+    // The promise breaks after its time and before the next look.
     stage.add(OTHER, "/mapper", &[], &[]);
     stage.after(1500);
     assert!(!missing(&stage.after(FOREIGN_MS)).is_its_own);
@@ -225,7 +225,7 @@ fn parameters_go_in_before_configure_and_late_ones_after() {
     stage.answers(&Ask::Set(vec![("late".to_owned(), json!(7))]), Answer::Set(vec![Ok(())]));
     stage.answers(&Ask::Transition(Transition::Activate), Answer::Transition(true));
     assert!(matches!(stage.after(10), Health::Holds { .. }));
-    // From now on it is only looked at.
+    // From now on the node is only observed.
     assert_eq!(stage.asked(), []);
     stage.after(3000);
     stage.answers(&Ask::State, Answer::State(LifecycleState::Active));
@@ -354,7 +354,7 @@ fn a_topic_counts_when_it_comes_often_enough() {
     let health = stage.after(0);
     assert_eq!(missing(&health).code, FailureCode::TOPIC_SILENT);
     assert_eq!(missing(&health).what, "`/scan` does not come at 5 Hz any more");
-    // The figure in the text stays: a report for each look would be one too many.
+    // The figure in the text stays: otherwise each look would cause a report.
     assert_eq!(stage.after(1000), health);
 }
 
@@ -382,7 +382,7 @@ fn a_node_that_comes_back_is_brought_up_again_and_one_that_left_active_is_not() 
     let mut stage = Stage::new(lifecycle(&[("resolution", json!(0.1))]), true);
     stage.add(OURS, "/mapper", &[], &[]);
     assert!(matches!(stage.after(0), Health::Holds { .. }));
-    // It was brought up before this agent: no parameter is set, nothing is configured.
+    // The node was brought up before this agent: no parameter is set, nothing is configured.
     stage.answers(&Ask::State, Answer::State(LifecycleState::Active));
     stage.after(2000);
     stage.answers(&Ask::State, Answer::State(LifecycleState::Inactive));
@@ -400,7 +400,7 @@ fn a_node_that_comes_back_is_brought_up_again_and_one_that_left_active_is_not() 
     stage.answers(&Ask::State, Answer::State(LifecycleState::Active));
     stage.remove(OURS);
     stage.add(AGAIN, "/mapper", &[], &[]);
-    // It came back so soon that it was not missed, but it is not active.
+    // The node came back before its absence was noticed, but it is not active.
     assert_eq!(missing(&stage.after(10)).code, FailureCode::NODE_INACTIVE);
     stage.answers(&Ask::State, Answer::State(LifecycleState::Unconfigured));
     stage
@@ -426,7 +426,7 @@ fn what_a_node_refuses_when_it_comes_back_degrades_the_task() {
     assert_eq!(missing(&health).code, FailureCode::LIFECYCLE_FAILED);
 }
 
-/// What may happen between two looks.
+/// Events that may happen between two looks.
 #[derive(Debug, Clone)]
 enum Event {
     Appear(ParticipantId),
@@ -492,7 +492,7 @@ proptest! {
             }
             let health = stage.after(1);
             open.extend(stage.asked());
-            // One question at a time to each process's node.
+            // At most one pending question for each process's node.
             for participant in [OURS, AGAIN] {
                 prop_assert!(open.iter().filter(|question| question.instance == participant).count() <= 2);
             }

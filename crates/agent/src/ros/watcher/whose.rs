@@ -1,5 +1,5 @@
-//! Whose the participants of a graph are, as far as one run is concerned: its own, somebody else's,
-//! or nobody's any more.
+//! Determines the owners of a graph's participants, as seen from one run: the run itself, another
+//! owner, or no living process.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
@@ -9,26 +9,27 @@ use std::time::{Duration, Instant};
 use crate::ros::graph::{Graph, Owners, Participant, ParticipantId, Snapshot};
 use crate::ros::readiness::Promise;
 
-/// How long before its start was recorded a process may have been seen: the record is written after
-/// the start.
+/// Maximum delay between a process's start and the record of that start: a participant may have
+/// been seen in between.
 const START_SLACK: Duration = Duration::from_secs(1);
 
-/// Participants by whose they are.
+/// Participants by owner.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Whose {
-    /// Those of the run's processes.
+    /// Participants of the run's processes.
     pub(super) ours: BTreeSet<ParticipantId>,
-    /// Others that live, each in words.
+    /// Living participants of other owners, each with a description.
     pub(super) others: BTreeMap<ParticipantId, String>,
-    /// Those whose process is gone: discovery knows of them until their lease ends.
+    /// Participants of processes that are gone: discovery knows of them until their lease ends.
     pub(super) gone: BTreeSet<ParticipantId>,
-    /// All that were once the run's and are still known.
+    /// All participants that once belonged to the run and are still known.
     pub(super) ever_ours: BTreeSet<ParticipantId>,
 }
 
 impl Whose {
-    /// Looks at the participants of `snapshot`, where the run has the processes `pids` and was
-    /// started at `started`. `ever_ours` are those that were found to be its own before.
+    /// Determines the owners of the participants in `snapshot`, for a run with the processes `pids`
+    /// that was started at `started`. `ever_ours` are the participants that were found to belong to
+    /// the run before.
     pub(super) async fn look(
         snapshot: Arc<Snapshot>,
         pids: Vec<u32>,
@@ -49,7 +50,8 @@ impl Whose {
         let mut whose = Self::default();
         for (id, participant) in participants {
             let was_ours = ever_ours.contains(id);
-            // Where the kernel can't tell, what came after the start counts as the run's.
+            // Where the kernel can't tell, participants that came after the start count as the
+            // run's.
             let later =
                 started.is_some_and(|started| participant.first_seen + START_SLACK >= started);
             let ours = owners.theirs.contains(id) || (owners.unknown.contains(id) && later);
@@ -67,8 +69,8 @@ impl Whose {
         whose
     }
 
-    /// The same, with those of the others that have promised names as processes of this robot,
-    /// where that can be told. It takes a moment for each of them.
+    /// The same, but other participants with promised names are described as processes of this
+    /// robot, where that can be determined. This takes a moment for each of them.
     pub(super) async fn naming_takers(mut self, promise: &Promise, snapshot: &Snapshot) -> Self {
         for id in promise.takers(snapshot, &self.others) {
             let (Some(words), Some(participant)) =
@@ -83,14 +85,14 @@ impl Whose {
         self
     }
 
-    /// Whether this participant was there at the last look.
+    /// Whether the last look included this participant.
     pub(super) fn knows(&self, id: &ParticipantId) -> bool {
         self.ours.contains(id) || self.others.contains_key(id) || self.gone.contains(id)
     }
 }
 
-/// Those whose address another one has that was seen later: two processes can't have one port, so
-/// the first is gone.
+/// Participants whose address belongs to another participant that was seen later: two processes
+/// can't have one port, so the first is gone.
 fn replaced(participants: &BTreeMap<ParticipantId, Participant>) -> BTreeSet<ParticipantId> {
     let mut newest: BTreeMap<SocketAddr, (Instant, ParticipantId)> = BTreeMap::new();
     for (id, participant) in participants {

@@ -1,10 +1,11 @@
-//! For tests: a place in which what is mounted is seen by nobody else and gone with the test.
+//! For tests: a mount namespace in which mounts are invisible to other processes and disappear with
+//! the test.
 
 use nix::mount::{MsFlags, mount};
 use nix::sched::{CloneFlags, unshare};
 
-/// Does `work` in a thread that may mount what it likes. Where only root may do that, it is said
-/// that it is left out.
+/// Runs `work` in a thread that may mount file systems. Where only root may mount, prints that the
+/// test is skipped.
 pub(crate) fn with_own_mounts(work: impl FnOnce() + Send) {
     let enter = || {
         unshare(CloneFlags::CLONE_NEWNS)?;

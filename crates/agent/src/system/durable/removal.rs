@@ -1,6 +1,6 @@
-//! Removes directory trees that somebody else made: of any depth, longer than a path can be, full
-//! of links. It takes a bounded number of descriptors and a bounded stack, goes by descriptors
-//! alone and follows no link.
+//! Removes untrusted directory trees: of any depth, with paths above the length limit, full of
+//! links. The removal uses a bounded number of descriptors and a bounded stack, works by
+//! descriptors alone and follows no link.
 
 use std::ffi::OsStr;
 use std::fs;
@@ -15,13 +15,12 @@ use nix::fcntl::{AT_FDCWD, OFlag, openat, renameat};
 use nix::sys::stat::{Mode, fstat};
 use nix::unistd::{UnlinkatFlags, unlinkat};
 
-/// How many levels are open at a time, with two descriptors each.
+/// Maximum number of levels open at a time, with two descriptors each.
 const MAX_LEVELS: usize = 32;
-/// What a directory is called that was moved up, before its number.
+/// Name prefix, before a number, of a directory that was moved up.
 const MOVED_UP: &str = ".deeper-";
 
-/// Removes a directory with all it holds, if it is there; so it does a file or link. No link is
-/// followed.
+/// Removes a directory with all its contents, or a file or link, if it exists. No link is followed.
 pub fn remove_dir_all(path: &Path) -> io::Result<()> {
     match unlinkat(AT_FDCWD, path, UnlinkatFlags::NoRemoveDir) {
         Ok(()) | Err(Errno::ENOENT) => return Ok(()),
@@ -42,13 +41,13 @@ pub fn remove_dir_all(path: &Path) -> io::Result<()> {
 /// The removal of one tree.
 struct Removal<'a> {
     top: &'a OwnedFd,
-    /// How many directories were moved up to the top.
+    /// Number of directories that were moved up to the top.
     moved: u64,
 }
 
 impl Removal<'_> {
-    /// Removes what is in `dir`. What lies more than `levels` below it goes to the top, for a later
-    /// pass.
+    /// Removes the contents of `dir`. Directories more than `levels` below it are moved to the top,
+    /// for a later pass.
     fn empty(&mut self, dir: &OwnedFd, levels: usize) -> io::Result<()> {
         for entry in fs::read_dir(by_descriptor(dir))? {
             let name = entry?.file_name();
@@ -73,7 +72,7 @@ impl Removal<'_> {
             let place = format!("{MOVED_UP}{}", self.moved);
             self.moved += 1;
             match renameat(dir, name, self.top, place.as_str()) {
-                // Something has that name: there are no more such than entries.
+                // The name is taken: there are no more such names than entries.
                 Err(Errno::ENOTEMPTY | Errno::EEXIST | Errno::ENOTDIR) => {}
                 moved => return Ok(moved?),
             }
@@ -81,8 +80,8 @@ impl Removal<'_> {
     }
 }
 
-/// Opens a directory, which gets the rights that its removal takes: a build may leave some that
-/// even their owner can't change.
+/// Opens a directory and gives it the mode that its removal needs: a build may leave directories
+/// that even their owner can't change.
 fn open_dir(at: impl AsFd, name: &(impl NixPath + ?Sized)) -> io::Result<OwnedFd> {
     let flags = OFlag::O_PATH | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     let dir = openat(at, name, flags, Mode::empty())?;
@@ -109,8 +108,8 @@ mod tests {
 
     use super::*;
 
-    /// Deeper than a stack of two megabytes is for whoever calls itself at each level, and than
-    /// there are descriptors.
+    /// Too deep for a stack of two megabytes with one recursive call per level, and for the
+    /// available descriptors.
     const DEPTH: usize = 20_000;
 
     #[test]
@@ -119,7 +118,7 @@ mod tests {
         let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
         fs::create_dir(&tree).expect("made");
         fs::write(&outside, "kept").expect("written");
-        // Names that are in the way of what is moved up.
+        // These names conflict with those of directories that are moved up.
         fs::write(tree.join(format!("{MOVED_UP}0")), "").expect("written");
         fs::create_dir_all(tree.join(format!("{MOVED_UP}1/full"))).expect("made");
         let mut dir = open_dir(AT_FDCWD, &tree).expect("opened");

@@ -1,53 +1,54 @@
-//! What the robot's gate was asked about a task, as the ledger keeps it. It asks nothing itself.
+//! The questions to the robot's gate and their answers, as stored in the ledger. This module asks
+//! nothing itself.
 
 use serde::{Deserialize, Serialize};
 use task_proto::report::Failure;
 use task_proto::{DeploymentId, Version};
 
-/// What the robot's gate was asked, and what it said.
+/// A question to the robot's gate, with its answer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GateRecord {
     /// The question.
     pub question: GateQuestion,
-    /// The last answer to it.
+    /// The last answer to the question.
     pub answer: Option<GateAnswer>,
-    /// How often the answer was no.
+    /// The number of refusals.
     pub refusals: u32,
-    /// It is not asked again before this time.
+    /// The gate is not asked again before this time.
     pub retry_at_ms: u64,
 }
 
 /// A question to the robot's gate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GateQuestion {
-    /// What is about to be done.
+    /// The step in question.
     pub step: GateStep,
-    /// With which order's run.
+    /// The deployment that ordered the run.
     pub deployment: DeploymentId,
-    /// Which of its runs.
+    /// The run number within the deployment.
     pub run: u64,
-    /// Of which version.
+    /// The version that the step concerns.
     pub version: Version,
 }
 
-/// What the robot's gate may forbid.
+/// A step that the robot's gate may forbid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GateStep {
-    /// To start a task that does not run.
+    /// Start a task that does not run.
     Start,
-    /// To stop one that runs.
+    /// Stop a task that runs.
     Stop,
-    /// To replace one version by another.
+    /// Replace one version by another.
     Switch,
 }
 
-/// What the robot's gate said.
+/// The answer of the robot's gate.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum GateAnswer {
-    /// Yes.
+    /// The step may be done.
     Allowed,
-    /// Not now, and why.
+    /// The step may not be done now; holds the reason.
     Refused(Failure),
 }

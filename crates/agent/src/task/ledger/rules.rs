@@ -1,30 +1,29 @@
-//! How a run is to be run, as the ledger keeps it: the package's manifest need not be there any
-//! more.
+//! The rules of a run, as stored in the ledger: the package's manifest may be gone by then.
 
 use serde::{Deserialize, Serialize};
 use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
 
-/// What of a task manifest matters while the task runs.
+/// The parts of a task manifest that matter while the task runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunRules {
     /// Service or job.
     pub kind: TaskKind,
-    /// What a reboot does.
+    /// The effect of a reboot.
     pub on_boot: OnBoot,
-    /// When a process that ended is started again.
+    /// When a process that ended is restarted.
     pub restart: Restart,
     /// Whether an interrupted job may be started again.
     pub idempotent: bool,
     /// Seconds between the signals of a stop.
     pub stop_timeout_s: u32,
-    /// Seconds that all must hold before it is ready.
+    /// Seconds that all conditions must hold before the run is ready.
     pub hold_s: u32,
-    /// Seconds in which a process must get ready, and for how long it may be degraded.
+    /// Seconds in which a process must become ready, and for which it may stay degraded.
     pub ready_timeout_s: u32,
     /// Seconds a job may run.
     #[serde(default)]
     pub deadline_s: Option<u32>,
-    /// Whether files are to be brought back once it is over.
+    /// Whether output files are uploaded once the run is over.
     #[serde(default)]
     pub has_outputs: bool,
 }

@@ -1,5 +1,5 @@
-//! What is made of a process that lives and is wanted: whether it is ready, whether it goes on as
-//! it should, whether it has had its time. Pure, like the plan.
+//! Supervision of a live, wanted process: readiness, degradation and the deadline. Pure, like the
+//! plan.
 
 use task_proto::manifest::{Restart, TaskKind};
 use task_proto::report::{Failure, FailureCode};
@@ -8,7 +8,7 @@ use super::{CALM_MS, Next, Situation, Step, record, tidy, transition};
 use crate::task::ledger::{ActiveRun, Condemned, ProcessRecord};
 use crate::task::observed::Health;
 
-/// The next step about `process`, which nothing but itself ends.
+/// The next step for `process`, which no order stops.
 pub(super) fn next(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     if process.condemned.is_some() {
         return stop(s, active);
@@ -43,7 +43,7 @@ fn gets_ready(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) ->
     let too_late_ms = process.started_ms + u64::from(timeout_s) * 1000;
     let failure = match s.health {
         Health::Refused(failure) => failure.clone(),
-        // What came in time has its time to hold.
+        // Conditions that were met in time get the full hold time.
         Health::Holds { since_ms } if *since_ms <= too_late_ms => {
             let ready_at_ms =
                 (*since_ms).max(process.started_ms) + u64::from(active.rules.hold_s) * 1000;
@@ -64,9 +64,8 @@ fn gets_ready(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) ->
             Failure::new(FailureCode::NOT_READY, text)
         }
     };
-    // A run that was ready before, and was started again, is started again once more; a first one
-    // has failed. That goes for a refusal as well: a device may come later than its driver after
-    // the power did.
+    // A run that was ready before is restarted; a run that never was has failed. The same holds for
+    // a refusal: after a power cut a device may come up later than its driver.
     let again = active.ever_ready && starts_again(active);
     record(transition::condemned(s, Condemned { failure, again }))
 }
@@ -103,7 +102,7 @@ fn goes_on(s: &Situation<'_>, active: &ActiveRun, process: &ProcessRecord) -> Ne
     )
 }
 
-/// Whether the policy starts a process again that failed. A job's is not: it runs once.
+/// Whether the policy restarts a failed process. A job is never restarted: it runs once.
 fn starts_again(active: &ActiveRun) -> bool {
     active.rules.kind == TaskKind::Service && active.rules.restart != Restart::Never
 }

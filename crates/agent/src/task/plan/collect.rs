@@ -1,19 +1,19 @@
-//! What is done about the files that ended runs are to bring back. Pure, like the plan.
+//! Decides about the output files of ended runs. Pure, like the plan.
 //!
-//! That a run is over is in the ledger before its files travel, so a job is never run again for
-//! their sake. A job's end is reported once they are there, or were given up.
+//! The ledger records the end of a run before its files are uploaded, so a job never runs again for
+//! the sake of its files. A job's end is reported once its files are uploaded or given up.
 
 use task_proto::manifest::TaskKind;
 
 use super::{Next, Situation, Step, record, transition};
 use crate::task::ledger::{ActiveRun, Collection, TaskRecord};
 
-/// How long it is tried, in one boot of the robot.
+/// How long the upload is attempted, within one boot of the robot.
 const GIVE_UP_MS: u64 = 24 * 60 * 60 * 1000;
-/// The most ended runs that wait at the same time; beyond it the oldest is given up.
+/// The maximum number of ended runs that wait for their upload; beyond this the oldest is given up.
 const MAX_WAITING: usize = 4;
 
-/// The next step towards the files of ended runs being at the server.
+/// The next step of the upload of ended runs' files.
 pub fn collect(s: &Situation<'_>) -> Next {
     let Some(collection) =
         s.record.collections.first().filter(|_| s.desired.is_some() && !s.deleting)
@@ -30,7 +30,7 @@ pub fn collect(s: &Situation<'_>) -> Next {
     Next::Act(Step::Collect(Box::new(collection.clone())))
 }
 
-/// Whether a job's files are still where a process of `run` would write. A service does not wait
+/// Whether a job's files still lie where a process of `run` would write. A service does not wait
 /// for its last files.
 pub(super) fn occupies(record: &TaskRecord, run: &ActiveRun) -> bool {
     let is_in_the_way =
@@ -39,7 +39,7 @@ pub(super) fn occupies(record: &TaskRecord, run: &ActiveRun) -> bool {
 }
 
 impl Collection {
-    /// What `run` is to bring back, now that it is over.
+    /// The output files of `run`, which is over.
     pub fn of(run: &ActiveRun, now_ms: u64) -> Self {
         Self {
             deployment: run.deployment.clone(),

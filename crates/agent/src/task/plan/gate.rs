@@ -1,11 +1,11 @@
-//! When the robot's gate is asked, and what its answer means. Pure, like the plan.
+//! Decides when the robot's gate is asked, and interprets its answer. Pure, like the plan.
 //!
-//! It is asked before a run is started for the first time or for the first time since the robot was
-//! booted, before the operator's order stops one, and before one version takes the place of
-//! another; that one answer covers the stop of the old, the start of the new, and the return of the
-//! old should the new one not get ready. It is not asked before a process is started again that
-//! ended by itself, nor before one is stopped that failed: the robot has let it in, and is no
-//! better off with half of it.
+//! The gate is asked before the first start of a run, before its first start since the robot
+//! booted, before the operator's order stops a run, and before one version replaces another. The
+//! answer to a replacement covers the stop of the old version, the start of the new one, and the
+//! return of the old one if the new one does not become ready. The gate is not asked before a
+//! restart of a process that ended by itself, nor before a stop of a failed process: the robot has
+//! admitted the run, and half of a run does not help the robot.
 
 use task_proto::desired::Wanted;
 
@@ -13,21 +13,21 @@ use super::{Next, Situation, Step, record, takes_over, transition};
 use crate::task::ledger::{GateAnswer, GateQuestion, GateStep};
 use crate::task::observed::ProcessState;
 
-/// What the gate says of the step that is next.
+/// The gate's decision about the next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Verdict {
-    /// There is no gate, it allowed the step, or it need not be asked.
+    /// There is no gate, the gate allowed the step, or the step needs no permission.
     Go,
-    /// It has not answered yet.
+    /// The gate has not answered yet.
     Asked,
-    /// It refused, and is asked again later.
+    /// The gate refused and is asked again later.
     NotNow,
 }
 
-/// The next question to the gate, if there is one to be asked now.
+/// The next question to the gate, if one is due now.
 pub fn consult(s: &Situation<'_>) -> Next {
     let rest = |until_ms| Next::Rest { until_ms };
-    // The step that was allowed may be the one under way.
+    // The allowed step may be the one under way.
     if s.acting {
         return rest(None);
     }
@@ -45,7 +45,7 @@ pub fn consult(s: &Situation<'_>) -> Next {
     }
 }
 
-/// Whether the step that is next may be done as far as the gate is concerned.
+/// Whether the gate permits the next step.
 pub(super) fn verdict(s: &Situation<'_>) -> Verdict {
     let Some(question) = question(s) else { return Verdict::Go };
     match s.record.gate.as_ref().filter(|gate| gate.question == question).map(|gate| &gate.answer) {
@@ -55,7 +55,7 @@ pub(super) fn verdict(s: &Situation<'_>) -> Verdict {
     }
 }
 
-/// What the gate has to allow before anything more can be done.
+/// The question that the gate has to answer before any further step.
 fn question(s: &Situation<'_>) -> Option<GateQuestion> {
     if !s.gated {
         return None;

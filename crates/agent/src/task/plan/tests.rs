@@ -1,6 +1,6 @@
-//! Properties of the plan, shown in a small simulated world: whatever happens in whatever order, no
-//! job runs twice, no task has two processes, what is not wanted is interrupted, and once it is
-//! quiet everything converges.
+//! Properties of the plan, shown in a small simulated world with events in any order: no job runs
+//! twice, no task has two processes, unwanted steps are interrupted, and the world converges once
+//! it is quiet.
 
 mod world;
 
@@ -129,7 +129,7 @@ fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
         world.happen(Happening::Learn);
     }
     let (Step::Start(run), _) = world.steps[0].clone() else { panic!("looked for") };
-    // The shim did not answer in time, and has started it all the same.
+    // The shim did not answer in time but has started the process.
     world.alive.push(run.process.expect("begun").dir);
     world.happen(Happening::Effect { well: false });
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
@@ -315,7 +315,7 @@ fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() 
         (world.alive.len(), world.record.as_ref().expect("a record").phase),
         (1, Phase::RolledBack)
     );
-    // A reboot brings the old one back, and the order is not tried again by itself.
+    // A reboot brings the old run back, and the order is not retried by itself.
     world.happen(Happening::Reboot);
     world.settle();
     let record = world.record.as_ref().expect("a record");
@@ -532,7 +532,7 @@ fn the_gate_allows_a_switch_as_a_whole() {
     world.happen(Happening::Learn);
     assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
     world.settle();
-    // A crash is no new start, a reboot is.
+    // A crash is not a new start, a reboot is.
     world.happen(Happening::ProcessEnds { code: 1 });
     world.happen(Happening::Wait { ms: 60_000 });
     assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
@@ -603,7 +603,7 @@ fn who_has_signed_it_is_looked_for_before_anything_of_it_is_fetched() {
     world.happen(Happening::Effect { well: true });
     world.happen(Happening::Learn);
     assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]), "{:?}", world.steps);
-    // Whoever signed it is trusted no more while it is pulled.
+    // The publisher loses its trust during the pull.
     world.happen(Happening::Signed(false));
     world.happen(Happening::Effect { well: true });
     world.happen(Happening::Learn);

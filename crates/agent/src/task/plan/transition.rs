@@ -1,5 +1,5 @@
-//! How a record changes: by an order, by the beginning and end of a step, by what a process did.
-//! Pure, like the plan.
+//! State transitions of a task record: a new order, the beginning and end of a step, the end of a
+//! process. Pure, like the plan.
 
 use task_proto::desired::{DesiredTask, Wanted};
 use task_proto::manifest::{OnBoot, Restart, TaskKind};
@@ -12,16 +12,17 @@ use crate::task::ledger::{
 };
 use crate::task::observed::Exit;
 
-/// How a step ended that did not fail.
+/// The result of a step that did not fail.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Done {
-    /// All of it was done.
+    /// The step is complete.
     Well,
-    /// A start: the process id.
+    /// A process was started; holds its process id.
     Started(u32),
-    /// The server told this robot to come back later. That is no failure and no try.
+    /// The server told this robot to come back later. This counts neither as a failure nor as an
+    /// attempt.
     ToldToWait {
-        /// Not before so many milliseconds.
+        /// The shortest wait in milliseconds.
         at_least_ms: u64,
     },
 }
@@ -29,9 +30,9 @@ pub enum Done {
 /// A step that did not succeed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StepFailure {
-    /// Why.
+    /// The cause.
     pub failure: Failure,
-    /// Whether it may succeed later, and not before how many milliseconds; `None`: it never will.
+    /// The shortest wait in milliseconds before a retry; `None`: a retry can never succeed.
     pub retry_after_ms: Option<u64>,
 }
 
@@ -39,22 +40,22 @@ pub struct StepFailure {
 const BACKOFF_BASE_MS: u64 = 1000;
 /// The longest wait before a step is tried again.
 const MAX_STEP_BACKOFF_MS: u64 = 5 * 60 * 1000;
-/// What a wait that the server asked for is lengthened by at most.
+/// The most jitter that is added to a wait requested by the server.
 const MAX_WAIT_JITTER_MS: u64 = 30 * 1000;
 /// The longest wait before the robot's gate is asked again.
 const MAX_GATE_BACKOFF_MS: u64 = 60 * 1000;
 /// The longest wait before a process is started again.
 const MAX_RESTART_BACKOFF_MS: u64 = 60 * 1000;
 
-/// Exponential backoff with full jitter, `jitter` being even from 0 to 1: the wait after the
-/// `attempt`th failure.
+/// Exponential backoff with full jitter: the wait after the `attempt`th failure. `jitter` is
+/// uniform from 0 to 1.
 pub fn backoff_ms(attempt: u32, max_ms: u64, jitter: f64) -> u64 {
     let ceiling = BACKOFF_BASE_MS.saturating_mul(1 << attempt.clamp(1, 20)).min(max_ms);
     // Rounding a positive number below 2^32 loses nothing that matters.
     (ceiling as f64 * jitter.clamp(0.0, 1.0)) as u64
 }
 
-/// The record under a new order. A run that is alive goes on until the new version takes over.
+/// The record under a new order. A live run continues until the new version takes over.
 pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRecord {
     let mut record = record.clone();
     let is_down = record.active.as_ref().is_none_or(|active| active.process.is_none());
@@ -69,7 +70,7 @@ pub fn adopted(record: &TaskRecord, order: &DesiredTask, now_ms: u64) -> TaskRec
     record
 }
 
-/// The record that is written before `step` is done. `start` is the agent's start counter.
+/// The record that is written before `step` begins. `start` is the agent's start counter.
 pub fn begun(
     record: &TaskRecord,
     step: &Step,
@@ -143,7 +144,7 @@ pub fn begun(
     record
 }
 
-/// The record after `step`, which gave `outcome`.
+/// The record after `step` ended with `outcome`.
 pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailure>) -> TaskRecord {
     let mut record = s.record.clone();
     match (step, outcome) {
@@ -155,7 +156,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
             | Step::Build(package),
             outcome,
         ) => {
-            // The step of an order that was replaced meanwhile says nothing about the new one.
+            // A step for an order that was replaced meanwhile says nothing about the new order.
             if record.order.package == *package {
                 prepared(&mut record.preparation, s, outcome);
             }
@@ -172,8 +173,8 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
         }
         (Step::Start(_), Err(StepFailure { failure, retry_after_ms })) => {
             prepare_changed(&mut record, &failure);
-            // It may have come about after all: what is made of the failure waits until no process
-            // is there.
+            // The process may have been started despite the failure. We act on the failure only
+            // once no process is left.
             if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut())
             {
                 process.condemned = Some(Condemned { failure, again: retry_after_ms.is_some() });
@@ -229,7 +230,7 @@ pub fn finished(s: &Situation<'_>, step: &Step, outcome: Result<Done, StepFailur
     record
 }
 
-/// Begins to prepare anew what was found to be changed on the disk, if it is what is ordered.
+/// Prepares the ordered version again after its files on the disk were found to be changed.
 fn prepare_changed(record: &mut TaskRecord, failure: &Failure) {
     let is_ordered = record.active.as_ref().is_some_and(|active| active.is_for(&record.order));
     if failure.code == FailureCode::TREE_CHANGED && is_ordered {
@@ -256,7 +257,8 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
     preparation.retry_at_ms = 0;
     match outcome {
         Ok(Done::ToldToWait { at_least_ms }) => {
-            // Only the end of the order bounds how often: the server knows when it has room.
+            // Only the end of the order bounds the number of waits: the server knows when it has
+            // capacity.
             preparation.failure = None;
             let wait_ms = at_least_ms.saturating_add(wait_jitter_ms(at_least_ms, s.jitter));
             preparation.retry_at_ms = s.now_ms.saturating_add(wait_ms);
@@ -268,7 +270,7 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
         }
         Err(StepFailure { failure, retry_after_ms: Some(least_ms) }) => {
             preparation.failure = Some(failure);
-            // Retries go on until the order ends: the server lets it expire.
+            // Retries go on until the order ends: the server lets the order expire.
             let wait_ms =
                 backoff_ms(preparation.attempts, MAX_STEP_BACKOFF_MS, s.jitter).max(least_ms);
             preparation.retry_at_ms = s.now_ms.saturating_add(wait_ms);
@@ -276,8 +278,7 @@ fn prepared(preparation: &mut Preparation, s: &Situation<'_>, outcome: Result<Do
     }
 }
 
-/// What is added to a wait of `least_ms`, so that robots that were told the same do not all come
-/// back at once.
+/// Jitter for a wait of `least_ms`, so that robots with the same wait do not all come back at once.
 fn wait_jitter_ms(least_ms: u64, jitter: f64) -> u64 {
     let most_ms = (least_ms / 4).clamp(BACKOFF_BASE_MS, MAX_WAIT_JITTER_MS);
     (most_ms as f64 * jitter.clamp(0.0, 1.0)) as u64
@@ -294,10 +295,10 @@ pub(super) fn prepared_to(s: &Situation<'_>, phase: Phase, failure: Option<Failu
     record
 }
 
-/// The record once all that makes the process ready has held long enough.
+/// The record once all readiness conditions have held long enough.
 pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
-    // It has proved itself: what it replaced is not needed any more.
+    // The new run has proved itself, so the replaced run is not needed any more.
     if let Some(before) = record.fallback.take() {
         collect_files(&mut record, &before, s.now_ms);
     }
@@ -311,7 +312,7 @@ pub(super) fn ready(s: &Situation<'_>) -> TaskRecord {
     record
 }
 
-/// The record once there is nothing to ask the gate.
+/// The record once the gate has no pending question.
 pub(super) fn ungated(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     record.gate = None;
@@ -319,7 +320,7 @@ pub(super) fn ungated(s: &Situation<'_>) -> TaskRecord {
     record
 }
 
-/// The record once it is decided that the process must end.
+/// The record once the process is marked to be stopped because of a failure.
 pub(super) fn condemned(s: &Situation<'_>, condemned: Condemned) -> TaskRecord {
     let mut record = s.record.clone();
     if let Some(process) = record.active.as_mut().and_then(|active| active.process.as_mut()) {
@@ -328,7 +329,7 @@ pub(super) fn condemned(s: &Situation<'_>, condemned: Condemned) -> TaskRecord {
     record
 }
 
-/// The record once a restarted process has run for long.
+/// The record once a restarted process has run calmly.
 pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
     let mut record = record.clone();
     if let Some(active) = &mut record.active {
@@ -337,7 +338,7 @@ pub(super) fn calm(record: &TaskRecord) -> TaskRecord {
     record
 }
 
-/// The record once it is known that what the active run is to run can't be had anew.
+/// The record once the deleted files of the active run are known to be unrecoverable.
 pub(super) fn not_restored(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let failure = record.preparation.failure.clone();
@@ -348,16 +349,16 @@ pub(super) fn not_restored(s: &Situation<'_>) -> TaskRecord {
     record
 }
 
-/// The record when it turns out that the process it announces was never started: as if it had not
-/// been tried, unless the start is known to have failed.
+/// The record once the process in the record turns out to have never been started. The start does
+/// not count as an attempt, unless it is known to have failed.
 pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     let mut record = s.record.clone();
     let process = record.active.as_mut().and_then(|active| active.process.take());
     if let Some(condemned) = process.and_then(|process| process.condemned) {
         let run = record.active.clone();
-        // A job as well: nothing of it has run.
+        // A job may be retried as well: none of it has run.
         give_up_or_retry(&mut record, s, condemned.failure, condemned.again);
-        // Processes of it may have run before.
+        // Earlier processes of the run may have written files.
         if let Some(run) = run.filter(ActiveRun::has_started) {
             collect_if_over(&mut record, &run, s.now_ms);
         }
@@ -366,7 +367,7 @@ pub(super) fn never_started(s: &Situation<'_>) -> TaskRecord {
     record
 }
 
-/// The record after the active run's process has ended without being asked to.
+/// The record after the active run's process has ended without a stop from the agent.
 pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     let mut record = s.record.clone();
     let Some(active) = &mut record.active else { return record };
@@ -377,7 +378,7 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     if let Some(condemned) = process.condemned {
         give_up_or_retry(&mut record, s, condemned.failure, condemned.again && !is_job);
     } else if process.boot_id != s.boot_id && !(is_job && exit.is_success()) {
-        // Whatever status it left, it ended because the robot went down.
+        // The process ended because the robot went down, whatever its exit status.
         after_reboot(&mut record, s.now_ms);
     } else if is_job {
         job_ended(active, exit);
@@ -394,20 +395,20 @@ pub(super) fn ended(s: &Situation<'_>, exit: &Exit) -> TaskRecord {
     record
 }
 
-/// Sees to the files of `run`, whose process is gone, unless the run goes on: with another process,
-/// or later.
+/// Queues the output files of `run`. The process is gone; files are not queued if the run continues
+/// now or later with another process.
 fn collect_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
     let goes_on =
         record.active.as_ref().is_some_and(|active| active.is_same(run) && active.end.is_none());
     let stopped = record.order.wanted == Wanted::Stopped;
-    // One that was replaced may come back; it is over once the new one is ready.
+    // A replaced run may come back; it is over once the new run is ready.
     if !goes_on || stopped {
         collect_files(record, run, now_ms);
     }
 }
 
-/// Sees to the files of a run that has left the record without an end of its own: it was stopped
-/// for another one, and will not come back.
+/// Queues the output files of a run that left the record without an end of its own. The run was
+/// stopped for another run and will not come back.
 fn collect_if_left(record: &mut TaskRecord, run: Option<ActiveRun>, now_ms: u64) {
     let Some(run) = run.filter(|run| run.end.is_none() && run.has_started()) else { return };
     if ![&record.active, &record.fallback].into_iter().flatten().any(|other| other.is_same(&run)) {
@@ -473,8 +474,8 @@ fn job_ended(active: &mut ActiveRun, exit: &Exit) {
     };
 }
 
-/// A service that was never ready gets its readiness time to be so; one that was gets
-/// [`MAX_RESTARTS_IN_A_ROW`].
+/// Limits the restarts of a service. A service that was never ready has its readiness timeout to
+/// become so; one that was ready has [`MAX_RESTARTS_IN_A_ROW`] restarts.
 fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure, again: bool) {
     let Some(active) = &mut record.active else { return };
     let tried_ms = s.now_ms.saturating_sub(active.first_start_ms);
@@ -488,8 +489,8 @@ fn give_up_or_retry(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure
         s.now_ms + backoff_ms(active.restarts_in_a_row, MAX_RESTART_BACKOFF_MS, s.jitter);
 }
 
-/// The active run is over for good. The one it replaced comes back, if it was never as good as
-/// that.
+/// Ends the active run for good. The run that it replaced comes back, if the active run was never
+/// ready.
 fn give_up(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure) {
     let Some(active) = &mut record.active else { return };
     let Some(mut before) = record.fallback.take() else {
@@ -503,8 +504,8 @@ fn give_up(record: &mut TaskRecord, s: &Situation<'_>, failure: Failure) {
     record.finish(deployment, run, End { phase: Phase::RolledBack, failure: Some(failure) });
 }
 
-/// After a rollback the order stands by the run that came back: once that is over as well, it is
-/// not `rolled_back`.
+/// After a rollback, the state of the order follows the run that came back. Once that run is over
+/// as well, the order is no longer `rolled_back`.
 fn came_back_in_vain(record: &mut TaskRecord, phase: Phase, what: &str) {
     let Some(active) = record.active.as_ref().filter(|active| !active.is_for(&record.order)) else {
         return;

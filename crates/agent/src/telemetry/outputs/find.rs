@@ -1,6 +1,6 @@
-//! Finds the files that `outputs.paths` names: regular files below one directory. Links are neither
-//! followed nor brought back, because a task could point them at what is not its own; nor are
-//! pipes, sockets and devices, which are not opened.
+//! Finds the files that match `outputs.paths`: regular files below one directory. Links are neither
+//! followed nor uploaded, because a task could point them at files that belong to others. Pipes,
+//! sockets and devices are not opened or uploaded.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read as _};
@@ -15,12 +15,12 @@ use task_proto::output::{MAX_FILES, OutputFile};
 use super::{OutputError, too_many};
 use crate::system::untrusted_file::{Directory, Entry};
 
-/// The most names looked at for one pattern.
+/// Most names examined for one pattern.
 const MAX_LOOKED_AT: usize = 200_000;
-/// The deepest directory looked into.
+/// Deepest directory that is searched.
 const MAX_DEPTH: usize = 48;
 
-/// The files that match, sorted by path, with their digests.
+/// The matching files, sorted by path, with their digests.
 pub(super) fn files(
     directory: &Path,
     patterns: &[String],
@@ -54,7 +54,7 @@ pub(super) fn files(
     hashed.collect()
 }
 
-/// A pattern's parts between slashes.
+/// Splits a pattern at its slashes.
 fn parts(pattern: &str) -> Result<Vec<glob::Pattern>, OutputError> {
     let invalid = |reason| OutputError::Pattern { pattern: pattern.to_owned(), reason };
     let parts = pattern.split('/').filter(|part| !part.is_empty() && *part != ".");
@@ -69,7 +69,7 @@ fn parts(pattern: &str) -> Result<Vec<glob::Pattern>, OutputError> {
 struct Search<'a, F> {
     found: &'a mut BTreeMap<OutputPath, u64>,
     left: usize,
-    /// Makes an error about a path below the root.
+    /// Builds an error for a path below the root.
     unreadable: &'a F,
 }
 
@@ -78,7 +78,7 @@ where
     F: Fn(&str) -> E,
     E: FnOnce(io::Error) -> OutputError,
 {
-    /// Looks for `parts` in `directory`, whose path below the root is `prefix`.
+    /// Searches for `parts` in `directory`, whose path below the root is `prefix`.
     fn descend(
         &mut self,
         directory: &Directory,
@@ -89,7 +89,7 @@ where
         let Some((part, rest)) = parts.split_first() else { return Ok(()) };
         let is_any_depth = part.as_str() == "**";
         if is_any_depth {
-            // No directory at all in its place.
+            // `**` also matches no directory at all.
             self.descend(directory, prefix, rest, depth)?;
         }
         let unreadable = self.unreadable;
@@ -100,7 +100,7 @@ where
                     "more than {MAX_LOOKED_AT} names would have to be looked at"
                 ))
             })?;
-            // What has no printable name can't be named in a manifest either.
+            // A name that is not printable text can't appear in a manifest either.
             let Ok(name) = name.into_string() else { continue };
             if !is_any_depth && !part.matches(&name) {
                 continue;
@@ -125,8 +125,7 @@ where
     }
 }
 
-/// The digest of a file as long as it was when it was found: something may still write to it,
-/// without end.
+/// Hashes a file up to the size that was found, because a process may keep appending to it.
 pub(super) fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
     let mut file = root.file(path)?.take(found);
     let (mut hash, mut size) = (Sha256::new(), 0);

@@ -1,6 +1,6 @@
-//! Pushes an output through the OCI distribution API: the config and the manifest, to hear whether
-//! it would be kept, then blobs in chunks that go on where they broke off, then the manifest once
-//! more.
+//! Pushes an output through the OCI distribution API. First come the config and the manifest, to
+//! learn whether the registry would accept the output. Then come the blobs, in chunks that resume
+//! after a cut, and finally the manifest again.
 
 use std::collections::BTreeMap;
 use std::io::{Read as _, Seek as _, SeekFrom};
@@ -26,34 +26,35 @@ use crate::system::untrusted_file::Directory;
 use crate::transfer::credential::Credential;
 use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryWords};
 
-/// Bytes sent in one request: what a bad link loses at most.
+/// Bytes per request: the most that a cut of a bad link loses.
 const CHUNK_BYTES: u64 = 1024 * 1024;
-/// The registry's word for a manifest whose files are not all there.
+/// Registry error code for a manifest with missing files.
 const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
-/// And for bytes that are not those of the digest.
+/// Registry error code for bytes that do not match the digest.
 const OTHER_BYTES: &str = "DIGEST_INVALID";
-/// How long one request may take.
+/// Timeout for one request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
-/// How often an upload is begun again in one go that the server has forgotten, or received as other
+/// Most restarts of an upload in one attempt, after the server forgot the upload or received other
 /// bytes.
 const MAX_BEGINNINGS: u32 = 3;
-/// How often a request whose body the server received as other bytes is sent again in one go.
+/// Most repeats of a request in one attempt, after the server received other bytes than its body.
 const MAX_SENT_AGAIN: u32 = 3;
-/// The registry's words for a manifest that can't be read: ours can.
+/// Registry error code for an unreadable manifest. Ours is readable, so the network changed its
+/// bytes.
 const OTHER_MANIFEST: &str = "MANIFEST_INVALID";
 
-/// The server's registry, as this robot may use it.
+/// The server's registry, with this robot's access.
 #[derive(Clone)]
 pub struct Registry {
     client: reqwest::Client,
     base: Url,
     token: Credential,
-    /// Whose turn it is to push: the server keeps so much of a robot that is not listed yet, and
-    /// two would share that.
+    /// Permits one push at a time: the server limits the bytes of a robot that are not listed yet,
+    /// and two pushes would share that limit.
     turn: Arc<Semaphore>,
 }
 
-/// Uploads under way, by the digest of what they bring.
+/// Uploads in progress: location by the digest of the uploaded blob.
 type Notes = BTreeMap<Digest, String>;
 
 impl Registry {
@@ -71,7 +72,8 @@ impl Registry {
         self.client.request(method, url).bearer_auth(self.token.current()).timeout(REQUEST_TIMEOUT)
     }
 
-    /// Sends what makes the registry take these bytes as a whole, and has its word that it did.
+    /// Sends a request that stores bytes as a whole, and checks that the registry confirms their
+    /// digest.
     async fn store(
         &self,
         what: &str,
@@ -82,8 +84,8 @@ impl Registry {
         if is_of(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
     }
 
-    /// The same for bytes that are held in memory and known to be those of the digest: where the
-    /// server received others, they are sent again.
+    /// Like [`Self::store`], for bytes in memory that match the digest. If the server received
+    /// other bytes, the request is repeated.
     async fn store_exactly(
         &self,
         what: &str,
@@ -112,7 +114,7 @@ impl Registry {
         }
     }
 
-    /// Sends what begins or goes on with an upload; gives its answer and where it goes on.
+    /// Starts or continues an upload. Returns the answer and the location for the next request.
     async fn upload(
         &self,
         what: &str,
@@ -156,7 +158,7 @@ pub(super) async fn push(
     let (repository, tag) = output.repository().zip(output.tag()).ok_or_else(refused)?;
     let total = output.files.iter().map(|file| file.blob.size).sum();
     progress.send_replace(Progress { done: 0, total });
-    // It is never closed.
+    // The semaphore is never closed.
     let _turn = registry.turn.acquire().await;
     let mut push = Push {
         registry,
@@ -180,7 +182,7 @@ pub(super) async fn push(
         };
         registry.store_exactly("the output", Digest::of(&manifest), put).await
     };
-    // What the server would not list need not travel.
+    // Files of an output that the server would refuse need not be sent.
     match list().await {
         Err(OutputError::Refused { code, .. }) if code == FILES_MISSING => {}
         listed => return listed,
@@ -191,7 +193,7 @@ pub(super) async fn push(
         progress.send_modify(|progress| progress.done = push.done);
     }
     match list().await {
-        // It was there when this began, and has been collected meanwhile.
+        // A file was present at the start, and the server has deleted it meanwhile.
         Err(OutputError::Refused { status, code, text, .. }) if code == FILES_MISSING => {
             Err(OutputError::Busy { status, text, retry_after: None })
         }
@@ -205,7 +207,7 @@ struct Push<'a> {
     order: &'a OutputOrder,
     notes: Notes,
     notes_path: &'a Path,
-    /// Bytes of the files before this one.
+    /// Bytes of all files before the current one.
     done: u64,
     progress: &'a watch::Sender<Progress>,
 }
@@ -229,14 +231,14 @@ impl Push<'_> {
             };
             let is_first = beginnings < MAX_BEGINNINGS;
             match sent {
-                // The server has collected the upload, or took a chunk whose answer was lost.
+                // The server has deleted the upload, or stored a chunk and its answer was lost.
                 Err(OutputError::Refused { status: 404 | 416, .. }) if is_first => {
                     self.note(blob.digest, None)?
                 }
                 Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES => {
                     self.note(blob.digest, None)?;
-                    // A task that runs again writes where it wrote before. Otherwise the way there
-                    // is at fault.
+                    // A task that runs again overwrites its files. If the file is unchanged, the
+                    // network is at fault.
                     if !self.is_unchanged(path, blob).await? {
                         return Err(self.changed(path));
                     }
@@ -250,7 +252,7 @@ impl Push<'_> {
         }
     }
 
-    /// Pushes what fits into one request.
+    /// Pushes a blob that fits into one request.
     async fn small(&self, digest: Digest, bytes: Bytes) -> Result<(), OutputError> {
         let post = || {
             let post = self
@@ -323,8 +325,8 @@ fn note_error(path: &Path, source: std::io::Error) -> OutputError {
     OutputError::Note { path: path.to_owned(), source }
 }
 
-/// What an earlier try noted of these files; nothing, if that can't be read: then uploads begin
-/// anew.
+/// Reads the upload notes of an earlier attempt for these files. If they can't be read, uploads
+/// start over.
 fn read_notes(path: &Path, output: &OutputSet) -> Notes {
     let read =
         std::fs::read(path).ok().and_then(|bytes| serde_json::from_slice::<Notes>(&bytes).ok());
@@ -356,21 +358,23 @@ async fn read_part(
     read.map_err(|source| OutputError::Read { path: failed_at, source })
 }
 
-/// How many bytes an upload has. A single one can't be told from none, and then it begins anew.
+/// Number of bytes that an upload has received. A range of one byte looks like an empty one, so the
+/// upload then starts over.
 fn uploaded(status: &Response) -> u64 {
     let range = status.headers().get(RANGE).and_then(|value| value.to_str().ok());
     let last = range.and_then(|range| range.strip_prefix("0-")?.parse::<u64>().ok());
     last.filter(|last| *last > 0).map_or(0, |last| last.saturating_add(1))
 }
 
-/// Where an upload goes on, as a path of this server, which says so in every answer about one.
+/// Location for the next request of an upload, as a path on this server. Every answer about an
+/// upload carries one.
 fn location(response: &Response) -> Result<String, OutputError> {
     let location = response.headers().get(LOCATION).and_then(|value| value.to_str().ok());
     let path = location.filter(|location| location.starts_with("/v2/") && !location.contains('?'));
     path.map(str::to_owned).ok_or_else(|| not_the_server(response))
 }
 
-/// Whether the answer is about these bytes, as a registry's is that has them.
+/// Whether the answer names this digest, as the answer of a registry with these bytes does.
 fn is_of(response: &Response, digest: Digest) -> bool {
     response
         .headers()

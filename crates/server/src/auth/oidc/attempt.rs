@@ -1,13 +1,13 @@
-//! One attempt to sign in: a secret that only the browser keeps, in a cookie, while it is away at
-//! the provider. What the provider is told is made of it, so that an answer is only good in the
-//! browser that asked, and nothing is remembered here.
+//! One sign-in attempt: a secret that only the browser keeps, in a cookie, while the user is at the
+//! provider. The values sent to the provider are derived from the secret. So an answer is only
+//! valid in the browser that made the attempt, and the server stores nothing.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 use sha2::{Digest as _, Sha256};
 use subtle::ConstantTimeEq as _;
 
-/// The secret's bytes.
+/// The secret's length in bytes.
 const SECRET_BYTES: usize = 32;
 
 /// One attempt.
@@ -15,22 +15,22 @@ const SECRET_BYTES: usize = 32;
 pub struct Attempt([u8; SECRET_BYTES]);
 
 impl Attempt {
-    /// A new one.
+    /// A new attempt with a random secret.
     pub fn random() -> Self {
         Self(rand::random())
     }
 
-    /// The one that the browser had kept; `None` if that is none.
+    /// The attempt that the browser kept; `None` if the text is invalid.
     pub fn kept(text: &str) -> Option<Self> {
         URL_SAFE_NO_PAD.decode(text).ok()?.try_into().ok().map(Self)
     }
 
-    /// What the browser is to keep.
+    /// The secret, for the browser's cookie.
     pub fn reveal(&self) -> String {
         URL_SAFE_NO_PAD.encode(self.0)
     }
 
-    /// What comes back with the answer.
+    /// The `state` parameter, which is returned with the answer.
     pub fn state(&self) -> String {
         self.derived("state")
     }
@@ -40,22 +40,22 @@ impl Attempt {
         self.state().as_bytes().ct_eq(state.as_bytes()).into()
     }
 
-    /// What comes back in the ID token.
+    /// The nonce, which is returned in the ID token.
     pub fn nonce(&self) -> String {
         self.derived("nonce")
     }
 
-    /// What has to be shown with the code (RFC 7636).
+    /// The code verifier, sent with the code (RFC 7636).
     pub fn verifier(&self) -> String {
         self.derived("verifier")
     }
 
-    /// What tells the provider which verifier that will be.
+    /// The code challenge, which commits to the verifier.
     pub fn challenge(&self) -> String {
         URL_SAFE_NO_PAD.encode(Sha256::digest(self.verifier()))
     }
 
-    /// None of these tells anything about another one.
+    /// Derives a value; no derived value reveals another one.
     fn derived(&self, purpose: &str) -> String {
         let digest = Sha256::new().chain_update(purpose).chain_update([0]).chain_update(self.0);
         URL_SAFE_NO_PAD.encode(digest.finalize())

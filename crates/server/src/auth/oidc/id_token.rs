@@ -1,6 +1,6 @@
-//! An ID token: a signed document in which the provider says who has signed in (OpenID Connect
-//! Core, 2 and 3.1.3.7). It is believed if a key of the provider made it, for this server, now, and
-//! for this attempt.
+//! An ID token: a signed document in which the provider identifies the signed-in user (OpenID
+//! Connect Core, 2 and 3.1.3.7). A token is valid if a key of the provider signed it, for this
+//! server, now, and for this attempt.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -9,36 +9,36 @@ use subtle::ConstantTimeEq as _;
 
 use super::keys::{Algorithm, KeySet};
 
-/// The longest token that is looked at.
+/// Maximum size of a token.
 const MOST_BYTES: usize = 64 * 1024;
-/// The longest subject (OpenID Connect Core, 2).
+/// Maximum length of a subject (OpenID Connect Core, 2).
 const MOST_SUBJECT_BYTES: usize = 255;
-/// By how much the provider's clock may differ.
+/// Permitted difference of the provider's clock.
 const SKEW_S: f64 = 60.0;
 
-/// Why a token is not believed.
+/// The reason for rejecting a token.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IdTokenError {
-    /// It is no token.
+    /// The text is not a token.
     #[error("it is not a signed JWT")]
     Malformed,
-    /// It is signed in a way that proves nothing, or in one that is not known here.
+    /// The signature's algorithm proves nothing, or is not supported.
     #[error("its algorithm is neither RS256 nor ES256")]
     Algorithm,
     /// None of the provider's keys made the signature.
     #[error("none of the provider's keys made its signature")]
     Signature,
-    /// It says something else than it should.
+    /// A claim has an unexpected value.
     #[error("{claim}: {reason}")]
     Claim {
-        /// Where.
+        /// The claim.
         claim: &'static str,
-        /// What is wrong.
+        /// The error.
         reason: &'static str,
     },
 }
 
-/// What a token has to say.
+/// The claims that a token must contain.
 pub(super) struct Expected<'a> {
     pub(super) issuer: &'a str,
     pub(super) client_id: &'a str,
@@ -46,7 +46,7 @@ pub(super) struct Expected<'a> {
     pub(super) now_ms: u64,
 }
 
-/// A token that nobody has verified yet.
+/// A token that is not yet verified.
 pub(super) struct IdToken<'a> {
     key_id: Option<String>,
     algorithm: Algorithm,
@@ -64,7 +64,7 @@ impl<'a> IdToken<'a> {
         let (header, payload) = signed.split_once('.').ok_or(IdTokenError::Malformed)?;
         let signature = URL_SAFE_NO_PAD.decode(signature).map_err(|_| IdTokenError::Malformed)?;
         let header = object(header)?;
-        // Whatever an extension means, it is not understood here (RFC 7515, 4.1.11).
+        // Extensions are not supported, whatever they mean (RFC 7515, 4.1.11).
         if header.contains_key("crit") {
             return Err(IdTokenError::Malformed);
         }
@@ -74,12 +74,12 @@ impl<'a> IdToken<'a> {
         Ok(Self { key_id, algorithm, signed, payload, signature })
     }
 
-    /// Whether the key that it names is there.
+    /// Whether the set contains the key that the token names.
     pub(super) fn has_key_in(&self, keys: &KeySet) -> bool {
         keys.has(self.key_id.as_deref(), self.algorithm)
     }
 
-    /// What it says, if it is to be believed.
+    /// The claims, if the token is valid.
     pub(super) fn verify(
         &self,
         keys: &KeySet,
@@ -104,17 +104,17 @@ fn object(part: &str) -> Result<Map<String, Value>, IdTokenError> {
     serde_json::from_slice(&bytes).map_err(|_| IdTokenError::Malformed)
 }
 
-/// What a verified token says.
+/// The claims of a verified token.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Claims(Map<String, Value>);
 
 impl Claims {
-    /// Who it is at the provider: never given to anybody else there, unlike a name or an address.
+    /// The user's identifier at the provider: never reassigned there, unlike a name or an address.
     pub fn subject(&self) -> &str {
         self.text("sub").unwrap_or_default()
     }
 
-    /// A claim by its name, or by the path to it, like `realm_access.roles`.
+    /// A claim by its name, or by its path, like `realm_access.roles`.
     pub fn get(&self, name: &str) -> Option<&Value> {
         self.0.get(name).or_else(|| {
             let mut path = name.split('.');
@@ -123,7 +123,7 @@ impl Claims {
         })
     }
 
-    /// Whether the claim is this value, or a list with it.
+    /// Whether the claim equals this value, or is a list that contains it.
     pub fn has(&self, name: &str, value: &str) -> bool {
         let is_it = |found: &Value| match found {
             Value::String(text) => text == value,
@@ -205,7 +205,7 @@ mod tests {
         now_ms: NOW_S * 1000,
     };
 
-    /// A provider's key and the set it is published in.
+    /// A provider's key and the set in which it is published.
     struct Signer {
         pair: EcdsaKeyPair,
         keys: KeySet,
@@ -325,7 +325,7 @@ mod tests {
             let token = signer.sign(&json!({ "alg": alg, "kid": "k" }), &claims());
             assert_eq!(signer.verified(&token), Err(IdTokenError::Algorithm), "{alg}");
         }
-        // A public key is no secret that a token could be signed with.
+        // A public key is not secret, so a token must not be signed with it.
         assert_eq!(
             signer.verified(&signer.sign(&json!({ "alg": "RS256" }), &claims())),
             Err(IdTokenError::Signature)

@@ -1,5 +1,5 @@
-//! The provider's public keys (RFC 7517), and whether one of them made a signature: RSA or ECDSA on
-//! P-256, each with SHA-256. A key is only ever used for the algorithm that it is for.
+//! The provider's public keys (RFC 7517), and verification of signatures: RSA or ECDSA on P-256,
+//! each with SHA-256. A key is only ever used for its own algorithm.
 
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
@@ -8,12 +8,12 @@ use ring::signature::{
 };
 use serde_json::Value;
 
-/// The most keys that are looked at.
+/// Maximum number of keys that are read.
 const MOST_KEYS: usize = 64;
-/// The coordinates of a point on P-256.
+/// Length of a coordinate of a point on P-256, in bytes.
 const COORDINATE_BYTES: usize = 32;
 
-/// How a token is signed.
+/// A signature algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Algorithm {
     /// RSASSA-PKCS1-v1_5.
@@ -23,7 +23,8 @@ pub(super) enum Algorithm {
 }
 
 impl Algorithm {
-    /// By its name in a token; `none` and those with a shared secret are not among them.
+    /// The algorithm by its name in a token; `none` and algorithms with a shared secret are not
+    /// supported.
     pub(super) fn by_name(name: &str) -> Option<Self> {
         match name {
             "RS256" => Some(Self::Rs256),
@@ -33,7 +34,7 @@ impl Algorithm {
     }
 }
 
-/// The keys that can be used.
+/// The usable keys.
 #[derive(Clone)]
 pub(super) struct KeySet(Vec<Key>);
 
@@ -50,7 +51,7 @@ enum Public {
 }
 
 impl KeySet {
-    /// Those of a document that are for signatures of a kind known here; others don't matter.
+    /// The document's keys for supported signatures; others are ignored.
     pub(super) fn read(document: &Value) -> Self {
         let keys = document["keys"].as_array().map(Vec::as_slice).unwrap_or_default();
         Self(keys.iter().take(MOST_KEYS).filter_map(key).collect())
@@ -61,7 +62,7 @@ impl KeySet {
         self.candidates(id, algorithm).next().is_some()
     }
 
-    /// Whether the key of this id, or without an id one of them, made the signature.
+    /// Whether the key of this id, or any key if there is no id, made the signature.
     pub(super) fn made(
         &self,
         id: Option<&str>,
@@ -124,7 +125,7 @@ fn key(key: &Value) -> Option<Key> {
     Some(Key { id: text("kid").map(str::to_owned), public })
 }
 
-/// Some write a number with zeros before it.
+/// Removes leading zeros, which some providers write.
 fn significant(bytes: Vec<u8>) -> Vec<u8> {
     bytes.into_iter().skip_while(|byte| *byte == 0).collect()
 }
@@ -135,8 +136,7 @@ mod tests {
 
     use super::*;
 
-    /// A key that another library made, and its signature of "taskd". A zero stands before the
-    /// number.
+    /// A key made by another library, and its signature of "taskd". The number has a leading zero.
     const MODULUS: &str = "AMQuNJDfmwJ5gOo1I5qkpJlO-UAI7qEUDpLyXXVA9x2sUyVesowaz0BGCX2D9ABHuWY76W-j8QT1oJZTV7dFPKR7_LlHgY55KR8L\
          VQeIfGaKpCZez_0GXo8FNf755GJO3Sq5dDCgGDRSmCmkADvczU7JbTDMtw03cRe94-WZOOpeH6FLD86yb_nzBHazBLbQlcddbiCp\
          cg8iCjvzAx0-S0V4-uSEpAwBkVwB9KAV-U-UNA6nn-7vO2R-1I_Gy8YL4FqQpg4RImBbfBO14k7QbvWwTxSUNa0YMWPJxzX3AQXp\

@@ -1,7 +1,6 @@
-//! Signing in by an OpenID Connect provider, the authorization code flow with PKCE: where the
-//! browser is sent, what its code is exchanged for, and whom the ID token means. It knows the
-//! provider's documents and keys for a while. It never decides what somebody may do here, and
-//! stores nothing.
+//! Sign-in by an OpenID Connect provider, the authorization code flow with PKCE: the authorization
+//! URL, the exchange of the code, and the user that the ID token identifies. This module caches the
+//! provider's documents and keys. It never decides the user's rights here, and stores nothing.
 
 mod attempt;
 mod id_token;
@@ -25,68 +24,67 @@ pub use id_token::{Claims, IdTokenError};
 use id_token::{Expected, IdToken};
 use keys::KeySet;
 
-/// How long the provider may take for one answer.
+/// Time limit for one answer of the provider.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// The largest answer that is read.
+/// Maximum size of an answer.
 const MOST_BYTES: usize = 1024 * 1024;
-/// Codes that are exchanged at a time; one more is turned away.
+/// Maximum concurrent code exchanges; a further one is refused.
 const MOST_EXCHANGES: usize = 16;
-/// How long the provider's documents count.
+/// Lifetime of the provider's documents in the cache.
 const LIFETIME_MS: u64 = 60 * 60 * 1000;
-/// How long after asking for its documents it is not asked again, if that failed or a key was not
-/// among them.
+/// Pause before the documents are fetched again, after a failure or when a key was missing.
 const PAUSE_MS: u64 = 10_000;
-/// The longest secret in the file.
+/// Maximum length of the secret in the file.
 const MOST_SECRET_BYTES: u64 = 4096;
 
-/// Why nobody was signed in.
+/// The reason why no user was signed in.
 #[derive(Debug, thiserror::Error)]
 pub enum OidcError {
-    /// It did not answer.
+    /// The provider did not answer.
     #[error("the provider's {what} can't be reached")]
     Unreachable {
-        /// What was asked for.
+        /// The requested object.
         what: &'static str,
-        /// Why.
+        /// The cause.
         source: reqwest::Error,
     },
-    /// It answered with something else.
+    /// The provider's answer is unusable.
     #[error("the provider's {what} can't be used: {reason}")]
     Unusable {
-        /// What was asked for.
+        /// The requested object.
         what: &'static str,
-        /// What is wrong with it.
+        /// The error in the answer.
         reason: String,
     },
-    /// Its documents could not be had a moment ago.
+    /// The provider's documents could not be fetched a moment ago.
     #[error("the provider failed a moment ago and is not asked again yet")]
     Resting,
-    /// More at once than are exchanged.
+    /// The maximum number of exchanges is running.
     #[error("too many sign-ins at once")]
     Busy,
-    /// The ID token is not to be believed.
+    /// The ID token failed validation.
     #[error("the provider's ID token is not to be believed")]
     IdToken(#[from] IdTokenError),
 }
 
-/// Why the settings can't be used.
+/// The reason why the settings can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum OidcSetUpError {
     /// The file with the secret can't be read.
     #[error("oidc.client_secret_file: {} can't be read", path.display())]
     SecretFile {
-        /// Which.
+        /// The file.
         path: PathBuf,
-        /// Why.
+        /// The operating system's error.
         source: std::io::Error,
     },
-    /// There is no secret in it.
+    /// The file contains no secret.
     #[error("oidc.client_secret_file: {} holds no secret: expected one line", path.display())]
     NoSecret {
-        /// Which.
+        /// The file.
         path: PathBuf,
     },
-    /// No HTTP client can be made.
+    /// The HTTP client can't be created.
     #[error("oidc: the provider can't be asked")]
     Client(#[source] reqwest::Error),
 }
@@ -100,7 +98,7 @@ pub struct Provider {
     exchanges: Semaphore,
 }
 
-/// What the provider has said about itself.
+/// The provider's documents.
 #[derive(Default)]
 struct Known {
     document: Option<(Document, u64)>,
@@ -108,7 +106,7 @@ struct Known {
     failed_ms: Option<u64>,
 }
 
-/// Of the discovery document what is needed here.
+/// The fields of the discovery document that are needed here.
 #[derive(Clone, Deserialize)]
 struct Document {
     issuer: String,
@@ -130,10 +128,10 @@ struct TokenRefusal {
 }
 
 impl Provider {
-    /// The provider that these settings name. It is not asked anything yet.
+    /// Creates the provider from these settings. Nothing is requested yet.
     pub fn new(settings: OidcSettings) -> Result<Self, OidcSetUpError> {
         let secret = settings.client_secret_file.as_ref().map(read_secret).transpose()?;
-        // A second install is refused because the first is in place, which is all that matters.
+        // A second installation fails because the first is in place, which is sufficient.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = Client::builder()
             .timeout(PATIENCE)
@@ -150,17 +148,17 @@ impl Provider {
         })
     }
 
-    /// What it is set to.
+    /// The provider's settings.
     pub fn settings(&self) -> &OidcSettings {
         &self.settings
     }
 
-    /// What somebody of whom the provider says this may do; `None`: nothing.
+    /// The rule that gives a user with these claims rights; `None`: no rights.
     pub fn rule_for(&self, claims: &Claims) -> Option<&RoleRule> {
         self.settings.rules.iter().find(|rule| claims.has(&rule.claim, &rule.value))
     }
 
-    /// Where the browser is to go.
+    /// The authorization URL for the browser.
     pub async fn address(&self, attempt: &Attempt, now_ms: u64) -> Result<String, OidcError> {
         let document = self.document(now_ms).await?;
         let what = "authorization endpoint";
@@ -178,7 +176,7 @@ impl Provider {
         Ok(url.into())
     }
 
-    /// Whom the code stands for that the attempt ended with.
+    /// The user identified by the code that the attempt returned.
     pub async fn who(
         &self,
         attempt: &Attempt,
@@ -259,7 +257,7 @@ impl Provider {
         );
         let document: Document = self.fetch(what, &url).await?;
         let unusable = |reason: String| Err(OidcError::Unusable { what, reason });
-        // Or else one provider could speak for another.
+        // Otherwise one provider could speak for another.
         if document.issuer != self.settings.issuer {
             return unusable(format!(
                 "its issuer is {:?}, not {:?}",
@@ -278,7 +276,7 @@ impl Provider {
         Ok(document)
     }
 
-    /// The provider's keys, and the one the token names among them, if there is such a one.
+    /// The provider's keys, including the key that the token names, if that key exists.
     async fn keys(
         &self,
         document: &Document,
@@ -288,8 +286,8 @@ impl Provider {
         let mut known = self.known.lock().await;
         if let Some((keys, since_ms)) = &known.keys {
             let age_ms = now_ms.saturating_sub(*since_ms);
-            // It may have a new key; but nobody makes the server ask again and again by naming keys
-            // that are none.
+            // The provider may have a new key; but unknown key names must not make the server fetch
+            // again and again.
             let is_enough = age_ms < PAUSE_MS || token.has_key_in(keys);
             if age_ms < LIFETIME_MS && is_enough {
                 return Ok(keys.clone());
@@ -324,8 +322,8 @@ impl Known {
 }
 
 impl Document {
-    /// Whether the client's secret goes into the header, as it does unless the provider says
-    /// otherwise.
+    /// Whether the client's secret is sent in the header, which is the default unless the provider
+    /// excludes it.
     fn takes_basic(&self) -> bool {
         let methods = self.token_endpoint_auth_methods_supported.as_deref().unwrap_or_default();
         let takes = |wanted: &str| methods.iter().any(|method| method == wanted);
@@ -353,14 +351,14 @@ async fn read(
 }
 
 fn parsed<T: DeserializeOwned>(what: &'static str, body: &[u8]) -> Result<T, OidcError> {
-    // What serde says of it may repeat a secret.
+    // The error text of serde may repeat a secret.
     let reason =
         |error: serde_json::Error| format!("line {}: {:?}", error.line(), error.classify());
     serde_json::from_slice(body)
         .map_err(|error| OidcError::Unusable { what, reason: reason(error) })
 }
 
-/// Both are written as in a form before they are put together (RFC 6749, 2.3.1).
+/// Both values are form-encoded before they are joined (RFC 6749, 2.3.1).
 fn basic(client_id: &str, secret: &str) -> String {
     let form = |text: &str| {
         let mut url = Url::parse("http://localhost").expect("a URL");

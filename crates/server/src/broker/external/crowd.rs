@@ -1,5 +1,5 @@
-//! One package on its way to many through an external broker: a window on the broker's
-//! acknowledgements, and who listens as far as robots report it.
+//! One package in fan-out through an external broker: a window on the broker's acknowledgements,
+//! and the subscribers as far as robots report them.
 
 use std::collections::HashSet;
 use std::sync::{Arc, Mutex};
@@ -11,7 +11,7 @@ use task_proto::{Digest, RobotId};
 use super::super::{FanOutError, Part, PartQos};
 use super::{External, lock};
 
-/// The package and those who said that they listen.
+/// The package and the robots that have reported a subscription.
 pub(in super::super) struct Crowd {
     external: Arc<External>,
     digest: Digest,

@@ -1,8 +1,9 @@
-//! Brokers that are not ours: the server is a client of one of them, with one session that is begun
-//! anew, with jitter, whenever it ends, there or at the next. What MQTT 3.1.1 does not tell a
-//! client is not known here: who listens, who was let in, from where. Who is there follows from
-//! what robots say; nobody can be put out. Messages prove only what the broker's access control
-//! list does: the robot that a topic names. Reports never come this way (see docs/decisions).
+//! External brokers: the server is a client of one of them. When its session ends, a new one begins
+//! after a jittered pause, at the same broker or the next. MQTT 3.1.1 does not tell a client the
+//! broker's subscribers, admitted clients or addresses, so they are unknown here. Presence follows
+//! from robots' messages, and we cannot close robots' sessions. A message proves only as much as
+//! the broker's access control list does: the robot that its topic names. Reports never use this
+//! path (see docs/decisions).
 
 mod crowd;
 mod outbox;
@@ -29,39 +30,38 @@ pub(super) use crowd::Crowd;
 use outbox::{Letter, Outbox};
 use present::Present;
 
-/// The last level of the topic on which the server hears itself.
+/// The last level of the topic on which the server receives its own message.
 pub const CANARY_LEVEL: &str = "server";
-/// KiB of packages' parts that the broker has not acknowledged; a larger part goes alone.
+/// KiB of packages' parts that the broker has not acknowledged; a larger part is sent alone.
 const WINDOW_KIB: u32 = 4 * 1024;
-/// How long the broker may leave so many unacknowledged.
+/// How long the broker may leave a full window unacknowledged.
 const PART_PATIENCE: Duration = Duration::from_secs(30);
-/// How long whoever rings many robots waits for room at most; a session that takes nothing ends by
-/// itself.
+/// Maximum wait for room of a caller that rings many robots; a stalled session ends by itself.
 const ROOM_PATIENCE: Duration = Duration::from_secs(60);
-/// The longest wait between two tries to connect.
+/// Maximum pause between two connection attempts.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
-/// The longest wait before the second.
+/// Maximum pause before the second attempt.
 const FIRST_PAUSE: Duration = Duration::from_millis(500);
-/// A session that lasted this long shows that the way is good: the pauses begin anew.
+/// A session of this length proves the connection good: the backoff starts again.
 const GOOD_SESSION: Duration = Duration::from_secs(30);
 
-/// Which brokers, and as whom.
+/// The external brokers and the server's account there.
 #[derive(Debug, Clone)]
 pub struct ExternalConfig {
-    /// Where they are, with the server's user and password there. One at a time is used; the next
-    /// one when it fails.
+    /// The brokers' URLs, with the server's user and password. One broker is used at a time; on
+    /// failure the next one.
     pub brokers: BrokerUrls,
-    /// Which one a session was up at last, for those who tell robots.
+    /// The broker of the last live session; announced to robots.
     pub current: Arc<AtomicUsize>,
-    /// The authority behind their certificates; absent: the system's roots vouch for them.
+    /// The pinned authority of the brokers' certificates; absent: the system's roots.
     pub pin: Option<CaPin>,
     /// The MQTT client id; the broker ends an older session of the same id.
     pub client_id: String,
-    /// What all topics start with.
+    /// The prefix of all topics.
     pub prefix: TopicPrefix,
 }
 
-/// How the broker at `url` is reached.
+/// The route to the broker at `url`.
 pub fn external_route(url: &BrokerUrl, pin: Option<CaPin>) -> Route {
     let tls = || Arc::new(Trust::by(pin).client_config(Clock::for_certificates()));
     Route { host: url.host.clone(), port: url.port, tls: url.tls.then(tls), websocket: None }
@@ -72,7 +72,7 @@ pub(super) struct Place {
     /// Its number in the list.
     number: usize,
     url: BrokerUrl,
-    /// How it is reached.
+    /// The route to the broker.
     route: Route,
 }
 
@@ -81,11 +81,11 @@ pub(super) struct External {
     config: ExternalConfig,
     inbox: Arc<dyn Inbox>,
     outbox: Mutex<Outbox>,
-    /// Something was put into the outbox.
+    /// A message was put into the outbox.
     filled: Notify,
-    /// Something was taken out of it.
+    /// A message was taken out of the outbox.
     taken: Notify,
-    /// What is free of the window, in KiB.
+    /// Free KiB of the window.
     window: Arc<Semaphore>,
     present: Mutex<Present>,
     traffic: Mutex<MqttTraffic>,
@@ -94,8 +94,8 @@ pub(super) struct External {
 }
 
 impl External {
-    /// Begins to connect. It goes on until [`External::shutdown`], whatever the broker does; the
-    /// receiver always has how it is.
+    /// Begins to connect, and reconnects until [`External::shutdown`]. The receiver always has the
+    /// current health.
     pub(super) fn start(
         config: ExternalConfig,
         inbox: Arc<dyn Inbox>,
@@ -121,11 +121,11 @@ impl External {
         (external, health)
     }
 
-    /// One session after another.
+    /// Runs one session after another.
     async fn run(self: Arc<Self>, health: watch::Sender<Health>) {
         let places = self.places();
         let (mut failures, mut number) = (0u32, 0);
-        // What was wrong with each when it was tried last: the same is not said again.
+        // The last error of each broker: an unchanged error is not logged again.
         let mut said = vec![None; places.len()];
         loop {
             let (place, begun) = (&places[number], tokio::time::Instant::now());
@@ -147,7 +147,7 @@ impl External {
             if !was_up {
                 number = (number + 1) % places.len();
             }
-            // The wait grows with each round of all brokers.
+            // The pause grows with each round of all brokers.
             let rounds = failures / places.len() as u32;
             tokio::select! {
                 () = tokio::time::sleep(pause(rounds, rand::random())) => {}
@@ -165,8 +165,8 @@ impl External {
         self.config.brokers.all().iter().enumerate().map(place).collect()
     }
 
-    /// No session: nobody can be reached, and who is there is found out anew in the next one.
-    /// Whether there was one.
+    /// Marks the session as ended: no robot is reachable, and the next session determines presence
+    /// anew. Returns whether there was a session.
     fn leave(&self) -> bool {
         let was_up = {
             let mut outbox = lock(&self.outbox);
@@ -197,12 +197,12 @@ impl External {
         Ok(())
     }
 
-    /// Any robot may be listening, known to be there or not.
+    /// Whether the session is live. Any robot may be subscribed then, known to be present or not.
     pub(super) fn is_up(&self) -> bool {
         lock(&self.outbox).is_open()
     }
 
-    /// Waits until what was rung before has gone out, all but a little.
+    /// Waits until almost all earlier notifications have been sent.
     pub(super) async fn room(&self) {
         let room = async {
             loop {
@@ -214,11 +214,11 @@ impl External {
                 taken.await;
             }
         };
-        // At worst more waits than should, for once.
+        // After the timeout the outbox is longer than intended, once.
         let _ = tokio::time::timeout(ROOM_PATIENCE, room).await;
     }
 
-    /// Publishes a part once there is a place for it in the window of unacknowledged ones.
+    /// Publishes a part once there is room in the window of unacknowledged parts.
     async fn publish_part(
         &self,
         digest: Digest,
@@ -241,12 +241,13 @@ impl External {
         let _ = tokio::time::timeout(patience, self.window.acquire_many(WINDOW_KIB)).await;
     }
 
-    /// What is taken of the window.
+    /// The used part of the window.
     pub(super) fn queued_part_bytes(&self) -> usize {
         (WINDOW_KIB as usize).saturating_sub(self.window.available_permits()) * 1024
     }
 
-    /// The robot counts as gone. Its session lasts: a client can't end another's in MQTT 3.1.1.
+    /// Marks the robot as gone. Its session remains: an MQTT 3.1.1 client can't end another
+    /// client's session.
     pub(super) fn disconnect(&self, robot: &RobotId) {
         let number = lock(&self.present).forget(robot);
         if let Some(number) = number {
@@ -276,7 +277,7 @@ impl External {
     }
 }
 
-/// Exponential backoff with full jitter, `jitter` being even from 0 to 1.
+/// Exponential backoff with full jitter; `jitter` is uniform from 0 to 1.
 fn pause(failures: u32, jitter: f64) -> Duration {
     FIRST_PAUSE.saturating_mul(1 << failures.min(10)).min(MAX_PAUSE).mul_f64(jitter.clamp(0.0, 1.0))
 }

@@ -1,6 +1,6 @@
-//! What waits to be published at an external broker: questions before desired states before parts
-//! of packages, and of a robot's desired states only the newest. It holds nothing while there is no
-//! session: whoever puts something in is told.
+//! Messages to publish at an external broker: questions before desired states before parts of
+//! packages, and only the newest desired state of each robot. The outbox is closed without a
+//! session: callers then get an error.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -11,39 +11,39 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::super::{NotAsked, NotConnected, PartQos};
 
-/// Questions that may wait; no more are under way in the whole server.
+/// Maximum pending questions, equal to the maximum in the whole server.
 const MAX_QUESTIONS: usize = 1024;
-/// Bytes of desired states that may wait before whoever rings should.
+/// Bytes of pending desired states above which callers should wait.
 const MANY_STATE_BYTES: usize = 32 * 1024 * 1024;
 
-/// What waits.
+/// The pending messages.
 #[derive(Default)]
 pub(super) struct Outbox {
     is_open: bool,
     questions: VecDeque<(RobotId, Bytes)>,
-    /// Whose states wait, the first one first, and the states.
+    /// The robots with pending states, the first one first, and the states.
     rung: VecDeque<RobotId>,
     states: HashMap<RobotId, Bytes>,
     state_bytes: usize,
     parts: VecDeque<Letter>,
 }
 
-/// What is to be published next.
+/// The next message to publish.
 pub(super) struct Letter {
     pub(super) topic: Topic,
     pub(super) payload: Bytes,
     pub(super) qos: PartQos,
-    /// Given back once the broker has acknowledged it.
+    /// Freed once the broker has acknowledged the message.
     pub(super) place: Option<OwnedSemaphorePermit>,
 }
 
 impl Outbox {
-    /// A session is up.
+    /// A session is live.
     pub(super) fn open(&mut self) {
         self.is_open = true;
     }
 
-    /// No session is up any more; what waits is forgotten.
+    /// The session has ended; pending messages are dropped.
     pub(super) fn close(&mut self) {
         *self = Self::default();
     }
@@ -80,7 +80,7 @@ impl Outbox {
         Ok(())
     }
 
-    /// Takes a part of a package; the window bounds how many wait.
+    /// Adds a part of a package; the window bounds the number of pending parts.
     pub(super) fn part(&mut self, part: Letter) -> Result<(), NotConnected> {
         if !self.is_open {
             return Err(NotConnected);

@@ -1,16 +1,17 @@
-//! Who is at an external broker, as far as robots say so themselves: by their `status`, which ends
-//! with their last will, and by everything else they publish. Pure; it neither reads messages nor
-//! tells anyone.
+//! Presence at an external broker, as far as robots report it themselves: by their `status`, which
+//! ends with their last will, and by all other messages. Pure; this module neither reads messages
+//! nor notifies other modules.
 
 use std::collections::HashMap;
 
 use task_proto::RobotId;
 use task_proto::report::Status;
 
-/// Robots known to be there at most; further ones are heard and can't be asked anything.
+/// Maximum robots known to be present; we receive messages of further robots and can't send them
+/// questions.
 const MAX_ROBOTS: usize = 100_000;
 
-/// The robots that are there.
+/// The present robots.
 #[derive(Default)]
 pub(super) struct Present {
     robots: HashMap<RobotId, Seat>,
@@ -19,23 +20,23 @@ pub(super) struct Present {
 }
 
 struct Seat {
-    /// Start and connection that the robot named; `None` while it has not.
+    /// Start and connection that the robot named; `None` while unknown.
     position: Option<(u64, u64)>,
     number: u64,
 }
 
-/// What a message says about the robot's connections, by our numbers.
+/// Changes of the robot's connections that follow from a message, by our numbers.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub(super) struct Turn {
-    /// This one has ended.
+    /// This connection has ended.
     pub(super) ended: Option<u64>,
-    /// This one has begun, after that.
+    /// This connection has begun, after that.
     pub(super) begun: Option<u64>,
 }
 
 impl Present {
-    /// The robot published its status, or the broker did in its name. One that names an older
-    /// connection than is known comes too late.
+    /// The robot published its status, or the broker did in its name. A status of an older
+    /// connection than the known one is late and ignored.
     pub(super) fn status(&mut self, robot: &RobotId, status: &Status) -> Turn {
         let position = Some((status.start, status.connection));
         let Some(seat) = self.robots.get_mut(robot) else {
@@ -56,22 +57,22 @@ impl Present {
         Turn { ended, ..self.enter(robot, position) }
     }
 
-    /// The robot published something else: it is there, even if its status was lost.
+    /// The robot published another message: the robot is present, even if its status was lost.
     pub(super) fn heard(&mut self, robot: &RobotId) -> Turn {
         if self.robots.contains_key(robot) { Turn::default() } else { self.enter(robot, None) }
     }
 
-    /// The robot may no longer be there as far as we are concerned. Gives its connection.
+    /// The server treats the robot as gone. Returns its connection.
     pub(super) fn forget(&mut self, robot: &RobotId) -> Option<u64> {
         self.robots.remove(robot).map(|seat| seat.number)
     }
 
-    /// Nothing is known any more. Gives who was there.
+    /// Clears all presence. Returns the robots that were present.
     pub(super) fn clear(&mut self) -> Vec<(RobotId, u64)> {
         self.robots.drain().map(|(robot, seat)| (robot, seat.number)).collect()
     }
 
-    /// The connection by which the robot is there.
+    /// The robot's current connection.
     pub(super) fn connection(&self, robot: &RobotId) -> Option<u64> {
         self.robots.get(robot).map(|seat| seat.number)
     }

@@ -1,6 +1,6 @@
-//! One session at an external broker, and the only place in the server that names rumqttc:
-//! subscribes, hears itself once to know that the broker passes messages on, then takes in what
-//! robots say and publishes what waits.
+//! One session at an external broker, and the only module of the server that names rumqttc. It
+//! subscribes and receives its own message once, which proves that the broker passes messages on.
+//! Then it receives robots' messages and publishes the outbox.
 
 use std::collections::VecDeque;
 use std::error::Error;
@@ -26,38 +26,38 @@ use super::{CANARY_LEVEL, External, Place, lock};
 use crate::domain::broker_url::BrokerUrl;
 
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
-/// How long connecting, and flushing, may take.
+/// Time limit for connecting, and for flushing.
 const NETWORK_TIMEOUT: Duration = Duration::from_secs(10);
-/// How long the server's own message may take to come back.
+/// Time limit for the server's own message to come back.
 const CANARY_PATIENCE: Duration = Duration::from_secs(10);
-/// How long saying goodbye may take.
+/// Time limit for the DISCONNECT.
 const GOODBYE_PATIENCE: Duration = Duration::from_secs(1);
-/// Unacknowledged messages of ours.
+/// Maximum unacknowledged messages of the server.
 const MAX_IN_FLIGHT: u16 = 256;
 /// Requests between this task and rumqttc, and events the other way.
 const QUEUED: usize = 64;
-/// The largest message that is taken in. A larger one ends the session, so the broker should refuse
-/// it before: see docs/broker.md.
+/// Maximum size of a received message. A larger one ends the session, so the broker should refuse
+/// it earlier: see docs/broker.md.
 const MAX_TAKEN_BYTES: usize = 4 * 1024 * 1024;
-/// The largest that is sent: a part, and what is around it.
+/// Maximum size of a sent message: a part and its overhead.
 const MAX_SENT_BYTES: usize = MAX_PART_BYTES + 1024;
-/// The largest status that is read.
+/// Maximum size of a status.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
-/// What robots say that is not a report.
+/// Robots' topics other than reports.
 const HEARD: [RobotTopic; 4] =
     [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
-/// MQTT's fixed header at most, and the packet id.
+/// Maximum size of MQTT's fixed header plus the packet id.
 const HEADER_BYTES: usize = 7;
 
-/// Why a session ended.
+/// The reason why a session ended.
 pub(super) enum Ended {
-    /// The broker does not accept the server.
+    /// The broker refused the server's CONNECT.
     Refused(ConnectReturnCode),
-    /// There is no TLS with it.
+    /// The TLS connection failed.
     Unreachable(LineError),
     /// The server's own message did not come back.
     Deaf,
-    /// Anything else.
+    /// Any other error.
     Lost(ConnectionError),
 }
 
@@ -66,7 +66,7 @@ impl Ended {
         matches!(self, Self::Refused(_))
     }
 
-    /// For the operator: what is wrong and where it is mended.
+    /// Text for the operator: the error and the place to fix it.
     pub(super) fn text(&self, url: &BrokerUrl) -> String {
         let broker = format!("the broker at {}", url.address());
         match self {
@@ -111,8 +111,8 @@ pub(super) async fn run(
     let (client, mut event_loop) = AsyncClient::new(options(external, place, &line), QUEUED);
     event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs());
     let (events_in, mut events) = mpsc::channel(QUEUED);
-    // rumqttc's poll must not be dropped half way, so it runs in one future that lives as long as
-    // the session.
+    // rumqttc's poll must not be dropped half way, so one future runs it for as long as the session
+    // lives.
     let pump = async {
         loop {
             match event_loop.poll().await {
@@ -129,11 +129,13 @@ pub(super) async fn run(
     let deadline = Instant::now() + NETWORK_TIMEOUT + CANARY_PATIENCE;
     let ended = loop {
         tokio::select! {
-            // Cancel-safe: the future is pinned outside of the loop and goes on where it was.
+            // Cancel-safe: the future is pinned outside of the loop and continues in the next
+            // iteration.
             ended = &mut pump => break Some(ended),
-            // Cancel-safe, likewise. It does not end before the session does.
+            // Cancel-safe: the future is pinned outside of the loop. It does not end before the
+            // session does.
             () = &mut carrying => {}
-            // Cancel-safe: an event stays in the channel until it is received.
+            // Cancel-safe: an event stays in the channel until received.
             Some(event) = events.recv() => {
                 if session.take(event).await {
                     health.send_replace(Health::Serving);
@@ -141,7 +143,7 @@ pub(super) async fn run(
             }
             // Cancel-safe: a permit that was not taken stays.
             () = external.filled.notified() => {}
-            // Cancel-safe: a timer that is made anew for the same time.
+            // Cancel-safe: the timer is recreated with the same deadline.
             () = tokio::time::sleep_until(deadline), if !session.is_up => break Some(Ended::Deaf),
             // Cancel-safe: a token can be awaited again.
             () = external.stop.cancelled() => break None,
@@ -149,7 +151,7 @@ pub(super) async fn run(
         session.publish_waiting();
     };
     if ended.is_none() && session.client.try_disconnect().is_ok() {
-        // It ends by itself once the broker has closed the connection.
+        // The pump ends by itself once the broker has closed the connection.
         let goodbye =
             async { tokio::join!(&mut pump, async { while events.recv().await.is_some() {} }) };
         let goodbye = async {
@@ -163,7 +165,7 @@ pub(super) async fn run(
     ended
 }
 
-/// The error with all that led to it, in one line.
+/// The error with its chain of causes, in one line.
 fn with_causes(error: &dyn Error) -> String {
     let (mut text, mut cause) = (error.to_string(), error.source());
     while let Some(error) = cause {
@@ -191,9 +193,9 @@ struct Session<'a> {
     client: AsyncClient,
     canary: String,
     is_up: bool,
-    /// The places of messages that were handed to rumqttc and have no packet id yet.
+    /// The permits of messages that were handed to rumqttc and have no packet id yet.
     unsent: VecDeque<Option<OwnedSemaphorePermit>>,
-    /// Of those that were sent under this packet id.
+    /// The permits of messages sent under this packet id.
     sent: VecDeque<(u16, Option<OwnedSemaphorePermit>)>,
 }
 
@@ -211,7 +213,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Takes in what happened; whether the session has come up by that.
+    /// Handles an event; returns whether the session has come up through it.
     async fn take(&mut self, event: Event) -> bool {
         self.count(&event);
         match event {
@@ -223,7 +225,7 @@ impl<'a> Session<'a> {
             Event::Incoming(Packet::PubAck(ack)) => self.acknowledged(ack.pkid),
             Event::Incoming(Packet::PubComp(complete)) => self.acknowledged(complete.pkid),
             Event::Outgoing(Outgoing::Publish(id)) => {
-                // Without a packet id nothing comes back: its place is free at once.
+                // Without a packet id there is no acknowledgement: the permit is free at once.
                 if let Some(place) = self.unsent.pop_front().filter(|_| id != 0) {
                     self.sent.push_back((id, place));
                 }
@@ -252,8 +254,8 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// The server hears itself: from here on robots can be reached, and each is asked by its
-    /// doorbell whether it is there.
+    /// The server has received its own message. From here on robots are reachable, and a doorbell
+    /// asks each robot to report its presence.
     fn come_up(&mut self) -> bool {
         if self.is_up {
             return false;
@@ -268,7 +270,7 @@ impl<'a> Session<'a> {
     }
 
     async fn hear(&mut self, message: Publish) {
-        // Nothing of ours is retained: this was said some time ago, by whomever.
+        // We retain nothing: this message is old, and its sender is unknown.
         if message.retain {
             return;
         }
@@ -285,13 +287,13 @@ impl<'a> Session<'a> {
             let mut present = lock(&self.external.present);
             match &status {
                 Some(Some(status)) => present.status(&robot, status),
-                // What can't be read says nothing; the inbox says so.
+                // An unreadable message carries no information; the inbox reports the error.
                 Some(None) => Turn::default(),
                 None => present.heard(&robot),
             }
         };
         self.tell(&robot, &turn);
-        // The status with which it went away is of none.
+        // The status that announced the end belongs to no connection.
         let connection = lock(&self.external.present).connection(&robot).unwrap_or_default();
         let message = RobotMessage {
             robot,
@@ -301,7 +303,7 @@ impl<'a> Session<'a> {
             connection,
             token_number: None,
         };
-        // None of these topics is stored, so this answers at once.
+        // Messages on these topics are not stored, so this returns at once.
         let _ = self.external.inbox.receive(message).await;
     }
 
@@ -315,7 +317,7 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Hands over what waits, as much as rumqttc is sure to take at once.
+    /// Hands over the waiting messages, as many as rumqttc can certainly accept at once.
     fn publish_waiting(&mut self) {
         while self.is_up && self.unsent.len() < QUEUED / 2 {
             let Some(letter) = lock(&self.external.outbox).next() else { break };

@@ -1,4 +1,4 @@
-//! Who may say and hear what: pure functions of the visitor and the topic. It never looks anything
+//! Topic permissions: pure functions of the client and the topic. This module never looks anything
 //! up.
 
 use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
@@ -6,7 +6,7 @@ use task_proto::{Digest, RobotId, UserName};
 
 use crate::broker::router::CANARY_TOPIC;
 
-/// Who a session belongs to.
+/// The owner of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Visitor {
     Robot {
@@ -18,30 +18,30 @@ pub(super) enum Visitor {
     Canary,
 }
 
-/// Where a message that may be published goes.
+/// The destination of a permitted message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Route {
-    /// To the inbox before it is acknowledged, and then to whoever listens.
+    /// To the inbox before the acknowledgement, and then to all subscribers.
     Inbox(RobotTopic),
-    /// Through the router whether anyone listens or not.
+    /// Through the router whether there are subscribers or not.
     Canary,
 }
 
-/// What a session hears by a subscription that may be made.
+/// The source of messages for a permitted subscription.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Hearing {
-    /// The server's words to this robot, straight from its doorbell.
+    /// The server's messages to this robot, straight from its doorbell.
     Desired,
-    /// The server's questions to this robot, likewise.
+    /// The server's questions to this robot, straight from its doorbell.
     Request,
-    /// A package's parts, to whom they are granted: the session knows.
+    /// A package's parts, for permitted robots: the session checks the permission.
     Package(Digest),
-    /// What matches the filter among what goes through the router.
+    /// Messages of the router that match the filter.
     Router,
 }
 
-/// Where the visitor's message on `topic` goes; `None` if the visitor may not send it. A robot
-/// speaks on its own from-robot topics only, an operator not at all.
+/// The destination of the client's message on `topic`; `None` if the client may not publish there.
+/// A robot publishes on its own from-robot topics only, an operator not at all.
 pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
     match visitor {
         Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
@@ -60,9 +60,9 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
     }
 }
 
-/// What the visitor hears by a subscription to `filter`; `None` if the visitor may not make it. A
-/// robot hears what is said to it, by exact name; an operator anything whose first levels are the
-/// prefix.
+/// The source of messages for a subscription to `filter`; `None` if the client may not subscribe. A
+/// robot subscribes to its own topics by exact name, an operator to any filter whose first levels
+/// are the prefix.
 pub(super) fn may_subscribe(
     visitor: &Visitor,
     prefix: &TopicPrefix,

@@ -1,4 +1,4 @@
-//! What the inbox is told of robots' sessions.
+//! Notifies the inbox of robots' sessions.
 
 use std::net::SocketAddr;
 
@@ -8,7 +8,7 @@ use super::Context;
 use super::access::Visitor;
 use crate::broker::Inbox;
 
-/// Tells the inbox of a robot's session, and of its end even if the session's task should panic.
+/// Notifies the inbox of a robot's session, and of its end even if the session's task panics.
 pub(super) struct Attendance<'a> {
     inbox: &'a dyn Inbox,
     robot: RobotId,
@@ -16,7 +16,7 @@ pub(super) struct Attendance<'a> {
 }
 
 impl<'a> Attendance<'a> {
-    /// The session is live; `None` if it is no robot's.
+    /// The session is live; `None` if the client is not a robot.
     pub(super) fn begin(
         context: &'a Context,
         visitor: &Visitor,

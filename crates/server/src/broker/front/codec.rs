@@ -1,12 +1,12 @@
-//! Reads what clients send: MQTT 3.1.1, strictly. rumqttd's decoder is not used, because it
-//! overlooks wrong flags, trailing bytes, zero packet ids and bad filters, some of which its router
-//! does not survive; its encoder is. It never answers anything and holds no state between packets.
+//! Decodes clients' packets: MQTT 3.1.1, strictly. We do not use rumqttd's decoder, because it
+//! overlooks wrong flags, trailing bytes, zero packet ids and bad filters, some of which kill its
+//! router; we do use its encoder. This module never answers and holds no state between packets.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use rumqttd::protocol::v4::{V4, write_remaining_length};
 use rumqttd::protocol::{Packet, Protocol, QoS};
 
-/// A packet from a client, with everything checked that can be checked without knowing the session.
+/// A packet from a client. All checks that need no session state are done.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Received {
     /// CONNECT.
@@ -15,22 +15,22 @@ pub enum Received {
     Publish(Publish),
     /// PUBACK, of the packet with this id.
     PubAck(u16),
-    /// PUBREC, likewise.
+    /// PUBREC, of the packet with this id.
     PubRec(u16),
-    /// PUBREL, likewise.
+    /// PUBREL, of the packet with this id.
     PubRel(u16),
-    /// PUBCOMP, likewise.
+    /// PUBCOMP, of the packet with this id.
     PubComp(u16),
     /// SUBSCRIBE.
     Subscribe {
-        /// What the SUBACK names.
+        /// The packet id that the SUBACK repeats.
         packet_id: u16,
-        /// The filters and the QoS asked for, at least one.
+        /// The filters and the requested QoS, at least one.
         filters: Vec<(String, QoS)>,
     },
     /// UNSUBSCRIBE.
     Unsubscribe {
-        /// What the UNSUBACK names.
+        /// The packet id that the UNSUBACK repeats.
         packet_id: u16,
         /// The filters, at least one.
         filters: Vec<String>,
@@ -42,76 +42,76 @@ pub enum Received {
 }
 
 impl Received {
-    /// Whether it only answers what we sent.
+    /// Whether the packet only answers one of ours.
     pub(super) fn is_answer(&self) -> bool {
         matches!(self, Self::PubAck(_) | Self::PubRec(_) | Self::PubRel(_) | Self::PubComp(_))
     }
 }
 
-/// What a client says first.
+/// The fields of CONNECT.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Connect {
-    /// Empty if the choice is left to us.
+    /// Empty if the server chooses.
     pub client_id: String,
-    /// Whether nothing is to be left of an earlier session.
+    /// Whether to discard the state of an earlier session.
     pub clean_session: bool,
-    /// Seconds in which it promises to say something; 0: no promise.
+    /// The keepalive in seconds; 0: none.
     pub keep_alive_s: u16,
-    /// What is to be said for it when it is gone.
+    /// The message to publish when the client is gone.
     pub will: Option<Will>,
-    /// Who it says it is.
+    /// The claimed user name.
     pub user_name: Option<String>,
-    /// What is to prove it.
+    /// The credential for the user name.
     pub password: Option<String>,
 }
 
-/// What a client leaves to be published after an end without DISCONNECT.
+/// A message to publish after an end without DISCONNECT.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Will {
-    /// Where.
+    /// The topic.
     pub topic: String,
-    /// What.
+    /// The bytes.
     pub payload: Bytes,
-    /// How surely.
+    /// The quality of service.
     pub qos: QoS,
 }
 
 /// A message. The packet id is 0 for QoS 0.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Publish {
-    /// Where: a name without wildcards.
+    /// The topic: a name without wildcards.
     pub topic: String,
-    /// How surely.
+    /// The quality of service.
     pub qos: QoS,
-    /// What its acknowledgement names.
+    /// The packet id that the acknowledgement repeats.
     pub packet_id: u16,
-    /// What.
+    /// The bytes.
     pub payload: Bytes,
 }
 
-/// Why bytes are not a packet that this broker takes.
+/// The reason why bytes are not an acceptable packet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
-    /// Another MQTT, of this protocol level.
+    /// An MQTT version of this protocol level, which we do not support.
     #[error("asks for protocol level {0}, and only MQTT 3.1.1 (level 4) is spoken")]
     UnknownProtocol(u8),
-    /// The server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this one keeps
-    /// none. One without a payload asks to keep nothing.
+    /// A server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this server keeps
+    /// none. A retained message without a payload asks to keep nothing.
     #[error("sends a message to be retained, and nothing is retained here")]
     Retained,
-    /// More bytes than a packet may have here.
+    /// The packet has this many bytes, more than permitted.
     #[error("sends a packet of {0} bytes, which is too large")]
     TooLarge(usize),
-    /// No MQTT.
+    /// The bytes are not MQTT.
     #[error("sends a malformed packet: {0}")]
     Malformed(&'static str),
 }
 
 use DecodeError::Malformed;
 
-/// Takes one packet off the front of `input`; `None` if more bytes are needed. What is wrong is
-/// said as early as the bytes show it, so that nobody has to wait for the rest of a packet that
-/// will be refused.
+/// Takes one packet off the front of `input`; `None` if more bytes are needed. Errors are reported
+/// as early as the bytes show them, so that no session waits for the rest of a packet that will be
+/// refused.
 pub fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>, DecodeError> {
     let Some(&first) = input.first() else { return Ok(None) };
     check_first_byte(first)?;
@@ -128,16 +128,16 @@ pub fn decode(input: &mut BytesMut, max_bytes: usize) -> Result<Option<Received>
     decode_body(first, Body(body)).map(Some)
 }
 
-/// Writes `packet`, one that we send.
+/// Encodes one of our own packets.
 pub(super) fn encode(packet: Packet, output: &mut BytesMut) {
     if let Err(error) = V4.write(packet, output) {
-        // What we write is bounded and complete, so this is a bug; the client notices a missing
+        // Our packets are bounded and complete, so this is a bug; the client notices a missing
         // packet by itself.
         tracing::error!(%error, "could not encode an MQTT packet");
     }
 }
 
-/// Writes a PUBLISH, which rumqttd lets nobody else build with a QoS.
+/// Encodes a PUBLISH; rumqttd's API can't build one with a QoS.
 pub fn encode_publish(publish: &Publish, output: &mut BytesMut) {
     let Publish { topic, qos, packet_id, payload } = publish;
     if encode_publish_head(topic, *qos, *packet_id, payload.len(), output) {
@@ -145,8 +145,8 @@ pub fn encode_publish(publish: &Publish, output: &mut BytesMut) {
     }
 }
 
-/// Writes all of a PUBLISH but its payload; false, and nothing is written, if no packet can be as
-/// large.
+/// Encodes a PUBLISH without its payload. Returns false and writes nothing if the packet would be
+/// too large for MQTT.
 pub(super) fn encode_publish_head(
     topic: &str,
     qos: QoS,
@@ -172,7 +172,7 @@ pub(super) fn encode_publish_head(
     true
 }
 
-/// The packet type, and the flags that go with it.
+/// Checks the packet type and its flags.
 fn check_first_byte(first: u8) -> Result<(), DecodeError> {
     let flags = first & 0x0f;
     match first >> 4 {
@@ -187,7 +187,7 @@ fn check_first_byte(first: u8) -> Result<(), DecodeError> {
     }
 }
 
-/// The remaining length and how many bytes it took; `None` if it is not complete.
+/// The remaining length and the number of bytes that encode it; `None` if incomplete.
 fn remaining_length(input: &[u8]) -> Result<Option<(usize, usize)>, DecodeError> {
     let mut length = 0;
     for (index, byte) in input.iter().take(4).enumerate() {
@@ -231,7 +231,7 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
     let level = body.byte()?;
     match (&name[..], level) {
         (b"MQTT", 4) => {}
-        // 3.1, 5.0 and versions to come: the answer is a CONNACK that says so.
+        // 3.1, 5.0 and future versions: the answer is a CONNACK with that reason.
         (b"MQTT", level) | (b"MQIsdp", level @ 3) => {
             return Err(DecodeError::UnknownProtocol(level));
         }
@@ -259,8 +259,8 @@ fn connect(body: &mut Body) -> Result<Connect, DecodeError> {
         Some(will)
     };
     let user_name = if flags & 0b1000_0000 == 0 { None } else { Some(body.text()?) };
-    // A password may be any bytes; ours are text, so whatever is lost here would have been refused
-    // anyway.
+    // A password may be any bytes; ours are text, so a password that loses bytes here would have
+    // been refused anyway.
     let password = match flags & 0b0100_0000 {
         0 => None,
         _ => Some(String::from_utf8_lossy(&body.binary()?).into_owned()),
@@ -317,7 +317,7 @@ fn filter_with_qos(body: &mut Body) -> Result<(String, QoS), DecodeError> {
     Ok((filter(body)?, qos(body.byte()?)?))
 }
 
-/// What is left of a packet.
+/// The undecoded rest of a packet.
 struct Body(Bytes);
 
 impl Body {

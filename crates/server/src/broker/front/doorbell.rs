@@ -1,6 +1,5 @@
-//! What is to be said to a robot next: the newest desired state, and the questions that are not yet
-//! asked. A slow robot neither blocks whoever speaks to it nor fills memory. It knows nothing of
-//! MQTT.
+//! Pending messages for a robot: the newest desired state, and the questions not yet sent. A slow
+//! robot neither blocks the senders nor fills memory. This module knows nothing of MQTT.
 
 use std::collections::VecDeque;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -8,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use bytes::Bytes;
 use tokio::sync::Notify;
 
-/// Questions that wait for one robot to take them.
+/// Maximum pending questions for one robot.
 const MAX_QUESTIONS: usize = 32;
 
 /// One session's doorbell.
@@ -26,13 +25,13 @@ struct Waiting {
 }
 
 impl Doorbell {
-    /// Leaves `payload` in the place of what was there.
+    /// Stores `payload`, replacing an earlier one.
     pub(super) fn ring(&self, payload: Bytes) {
         self.waiting().state = Some(payload);
         self.rung.notify_one();
     }
 
-    /// Takes back what was left for the session before.
+    /// Removes a payload that was stored for the previous session.
     pub(super) fn forget_state(&self) {
         self.waiting().state = None;
     }
@@ -48,7 +47,7 @@ impl Doorbell {
         }
     }
 
-    /// Adds a question; false if too many wait already.
+    /// Adds a question; false if too many are pending.
     pub(super) fn ask(&self, payload: Bytes) -> bool {
         let mut waiting = self.waiting();
         let has_room = waiting.questions.len() < MAX_QUESTIONS;
@@ -59,7 +58,8 @@ impl Doorbell {
         has_room
     }
 
-    /// Takes the next question, as soon as there is one. Cancel-safe, likewise.
+    /// Takes the next question, as soon as there is one. Cancel-safe: nothing is taken unless it is
+    /// returned.
     pub(super) async fn question(&self) -> Bytes {
         loop {
             if let Some(payload) = self.waiting().questions.pop_front() {

@@ -1,6 +1,6 @@
-//! Lets a client in: the TLS handshake where there is one, then one CONNECT, checked, admitted or
-//! refused with the right CONNACK. Until then a client gets little memory and little time. It never
-//! builds a session.
+//! Admits a client: the TLS handshake if there is one, then one CONNECT, which is checked and then
+//! admitted or refused with the right CONNACK. Until then a client gets little memory and little
+//! time. This module never builds a session.
 
 use std::io;
 use std::net::SocketAddr;
@@ -25,32 +25,32 @@ use crate::limits::conduct::{SESSION_COST, Verdict, Watched, Way};
 use crate::net::anteroom::Place;
 use crate::net::tls::ClientProof;
 
-/// The largest CONNECT, in bytes after the fixed header.
+/// Maximum size of CONNECT, in bytes after the fixed header.
 const MAX_CONNECT_BYTES: usize = 4 * 1024;
-/// The longest client id of an operator.
+/// Maximum length of an operator's client id.
 const MAX_CLIENT_ID_BYTES: usize = 256;
 /// The watchdog's client id.
 pub(in crate::broker) const CANARY_ID: &str = "router canary";
 
-/// A client that may come in.
+/// An admitted client.
 pub(super) struct Guest {
     pub(super) visitor: Visitor,
     pub(super) seat_name: SeatName,
     pub(super) keep_alive: Option<Duration>,
     pub(super) will: Option<Will>,
-    /// What was sent after CONNECT already, without waiting for the answer.
+    /// Bytes that the client sent after CONNECT without waiting for the answer.
     pub(super) input: BytesMut,
-    /// How it behaves, if it is a robot.
+    /// The rate limits, if the client is a robot.
     pub(super) watched: Option<Watched>,
     login: Login,
-    /// How often a robot had been put out before it was asked who this is.
+    /// How often robots had been evicted before the gatekeeper was asked.
     put_out: u64,
 }
 
 impl Guest {
-    /// Asks once more, now that the guest has a seat: whose rights ended on the way to it was not
-    /// there yet to be asked to leave. Of robots only if one was put out meanwhile: they come in
-    /// thousands.
+    /// Asks the gatekeeper again, now that the client has a slot. If its rights ended before it had
+    /// the slot, the request to leave could not reach it. For robots this happens only if one was
+    /// evicted meanwhile, because robots connect in thousands.
     pub(super) async fn check_again(&self, context: &Context) -> Result<(), Rejection> {
         let before = match &self.visitor {
             Visitor::Operator(user) => Principal::Operator(user.clone()),
@@ -71,20 +71,20 @@ impl Guest {
     }
 }
 
-/// A connection whose client has not said who it is.
+/// A connection whose client has not identified itself.
 pub(super) struct Arrival {
     pub(super) peer: SocketAddr,
-    /// What it has proven.
+    /// The proof from the TLS handshake.
     pub(super) proof: ClientProof,
-    /// By when it must have.
+    /// The deadline for identifying itself.
     deadline: tokio::time::Instant,
     place: Place,
 }
 
-/// Why a client does not come in.
+/// The reason why a client is not admitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(super) enum Rejection {
-    /// Nobody to answer: the client went away, was too slow, or does not speak MQTT.
+    /// No answer is possible: the client disconnected, was too slow, or does not speak MQTT.
     #[error("{0}")]
     Silent(&'static str),
     #[error(transparent)]
@@ -105,7 +105,7 @@ impl Arrival {
         }
     }
 
-    /// Waits for the client to take the next step, for as long as it has.
+    /// Waits for the client's next step, until the deadline.
     pub(super) async fn step<T>(
         &self,
         late: &'static str,
@@ -117,14 +117,14 @@ impl Arrival {
         }
     }
 
-    /// Waits for whoever has to leave for this one, if somebody has.
+    /// Waits for a connection to close in favour of this one, if that is necessary.
     pub(super) async fn find_place(&self, claim: Claim) -> Result<OwnedSemaphorePermit, Rejection> {
         let place =
             async { claim.place().await.ok_or(Rejection::Silent("comes when there is no place")) };
         self.step("comes when there is no place", place).await
     }
 
-    /// The handshake of a client that has to speak TLS.
+    /// The TLS handshake of a client, if TLS is required.
     pub(super) async fn shake_hands<S>(
         &self,
         handshake: impl Future<Output = io::Result<S>>,
@@ -136,19 +136,19 @@ impl Arrival {
     }
 }
 
-/// The watchdog's password: good for one entry, then made anew.
+/// The watchdog's password: valid for one login, then replaced.
 #[derive(Default)]
 pub(in crate::broker) struct CanaryPass(Mutex<Option<String>>);
 
 impl CanaryPass {
-    /// A new password in the place of the last.
+    /// Replaces the password by a new one.
     pub(in crate::broker) fn renew(&self) -> String {
         let secret = format!("{:032x}", rand::random::<u128>());
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(secret.clone());
         secret
     }
 
-    /// Whether `password` is the one; if so it is used up.
+    /// Whether `password` is the valid one; if so it is used up.
     fn redeem(&self, password: &str) -> bool {
         let mut secret = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let good = secret
@@ -161,7 +161,7 @@ impl CanaryPass {
     }
 }
 
-/// Reads CONNECT and finds out who it is.
+/// Reads CONNECT and determines the client's identity.
 pub(super) async fn welcome<S>(
     context: &Arc<Context>,
     stream: &mut S,
@@ -210,7 +210,7 @@ where
         }
         Visitor::Operator(user) => SeatName::Operator(user.clone(), connect.client_id.clone()),
     };
-    // 3.1.2.10: one and a half times what the client promised.
+    // 3.1.2.10: one and a half times the client's keepalive.
     let keep_alive = match connect.keep_alive_s {
         0 => None,
         seconds => Some(Duration::from_millis(u64::from(seconds) * 1500)),
@@ -218,7 +218,7 @@ where
     Ok(Guest { visitor, seat_name, keep_alive, will: connect.will, input, watched, login, put_out })
 }
 
-/// The robot, unless it was cut off and has to stay away for longer.
+/// Watches the robot, unless it was cut off and its backoff still runs.
 fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
     let now = tokio::time::Instant::now();
     let watched = context.conduct.watch(robot, Way::Mqtt, now);
@@ -232,13 +232,13 @@ fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
     ))
 }
 
-/// A CONNACK.
+/// Encodes a CONNACK.
 pub(super) fn connack(code: ConnectReturnCode, output: &mut BytesMut) {
-    // Sessions are always clean, so there is never one to come back to.
+    // Sessions are always clean, so there is never one to resume.
     encode(Packet::ConnAck(ConnAck { session_present: false, code }, None), output);
 }
 
-/// Tells the client why, as far as the protocol has an answer. Bounded by the write timeout.
+/// Sends the reason to the client, as far as the protocol has a code. Bounded by the write timeout.
 pub(super) async fn reject<S: AsyncWrite + Unpin>(
     context: &Context,
     stream: &mut S,
@@ -249,13 +249,13 @@ pub(super) async fn reject<S: AsyncWrite + Unpin>(
         Rejection::Malformed(DecodeError::UnknownProtocol(_)) => {
             ConnectReturnCode::RefusedProtocolVersion
         }
-        // A will to be retained.
+        // The client asked to retain its will.
         Rejection::Malformed(DecodeError::Retained) => ConnectReturnCode::NotAuthorized,
         Rejection::Malformed(_) | Rejection::Silent(_) => return,
     };
     let mut output = BytesMut::new();
     connack(code, &mut output);
-    // If it does not arrive the client sees the connection end, which says enough.
+    // If the answer does not arrive, the client sees the connection end, which is enough.
     let _ = timeout(context.limits.write_timeout, stream.write_all(&output)).await;
 }
 
@@ -333,23 +333,22 @@ async fn admit(
     }
 }
 
-/// Asks the gatekeeper who this is. That goes on to its end even if the client is not waited for
-/// any more: a robot's first use of a token has ended its others by then, and who came in by those
-/// has to go.
+/// Asks the gatekeeper for the client's identity. The lookup runs to its end even if the client is
+/// no longer waited for: a robot's first use of a token has ended the robot's other tokens by then,
+/// and sessions admitted by those must close.
 async fn ask(context: &Arc<Context>, login: Login) -> Result<Principal, Refusal> {
     let shared = context.clone();
     let asked = tokio::spawn(async move {
         let principal = shared.gatekeeper.admit(login).await;
         if let Ok(Principal::Robot { robot, is_first_use: true, .. }) = &principal {
-            // Nobody who came by a token that has ended keeps a seat, or gets one; this guest has
-            // none yet.
+            // No session of an ended token keeps or gets a slot; this client has none yet.
             shared.seats.ask_to_leave(robot);
         }
         principal
     });
     match timeout(context.limits.admit_timeout, asked).await {
         Ok(Ok(principal)) => principal,
-        // It took too long, or panicked.
+        // The lookup timed out or panicked.
         Ok(Err(_)) | Err(_) => Err(Refusal::Unavailable),
     }
 }

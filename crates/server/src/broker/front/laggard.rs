@@ -1,21 +1,21 @@
-//! Who holds up the others of a fan-out for too long: pure functions of how long each has. A
-//! listener is slow only compared with the others: time counts while at least half of them have all
-//! there is and wait. Where most are busy, it is the network that is slow.
+//! Detects subscribers that hold up a fan-out for too long, by pure functions of accumulated times.
+//! A subscriber is slow only compared with the others: time counts while at least half of them have
+//! all parts and wait. If most subscribers are busy, the network is the bottleneck.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// How long a listener may hold up the others, on balance.
+/// How long a subscriber may hold up the others, on balance.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// When all of them, one after another, have held up the rest for as long as this on balance …
+/// When all subscribers, one after another, have held up the rest for this long on balance …
 const PATIENCE_WITH_ALL: Duration = Duration::from_secs(10);
-/// … each is left only so much.
+/// … each subscriber has only this much patience left.
 const LITTLE_PATIENCE: Duration = Duration::from_millis(250);
-/// How long a listener may stay behind without a step forward, whether others wait or not.
+/// How long a subscriber may stay behind without progress, whether others wait or not.
 const LONGEST: Duration = Duration::from_secs(30);
 
-/// For how long so far the others have waited for somebody.
+/// Accumulated time for which the other subscribers have waited.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Waiting {
     before: Duration,
@@ -23,7 +23,7 @@ pub(super) struct Waiting {
 }
 
 impl Waiting {
-    /// From now on they do, or do not.
+    /// Sets whether the others wait from now on.
     pub(super) fn set(&mut self, is_waiting: bool, now: Instant) {
         self.before = self.total(now);
         self.since = is_waiting.then_some(now);
@@ -35,33 +35,33 @@ impl Waiting {
     }
 }
 
-/// How long the others have waited for one of them, on balance: it grows while they do, and shrinks
-/// as fast otherwise.
+/// How long the others have waited for one subscriber, on balance: the value grows while they wait,
+/// and shrinks as fast otherwise.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hold {
     balance: Duration,
     settled_at: Instant,
     settled_total: Duration,
     behind_since: Option<Instant>,
-    /// How long it was behind before, without a step forward since.
+    /// How long the subscriber was behind earlier, without progress since.
     stuck: Duration,
 }
 
 impl Hold {
-    /// One that has just come.
+    /// The state of a new subscriber.
     pub(super) fn new(waiting: &Waiting, now: Instant) -> Self {
         let (balance, settled_total) = (Duration::ZERO, waiting.total(now));
         Self { balance, settled_at: now, settled_total, behind_since: None, stuck: Duration::ZERO }
     }
 
-    /// From now on the listener is behind, or has come forward.
+    /// The subscriber is behind from now on, or has made progress.
     pub(super) fn set(&mut self, is_behind: bool, waiting: &Waiting, now: Instant) {
         let (balance, behind_since) = (self.balance(waiting, now), is_behind.then_some(now));
         let stuck = if is_behind { self.stuck } else { Duration::ZERO };
         *self = Self { balance, behind_since, stuck, ..Self::new(waiting, now) };
     }
 
-    /// It leaves, and may come back: that is no step forward.
+    /// The subscriber leaves, and may come back: leaving is no progress.
     pub(super) fn leave(&mut self, waiting: &Waiting, now: Instant) {
         let (balance, stuck) = (self.balance(waiting, now), self.stuck(now));
         *self = Self { balance, stuck, ..Self::new(waiting, now) };
@@ -81,7 +81,8 @@ impl Hold {
         (self.balance + charged).saturating_sub(elapsed - charged)
     }
 
-    /// Whether the listener should go; `all` is as if one of them had always been behind.
+    /// Whether to remove the subscriber; `all` is computed as if one of them had always been
+    /// behind.
     pub(super) fn is_too_long(&self, all: &Self, waiting: &Waiting, now: Instant) -> bool {
         if self.behind_since.is_none() {
             return false;
@@ -112,7 +113,7 @@ mod tests {
         waiting.set(true, start);
         assert!(!hold.is_too_long(&all, &waiting, start + ms(1_999)));
         assert!(hold.is_too_long(&all, &waiting, start + ms(2_000)));
-        // What it makes good counts for it: 1,500 less 1,000, and 1,500 more.
+        // Recovery counts in its favour: 1,500 less 1,000, and 1,500 more.
         hold.set(false, &waiting, start + ms(1_500));
         hold.set(true, &waiting, start + ms(2_500));
         assert!(!hold.is_too_long(&all, &waiting, start + ms(3_999)));
@@ -145,7 +146,7 @@ mod tests {
         let (mut waiting, quiet) = (Waiting::default(), Waiting::default());
         let (mut hold, all) = (Hold::new(&waiting, start), Hold::new(&waiting, start));
         let mut alone = hold;
-        // Nobody waits: what counts is that it has not moved.
+        // The others do not wait: only the lack of progress counts.
         for round in [0, 10_000, 20_000] {
             alone.set(true, &quiet, start + ms(round));
             assert!(!alone.is_too_long(&all, &quiet, start + ms(round + 9_999)));
@@ -156,7 +157,7 @@ mod tests {
         alone.set(false, &quiet, start + ms(40_000));
         alone.set(true, &quiet, start + ms(40_001));
         assert!(!alone.is_too_long(&all, &quiet, start + ms(70_000)), "it has come forward");
-        // Others wait: it has cost them 1,500 before it left, and costs them 500 more.
+        // The others wait: the subscriber cost them 1,500 before it left, and costs them 500 more.
         waiting.set(true, start);
         hold.set(true, &waiting, start);
         hold.leave(&waiting, start + ms(1_500));

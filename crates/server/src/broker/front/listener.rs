@@ -1,5 +1,5 @@
-//! Accepts connections and gives each a task of its own, so that no client waits for another: a TLS
-//! handshake is done in there too. It reads no byte.
+//! Accepts connections and spawns a task for each, so that no client waits for another: the task
+//! also performs the TLS handshake. This module reads no byte.
 
 use std::future::ready;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use tokio::net::TcpListener;
 use super::Front;
 use crate::net::tls::ClientProof;
 
-/// For the system to have file descriptors again.
+/// Pause until the operating system has file descriptors again.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
 /// Accepts until the front stops.
@@ -32,7 +32,7 @@ pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
             tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
             continue;
         };
-        // Small packets, each of which somebody waits for. If it can't be set, they come a little
+        // Packets are small and awaited by the other side. If this fails, they arrive a little
         // later.
         let _ = stream.set_nodelay(true);
         match front.context.tls.clone() {

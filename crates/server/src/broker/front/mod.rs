@@ -1,8 +1,8 @@
-//! The MQTT front: all that lies between the network and the inbox or the router. rumqttd's own
-//! listeners must not face clients; what they get wrong is done here: admission, access, takeover,
-//! wills, time limits, bounds on memory. It never retains a message, so one that asks for that ends
-//! the session; and it never keeps a session beyond its connection: the wish for a lasting one is
-//! ignored.
+//! The MQTT front: all code between the network and the inbox or the router. rumqttd's own
+//! listeners must not face clients, so the front does the parts that they get wrong: admission,
+//! access, takeover, wills, timeouts, bounds on memory. The front never retains a message, so a
+//! message with the retain flag ends the session. It never keeps a session beyond its connection: a
+//! request for a persistent session is ignored.
 
 mod access;
 mod attendance;
@@ -55,7 +55,7 @@ pub(super) struct Front {
     sessions: TaskTracker,
 }
 
-/// What every session shares.
+/// The state shared by all sessions.
 struct Context {
     prefix: TopicPrefix,
     limits: Limits,
@@ -67,11 +67,11 @@ struct Context {
     totals: Totals,
     grants: Grants,
     canary_pass: Arc<CanaryPass>,
-    /// Who has not sent CONNECT yet.
+    /// Connections that have not sent CONNECT yet.
     anteroom: Arc<Anteroom>,
-    /// How many connections there may be.
+    /// The limit on connections.
     places: Places,
-    /// What the listener speaks, if it encrypts.
+    /// The TLS configuration, if the listener encrypts.
     tls: Option<Tls>,
     /// Clients of other MQTT versions.
     other_protocols: OtherProtocols,
@@ -167,8 +167,8 @@ impl Front {
         self.context.canary_pass.clone()
     }
 
-    /// Serves the connection that `handshake` ends in, if it does in time. False: there are too
-    /// many connections.
+    /// Serves the connection that `handshake` returns, if it completes in time. False: there are
+    /// too many connections.
     pub(super) fn take_in<S>(
         &self,
         peer: SocketAddr,

@@ -1,15 +1,15 @@
-//! Log lines about clients that speak another version of MQTT. MQTT 3.1.1 answers them with return
-//! code 1 and no more, so the log is the only place that can name the client and the remedy.
-//! Anybody can cause such a line: there is one a minute.
+//! Log lines about clients that speak another version of MQTT. MQTT 3.1.1 answers them only with
+//! return code 1, so the log is the only place that can name the client and the remedy. Any client
+//! can cause such a line, so we write at most one a minute.
 
 use std::net::SocketAddr;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// The least time between two lines.
+/// Minimum time between two lines.
 const INTERVAL: Duration = Duration::from_secs(60);
 
-/// When the last line was written, and how many clients came since.
+/// When the last line was written, and the number of clients since.
 #[derive(Debug, Default)]
 pub(super) struct OtherProtocols(Mutex<Lines>);
 
@@ -20,12 +20,12 @@ struct Lines {
 }
 
 impl OtherProtocols {
-    /// Notes that the client at `peer` asks for protocol level `level`.
+    /// Records that the client at `peer` requests protocol level `level`.
     pub(super) fn refused(&self, peer: SocketAddr, level: u8) {
         let version = match level {
             3 => "3.1",
             5 => "5",
-            // Tools that look whether MQTT is spoken ask for levels that nobody has.
+            // Tools that probe for MQTT request levels that do not exist.
             _ => return,
         };
         let lines = self.0.lock();
@@ -42,7 +42,7 @@ impl OtherProtocols {
 }
 
 impl Lines {
-    /// How many clients no line told of, if one is due at `now`.
+    /// The number of clients without a line, if a line is due at `now`.
     fn take(&mut self, now: Instant) -> Option<u64> {
         if self.last.is_some_and(|last| now.duration_since(last) < INTERVAL) {
             self.unreported += 1;

@@ -1,16 +1,16 @@
-//! One session's messages to its client that are not yet acknowledged: packet ids, the window, the
-//! QoS 2 steps. It never holds a payload, since a clean session sends nothing again.
+//! One session's unacknowledged messages to its client: packet ids, the window, the QoS 2 steps.
+//! This module never holds a payload, since a clean session sends nothing again.
 
 use std::collections::HashMap;
 
 use rumqttd::protocol::QoS;
 
-/// Messages under way at a time.
+/// Maximum messages in flight.
 const MAX_IN_FLIGHT: usize = 32;
-/// Parts of packages among them: a new desired state never waits behind them.
+/// Maximum parts of packages among them: a new desired state never waits behind parts.
 pub(super) const MAX_PARTS_IN_FLIGHT: usize = 24;
 
-/// The window of messages under way.
+/// The window of messages in flight.
 #[derive(Debug, Default)]
 pub(super) struct Outgoing {
     last_id: u16,
@@ -42,7 +42,7 @@ impl Outgoing {
             QoS::AtLeastOnce => Awaiting::Acknowledgement,
             QoS::ExactlyOnce => Awaiting::Receipt,
         };
-        // Ends soon: far fewer ids are in flight than there are.
+        // Ends soon: far fewer ids are in flight than exist.
         loop {
             self.last_id = self.last_id.checked_add(1).unwrap_or(1);
             if !self.in_flight.contains_key(&self.last_id) {
@@ -52,13 +52,12 @@ impl Outgoing {
         }
     }
 
-    /// A PUBACK came; true if it ends a message. Acknowledgements of what was not sent change
-    /// nothing.
+    /// Handles a PUBACK; true if a message is complete. Unexpected acknowledgements change nothing.
     pub(super) fn acknowledged(&mut self, id: u16) -> bool {
         self.end(id, Awaiting::Acknowledgement)
     }
 
-    /// A PUBREC came; it is answered with PUBREL in any case, as a client may repeat it.
+    /// Handles a PUBREC; the answer is a PUBREL in any case, as a client may repeat the PUBREC.
     pub(super) fn received(&mut self, id: u16) {
         if let Some(awaiting) = self.in_flight.get_mut(&id)
             && *awaiting == Awaiting::Receipt
@@ -67,7 +66,7 @@ impl Outgoing {
         }
     }
 
-    /// A PUBCOMP came; likewise.
+    /// Handles a PUBCOMP; true if a message is complete. Unexpected ones change nothing.
     pub(super) fn completed(&mut self, id: u16) -> bool {
         self.end(id, Awaiting::Completion)
     }

@@ -1,14 +1,14 @@
-//! What a session has still to write: small packets, and at most one payload that it shares with
-//! other sessions, which is therefore never copied. It knows nothing of MQTT.
+//! Pending output of a session: small packets, and at most one payload that is shared with other
+//! sessions and therefore never copied. This module knows nothing of MQTT.
 
 use std::io::IoSlice;
 
 use bytes::{Buf, Bytes, BytesMut};
 
-/// Buffers above this are given back when they are empty.
+/// Buffers above this size are released when they are empty.
 const MAX_IDLE_BYTES: usize = 8 * 1024;
 
-/// Bytes on their way out, in the order they are written.
+/// Pending bytes, in the order of writing.
 #[derive(Debug, Default)]
 pub(super) struct Output {
     before: BytesMut,
@@ -21,12 +21,12 @@ impl Output {
         !self.has_remaining()
     }
 
-    /// Where the next packet goes.
+    /// The buffer for the next packet.
     pub(super) fn packets(&mut self) -> &mut BytesMut {
         if self.shared.is_empty() { &mut self.before } else { &mut self.after }
     }
 
-    /// Adds a payload without copying it. To be called when no other is on its way.
+    /// Adds a payload without copying it. Call this only when no other payload is pending.
     pub(super) fn share(&mut self, payload: Bytes) {
         debug_assert!(self.shared.is_empty() && self.after.is_empty(), "one at a time");
         self.shared = payload;
@@ -42,14 +42,14 @@ impl Output {
         self.shared.len()
     }
 
-    /// An idle connection holds no large buffer.
+    /// Releases large buffers of an idle connection.
     pub(super) fn give_back(&mut self) {
         give_back(&mut self.before);
         give_back(&mut self.after);
     }
 }
 
-/// Lets go of a buffer's memory, if it is large and holds nothing.
+/// Releases a buffer's memory, if the buffer is large and empty.
 pub(super) fn give_back(buffer: &mut BytesMut) {
     if buffer.is_empty() && buffer.capacity() > MAX_IDLE_BYTES {
         *buffer = BytesMut::new();
@@ -81,7 +81,7 @@ impl Buf for Output {
         }
         assert_eq!(count, 0, "no more is written than there is");
         if self.shared.is_empty() {
-            // Lets go of the payload, which as an empty slice would still be held.
+            // Releases the payload, which would still be held as an empty slice.
             self.shared = Bytes::new();
             if self.before.is_empty() {
                 std::mem::swap(&mut self.before, &mut self.after);

@@ -1,7 +1,7 @@
-//! Who may hear the parts of which package, the few parts that are on their way, and how far each
-//! listener has come. The parts are held once, whatever the number of listeners, and no more of
-//! them than a window; a publisher waits for the slowest listener, and puts out who holds up the
-//! others. It never touches a socket.
+//! Permissions to subscribe to a package's parts, the few parts in flight, and the progress of each
+//! subscriber. The parts are held once, whatever the number of subscribers, and at most one window
+//! of them. A publisher waits for the slowest subscriber, and removes subscribers that hold up the
+//! others. This module never touches a socket.
 
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,19 +14,19 @@ use tokio::time::Instant;
 use super::laggard::{Hold, Waiting};
 use crate::broker::Part;
 
-/// Packages that are fanned out at the same time.
+/// Maximum packages in fan-out at the same time.
 const MAX_FAN_OUTS: usize = 4;
-/// Parts that the slowest listener may be behind, and the bytes of these parts, if it is not one
-/// alone. Fewer than the messages that a session may have under way, so that there is always room
-/// for a new desired state.
+/// Maximum lag of the slowest subscriber in parts, and the bytes of these parts, unless it is a
+/// single part. Fewer than the in-flight messages of a session, so that there is always room for a
+/// new desired state.
 const WINDOW_PARTS: u64 = super::outgoing::MAX_PARTS_IN_FLIGHT as u64;
 const WINDOW_BYTES: u64 = 4 * 1024 * 1024;
 
-/// Every package that is being fanned out.
+/// All packages in fan-out.
 #[derive(Default)]
 pub(in crate::broker) struct Grants(Mutex<HashMap<Digest, Arc<Grant>>>);
 
-/// One package, and the robots that may hear it.
+/// One package, and the robots that may subscribe to its parts.
 pub(in crate::broker) struct Grant {
     digest: Digest,
     qos: QoS,
@@ -37,58 +37,59 @@ pub(in crate::broker) struct Grant {
 }
 
 struct Progress {
-    /// The number of the last part that went out; the first is 1.
+    /// The number of the last part that was sent; the first is 1.
     sent: u64,
-    /// The last of them, up to a window.
+    /// The last parts, up to a window.
     parts: VecDeque<Part>,
-    /// Who may listen.
+    /// The permitted robots.
     robots: HashMap<RobotId, Permit>,
     listeners: usize,
-    /// Listeners that are a whole window behind.
+    /// Subscribers that are a whole window behind.
     behind: usize,
-    /// Listeners that are done with all that was sent.
+    /// Subscribers that have finished all parts sent so far.
     idle: usize,
-    /// For how long these have waited for those.
+    /// How long the finished subscribers have waited for the slow ones.
     waiting: Waiting,
-    /// How long all listeners, one after another, have held up the rest.
+    /// Total time for which the subscribers, one after another, have held up the rest.
     all: Hold,
-    /// Who was put out and not asked for yet.
+    /// Robots that were removed and not yet returned by `take_put_out`.
     put_out: Vec<RobotId>,
 }
 
-/// That a robot may listen.
+/// A robot's permission to subscribe.
 #[derive(Default)]
 struct Permit {
-    /// If it does.
+    /// The subscriber's progress, if the robot subscribes.
     listening: Option<Listening>,
-    /// How long it had held up the others when it last left: whoever comes back goes on from there.
+    /// How long the robot had held up the others when it last left; after a return the count
+    /// continues from there.
     held: Option<Hold>,
 }
 
-/// How far a listener has come.
+/// The progress of a subscriber.
 struct Listening {
-    /// The last part that its session took.
+    /// The last part that the subscriber's session took.
     taken: u64,
-    /// Those that it took and its robot has not acknowledged.
+    /// Parts that the session took and the robot has not acknowledged.
     open: BTreeSet<u64>,
     hold: Hold,
-    /// Tells its session that there is something new.
+    /// Wakes the subscriber's session for news.
     news: Arc<Notify>,
 }
 
 impl Listening {
-    /// The parts of `sent` that are not done with.
+    /// The number of sent parts that are not finished.
     fn lacks(&self, sent: u64) -> u64 {
         sent - self.open.first().map_or(self.taken, |first| first - 1)
     }
 }
 
-/// Why there is no grant.
+/// The reason for refusing a grant.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::broker) enum NotGranted {
-    /// This package is being fanned out already.
+    /// This package is already in fan-out.
     UnderWay,
-    /// As many packages as there may be.
+    /// The maximum number of packages is in fan-out.
     Full,
 }
 
@@ -118,7 +119,7 @@ impl Grants {
         Ok(grant)
     }
 
-    /// Closes it to everybody.
+    /// Closes the package to all robots.
     pub(in crate::broker) fn close(&self, grant: &Grant) {
         lock(&self.0).remove(&grant.digest);
         let mut progress = grant.progress();
@@ -139,7 +140,7 @@ impl Grants {
             .cloned()
     }
 
-    /// The bytes of the parts that are on their way.
+    /// The bytes of the parts in flight.
     pub(in crate::broker) fn queued_bytes(&self) -> usize {
         lock(&self.0).values().map(|grant| grant.queued_bytes()).sum()
     }
@@ -154,7 +155,7 @@ impl Grant {
         self.qos
     }
 
-    /// Opens it to further robots.
+    /// Opens the package to further robots.
     pub(in crate::broker) fn admit(&self, robots: impl IntoIterator<Item = RobotId>) {
         let mut progress = self.progress();
         for robot in robots {
@@ -162,41 +163,41 @@ impl Grant {
         }
     }
 
-    /// Closes it to one robot.
+    /// Closes the package to one robot.
     pub(in crate::broker) fn withdraw(&self, robot: &RobotId, now: Instant) {
         self.progress().remove(robot, self.window, now);
         self.moved.notify_one();
     }
 
-    /// Robots that listen now.
+    /// The number of robots that subscribe now.
     pub(in crate::broker) fn listeners(&self) -> usize {
         self.progress().listeners
     }
 
-    /// Whether the robot listens now.
+    /// Whether the robot subscribes now.
     pub(in crate::broker) fn is_listening(&self, robot: &RobotId) -> bool {
         self.progress().robots.get(robot).is_some_and(|permit| permit.listening.is_some())
     }
 
-    /// The bytes of the parts that are held for listeners.
+    /// The bytes of the parts that are held for subscribers.
     pub(in crate::broker) fn queued_bytes(&self) -> usize {
         self.progress().parts.iter().map(Part::len).sum()
     }
 
-    /// Waits until a robot has begun to listen since this was waited for last. For one caller at a
-    /// time; cancel-safe.
+    /// Waits until a robot has subscribed since the last call. For one caller at a time;
+    /// cancel-safe.
     pub(in crate::broker) async fn joined(&self) {
         self.joined.notified().await;
     }
 
-    /// Waits until no listener is a whole window behind. For one caller at a time; cancel-safe.
+    /// Waits until no subscriber is a whole window behind. For one caller at a time; cancel-safe.
     pub(in crate::broker) async fn room(&self) {
         while self.progress().behind > 0 {
             self.moved.notified().await;
         }
     }
 
-    /// Waits until no listener lacks any part. Likewise.
+    /// Waits until no subscriber lacks any part. For one caller at a time; cancel-safe.
     pub(in crate::broker) async fn all_idle(&self) {
         loop {
             {
@@ -209,7 +210,7 @@ impl Grant {
         }
     }
 
-    /// Hands the next part to all who listen. To be called when there is room.
+    /// Hands the next part to all subscribers. Call this when there is room.
     pub(in crate::broker) fn send(&self, part: Part, now: Instant) {
         let mut progress = self.progress();
         progress.sent += 1;
@@ -231,7 +232,7 @@ impl Grant {
         progress.measure(now);
     }
 
-    /// Closes it to those who have held up all others for too long, and says who they were.
+    /// Closes the package to robots that have held up all others for too long, and returns them.
     pub(in crate::broker) fn put_out_laggards(&self, now: Instant) -> Vec<RobotId> {
         let mut progress = self.progress();
         let Progress { all, waiting, .. } = *progress;
@@ -248,7 +249,7 @@ impl Grant {
         laggards
     }
 
-    /// Those put out since this was asked last.
+    /// The robots removed since the last call.
     pub(in crate::broker) fn take_put_out(&self) -> Vec<RobotId> {
         std::mem::take(&mut self.progress().put_out)
     }
@@ -280,7 +281,7 @@ impl Progress {
         self.robots.get_mut(robot)?.listening.as_mut()
     }
 
-    /// Takes the robot's right away and tells its session.
+    /// Removes the robot's permission and tells its session.
     fn remove(&mut self, robot: &RobotId, window: u64, now: Instant) {
         if let Some(listening) = self.robots.remove(robot).and_then(|permit| permit.listening) {
             listening.news.notify_one();
@@ -288,7 +289,7 @@ impl Progress {
         }
     }
 
-    /// The robot listens no longer, if it did. It may come back.
+    /// The robot's subscription ends, if there is one. The robot may come back.
     fn leave(&mut self, robot: &RobotId, window: u64, now: Instant) {
         let waiting = self.waiting;
         let Some(permit) = self.robots.get_mut(robot) else { return };
@@ -298,7 +299,7 @@ impl Progress {
         self.discount(&listening, window, now);
     }
 
-    /// The listener counts no longer.
+    /// Removes the subscriber from the counts.
     fn discount(&mut self, listening: &Listening, window: u64, now: Instant) {
         let lacks = listening.lacks(self.sent);
         self.listeners -= 1;
@@ -307,31 +308,31 @@ impl Progress {
         self.measure(now);
     }
 
-    /// Whether the others wait for somebody from now on.
+    /// Updates whether the other subscribers wait from now on.
     fn measure(&mut self, now: Instant) {
         self.waiting.set(self.behind > 0 && self.idle * 2 >= self.listeners, now);
     }
 }
 
-/// A robot's session that listens; it counts as behind until this is dropped.
+/// A robot's session that subscribes; it counts as behind until this is dropped.
 pub(super) struct Member {
     grant: Arc<Grant>,
     robot: RobotId,
 }
 
-/// What a member's session should do.
+/// The next action of a member's session.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Due {
-    /// Send this part, and say so.
+    /// Send this part, and call `Member::take`.
     Part(u64, Part),
-    /// Forget the package.
+    /// Drop the package.
     End,
     /// Wait.
     Nothing,
 }
 
 impl Member {
-    /// The robot hears everything from now on; `news` tells its session. `None` if the grant was
+    /// The robot receives all parts from now on; `news` wakes its session. `None` if the grant was
     /// withdrawn meanwhile.
     pub(super) fn join(grant: Arc<Grant>, robot: &RobotId, news: Arc<Notify>) -> Option<Self> {
         let (now, mut progress) = (Instant::now(), grant.progress());
@@ -351,7 +352,7 @@ impl Member {
         self.grant.qos()
     }
 
-    /// What comes next. It changes nothing.
+    /// The next action. Changes nothing.
     pub(super) fn due(&self) -> Due {
         let progress = self.grant.progress();
         let permit = progress.robots.get(&self.robot);
@@ -365,7 +366,7 @@ impl Member {
         part.map_or(Due::Nothing, |part| Due::Part(number, part.clone()))
     }
 
-    /// The session sends the part of this number.
+    /// Records that the session sends the part of this number.
     pub(super) fn take(&self, number: u64) {
         if let Some(listening) = self.grant.progress().listening(&self.robot) {
             listening.taken = number;
@@ -373,7 +374,7 @@ impl Member {
         }
     }
 
-    /// The robot has it.
+    /// Records that the robot has the part.
     pub(super) fn acknowledged(&self, number: u64) {
         let (now, mut progress) = (Instant::now(), self.grant.progress());
         let (window, sent, waiting) = (self.grant.window, progress.sent, progress.waiting);

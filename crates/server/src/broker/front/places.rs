@@ -1,6 +1,5 @@
-//! How many connections there may be. When there are as many, whoever has been silent for longest
-//! gives way to a newcomer, so that those who say nothing keep nobody out. It never touches a
-//! socket.
+//! Limits the number of connections. At the limit, the longest silent connection is closed to admit
+//! a new one, so silent clients keep no client out. This module never touches a socket.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,9 +9,9 @@ use tokio::time::timeout;
 
 use crate::net::anteroom::Anteroom;
 
-/// Newcomers that wait for a place at a time: connections beyond those there may be.
+/// Maximum new connections that wait for a place, beyond the limit of connections.
 const MAX_WAITING: usize = 128;
-/// How long each waits. Who gives way is gone sooner.
+/// Time limit of each wait. The connection that is closed is gone sooner.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 /// The places of a listener.
@@ -21,22 +20,22 @@ pub(super) struct Places {
     turns: Arc<Semaphore>,
 }
 
-/// What a newcomer gets.
+/// The claim of a new connection.
 pub(super) enum Claim {
     /// A place.
     Place(OwnedSemaphorePermit),
-    /// A turn to wait for the place of somebody who has to leave.
+    /// A turn to wait for the place of a connection that is being closed.
     Turn(Arc<Semaphore>, OwnedSemaphorePermit),
 }
 
 impl Places {
-    /// So many.
+    /// Starts with this number of places.
     pub(super) fn new(most: usize) -> Self {
         Self { free: Arc::new(Semaphore::new(most)), turns: Arc::new(Semaphore::new(MAX_WAITING)) }
     }
 
-    /// For one more connection; `None` if there is no place, and nobody in the anteroom who could
-    /// give way.
+    /// Claims a place for one more connection; `None` if there is no place, and no connection in
+    /// the anteroom that can be closed.
     pub(super) fn claim(&self, anteroom: &Anteroom) -> Option<Claim> {
         if let Ok(place) = self.free.clone().try_acquire_owned() {
             return Some(Claim::Place(place));
@@ -47,7 +46,7 @@ impl Places {
 }
 
 impl Claim {
-    /// The place, once it is free.
+    /// Returns the place, once it is free.
     pub(super) async fn place(self) -> Option<OwnedSemaphorePermit> {
         match self {
             Self::Place(place) => Some(place),

@@ -1,6 +1,6 @@
-//! One client's session, from its seat to its end: a single task that reads, acts, answers and
-//! keeps the time. Everything it holds is bounded; it stops reading while a message is being stored
-//! or answers are not read.
+//! One client's session, from its slot to its end: a single task that reads, handles packets,
+//! answers and enforces timeouts. All its buffers are bounded; it stops reading while a message is
+//! being stored or while the client leaves answers unread.
 
 use std::collections::HashMap;
 use std::io;
@@ -43,15 +43,15 @@ use parts::{Parts, due};
 use subscriptions::lower;
 use unreleased::Unreleased;
 
-/// Answers a client may leave unread before nothing more is read from it.
+/// Maximum unread answers before we stop reading from the client.
 const MAX_UNREAD_BYTES: usize = 64 * 1024;
-/// How long a connection is kept open for the client to read what was said last.
+/// How long a connection stays open for the client to read the last bytes.
 const LINGER: Duration = Duration::from_secs(1);
 
-/// Why a session ended.
+/// The reason why a session ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 enum End {
-    /// DISCONNECT: the one end that leaves the will unsaid.
+    /// DISCONNECT: the only end that discards the will.
     #[error("says goodbye")]
     Goodbye,
     #[error("goes away without a word")]
@@ -111,8 +111,8 @@ where
     linger(&mut stream).await;
 }
 
-/// Everything before the session is live: who it is, the seat, and a link to the router if it needs
-/// one.
+/// All steps before the session is live: the client's identity, the slot, and a link to the router
+/// if the session needs one.
 async fn enter<S>(
     context: &Arc<Context>,
     stream: &mut S,
@@ -140,8 +140,8 @@ where
     Ok((guest, seat, Some(listener)))
 }
 
-/// The session, and what must happen at its end in this order: the link to the router ends, the
-/// will is said, the inbox hears of the end, and the seat is free.
+/// Runs the session, and then its cleanup in this order: the link to the router ends, the will is
+/// published, the inbox is told of the end, and the slot is free.
 async fn live<S>(
     context: &Context,
     stream: &mut S,
@@ -153,8 +153,8 @@ async fn live<S>(
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    // It may have been meant for whoever had the seat before. Whoever is told of this session rings
-    // again.
+    // The payload may have been meant for the previous session of the slot. The code that is told
+    // of this session rings again.
     seat.doorbell().forget_state();
     let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
     let (reader, writer) = tokio::io::split(stream);
@@ -200,8 +200,8 @@ where
     end
 }
 
-/// Lets the client read what was written last: closing with bytes unread on our side would reset
-/// the connection.
+/// Lets the client read the last bytes: closing with bytes unread on our side would reset the
+/// connection.
 async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
     let read_out = async {
         stream.shutdown().await?;
@@ -209,7 +209,7 @@ async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
         while stream.read(&mut scrap).await? > 0 {}
         io::Result::Ok(())
     };
-    // Whatever went wrong, the connection is over.
+    // The connection is over in any case.
     let _ = timeout(LINGER, read_out).await;
 }
 
@@ -222,13 +222,13 @@ struct Session<'a, S> {
     writer: WriteHalf<&'a mut S>,
     input: BytesMut,
     output: Output,
-    /// Whether all that left `output` has left the stream's own buffers as well.
+    /// Whether the bytes that left `output` have left the stream's own buffers as well.
     is_flushed: bool,
     listener: Option<Listener>,
     hearing: HashMap<String, (Hearing, QoS)>,
-    /// How the robot behaves.
+    /// The rate limits of the robot.
     watched: Option<&'a Watched>,
-    /// Until when nothing more is taken from it.
+    /// Nothing more is read from the robot before this time.
     slowed_until: Option<Instant>,
     refused_filters: u32,
     parts: Parts,
@@ -236,21 +236,21 @@ struct Session<'a, S> {
     unreleased: Unreleased,
     storing: Option<Storing<'a>>,
     keep_alive: Duration,
-    /// When the last packet came, or enough of the one that is coming.
+    /// When the last packet arrived, or enough of the incoming one.
     heard_at: Instant,
-    /// How much of that one was there then.
+    /// Bytes of the incoming packet that were present at that time.
     heard_bytes: usize,
-    /// When the client last took something of what it was sent, or there was nothing to take.
+    /// When the client last read some of our bytes, or there was nothing to read.
     progress_at: Instant,
 }
 
-/// A message on its way into the inbox, and the acknowledgement that waits for it.
+/// A message that is being stored by the inbox, and the pending acknowledgement.
 struct Storing<'a> {
     publish: Publish,
     stored: BoxFuture<'a, Result<(), NotStored>>,
 }
 
-/// What a session wakes up for.
+/// An event that wakes a session.
 enum Woken {
     Read(io::Result<usize>),
     Wrote(io::Result<()>),
@@ -258,7 +258,7 @@ enum Woken {
     Rung(Bytes),
     Asked(Bytes),
     Heard(Result<Heard, RouterError>),
-    /// It is not slowed any more.
+    /// The slowed period is over.
     Due,
     PartDue(Digest, Due),
     Late(End),
@@ -281,15 +281,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             }
         };
         if !matches!(end, End::Deaf | End::Withdrawn) {
-            // What was answered before the end is still due. If it can't be had any more, the
+            // Answers from before the end are still due. If the client can't receive them, the
             // connection is over anyway.
             let _ = timeout(LINGER, self.writer.write_all_buf(&mut self.output)).await;
         }
         end
     }
 
-    /// Waits for whatever comes first. Every branch is cancel-safe: bytes stay in the socket or the
-    /// buffers, payloads in the doorbell or the link, and what is being stored is polled in place.
+    /// Waits for the first event. Every branch is cancel-safe: bytes stay in the socket or the
+    /// buffers, payloads in the doorbell or the link, and the message that is being stored is
+    /// polled in place.
     async fn wait(&mut self) -> Woken {
         let (deadline, lateness) = self.deadline();
         let may_read = self.may_read();
@@ -313,20 +314,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             () = sleep_until(deadline) => Woken::Late(lateness),
         };
         if may_send {
-            // Until now there was nothing to take, however long that was.
+            // Until now there was nothing to read, for any length of time.
             self.progress_at = Instant::now();
         }
         woken
     }
 
-    /// By when something must happen, and what it means if it does not.
+    /// The next deadline, and the reason for ending the session if the deadline passes.
     fn deadline(&mut self) -> (Instant, End) {
         if self.caught_up() {
             self.progress_at = Instant::now();
         }
         let unread_until = self.progress_at + self.context.limits.write_timeout;
         let silent_until = self.heard_at + self.keep_alive;
-        // While we don't read, the client can't be blamed for its silence.
+        // While we don't read, the client is not responsible for its silence.
         if self.may_read() && silent_until < unread_until || self.caught_up() && !self.is_busy() {
             (silent_until, End::Silent)
         } else {
@@ -334,7 +335,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
     }
 
-    /// Whether the client has taken all it was sent.
+    /// Whether the client has read all our bytes.
     fn caught_up(&self) -> bool {
         self.output.is_empty() && self.is_flushed && self.outgoing.has_room()
     }
@@ -343,7 +344,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         !self.is_busy() && self.output.own_bytes() < MAX_UNREAD_BYTES
     }
 
-    /// Whether what was read last is still being acted on, or was more than may come.
+    /// Whether the last packet is still being handled, or exceeded the limits.
     fn is_busy(&self) -> bool {
         self.storing.is_some() || self.slowed_until.is_some()
     }
@@ -364,7 +365,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
             Woken::PartDue(digest, due) => self.act_on_part(digest, due)?,
             Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
-            // It could not be heard, so it was not silent.
+            // We did not read, so the silence does not count.
             Woken::Due => (self.slowed_until, self.heard_at) = (None, Instant::now()),
             Woken::Late(end) => return Err(end),
         }
@@ -477,7 +478,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         self.hearing.values().find(|(hearing, _)| *hearing == wanted).map(|(_, qos)| *qos)
     }
 
-    /// Sends what is said to this robot alone.
+    /// Sends a message that is for this robot alone.
     fn send_own(&mut self, last: RobotTopic, hearing: Hearing, payload: Bytes) {
         if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing))
         {
@@ -541,15 +542,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 }
 
-/// Hands a message to the inbox, within the time it has.
+/// Hands a message to the inbox, within the inbox's time limit.
 async fn store(context: &Context, message: RobotMessage) -> Result<(), NotStored> {
     timeout(context.limits.inbox_timeout, context.inbox.receive(message))
         .await
         .unwrap_or(Err(NotStored))
 }
 
-/// Writes some of what is there, and waits until the stream holds none of it back. What a call that
-/// is dropped has written is gone from `output`, and `is_flushed` says whether more is to be done.
+/// Writes some of the output, and waits until the stream has flushed all of it. If the call is
+/// dropped, the written bytes are gone from `output`, and `is_flushed` tells whether more is to be
+/// done.
 async fn write<W: AsyncWrite + Unpin>(
     writer: &mut W,
     output: &mut Output,
@@ -566,7 +568,7 @@ async fn write<W: AsyncWrite + Unpin>(
     Ok(())
 }
 
-/// When the message on its way has arrived; never if there is none.
+/// Resolves when the pending message is stored; never if there is none.
 async fn stored(storing: &mut Option<Storing<'_>>) -> Result<(), NotStored> {
     match storing {
         Some(storing) => (&mut storing.stored).await,

@@ -1,6 +1,6 @@
-//! Who has which seat: one session for each robot, and for each of a person's client ids, of which
-//! one person has only so many. A newcomer takes the seat over only after the session before it has
-//! fully ended. It never touches a socket.
+//! Session slots: one session for each robot, and one for each client id of a person, with a limit
+//! for each person. A new session takes over a slot only after the previous session has fully
+//! ended. This module never touches a socket.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -13,13 +13,13 @@ use tokio_util::sync::CancellationToken;
 use super::doorbell::Doorbell;
 use super::traffic::Meter;
 
-/// What a session is known by. Robots and operators can't take over each other, whatever client id
-/// they give.
+/// The identity of a session. Robots and operators can't take over each other's sessions, whatever
+/// client id they present.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) enum SeatName {
     Robot(RobotId),
     Operator(UserName, String),
-    /// An operator who left the choice of a client id to us.
+    /// An operator without a client id of its own choice.
     Unnamed(UserName, u128),
     Canary,
 }
@@ -33,11 +33,11 @@ impl SeatName {
     }
 }
 
-/// All seats that are taken.
+/// All slots in use.
 pub(super) struct Seats {
     table: Mutex<Table>,
     most_of_a_person: usize,
-    /// How often a robot was put out.
+    /// How often robots were evicted.
     put_out: AtomicU64,
 }
 
@@ -58,7 +58,7 @@ struct Occupant {
     subscriptions: Mutex<Vec<Subscription>>,
 }
 
-/// A session's hold on its seat; dropping it says that the session has fully ended.
+/// A session's hold on its slot; dropping it marks the session as fully ended.
 pub(super) struct Seat {
     seats: Arc<Seats>,
     name: SeatName,
@@ -66,14 +66,14 @@ pub(super) struct Seat {
 }
 
 impl Seats {
-    /// Free ones, of which a person gets so many.
+    /// Starts with no slots in use, and a maximum for each person.
     pub(super) fn new(most_of_a_person: usize) -> Arc<Self> {
         Arc::new(Self { table: Mutex::default(), most_of_a_person, put_out: AtomicU64::new(0) })
     }
 
-    /// Asks whoever has the seat to leave, waits until they have, and sits down. Sessions that want
-    /// the same seat get it one after another in the order of their arrival; all but the last find
-    /// that they should leave again. `None`: the person has as many others as there may be.
+    /// Asks the session in the slot to leave, waits until it has ended, and takes the slot.
+    /// Sessions that want the same slot get it one after another in the order of arrival; all but
+    /// the last are asked to leave again at once. `None`: the person has reached the maximum.
     pub(super) async fn take(self: &Arc<Self>, name: SeatName, meter: Arc<Meter>) -> Option<Seat> {
         let (seat, before) = self.claim(name, meter)?;
         if let Some(before) = before {
@@ -116,7 +116,7 @@ impl Seats {
             .map(|occupant| occupant.doorbell.clone())
     }
 
-    /// The figures of the robot's session.
+    /// The traffic meter of the robot's session.
     pub(super) fn meter(&self, robot: &RobotId) -> Option<Arc<Meter>> {
         self.table()
             .occupants
@@ -124,14 +124,14 @@ impl Seats {
             .map(|occupant| occupant.meter.clone())
     }
 
-    /// What the robot's session listens to.
+    /// The subscriptions of the robot's session.
     pub(super) fn subscriptions(&self, robot: &RobotId) -> Vec<Subscription> {
         let occupant = self.table().occupants.get(&SeatName::Robot(robot.clone())).cloned();
         occupant.map_or_else(Vec::new, |occupant| occupant.subscriptions().clone())
     }
 
-    /// How often a robot was put out so far. Who was let in before the number changed has to be
-    /// asked again.
+    /// How often robots were evicted so far. A client that was admitted before the number changed
+    /// has to be checked again.
     pub(super) fn put_out(&self) -> u64 {
         self.put_out.load(Ordering::SeqCst)
     }
@@ -153,7 +153,7 @@ impl Seats {
         }
     }
 
-    /// How many robots have a seat.
+    /// The number of robots with a slot.
     pub(super) fn robots(&self) -> usize {
         self.table().robots
     }
@@ -166,12 +166,12 @@ impl Seats {
 }
 
 impl Table {
-    /// The seats that the person has whose seat this is; none of a robot.
+    /// The slots of the person that owns this slot; none for a robot.
     fn of_person(&self, name: &SeatName) -> usize {
         name.person().and_then(|person| self.people.get(person)).copied().unwrap_or_default()
     }
 
-    /// There is one more of them.
+    /// Counts one more slot.
     fn taken(&mut self, name: &SeatName) {
         self.robots += usize::from(matches!(name, SeatName::Robot(_)));
         if let Some(person) = name.person() {
@@ -179,7 +179,7 @@ impl Table {
         }
     }
 
-    /// There is one fewer.
+    /// Counts one slot fewer.
     fn given_back(&mut self, name: &SeatName) {
         self.robots -= usize::from(matches!(name, SeatName::Robot(_)));
         let Some(person) = name.person() else { return };
@@ -200,7 +200,7 @@ impl Occupant {
 }
 
 impl Seat {
-    /// Notes what the session listens to, for whoever looks.
+    /// Publishes the session's subscriptions for display.
     pub(super) fn listens_to(&self, mut subscriptions: Vec<Subscription>) {
         subscriptions.sort_by(|one, other| one.topic_filter.cmp(&other.topic_filter));
         *self.occupant.subscriptions() = subscriptions;
@@ -211,17 +211,17 @@ impl Seat {
         self.occupant.number
     }
 
-    /// Ends when the session should leave.
+    /// Cancelled when the session should leave.
     pub(super) fn leave(&self) -> &CancellationToken {
         &self.occupant.leave
     }
 
-    /// What counts this session's traffic.
+    /// The meter of this session's traffic.
     pub(super) fn meter(&self) -> &Meter {
         &self.occupant.meter
     }
 
-    /// What rings for this session.
+    /// The doorbell of this session.
     pub(super) fn doorbell(&self) -> &Doorbell {
         &self.occupant.doorbell
     }
@@ -262,7 +262,7 @@ mod tests {
         {
             assert!(take(other).await.is_some());
         }
-        // A seat that is taken over is the same one.
+        // A slot that is taken over is the same slot.
         let (again, ()) = tokio::join!(take(named), async {
             first.leave().cancelled().await;
             drop(first);

@@ -1,6 +1,6 @@
-//! What goes over MQTT, counted: bytes, packets, messages, acknowledgements, of each connection and
-//! of all. It only counts, with relaxed atomics; a reader sees figures that may be some packets
-//! apart from each other.
+//! MQTT traffic counters: bytes, packets, messages and acknowledgements, for each connection and in
+//! total. They use relaxed atomics; a reader sees figures that may be some packets apart from each
+//! other.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,7 +10,7 @@ use std::task::{Context, Poll};
 use task_proto::api::{MqttTraffic, Traffic};
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 
-/// What is counted of a connection.
+/// The counters of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Count {
     BytesIn,
@@ -46,8 +46,8 @@ impl Counters {
     }
 }
 
-/// One connection's figures. They count towards the totals from the moment it is known whose they
-/// are: the watchdog's never do.
+/// One connection's figures. They count towards the totals from the moment when the client is
+/// known: the watchdog's never do.
 #[derive(Default)]
 pub(super) struct Meter {
     own: Counters,
@@ -67,7 +67,7 @@ impl Meter {
     }
 }
 
-/// All connections' figures since the front began.
+/// The figures of all connections since the front began.
 #[derive(Default)]
 pub(super) struct Totals {
     traffic: Arc<Counters>,
@@ -77,13 +77,13 @@ pub(super) struct Totals {
 }
 
 impl Totals {
-    /// A client is let in.
+    /// Counts an admitted client.
     pub(super) fn accept(&self, meter: &Meter) {
         self.accepted.fetch_add(1, Ordering::Relaxed);
         self.take_in(meter);
     }
 
-    /// A client is turned away; without a meter it was not even listened to.
+    /// Counts a refused client; without a meter the client was refused before any byte was read.
     pub(super) fn refuse(&self, meter: Option<&Meter>) {
         self.refused.fetch_add(1, Ordering::Relaxed);
         if let Some(meter) = meter {
@@ -91,12 +91,12 @@ impl Totals {
         }
     }
 
-    /// A message is not taken: it may not be sent there, or could not be stored.
+    /// Counts a refused message: its topic is not allowed, or the message could not be stored.
     pub(super) fn refuse_message(&self) {
         self.messages_refused.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The figures, without those that only others know.
+    /// The figures, without those that only other modules know.
     pub(super) fn read(&self) -> MqttTraffic {
         MqttTraffic {
             connections_accepted: self.accepted.load(Ordering::Relaxed),
@@ -124,7 +124,7 @@ impl Totals {
     }
 }
 
-/// A stream whose bytes are counted.
+/// A stream that counts its bytes.
 pub(super) struct Metered<S> {
     pub(super) stream: S,
     pub(super) meter: Arc<Meter>,

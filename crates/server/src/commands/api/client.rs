@@ -1,6 +1,6 @@
-//! The server's API as the commands see it: one call, one method. It retries what may pass (a lost
-//! connection, a 5xx), always with the same idempotency key, and turns every refusal into an error
-//! with the server's own words.
+//! The commands' client of the server's API: one method per call. The client retries transient
+//! failures (a lost connection, a 5xx), always with the same idempotency key, and turns every
+//! refusal into an error with the server's own words.
 
 use std::cell::Cell;
 use std::net::IpAddr;
@@ -27,17 +27,17 @@ use crate::system::data_directory::{Addresses, OPERATOR_TOKEN, is_locked};
 const TRIES: u32 = 6;
 /// The longest pause between two tries.
 const MAX_PAUSE: Duration = Duration::from_secs(2);
-/// Nobody waits at a terminal for longer because the server asks for it: the refusal is shown.
+/// Longest Retry-After the client honours. Above this limit the refusal is shown at once.
 const MAX_RETRY_AFTER: Duration = Duration::from_secs(15);
-/// How long one answer may take, uploads excepted.
+/// Time limit of one answer, uploads excepted.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// The largest answer that is read: the list of a large fleet.
 const MAX_ANSWER_BYTES: usize = 256 * 1024 * 1024;
 
-/// Why the server did not do what it was asked.
+/// Why a request to the server failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// It answered with an error.
+    /// The server answered with an error.
     #[error("{message} ({code})")]
     Refused {
         /// The HTTP status.
@@ -47,36 +47,36 @@ pub enum ClientError {
         /// The server's words.
         message: String,
     },
-    /// It could not be reached, or went away.
+    /// The server could not be reached, or the connection was lost.
     #[error("can't reach the server at {url}{hint}")]
     Unreachable {
-        /// Where it should be.
+        /// Base URL of the server.
         url: String,
-        /// What to try instead, if that can be told; in brackets.
+        /// A suggestion for the user, in brackets; empty if there is none.
         hint: &'static str,
-        /// Why.
+        /// The cause.
         source: reqwest::Error,
     },
-    /// Something answered that is not taskd.
+    /// The answer did not come from taskd.
     #[error("what answers at {url} is not taskd (status {status})")]
     NotTheServer {
-        /// Where.
+        /// The URL.
         url: String,
         /// The HTTP status.
         status: StatusCode,
     },
-    /// The directory that says where the server is has none.
+    /// No server runs on the directory that would contain its address.
     #[error("no server is up that serves from {}: start it with taskd serve, or name another with --server", data.display())]
     NotServing {
         /// The directory.
         data: PathBuf,
     },
-    /// Whether a server serves from the directory can't be told.
+    /// Whether a server runs on the directory can't be determined.
     #[error("can't tell whether a server serves from {}", data.display())]
     DataDirectory {
         /// The directory.
         data: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
     /// No token was given.
@@ -85,29 +85,29 @@ pub enum ClientError {
          server runs, point --data at its data directory"
     )]
     NoToken {
-        /// Of which server.
+        /// The server's URL.
         url: String,
     },
     /// The token file can't be read.
     #[error("can't read the token file {}", path.display())]
     TokenFile {
-        /// Which.
+        /// The file's path.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: std::io::Error,
     },
-    /// The token is none.
+    /// The token is malformed.
     #[error("{origin}")]
     Token {
-        /// Where it came from.
+        /// Where the URL came from: a flag, the environment or a file.
         origin: String,
-        /// Why.
+        /// The parse error.
         source: InvalidToken,
     },
-    /// The URL is none.
+    /// The URL is malformed.
     #[error("--server: {url:?} is not an http:// or https:// URL")]
     Url {
-        /// What was given.
+        /// The URL as given.
         url: String,
     },
     /// A pin for a server that would be spoken to unencrypted.
@@ -115,7 +115,7 @@ pub enum ClientError {
         "--pin: {url} does not encrypt, so nothing there can be recognised by a pin; use https://"
     )]
     PinInPlainText {
-        /// What was given.
+        /// The URL as given.
         url: String,
     },
 }
@@ -149,8 +149,7 @@ impl ClientError {
         }
     }
 
-    /// What it means where `robot` was named: that there is no such robot is said alike by all
-    /// commands.
+    /// Turns an unknown-robot refusal for `robot` into the message that all commands share.
     pub(in crate::commands) fn about(self, robot: &RobotName) -> CommandError {
         match self {
             Self::Refused { status: StatusCode::NOT_FOUND, .. } => unknown(robot),
@@ -159,7 +158,7 @@ impl ClientError {
     }
 }
 
-/// A server and the token to ask it with.
+/// Client for one server with one token.
 pub(crate) struct Client {
     http: reqwest::Client,
     base: String,
@@ -175,7 +174,7 @@ impl Client {
         Ok(Self { token: Some(token), ..client })
     }
 
-    /// The same server, asked with the token that is kept for it.
+    /// The same server with the token that is stored for that server.
     pub(crate) fn with_token(self, token: &str) -> Result<Self, ClientError> {
         let token = token
             .parse()
@@ -219,14 +218,14 @@ impl Client {
         (host, url.and_then(|url| url.port_or_known_default()).unwrap_or_default())
     }
 
-    /// A path of the server as a request has it, where its URL has one of its own.
+    /// The request path on the server, including the path prefix of the server's URL.
     pub(crate) fn path(&self, path: &str) -> String {
         let own =
             reqwest::Url::parse(&self.base).map(|url| url.path().trim_end_matches('/').to_owned());
         format!("{}{path}", own.unwrap_or_default())
     }
 
-    /// Whom it takes for the server.
+    /// How the client authenticates the server.
     pub(crate) fn trust(&self) -> Trust {
         self.trust
     }
@@ -245,7 +244,7 @@ impl Client {
         self.answer(|| self.request(Method::GET, path)).await
     }
 
-    /// Likewise, with a query of this type.
+    /// GET with a query of this type.
     pub(crate) async fn get_by<Q: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -254,7 +253,7 @@ impl Client {
         self.answer(|| self.request(Method::GET, &format!("{BASE}{path}")).query(query)).await
     }
 
-    /// Opens a stream, tried once. It may go on for as long as it likes.
+    /// Opens a stream, without retries and without a time limit.
     pub(crate) async fn stream<Q: Serialize>(
         &self,
         path: &str,
@@ -278,7 +277,7 @@ impl Client {
             self.request(Method::DELETE, &path)
         };
         match self.send(request).await {
-            // It was there at the first try, whose answer was lost.
+            // The first try, whose answer was lost, has deleted the resource.
             Err(ClientError::Refused { status: StatusCode::NOT_FOUND, .. }) if tried.get() > 1 => {
                 Ok(())
             }
@@ -286,19 +285,19 @@ impl Client {
         }
     }
 
-    /// Does something that may be done twice; the answer's body does not matter.
+    /// Sends an idempotent request without a body; the answer's body is ignored.
     pub(crate) async fn act(&self, path: &str) -> Result<(), ClientError> {
         let path = format!("{BASE}{path}");
         self.send(|| self.request(Method::POST, &path)).await.map(drop)
     }
 
-    /// Replaces something; the answer's body does not matter.
+    /// Replaces a resource; the answer's body is ignored.
     pub(crate) async fn put<B: Serialize>(&self, path: &str, body: &B) -> Result<(), ClientError> {
         let path = format!("{BASE}{path}");
         self.send(|| self.request(Method::PUT, &path).json(body)).await.map(drop)
     }
 
-    /// Changes something to what the body says, which may be tried twice.
+    /// Sends an idempotent change with this body; safe to retry.
     pub(crate) async fn change<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -307,7 +306,7 @@ impl Client {
         self.answer(|| self.request(Method::PATCH, &format!("{BASE}{path}")).json(body)).await
     }
 
-    /// Asks for something that would be made twice if it were tried twice.
+    /// Sends a request that is not idempotent, and therefore never retries.
     pub(crate) async fn once<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -321,8 +320,8 @@ impl Client {
         }
     }
 
-    /// Orders something. However often it is tried, it is done once: `key` says that it is the same
-    /// order.
+    /// Sends an order. Retries are safe: `key` is the idempotency key, so the order is carried out
+    /// once.
     pub(crate) async fn order<B: Serialize, T: DeserializeOwned>(
         &self,
         path: &str,
@@ -337,8 +336,8 @@ impl Client {
         .await
     }
 
-    /// Asks a robot something. Tried once only: the robot may have done what was asked though no
-    /// answer came.
+    /// Sends a request to a robot. Never retried: the robot may have acted although no answer
+    /// arrived.
     pub(crate) async fn ask(&self, robot: &RobotName, ask: &Ask) -> Result<Answer, CommandError> {
         self.once(&format!("/robots/{robot}/ask"), ask)
             .await
@@ -377,8 +376,7 @@ impl Client {
         serde_json::from_slice(&body).map_err(|_| self.not_the_server(status))
     }
 
-    /// Sends until it is answered for good: success, or a refusal that trying again does not
-    /// change.
+    /// Sends until the answer is final: success, or a refusal that a retry does not change.
     pub(crate) async fn send(
         &self,
         request: impl Fn() -> RequestBuilder,
@@ -390,8 +388,8 @@ impl Client {
                 Ok(response) if response.status().is_success() => return Ok(response),
                 Ok(response) => {
                     let (status, wait) = (response.status(), retry_after(&response));
-                    // A server in trouble may be back sooner than it thinks; one that refuses knows
-                    // when it does not.
+                    // A server with a 5xx may recover sooner than its Retry-After says; a
+                    // deliberate refusal knows its own time.
                     let wait = if status.is_server_error() {
                         wait.map(|wait| wait.min(MAX_PAUSE))
                     } else {
@@ -413,7 +411,7 @@ impl Client {
         }
     }
 
-    /// What an answer that is no success says.
+    /// Reads the error out of an unsuccessful response.
     pub(crate) async fn refusal(&self, response: Response) -> ClientError {
         const MAX_ERROR_BYTES: usize = 64 * 1024;
         let status = response.status();
@@ -430,7 +428,7 @@ impl Client {
             let message = status.canonical_reason().unwrap_or("refused").to_lowercase();
             return ClientError::Refused { status, code: status.as_str().to_owned(), message };
         }
-        // A robot's own words may be among the server's.
+        // The server's message may contain a robot's own words.
         let refused = |code: &str, message: &str| ClientError::Refused {
             status,
             code: printable(code),
@@ -449,7 +447,7 @@ impl Client {
     }
 
     pub(crate) fn unreachable(&self, source: reqwest::Error) -> ClientError {
-        // The URL is in our own text; in reqwest's it would only be said twice.
+        // Our own message has the URL; reqwest's would repeat the URL.
         let hint = hint(&self.base, &source);
         ClientError::Unreachable { url: self.base.clone(), hint, source: source.without_url() }
     }
@@ -459,7 +457,7 @@ impl Client {
     }
 }
 
-/// What to try instead where the server was spoken to in the wrong way, as far as its answer tells.
+/// A hint for requests with the wrong scheme, as far as the error shows.
 fn hint(base: &str, error: &reqwest::Error) -> &'static str {
     let causes = std::iter::successors(std::error::Error::source(error), |cause| cause.source());
     let said = causes.map(ToString::to_string).collect::<Vec<_>>().join(": ");
@@ -499,15 +497,15 @@ fn retry_after(response: &Response) -> Option<Duration> {
     Some(Duration::from_secs(seconds))
 }
 
-/// URL and pin of the server that serves from the directory, as it wrote them into there. What one
-/// wrote that was killed since does not count: by now anybody may listen there.
+/// URL and pin that the server of this directory wrote there. The file of a server that was killed
+/// since does not count: another process may listen on its addresses by now.
 fn local_server(data: &Path) -> std::io::Result<Option<(String, Option<CaPin>)>> {
     let addresses = if is_locked(data)? { Addresses::published(data) } else { None };
     Ok(addresses.map(|addresses| (addresses.url(), addresses.ca_pin)))
 }
 
-/// What was said wins, then what runs on this machine, then what was signed in to. Who names a
-/// directory means the server that serves from it and no other.
+/// Explicit options win, then a server on this machine, then the last login. A given directory
+/// means the server of that directory and no other.
 fn find_server(
     connection: &Connection,
     data: Option<&Path>,
@@ -539,14 +537,14 @@ pub(in crate::commands) fn data_directory(connection: &Connection) -> Option<Pat
     named.or_else(|| crate::config::default_data_directory(|name| std::env::var_os(name)))
 }
 
-/// What was said wins, then what was signed in to, then what lies where a server on this machine
-/// would put it.
+/// Explicit options win, then the last login, then the file where a server on this machine would
+/// store the token.
 fn find_token(
     connection: &Connection,
     data: Option<&Path>,
     base: &str,
 ) -> Result<Token, ClientError> {
-    // Of a directory only the server that serves from it is shown the token.
+    // The token in a directory is sent only to the server of that directory.
     let data = data.filter(|data| serves_from(data, base));
     let is_said = connection.token.is_some() || connection.token_file.is_some();
     let names_data = connection.data.is_some() && data.is_some();
@@ -571,7 +569,7 @@ fn find_token(
     text.parse().map_err(|source| ClientError::Token { origin, source })
 }
 
-/// Whether what is reached at `base` is the server that serves from `data`.
+/// Whether the server at `base` is the server of directory `data`.
 fn serves_from(data: &Path, base: &str) -> bool {
     let Ok(Some((local, _))) = local_server(data) else { return false };
     let port =
@@ -588,17 +586,17 @@ fn read_token(path: &Path) -> Result<String, ClientError> {
         .map_err(|source| ClientError::TokenFile { path: path.to_owned(), source })
 }
 
-/// A key for an order that the operator gave none.
+/// An idempotency key for an order without a given one.
 pub(in crate::commands) fn random_key() -> String {
     format!("{:032x}", rand::random::<u128>())
 }
 
-/// Nobody is called that: a mistake in the command.
+/// No robot has this name: a mistake in the command.
 pub(in crate::commands) fn unknown(name: &RobotName) -> CommandError {
     CommandError::Usage(nobody(std::slice::from_ref(name)))
 }
 
-/// Says that no robot has these names.
+/// The error for robot names that do not exist.
 pub(in crate::commands) fn nobody(names: &[RobotName]) -> String {
     let names: Vec<&str> = names.iter().map(RobotName::as_str).collect();
     format!("no robot has the name or id {}", names.join(", "))
@@ -633,7 +631,7 @@ mod tests {
         assert_eq!(refused(StatusCode::BAD_REQUEST, "invalid_request"), Outcome::Usage);
     }
 
-    /// A server that says 503 twice and then tells which keys it was asked with.
+    /// A server that answers 503 twice and then lists the idempotency keys of the requests.
     async fn busy_server() -> std::net::SocketAddr {
         use std::sync::{Arc, Mutex};
 
@@ -664,8 +662,7 @@ mod tests {
         address
     }
 
-    /// Deletes and answers as a proxy does that lost its server; what is deleted is not there any
-    /// more.
+    /// Deletes, then answers as a proxy that lost its server; the deleted resource is gone.
     async fn gone_with_the_answer() -> axum::response::Response {
         use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -753,7 +750,8 @@ mod tests {
         {
             assert!(!finds(Some(other)), "{other}");
         }
-        // Killed, so that its addresses are still there: who listens there now is another.
+        // A killed server leaves its address file behind; any listener there now is another
+        // process.
         drop(server);
         for anyone in [
             None,

@@ -1,5 +1,5 @@
-//! What shells complete live: names that the server knows now. The shell asks the program itself,
-//! so a server that is away or slow must cost little and never a word on the terminal.
+//! Live shell completion: names that the server knows now. The shell runs the program itself, so a
+//! server that is away or slow must cost little time and never print to the terminal.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -19,19 +19,19 @@ use crate::commands::Connection;
 use crate::commands::display::output::{Format, printable};
 use crate::commands::display::view;
 
-/// The variable by which a shell's script says that it wants words completed.
+/// The variable by which a shell's script requests completion.
 pub(in crate::commands) const VARIABLE: &str = "TASKD_COMPLETE";
-/// How long the server may take.
+/// Time limit for the server.
 const PATIENCE: Duration = Duration::from_secs(1);
-/// What stands between the terms of a selector.
+/// Separators between the terms of a selector.
 const BETWEEN_TERMS: [char; 3] = [',', '&', '!'];
 
-/// Completes words and ends the program, if a shell asks for that; else does nothing.
+/// Completes words and ends the program, if a shell requests completion; otherwise does nothing.
 pub fn complete(command_line: fn() -> clap::Command) {
     CompleteEnv::with_factory(command_line).var(VARIABLE).complete();
 }
 
-/// Names and what is said of each.
+/// Names with their descriptions.
 type Candidates = BTreeMap<String, String>;
 
 /// Robots' names.
@@ -110,7 +110,7 @@ pub(in crate::commands) fn users() -> ArgValueCompleter {
     })
 }
 
-/// Ids of one's own access tokens.
+/// Ids of the user's own access tokens.
 pub(in crate::commands) fn tokens() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {
@@ -125,7 +125,7 @@ pub(in crate::commands) fn tokens() -> ArgValueCompleter {
     })
 }
 
-/// Ids of enrolment tokens.
+/// Ids of enrollment tokens.
 pub(in crate::commands) fn enrollment_tokens() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {
@@ -179,7 +179,7 @@ fn terms() -> Option<Candidates> {
     Some(terms)
 }
 
-/// Those of `find`'s names that begin as `current` does; none when they can't be had.
+/// Those of `find`'s names that begin with `current`; empty if the lookup fails.
 fn candidates(
     current: &OsStr,
     find: impl FnOnce(&str) -> Option<Candidates>,
@@ -187,7 +187,7 @@ fn candidates(
     let Some(text) = current.to_str() else { return Vec::new() };
     let found =
         find(text).unwrap_or_default().into_iter().filter(|(name, _)| name.starts_with(text));
-    // A robot or a package may have chosen the words.
+    // The words may come from a robot or a package.
     let candidate = |(name, help): (String, String)| {
         let help = (!help.is_empty()).then(|| printable(&help).into());
         CompletionCandidate::new(printable(&name)).help(help)
@@ -199,7 +199,7 @@ fn get<T: DeserializeOwned + Send + 'static>(path: &'static str) -> Option<T> {
     ask(async move |client| client.get(path, &[]).await.ok())
 }
 
-/// Asks the server that the words on the command line mean, for a second at the most.
+/// Sends a request to the server given on the command line, with a time limit of one second.
 fn ask<T, F>(question: impl FnOnce(Client) -> F) -> Option<T>
 where
     F: Future<Output = Option<T>>,
@@ -207,12 +207,12 @@ where
     let client = Client::connect(&connection(std::env::args())).ok()?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().ok()?;
     let answer = runtime.block_on(async { tokio::time::timeout(PATIENCE, question(client)).await });
-    // A name that is being resolved on another thread is not waited for.
+    // Does not wait for a name lookup on another thread.
     runtime.shutdown_background();
     answer.ok().flatten()
 }
 
-/// The options of a command line that is not finished, and what the environment says.
+/// The options of an incomplete command line, and the environment.
 fn connection(words: impl Iterator<Item = String>) -> Connection {
     let words: Vec<String> = words.collect();
     let option = |name: &str| {

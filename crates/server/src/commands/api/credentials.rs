@@ -1,5 +1,5 @@
-//! Credentials of `taskd login`, in a file that only its owner may read, by server. They are made
-//! and ended elsewhere.
+//! Credentials of `taskd login`, in a file that only its owner may read, by server. The credentials
+//! are created and ended elsewhere.
 
 use std::collections::BTreeMap;
 use std::fs::{DirBuilder, OpenOptions};
@@ -13,17 +13,17 @@ use task_proto::token::Token;
 
 use crate::commands::CommandError;
 
-/// The token that is kept for the server at `base`.
+/// The stored token for the server at `base`.
 pub(in crate::commands) fn kept_token(base: &str) -> Option<Token> {
     Kept::read(&path()?).ok()?.servers.remove(base)?.parse().ok()
 }
 
-/// The pin that was given when somebody signed in to the server at `base`.
+/// The pin from the login to the server at `base`.
 pub(in crate::commands) fn kept_pin(base: &str) -> Option<CaPin> {
     Kept::read(&path()?).ok()?.pins.remove(base)
 }
 
-/// The server that was signed in to last, unless it was signed out of.
+/// The server of the last login, unless that login was signed out.
 pub(in crate::commands) fn last_server() -> Option<String> {
     Kept::read(&path()?).ok()?.last
 }
@@ -35,12 +35,12 @@ pub(in crate::commands) struct Kept {
     /// The pins that were given with them.
     #[serde(default)]
     pub(in crate::commands) pins: BTreeMap<String, CaPin>,
-    /// The server that is meant where none is named.
+    /// The default server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(in crate::commands) last: Option<String>,
 }
 
-/// Where the credentials are kept, if there is a place for them.
+/// Path of the credentials file, if the environment defines one.
 pub(in crate::commands) fn path() -> Option<PathBuf> {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let base = set("XDG_CONFIG_HOME").or_else(|| set("HOME").map(|home| home.join(".config")))?;
@@ -48,7 +48,7 @@ pub(in crate::commands) fn path() -> Option<PathBuf> {
 }
 
 impl Kept {
-    /// What is kept; nothing where there is no file yet.
+    /// The stored credentials; empty if there is no file yet.
     pub(in crate::commands) fn read(path: &Path) -> Result<Self, CommandError> {
         let failed =
             |source| CommandError::Io { what: format!("can't read {}", path.display()), source };
@@ -59,7 +59,7 @@ impl Kept {
         }
     }
 
-    /// Only its owner may read it; it is there whole or not at all.
+    /// The file is readable by its owner only, and written atomically.
     pub(in crate::commands) fn write(&self, path: &Path) -> Result<(), CommandError> {
         let written = || {
             let directory = path.parent().unwrap_or(Path::new("."));

@@ -1,4 +1,4 @@
-//! Fetches a blob into a file that is there whole and proven, or not at all.
+//! Downloads a blob into a file that is complete and verified, or absent.
 
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
@@ -13,13 +13,13 @@ use tokio::time::timeout;
 
 use crate::commands::{CommandError, Session};
 
-/// The longest the server may say nothing in the middle of a file.
+/// The longest pause of the server in the middle of a file.
 const SILENCE: Duration = Duration::from_secs(60);
-/// The longest one file may take.
+/// Time limit for one file.
 const LONGEST: Duration = Duration::from_secs(24 * 60 * 60);
 
-/// The bytes at `url` in a new file in `directory`, which is gone with its handle unless it is put
-/// somewhere.
+/// The bytes at `url` in a new file in `directory`, which is deleted with its handle unless the
+/// file is persisted.
 pub(in crate::commands) async fn download(
     session: &Session,
     url: &str,
@@ -30,12 +30,12 @@ pub(in crate::commands) async fn download(
         what: format!("can't write to {}", directory.display()),
         source,
     };
-    // As any new file of this person, once it is whole.
+    // The permissions of a normal new file of this user, once the file is complete.
     let readable = std::fs::Permissions::from_mode(0o666);
     let file =
         tempfile::Builder::new().permissions(readable).tempfile_in(directory).map_err(failed)?;
     let mut writer = tokio::fs::File::from_std(file.reopen().map_err(failed)?);
-    // A large file may take long, as long as it goes on.
+    // A large file may take long, as long as the transfer makes progress.
     let mut response =
         session.client.send(|| session.client.request(Method::GET, url).timeout(LONGEST)).await?;
     let mut hash = Sha256::new();
@@ -59,7 +59,7 @@ pub(in crate::commands) async fn download(
     Ok(file)
 }
 
-/// Puts what was fetched in its place, where it replaces what is there.
+/// Moves the downloaded file to its place, replacing an existing file.
 pub(in crate::commands) fn put(file: NamedTempFile, path: &Path) -> Result<(), CommandError> {
     let failed =
         |source| CommandError::Io { what: format!("can't write {}", path.display()), source };

@@ -1,5 +1,5 @@
-//! Owns how commands ask the server, from credentials to uploads and waiting; it never decides what
-//! to ask for.
+//! Owns the requests of commands to the server, from credentials to uploads and waiting; it never
+//! decides which requests to send.
 
 pub(super) mod client;
 pub(super) mod complete;

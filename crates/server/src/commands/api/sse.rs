@@ -6,7 +6,7 @@ use serde::de::DeserializeOwned;
 /// The largest event that is read.
 const MAX_EVENT_BYTES: usize = 1024 * 1024;
 
-/// The events of one answer.
+/// The event stream of one response.
 pub(in crate::commands) struct Events {
     response: Response,
     buffer: Vec<u8>,
@@ -17,8 +17,8 @@ impl Events {
         Self { response, buffer: Vec::new() }
     }
 
-    /// The next event of this type; others are passed over. `None` at the end, or when an event is
-    /// too large. Cancel-safe: what was read stays in the buffer.
+    /// The next event of this type; others are skipped. `None` at the end, or when an event is too
+    /// large. Cancel-safe: bytes already read stay in the buffer.
     pub(in crate::commands) async fn next<T: DeserializeOwned>(
         &mut self,
     ) -> Result<Option<T>, reqwest::Error> {
@@ -38,7 +38,7 @@ impl Events {
     }
 }
 
-/// Takes the data of the first whole event out of `buffer`; empty if it has none.
+/// Takes the data of the first whole event out of `buffer`; empty if the event has none.
 fn take_event(buffer: &mut Vec<u8>) -> Option<Vec<u8>> {
     let end = buffer.windows(2).position(|pair| pair == b"\n\n")?;
     let event: Vec<u8> = buffer.drain(..end + 2).collect();

@@ -1,5 +1,5 @@
-//! Brings a package's blobs and manifest to the server's OCI store. What is there already is not
-//! sent again, and a blob streams from its file.
+//! Uploads a package's blobs and manifest to the server's OCI store. Blobs that the server has are
+//! not sent again, and a blob streams from its file.
 
 use std::path::Path;
 
@@ -18,13 +18,13 @@ use crate::commands::display::output::{bytes, say};
 use crate::commands::display::progress;
 use crate::package::Packed;
 
-/// How often a blob's upload is begun.
+/// How often a blob's upload is tried.
 const UPLOAD_TRIES: u32 = 4;
-/// How long a manifest's answer may take: the server reads a package's whole archive before it.
+/// Time limit for the answer to a manifest: the server reads a package's whole archive first.
 const MANIFEST_TIMEOUT: std::time::Duration = std::time::Duration::from_secs(11 * 60);
 /// An upload slower than this is given up.
 const MIN_BYTES_PER_SECOND: u64 = 16 * 1024;
-/// How much is read from the file at once.
+/// Bytes read from the file at a time.
 const CHUNK_BYTES: usize = 256 * 1024;
 
 /// A blob's bytes, in memory or in a file.
@@ -33,16 +33,17 @@ enum Source<'a> {
     File(&'a Path),
 }
 
-/// What is uploaded of a package.
+/// The parts of a package to upload.
 pub(in crate::commands) struct Upload<'a> {
     pub(in crate::commands) package: &'a PackageRef,
     pub(in crate::commands) config: &'a [u8],
     pub(in crate::commands) manifest: &'a [u8],
-    /// Absent: the server has it.
+    /// Absent: the server has the content.
     pub(in crate::commands) content: Option<&'a Path>,
-    /// Whether its version means it from now on; else it goes by its digest alone.
+    /// Whether the version becomes a tag of this package; otherwise the package is known only by
+    /// its digest.
     pub(in crate::commands) tagged: bool,
-    /// Whether it may take its version from a package with other content.
+    /// Whether the upload may take the version from a package with other content.
     pub(in crate::commands) force: bool,
 }
 
@@ -61,7 +62,7 @@ impl<'a> Upload<'a> {
     }
 }
 
-/// Uploads what the server lacks, and says how much that was.
+/// Uploads the missing parts, and reports the number of bytes sent.
 pub(in crate::commands) async fn upload(
     client: &Client,
     upload: &Upload<'_>,
@@ -95,7 +96,7 @@ pub(in crate::commands) async fn upload(
     Ok(())
 }
 
-/// Uploads a signed document, about `subject` or on its own. The same twice is the same.
+/// Uploads a signed document, about `subject` or on its own. The upload is idempotent.
 pub(in crate::commands) async fn upload_signed(
     client: &Client,
     repository: &RepositoryName,
@@ -150,8 +151,8 @@ async fn upload_blob(
     let mut tried = 0;
     loop {
         tried += 1;
-        // Each try is an upload of its own: the server collects what a broken one left, and forgets
-        // all when it restarts.
+        // Each try is a separate upload: the server collects the remains of a broken one, and
+        // forgets all uploads when it restarts.
         let session = client
             .send(|| client.request(Method::POST, &format!("/v2/{name}/blobs/uploads/")))
             .await?;
@@ -195,12 +196,13 @@ fn is_final(status: StatusCode) -> bool {
     )
 }
 
-/// Where the server wants the bytes: its `Location`, relative or absolute, with the digest added.
+/// The URL for the upload's bytes: the server's `Location`, relative or absolute, with the digest
+/// added.
 fn target(client: &Client, session: &Response, blob: BlobRef) -> Result<String, ClientError> {
     let location = session.headers().get(LOCATION).and_then(|value| value.to_str().ok());
     let location = location
         .and_then(|location| session.url().join(location).ok())
-        // The token goes nowhere but to the server it is for.
+        // The token is sent to its own server only.
         .filter(|url| url.origin() == session.url().origin());
     let mut url = location.ok_or_else(|| client.not_the_server(session.status()))?;
     url.query_pairs_mut().append_pair("digest", &blob.digest.to_string());
@@ -222,8 +224,8 @@ async fn body(source: &Source<'_>, size: u64) -> Result<Body, CommandError> {
     }
 }
 
-/// A version that is there with other content is refused before anything travels; the server has
-/// the last word.
+/// Refuses a version that exists with other content before any upload; the server's own check
+/// decides in the end.
 async fn check_version(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
     let package = upload.package;
     if !upload.tagged {
@@ -259,8 +261,7 @@ fn digest_of(response: &Response) -> Option<String> {
         .map(ToOwned::to_owned)
 }
 
-/// Puts the manifest, under the version as its tag unless it is to go by its digest, if it is not
-/// there already.
+/// Puts the manifest, unless the server has it: under its version as the tag, or under its digest.
 async fn put_manifest(client: &Client, upload: &Upload<'_>) -> Result<(), CommandError> {
     let Upload { package, manifest, tagged, force, .. } = upload;
     let reference =
@@ -298,7 +299,7 @@ mod tests {
     use crate::commands::Connection;
     use crate::commands::display::output::Format;
 
-    /// A server that forgets the first upload, as one that restarts does, and refuses all of the
+    /// A server that forgets the first upload, as after a restart, and refuses all uploads of the
     /// package `refused`.
     async fn forgetful_server(puts: Arc<AtomicU32>) -> std::net::SocketAddr {
         let begin = |axum::extract::Path(name): axum::extract::Path<String>| async move {

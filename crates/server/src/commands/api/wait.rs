@@ -1,6 +1,6 @@
-//! `--wait`: follows a deployment until every robot has settled or the time is over, and judges how
-//! it went. It asks the server again and again, so a server that restarts meanwhile costs time and
-//! nothing else.
+//! `--wait`: follows a deployment until every robot has settled or the time limit is reached, and
+//! determines the exit code. The command polls the server, so a restart of the server costs only
+//! time.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -15,14 +15,14 @@ use crate::commands::display::progress::DeploymentProgress;
 use crate::commands::display::view;
 use crate::commands::{CommandError, Outcome, Session};
 
-/// The first pause between two looks; it doubles while nothing changes.
+/// The first pause between two polls; the pause doubles while nothing changes.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 /// The longest pause.
 pub(in crate::commands) const MAX_PAUSE: Duration = Duration::from_secs(1);
 /// Robots named in one line of the verdict.
 const MAX_NAMES: usize = 20;
 
-/// Waits, then prints the deployment and the reasons of every robot that did not make it.
+/// Waits, then prints the deployment and the reasons of every robot that failed.
 pub(in crate::commands) async fn until_settled(
     session: &Session,
     id: &DeploymentId,
@@ -49,8 +49,8 @@ pub(in crate::commands) async fn until_settled(
     Ok(verdict.outcome)
 }
 
-/// Looks at the deployment until it is over or the time is; how it stood last, if the server has
-/// said it.
+/// Polls the deployment until it is over or the time limit is reached; returns its last known
+/// state.
 async fn follow(
     session: &Session,
     id: &DeploymentId,
@@ -88,8 +88,8 @@ async fn look(session: &Session, id: &DeploymentId) -> Result<DeploymentView, Cl
     session.client.get(&format!("/deployments/{id}"), &[]).await
 }
 
-/// Whether the server may answer if it is asked again: it is restarting, or something stands before
-/// it that is not it.
+/// Whether the server may answer a retry: the server is restarting, or a proxy in front of the
+/// server answered.
 pub(in crate::commands) fn may_pass(error: &ClientError) -> bool {
     match error {
         ClientError::Refused { status, .. } | ClientError::NotTheServer { status, .. } => {
@@ -105,7 +105,7 @@ fn is_over(view: &DeploymentView) -> bool {
     let mut assignments = view.assignments.iter().flatten();
     match view.state {
         DeploymentState::Cancelled => true,
-        // What is not released stays so until somebody resumes it.
+        // A paused rollout stays paused until a user resumes the deployment.
         DeploymentState::Paused => {
             assignments.all(|a| !a.released || a.phase.is_settled(view.kind))
         }
@@ -120,7 +120,7 @@ struct Verdict {
     text: String,
 }
 
-/// How it went: counts, and a line for each robot that did not make it.
+/// The verdict: counts, and a line for each robot that failed.
 fn judge(view: &DeploymentView) -> Verdict {
     let assignments = view.assignments.as_deref().unwrap_or_default();
     let (settled, open): (Vec<_>, Vec<_>) =
@@ -158,7 +158,7 @@ fn judge(view: &DeploymentView) -> Verdict {
     Verdict { outcome, text }
 }
 
-/// Robots that did not make it, those with one reason together, the most common first.
+/// Robots that failed, grouped by reason, the most common reason first.
 fn by_reason(assignments: &[&AssignmentView]) -> Vec<String> {
     let mut reasons: BTreeMap<String, Vec<&AssignmentView>> = BTreeMap::new();
     for assignment in assignments {

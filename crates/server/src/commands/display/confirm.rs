@@ -1,4 +1,5 @@
-//! Asks before many robots are changed, and before what can't be undone. It decides nothing else.
+//! Asks for confirmation before many robots are changed, and before irreversible actions. The
+//! module decides nothing else.
 
 use std::io::IsTerminal as _;
 
@@ -8,7 +9,7 @@ use crate::commands::CommandError;
 /// Up to this many robots an order is carried out without asking.
 const ASK_ABOVE: usize = 10;
 
-/// Whether the order may go on: it means few robots, `--yes` was given, or the person at the
+/// Whether the order may go on: the order affects few robots, `--yes` was given, or the user at the
 /// terminal agrees.
 pub(in crate::commands) fn confirm(
     what: &str,
@@ -26,7 +27,7 @@ pub(in crate::commands) fn confirm(
     ask(&format!("{what} means {robots} robots. Go on? [y/N]"))
 }
 
-/// The same for what can't be undone, however few are meant.
+/// Confirmation of an irreversible action, for any number of robots.
 pub(in crate::commands) fn always(what: &str, yes: bool) -> Result<(), CommandError> {
     if yes {
         return Ok(());

@@ -1,5 +1,5 @@
-//! How a deployment goes on: what has travelled, how fast, and when it will have. Pure: time comes
-//! in.
+//! Progress of a deployment: bytes transferred, rate, and remaining time. Pure: time is a
+//! parameter.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -10,35 +10,36 @@ use task_proto::time::span;
 
 use super::output::bytes;
 
-/// How far back the speed is measured.
+/// The time window of the rate.
 const WINDOW: Duration = Duration::from_secs(10);
 /// A speed over less time would be a guess.
 const MIN_WINDOW: Duration = Duration::from_secs(1);
 
-/// What was seen of a deployment lately.
+/// Recent observations of a deployment.
 #[derive(Debug, Default)]
 pub(in crate::commands) struct Course {
     seen: VecDeque<(Duration, u64)>,
 }
 
-/// How it goes on.
+/// Progress and forecast.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::commands) struct Estimate {
     /// Bytes that robots have.
     pub(in crate::commands) done: u64,
-    /// Bytes that all of them need who may still get them.
+    /// Bytes needed by all robots that may still receive them.
     pub(in crate::commands) total: u64,
-    /// Bytes a second lately; absent: nothing travels, or it is too early to say.
+    /// Current bytes per second; absent: nothing is being transferred, or there are too few
+    /// observations.
     pub(in crate::commands) bytes_per_s: Option<u64>,
-    /// Until the last byte, if it goes on so.
+    /// Time until the last byte at the current rate.
     pub(in crate::commands) left: Option<Duration>,
 }
 
 impl Course {
-    /// Takes down where the deployment stands at `now`, a time since whenever.
+    /// Records the deployment's state at `now`, a time since any fixed origin.
     pub(in crate::commands) fn look(&mut self, view: &DeploymentView, now: Duration) -> Estimate {
         let (done, total) = travelled(view);
-        // A robot may have to begin again.
+        // A robot may have to restart its transfer.
         if self.seen.back().is_some_and(|(_, before)| *before > done) {
             self.seen.clear();
         }
@@ -66,7 +67,7 @@ fn travelled(view: &DeploymentView) -> (u64, u64) {
             Phase::Fetching => assignment.progress.map_or(0, |progress| progress.done.min(size)),
             Phase::Unpacking | Phase::Building | Phase::Staged | Phase::Starting => size,
             Phase::Running | Phase::Succeeded | Phase::Stopped | Phase::RolledBack => size,
-            // Whatever it got, no more is to come.
+            // A failed robot receives no more bytes.
             Phase::Failed
             | Phase::Unmet
             | Phase::Superseded
@@ -167,7 +168,7 @@ pub(in crate::commands) mod tests {
         assert_eq!(course.look(&view(&[0, 0]), at(0)).text(), "0 B of 1.95 KiB");
         let estimate = course.look(&view(&[200, 0]), at(2));
         assert_eq!((estimate.bytes_per_s, estimate.left), (Some(100), Some(at(18))));
-        // What was 30 s ago no longer counts.
+        // Observations from 30 s ago no longer count.
         course.look(&view(&[200, 300]), at(30));
         let estimate = course.look(&view(&[300, 300]), at(40));
         assert_eq!(estimate.bytes_per_s, Some(10));

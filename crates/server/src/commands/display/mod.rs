@@ -1,4 +1,4 @@
-//! Owns what people see and are asked at the terminal; it never asks the server.
+//! Owns the output and the questions at the terminal; it never asks the server.
 
 pub(super) mod confirm;
 pub(super) mod course;

@@ -1,5 +1,5 @@
-//! Reads passwords: from the terminal, which does not show them, or from standard input. They are
-//! never arguments or variables, and never printed.
+//! Reads passwords: from the terminal without echo, or from standard input. Passwords are never
+//! arguments or variables, and never printed.
 
 use std::io::{self, BufRead as _, IsTerminal as _};
 
@@ -31,7 +31,7 @@ impl Secret {
     }
 }
 
-/// Asks for a password that is known.
+/// Asks for an existing password.
 pub(in crate::commands) fn ask(from_stdin: bool, what: &str) -> Result<Secret, CommandError> {
     if !from_stdin && !io::stdin().is_terminal() {
         return Err(CommandError::Usage(format!(
@@ -57,7 +57,7 @@ pub(in crate::commands) fn ask(from_stdin: bool, what: &str) -> Result<Secret, C
     Ok(Secret(text.to_owned()))
 }
 
-/// Asks for one that is new, at a terminal twice.
+/// Asks for a new password, at a terminal twice.
 pub(in crate::commands) fn new_one(from_stdin: bool, what: &str) -> Result<Secret, CommandError> {
     let first = ask(from_stdin, what)?;
     if !from_stdin && ask(false, "once more")?.0 != first.0 {
@@ -66,7 +66,7 @@ pub(in crate::commands) fn new_one(from_stdin: bool, what: &str) -> Result<Secre
     Ok(first)
 }
 
-/// A terminal that shows nothing of what is typed until this is dropped.
+/// A terminal without echo until this value is dropped.
 struct Quiet(Option<Termios>);
 
 impl Quiet {

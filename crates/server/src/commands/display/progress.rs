@@ -1,5 +1,5 @@
-//! Progress on stderr: a bar per robot for a few robots, one bar for many, plain lines where nobody
-//! sees bars move.
+//! Progress on stderr: a bar per robot for a few robots, one bar for many, plain lines without a
+//! terminal.
 
 use std::collections::HashMap;
 
@@ -32,7 +32,7 @@ pub(in crate::commands) fn upload_bar(size: u64) -> ProgressBar {
     bar
 }
 
-/// Follows one deployment.
+/// Progress display of one deployment.
 pub(in crate::commands) struct DeploymentProgress {
     bars: MultiProgress,
     moving: bool,
@@ -60,7 +60,7 @@ impl DeploymentProgress {
         }
     }
 
-    /// Shows where the deployment stands now.
+    /// Shows the deployment's present state.
     pub(in crate::commands) fn show(&mut self, view: &DeploymentView) {
         let assignments = view.assignments.as_deref().unwrap_or_default();
         self.show_bytes(view);
@@ -73,7 +73,7 @@ impl DeploymentProgress {
         }
     }
 
-    /// How much has travelled, how fast, and for how long it will; only where somebody looks.
+    /// Shows transferred bytes, rate and remaining time; only on a terminal.
     fn show_bytes(&mut self, view: &DeploymentView) {
         let estimate = self.course.look(view, self.since.elapsed());
         if !self.moving || estimate.total == 0 {
@@ -138,7 +138,7 @@ impl DeploymentProgress {
         bar.set_message(text);
     }
 
-    /// Takes the bars away, so that the result stands alone.
+    /// Removes the bars, so that the result stands alone.
     pub(in crate::commands) fn finish(self) {
         for bar in self.robots.into_values().chain(self.summary).chain(self.bytes) {
             bar.finish_and_clear();

@@ -1,6 +1,6 @@
-//! Which log lines were printed, so that the past and the stream, which overlap, show each line
-//! once. The robot names no line by a number: a line is its time and its words, and two alike are
-//! two.
+//! Tracks printed log lines, so that the past and the stream, which overlap, show each line once.
+//! Robots do not number lines: a line is identified by its time and text, and two identical lines
+//! count as two.
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::{HashMap, VecDeque};
@@ -21,14 +21,14 @@ pub(in crate::commands) struct Shown {
 
 #[derive(Default)]
 struct Counts {
-    /// How many like this were printed.
+    /// Number of such lines printed.
     printed: u32,
-    /// How many came by the stream.
+    /// Number of such lines received by the stream.
     streamed: u32,
 }
 
 impl Shown {
-    /// Whether a line that came by the stream is to be printed: the past has not had it.
+    /// Whether to print a line from the stream: false if the past already contained the line.
     pub(in crate::commands) fn streamed(&mut self, line: &LogLine) -> bool {
         let counts = self.counts(line);
         counts.streamed += 1;
@@ -40,12 +40,12 @@ impl Shown {
         is_new
     }
 
-    /// Those lines of the past that were not printed and come after what was.
+    /// The past lines that were not printed and come after the printed ones.
     pub(in crate::commands) fn missing(&mut self, past: &[LogLine]) -> Vec<LogLine> {
         let is_known =
             |line: &LogLine| self.counts.get(&key(line)).is_some_and(|counts| counts.printed > 0);
         let newest_ms = self.newest_ms;
-        // Before the first that was printed lies what nobody asked for.
+        // Lines before the first printed one were not requested.
         let begin = past.iter().position(is_known);
         let begin = begin
             .or_else(|| past.iter().position(|line| line.at_ms > newest_ms))
@@ -80,7 +80,8 @@ impl Shown {
     }
 }
 
-/// What a node says both on its topic and on its standard error is one line, whichever comes.
+/// A node's message that appears both on its topic and on its standard error counts as one line, in
+/// either order.
 fn key(line: &LogLine) -> u64 {
     let mut hasher = DefaultHasher::new();
     (line.at_ms, line.level, &line.task, &line.node, &line.text).hash(&mut hasher);

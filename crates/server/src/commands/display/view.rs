@@ -1,5 +1,4 @@
-//! How deployments and robots look to a person at the terminal. Text only; what is shown was asked
-//! for elsewhere.
+//! Formats deployments and robots for the terminal. Text only; the caller has requested the data.
 
 use std::collections::BTreeMap;
 
@@ -15,9 +14,9 @@ use super::output::{self, robots, time};
 use crate::commands::{CommandError, Session};
 use crate::domain::delivery::{FELL_BEHIND, ORDERED};
 
-/// Reasons for waiting that are shown; a gate may give each robot one of its own.
+/// Maximum number of reasons for waiting shown; a gate may give each robot a different reason.
 const MAX_REASONS: usize = 5;
-/// Robots that are named in one fact.
+/// Maximum number of robots named in one fact.
 const MAX_NAMES: usize = 20;
 
 /// A deployment's state, in a word.
@@ -30,7 +29,7 @@ pub(in crate::commands) fn state(state: DeploymentState) -> &'static str {
     }
 }
 
-/// How many robots stand in which phase, on one line.
+/// Number of robots in each phase, on one line.
 pub(in crate::commands) fn phases(view: &DeploymentView) -> String {
     let phases: Vec<_> =
         view.counts.iter().map(|count| format!("{}:{}", count.phase, count.count)).collect();
@@ -45,7 +44,7 @@ pub(in crate::commands) fn print(
     print_with(session, view, &COLUMNS)
 }
 
-/// The same; it also says of each robot how its bytes travel.
+/// Prints the deployment, with each robot's delivery mechanism.
 pub(in crate::commands) fn print_deliveries(
     session: &Session,
     view: &DeploymentView,
@@ -125,7 +124,7 @@ fn describe(view: &DeploymentView) -> String {
     output::facts(facts)
 }
 
-/// How the bytes travel to how many robots and why, the most common way first.
+/// Numbers of robots by delivery mechanism and reason, the most common first.
 fn mechanisms(assignments: &[AssignmentView]) -> Vec<String> {
     let mut ways: BTreeMap<(Delivery, &str), Vec<&str>> = BTreeMap::new();
     for decision in assignments.iter().filter_map(|assignment| assignment.delivery.as_ref()) {
@@ -149,11 +148,11 @@ fn mechanisms(assignments: &[AssignmentView]) -> Vec<String> {
 }
 
 fn rule_shown(rule: &str) -> String {
-    // The first two are no rules of anybody.
+    // The first two are no configured rules.
     if matches!(rule, ORDERED | FELL_BEHIND) { rule.to_owned() } else { format!("rule {rule:?}") }
 }
 
-/// How the bytes travel to one robot and why.
+/// One robot's delivery mechanism and its reason.
 fn way(delivery: Option<&DeliveryDecision>) -> String {
     let shown = |decision: &DeliveryDecision| {
         format!("{}: {}, {}", decision.mechanism, rule_shown(&decision.rule), decision.because)
@@ -161,7 +160,7 @@ fn way(delivery: Option<&DeliveryDecision>) -> String {
     delivery.map_or_else(|| "-".to_owned(), shown)
 }
 
-/// How many robots wait for what, the most common reason first.
+/// Numbers of waiting robots by reason, the most common reason first.
 fn deferred(assignments: &[AssignmentView]) -> Vec<String> {
     let mut counts: BTreeMap<&str, u64> = BTreeMap::new();
     for assignment in assignments.iter().filter(|assignment| assignment.phase == Phase::Deferred) {
@@ -205,7 +204,7 @@ fn assignment_row(assignment: &AssignmentView) -> Vec<String> {
     ]
 }
 
-/// Lists the robots an order means.
+/// Lists the robots that an order selects.
 pub(in crate::commands) fn print_matched(
     session: &Session,
     matched: &MatchedRobots,

@@ -1,6 +1,6 @@
-//! `taskd key`: publishers' keys, which never leave their machine, and the list of the publishers
-//! that robots trust. A list is drafted, signed by as many keepers as it takes, each where their
-//! key is, and published.
+//! `taskd key`: publishers' keys, which never leave their machine, and the list of publishers that
+//! robots trust. A list is drafted, signed by the required number of keepers, each on the machine
+//! with their key, and published.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -84,7 +84,7 @@ pub struct Draft {
     lifetime: Duration,
 }
 
-/// A key as it is printed.
+/// The printed form of a key.
 #[derive(Serialize)]
 struct KeyView {
     id: String,
@@ -162,7 +162,7 @@ fn print_key(output: &Output, key: PublicKey) -> Result<(), CommandError> {
     output.described(&KeyView { id: key.id(), key }, |view| view.id.to_string(), text)
 }
 
-/// The newest list on the server, as it says; robots find out themselves whether it may count.
+/// The newest list according to the server; robots check its validity themselves.
 async fn newest(client: &Client) -> Result<Option<PublisherList>, CommandError> {
     let tags: Tags = match client.read(&format!("/v2/{LIST_REPOSITORY}/tags/list")).await {
         Ok(tags) => tags,
@@ -184,7 +184,7 @@ async fn newest(client: &Client) -> Result<Option<PublisherList>, CommandError> 
     list.map(Some).map_err(|error| CommandError::Usage(format!("{what}: {error}")))
 }
 
-/// The list after `newest` that the command line asks for.
+/// The list after `newest`, with the changes of the command line.
 fn drafted(
     draft: &Draft,
     newest: Option<PublisherList>,
@@ -214,7 +214,7 @@ fn drafted(
     })
 }
 
-/// A role by its two options; what is not given is as `before`.
+/// A role from its two options; absent options keep their value from `before`.
 fn role(
     (keys_option, threshold_option): (&str, &str),
     keys: &[String],

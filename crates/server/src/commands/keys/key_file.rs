@@ -1,5 +1,5 @@
-//! A publisher's key on the disk: a file for its owner alone, and beside it one that everybody may
-//! read. The server never sees the first.
+//! A publisher's key pair on disk: a private file readable by its owner only, and beside it a
+//! public file. The server never sees the private file.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _, Write as _};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use task_proto::digest::{hex, unhex};
 use task_proto::envelope::{PublicKey, SigningKey};
 
-/// What a file with a private key begins with, so that whoever looks for lost secrets finds it.
+/// First bytes of a private key file, so that secret scanners find the file.
 const PRIVATE: &str = "taskd-private-key ed25519 ";
 /// More than either file has.
 const MAX_BYTES: u64 = 4096;
@@ -17,35 +17,35 @@ const MAX_BYTES: u64 = 4096;
 /// Why a key can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum KeyError {
-    /// The file can't be made or read.
+    /// The file can't be created or read.
     #[error("{} can't be used", path.display())]
     Io {
-        /// Which.
+        /// The file's path.
         path: PathBuf,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
-    /// Others than its owner may read a private key, or write it.
+    /// Accounts other than its owner can read or write a private key.
     #[error("{} has mode {mode:03o}: a private key is for its owner alone (chmod 600)", path.display())]
     Exposed {
         /// The file.
         path: PathBuf,
-        /// Its permissions.
+        /// The file's permissions.
         mode: u32,
     },
-    /// It holds something else.
+    /// The file is not a private key.
     #[error("{} holds no private key; taskd key new makes one", path.display())]
     NotPrivate {
         /// The file.
         path: PathBuf,
     },
-    /// Neither a public key nor a file with one.
+    /// Neither a public key nor a file with a public key.
     #[error("{0:?} is neither a public key nor a file with one")]
     NotPublic(String),
 }
 
-/// Makes a key: the private half at `path`, the public one at `path` and `.pub`. Nothing that is
-/// there is replaced.
+/// Creates a key: the private half at `path`, the public half at `path` and `.pub`. Existing files
+/// are never replaced.
 pub fn create(path: &Path) -> Result<PublicKey, KeyError> {
     let key = SigningKey::random();
     let private = format!("{PRIVATE}{}\n", hex(&key.to_bytes()));
@@ -53,7 +53,7 @@ pub fn create(path: &Path) -> Result<PublicKey, KeyError> {
     write_new(path, &private, 0o600)?;
     let written = write_new(&public_path(path), &format!("{public}\n"), 0o644);
     if written.is_err() {
-        // Half a key is of no use, and nobody has it yet.
+        // Half a key pair is of no use, and nothing uses the key yet.
         let _ = std::fs::remove_file(path);
     }
     written.map(|()| public)
@@ -74,7 +74,7 @@ pub fn read(path: &Path) -> Result<SigningKey, KeyError> {
     Ok(SigningKey::from_bytes(seed))
 }
 
-/// A public key as people name it: its text, or a file that holds it, or the private key beside
+/// A public key from an argument: the key's text, a file with the key, or the private key beside
 /// such a file.
 pub fn public(text: &str) -> Result<PublicKey, KeyError> {
     let from_file = |path: &Path| {

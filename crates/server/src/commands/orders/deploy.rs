@@ -133,7 +133,7 @@ pub(in crate::commands) async fn run(
     Ok(Outcome::Succeeded)
 }
 
-/// The newest deployments, as many as were asked for; the server gives them a page at a time.
+/// The newest deployments, up to the limit; the server returns them in pages.
 async fn newest(session: &Session, limit: u32) -> Result<DeploymentList, CommandError> {
     let mut list = DeploymentList::default();
     loop {

@@ -124,12 +124,11 @@ pub(in crate::commands) async fn run(
     // signature on the server.
     let keys = push.keys.iter().map(|path| key_file::read(path)).collect::<Result<Vec<_>, _>>()?;
     let matched = match &push.to {
-        // An order that may have been carried out before is known to the server, also where its
-        // robots are gone.
+        // The server knows an order that may be a repetition, even if its robots are gone.
         Some(selector) if push.idempotency_key.is_some() && !push.dry_run => {
             Some(selection::named(selection::matching(session, selector).await?.robots))
         }
-        // None at all is a mistake in the command, noticed before anything travels.
+        // An empty selection is a mistake in the command, noticed before any upload.
         Some(selector) => Some(selection::matched(session, selector).await?),
         None => None,
     };
@@ -182,7 +181,7 @@ pub(in crate::commands) async fn run(
     wait::until_settled(session, &ordered.id, push.timeout).await
 }
 
-/// Says on which robots a new deployment has found its package running.
+/// Reports the robots on which a new deployment found its package running.
 pub(in crate::commands) fn say_running(ordered: &DeploymentView) {
     const MAX_NAMES: usize = 5;
     let assignments = ordered.assignments.as_deref().unwrap_or_default();
@@ -196,7 +195,7 @@ pub(in crate::commands) fn say_running(ordered: &DeploymentView) {
     }
 }
 
-/// Puts what publishers say of the package beside it.
+/// Stores the publishers' signatures of the package beside the package.
 pub(in crate::commands) async fn sign(
     session: &Session,
     package: &PackageRef,
@@ -243,7 +242,7 @@ pub(in crate::commands) async fn pack(
     Ok(Outcome::Succeeded)
 }
 
-/// What the package goes by in other commands.
+/// The package's name in other commands.
 fn reference(package: &PackageRef) -> String {
     format!("{}:{}", package.name, package.version)
 }

@@ -1,6 +1,6 @@
-//! `taskd run`: what `ros2 launch` is on one's own machine, on a robot. The launch file and its
-//! arguments become part of the package that is ordered, so that the robot, its restarts and
-//! whoever looks later all see what was meant.
+//! `taskd run`: the counterpart of `ros2 launch` on a robot. The launch file and its arguments
+//! become part of the ordered package, so that the robot, its restarts and later readers all see
+//! the same intention.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -165,7 +165,7 @@ async fn stored(
     Ok(variant.package)
 }
 
-/// Says that the version before goes on, where the new one could not take its place.
+/// Reports that the previous version keeps running where the new one could not replace it.
 async fn say_what_still_runs(
     session: &Session,
     robot: &RobotId,

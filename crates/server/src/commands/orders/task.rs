@@ -53,7 +53,7 @@ pub struct RemoveOrder {
     timeout: Duration,
 }
 
-/// What is ordered.
+/// The action on the task.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::commands) enum Verb {
     Start,
@@ -95,7 +95,7 @@ pub(in crate::commands) async fn remove(
     until_gone(session, &task, &ordered, timeout).await
 }
 
-/// Brings each robot back to the package it had before the one it has now.
+/// Moves each robot back to the package it had before the present one.
 pub(in crate::commands) async fn roll_back(
     session: &Session,
     order: TaskOrder,
@@ -167,8 +167,8 @@ fn say_without(without: &[MatchedRobot]) {
     say(&format!("no earlier version ran on {}", names.join(", ")));
 }
 
-/// Waits until none of `ordered` has the task any more. Whoever was removed meanwhile has not,
-/// whoever was labelled or named anew may have.
+/// Waits until none of `ordered` has the task any more. A robot removed meanwhile no longer counts;
+/// a robot with new labels or a new name still does.
 async fn until_gone(
     session: &Session,
     task: &TaskName,
@@ -217,8 +217,8 @@ async fn until_gone(
     Ok(Outcome::TimedOut)
 }
 
-/// These robots, whatever becomes of their names and labels; where they are too many to be listed
-/// in a question, all.
+/// A selector of these robots by id, independent of their names and labels; of all robots if the
+/// list is too long for a query.
 fn by_id(robots: &[MatchedRobot]) -> Selector {
     const MAX_LISTED: usize = 200;
     let ids: Vec<&str> =
@@ -233,13 +233,13 @@ fn has_still(robot: &RobotView, task: &TaskName) -> bool {
         || robot.tasks.iter().any(|known| known.task == *task)
 }
 
-/// Whether the server means that there is nobody to order something of. Of an order that may have
-/// been carried out before, robots may be gone by now.
+/// Whether the refusal means that the selection is empty. If the order may be a repetition, its
+/// robots may be gone by now.
 fn is_nobody(code: &str, may_be_repeated: bool) -> bool {
     code == "no_robots_match" || (may_be_repeated && code == "unknown_robots")
 }
 
-/// Gives the order; the robots it was for.
+/// Sends the order; returns the robots that received the order.
 async fn give(
     session: &Session,
     verb: Verb,
@@ -247,12 +247,11 @@ async fn give(
 ) -> Result<MatchedRobots, CommandError> {
     let TaskOrder { task, on, dry_run, yes, idempotency_key } = order;
     let path = format!("/tasks/{task}/{}", verb.as_str());
-    // With a key this may be an order that was carried out before, whose tasks are gone by now: the
-    // server knows.
+    // With a key this may repeat an earlier order, whose tasks are gone by now: the server knows.
     let may_be_repeated = idempotency_key.is_some() && !dry_run;
     let key = idempotency_key.unwrap_or_else(random_key);
     let ask = OrderTask { selector: on.clone(), dry_run: true };
-    // A dry run is no order, so it gets a key of its own.
+    // A dry run changes nothing, so it gets a key of its own.
     let matched: MatchedRobots = match session.client.order(&path, &ask, &random_key()).await {
         Err(ClientError::Refused { code, .. }) if is_nobody(&code, may_be_repeated) => {
             MatchedRobots::default()

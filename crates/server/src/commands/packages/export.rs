@@ -1,5 +1,6 @@
-//! `taskd package export`: a package's files out of the store. The bytes are proven by their digest
-//! before anything is unpacked, as strictly as on a robot, and what is there is there whole.
+//! `taskd package export`: a package's files out of the store. The bytes are verified by their
+//! digest before anything is unpacked, as strictly as on a robot, and every exported file is
+//! complete.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -57,7 +58,7 @@ pub(in crate::commands) async fn export(
 fn write_tar(content: File, view: &PackageView, parent: &Path, to: &Path) -> io::Result<()> {
     let readable = std::fs::Permissions::from_mode(0o666);
     let mut file = tempfile::Builder::new().permissions(readable).tempfile_in(parent)?;
-    // No longer than it says it is.
+    // Reads no more than the announced size.
     io::copy(&mut zstd::Decoder::new(content)?.take(view.manifest.content.tar_size), &mut file)?;
     file.persist(to).map(drop).map_err(|error| error.error)
 }
@@ -68,6 +69,6 @@ fn write_tree(mut content: File, view: &PackageView, parent: &Path, to: &Path) -
     let facts = &view.manifest.content;
     unpack(&mut content, view.package.content.size, facts, &Limits::default(), &tree)
         .map_err(io::Error::other)?;
-    // In the place of an empty directory, or of none.
+    // Replaces an empty directory, or creates a new one.
     std::fs::rename(&tree, to)
 }

@@ -1,4 +1,4 @@
-//! `taskd output`: what tasks brought back from robots, listed and fetched.
+//! `taskd output`: lists and fetches tasks' outputs from robots.
 
 use std::path::{Path, PathBuf};
 
@@ -118,7 +118,7 @@ fn rows(view: &OutputView) -> Vec<Vec<String>> {
     view.output.files.iter().map(row).collect()
 }
 
-/// Fetches one file beside its place and moves it there once its bytes are proven.
+/// Fetches one file beside its destination and moves the file there once its bytes are verified.
 async fn fetch(
     session: &Session,
     view: &OutputView,

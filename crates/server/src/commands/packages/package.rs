@@ -1,4 +1,5 @@
-//! `taskd package`: what is in the store, what is in a package, and what differs between two.
+//! `taskd package`: the store's packages, a package's contents, and the differences between two
+//! packages.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -67,7 +68,7 @@ pub enum Action {
     },
 }
 
-/// A package as people name it.
+/// A package reference from the command line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PackageName {
     /// Its name.
@@ -134,7 +135,7 @@ pub(in crate::commands) async fn run(
     Ok(Outcome::Succeeded)
 }
 
-/// The version that is meant, the newest where none is named.
+/// The requested version, or the newest if none is named.
 pub(in crate::commands) async fn find(
     session: &Session,
     package: &PackageName,
@@ -181,7 +182,7 @@ fn row(view: &PackageView) -> Vec<String> {
     ]
 }
 
-/// Enough of a digest to tell versions apart.
+/// A digest prefix long enough to tell versions apart.
 pub(in crate::commands) fn short(digest: &Digest) -> String {
     digest.hex()[..12].to_owned()
 }
@@ -241,7 +242,7 @@ async fn info(session: &Session, package: &PackageName) -> Result<(), CommandErr
     })
 }
 
-/// On how many robots it should run.
+/// The number of robots that should run the package.
 fn used(versions: &PackageVersions, digest: &Digest) -> u64 {
     versions
         .running
@@ -336,7 +337,7 @@ fn letter(kind: PackageFileKind) -> char {
     }
 }
 
-/// As `ls -l` writes it.
+/// A mode in the format of `ls -l`.
 fn permissions(mode: u32) -> String {
     let letter = |(at, letter): (u32, char)| if mode & (0o400 >> at) == 0 { '-' } else { letter };
     (0..9).zip("rwxrwxrwx".chars()).map(letter).collect()
@@ -349,7 +350,7 @@ async fn diff(session: &Session, from: &PackageName, to: &str) -> Result<(), Com
     let Some(version) = &from.version else {
         return Err(CommandError::Usage(format!("{from}: say which version, as {from}:VERSION")));
     };
-    // Both may be given in full.
+    // Either reference may be complete.
     let to = match to.parse::<PackageName>() {
         Ok(PackageName { name, version: Some(version) }) if name == from.name => version,
         _ => to.to_owned(),

@@ -1,4 +1,4 @@
-//! `taskd audit`: shows what was done, exports it, and verifies that nothing of it was changed.
+//! `taskd audit`: shows the audit, exports it, and verifies that no entry was changed.
 
 use std::io::{BufRead as _, BufReader};
 use std::path::PathBuf;
@@ -80,7 +80,7 @@ pub(in crate::commands) async fn run(
     Ok(Outcome::Succeeded)
 }
 
-/// As many of the newest entries as were asked for; the server gives them a page at a time.
+/// The newest entries, up to the limit; the server returns them in pages.
 async fn newest(session: &Session, order: AuditOrder) -> Result<AuditPage, CommandError> {
     let AuditOrder { who, target, act, limit, .. } = order;
     let mut query = AuditQuery { after: None, before: None, limit: Some(limit), who, target, act };
@@ -130,7 +130,7 @@ async fn export(session: &Session) -> Result<Outcome, CommandError> {
             return Ok(Outcome::Succeeded);
         }
         for record in &page.records {
-            // What is exported broken would be found out when it is too late to look.
+            // A broken chain in the export would otherwise be discovered too late.
             link = link.follow(record).map_err(broken)?;
             if !stream_text(&format!("{}\n", json_line(record)?))? {
                 return Ok(Outcome::Succeeded);
@@ -177,7 +177,7 @@ fn verify_file(
     }
 }
 
-/// How far a chain was found to hold.
+/// The verified length of a chain.
 struct Verified {
     link: Link,
     expected: Option<Link>,

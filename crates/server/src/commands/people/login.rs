@@ -1,5 +1,5 @@
-//! `taskd login` and `taskd logout`: exchanges name and password for a token, which is kept in a
-//! file of its owner's, by server, until it is signed out or ends.
+//! `taskd login` and `taskd logout`: exchanges name and password for a token, which is stored by
+//! server in a file of the user until the token is signed out or ends.
 
 use std::time::Duration;
 
@@ -59,8 +59,8 @@ pub(in crate::commands) async fn log_out(connection: &Connection) -> Result<Outc
     let unknown = || CommandError::Usage(format!("you are not signed in at {base}"));
     let path = path().ok_or_else(unknown)?;
     let token = Kept::read(&path)?.servers.remove(&base).ok_or_else(unknown)?;
-    // It may have ended by itself, which comes to the same. One that the server may still take is
-    // not forgotten.
+    // The token may have expired by itself, with the same effect. A token that the server may still
+    // accept is not forgotten.
     match client.with_token(&token)?.delete("/session").await {
         Err(error) if error.outcome() != Outcome::NotAllowed => return Err(error.into()),
         _ => {}

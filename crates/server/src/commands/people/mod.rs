@@ -1,4 +1,4 @@
-//! Owns the commands about people, their tokens and what they did; it never touches robots.
+//! Owns the commands about people, their tokens and the audit; it never touches robots.
 
 pub(super) mod audit;
 pub(super) mod login;

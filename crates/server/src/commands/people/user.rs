@@ -1,4 +1,4 @@
-//! `taskd user`: who may use the server, and what each may do.
+//! `taskd user`: users and their rights.
 
 use clap::Subcommand;
 use task_proto::UserName;
@@ -116,7 +116,7 @@ pub(in crate::commands) async fn run(
     Ok(Outcome::Succeeded)
 }
 
-/// `taskd whoami`: whom the token stands for, and what it allows.
+/// `taskd whoami`: the user of the token, and the token's rights.
 pub(in crate::commands) async fn who_am_i(session: &Session) -> Result<Outcome, CommandError> {
     let me: Me = session.client.get("/me", &[]).await?;
     let name = |me: &Me| me.name.to_string();

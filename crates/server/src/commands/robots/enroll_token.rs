@@ -1,4 +1,4 @@
-//! `taskd enroll-token`: the tokens that robots enrol with.
+//! `taskd enroll-token`: the tokens that robots enroll with.
 
 use std::str::FromStr;
 use std::time::Duration;
@@ -16,12 +16,12 @@ use crate::commands::display::output::{robots, say, time};
 use crate::commands::{CommandError, Outcome, Session};
 use crate::config::{at_least_one, lifetime};
 
-/// How many enrolments a token is good for.
+/// Number of enrollments of a token.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Uses {
-    /// So many.
+    /// A number of uses.
     Number(u64),
-    /// Any number.
+    /// Unlimited.
     Unlimited,
 }
 
@@ -37,7 +37,7 @@ impl FromStr for Uses {
     }
 }
 
-/// What to do with enrolment tokens.
+/// What to do with enrollment tokens.
 #[derive(Debug, Subcommand)]
 pub enum Action {
     /// Make one and print it; it is shown this once
@@ -45,7 +45,7 @@ pub enum Action {
         /// Only this robot (id or name) may register again with it
         #[arg(long, value_name = "ROBOT", add = complete::robots())]
         robot: Option<String>,
-        /// How many enrolments it is good for [default: the server's setting enrolment.uses, 100]
+        /// How many enrollments it is good for [default: the server's setting enrollment.uses, 100]
         #[arg(long, value_name = "N|unlimited")]
         uses: Option<Uses>,
         /// How long it lives, like 2h or 7d [default: 1d]

@@ -1,6 +1,6 @@
-//! `taskd logs`: what a robot's tasks said, and with `-f` what they say. It joins the two without a
-//! gap: the stream is opened first, the past is asked for when the robot has said that it
-//! publishes, and again whenever the stream broke.
+//! `taskd logs`: past log lines of a robot's tasks, and with `-f` new lines as they appear. The two
+//! join without a gap: the stream is opened first, the past is requested once the robot has
+//! confirmed that it publishes, and again whenever the stream broke.
 
 use std::time::Duration;
 
@@ -18,9 +18,9 @@ use crate::commands::display::shown::Shown;
 use crate::commands::{CommandError, Outcome, Session};
 use crate::config::lifetime;
 
-/// A stream that says nothing for so long is broken: the server says something every 15 s.
+/// A stream without data for this long is broken: the server sends something every 15 s.
 const SILENCE: Duration = Duration::from_secs(60);
-/// How much further back than the break is asked for: clocks differ, and lines take their time.
+/// How far before the break the past is requested: clocks differ, and lines arrive late.
 const OVERLAP: Duration = Duration::from_secs(120);
 
 /// Shows what a robot's tasks said.
@@ -69,7 +69,7 @@ pub(in crate::commands) async fn run(
     Ok(Outcome::Succeeded)
 }
 
-/// Goes on with what a task says, as `taskd logs -f`.
+/// Follows a task's log, as `taskd logs -f`.
 pub(in crate::commands) async fn follow_task(
     session: &Session,
     robot: RobotName,
@@ -99,7 +99,7 @@ async fn past(
     session.client.get_by(&format!("/robots/{}/logs", order.robot), &query).await
 }
 
-/// Says what is not seen in the lines themselves.
+/// Explains on stderr which lines are missing, and why.
 fn explain(view: &LogsView) {
     if view.from == LogsFrom::Server {
         let reason = view.reason.as_deref().unwrap_or("the robot did not answer");
@@ -134,9 +134,9 @@ fn age(ms: u64) -> String {
 
 /// Why a stream was left.
 enum Left {
-    /// Nobody reads any more.
+    /// The reader has closed the pipe.
     Unread,
-    /// It broke, or the server stops.
+    /// The stream broke, or the server stops.
     Broken(String),
 }
 
@@ -153,7 +153,7 @@ async fn follow(session: &Session, order: &LogsOrder) -> Result<Outcome, Command
         let opened = session.client.stream(&format!("/robots/{}/logs", order.robot), &query).await;
         let left = match opened {
             Ok(response) => listen(session, order, Events::of(response), &mut screen).await?,
-            // What never worked is not waited for.
+            // A stream that never worked is not retried.
             Err(error) if screen.heard_at.is_none() || !wait::may_pass(&error) => {
                 return Err(error.about(&order.robot));
             }
@@ -197,7 +197,7 @@ async fn listen(
             LogEvent::Away { reason } if away.as_ref() != Some(&reason) => {
                 say(&format!("{}; waiting for it", printable(&reason)));
                 away = Some(reason);
-                // Until it comes, what the server remembers is all there is.
+                // Until the stream is back, the server's own memory of the log is the only source.
                 if screen.heard_at.is_some() {
                     true
                 } else {
@@ -216,14 +216,14 @@ async fn listen(
     }
 }
 
-/// Prints what was said before the stream began, or while it was broken; false when nobody reads
-/// any more.
+/// Prints the lines from before the stream began, or from while the stream was broken; false once
+/// the reader has closed the pipe.
 async fn catch_up(
     session: &Session,
     order: &LogsOrder,
     screen: &mut Screen,
 ) -> Result<bool, CommandError> {
-    // So many lines are asked for of the past, not of what a break has left out.
+    // The line limit applies to the past, not to lines missed during a break.
     let (since, lines) = match screen.heard_at {
         Some(heard_at) => (Some(heard_at.elapsed() + OVERLAP), None),
         None => (order.since, order.lines),
@@ -239,7 +239,7 @@ async fn catch_up(
     screen.print_past(&view.lines)
 }
 
-/// Lines on their way to whoever reads them: in columns, or each as JSON.
+/// Log lines for the reader: in columns, or each as JSON.
 struct Screen {
     format: Format,
     colours: bool,
@@ -271,7 +271,7 @@ impl Screen {
         self.print(&new)
     }
 
-    /// Prints those lines of the past that come after what was printed.
+    /// Prints the past lines that are newer than the lines already printed.
     fn print_past(&mut self, lines: &[LogLine]) -> Result<bool, CommandError> {
         let new = self.shown.missing(lines);
         self.heard_at = Some(Instant::now());

@@ -1,4 +1,4 @@
-//! `taskd robot`: shows robots, lets them in, changes them, puts them out and removes them.
+//! `taskd robot`: shows, approves, changes, revokes and removes robots.
 
 use std::str::FromStr;
 
@@ -21,7 +21,7 @@ use crate::commands::display::output::{robots, say};
 use crate::commands::display::view::print_matched;
 use crate::commands::{CommandError, Outcome, Session};
 
-/// Robots that are named one by one when something was done to them.
+/// Up to this number, changed robots are listed by name.
 const MAX_NAMED: usize = 10;
 
 /// What to do with robots.
@@ -114,9 +114,9 @@ pub enum Action {
 /// A label that robots get, or lose.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum LabelChange {
-    /// It has this value from now on.
+    /// Sets the label to this value.
     Set(LabelKey, LabelValue),
-    /// It is taken away.
+    /// Removes the label.
     Remove(LabelKey),
 }
 
@@ -256,7 +256,7 @@ async fn remove(
             matched
         }
         _ => {
-            // Who comes between the question and its answer was not shown.
+            // A robot that appears between the question and its answer was not shown.
             let selector = if yes { selector } else { those(&matched).unwrap_or(selector) };
             let order = BulkRemove { selector, dry_run: false };
             session.client.order("/bulk/remove", &order, &random_key()).await?
@@ -273,7 +273,7 @@ fn say_removed(robot: &MatchedRobot) {
     say(&format!("removed {} ({})", robot.name, robot.id));
 }
 
-/// These robots and no others; `None`: they are more than a selector can name one by one.
+/// A selector for exactly these robots; `None`: too many to list in a selector.
 fn those(matched: &MatchedRobots) -> Option<Selector> {
     let ids: Vec<&str> = matched.robots.iter().map(|robot| robot.id.as_str()).collect();
     ids.join(",").parse().ok()

@@ -9,7 +9,7 @@ use task_proto::settings::RobotSettings;
 
 use crate::commands::CommandError;
 
-/// A setting that is to have another value, or none.
+/// A setting to change or to reset.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Setting {
     key: String,
@@ -31,7 +31,7 @@ impl FromStr for Setting {
     }
 }
 
-/// `settings` with these changes; the error names the key as it was typed.
+/// `settings` with these changes; the error names the key as typed.
 pub(in crate::commands) fn changed(
     settings: Option<&RobotSettings>,
     set: &[Setting],
@@ -63,7 +63,7 @@ pub(in crate::commands) fn changed(
     Ok((!read.is_empty()).then_some(read))
 }
 
-/// The same the other way: `workspace=/ws limits.log_bytes=1000000`.
+/// Formats settings as typed: `workspace=/ws limits.log_bytes=1000000`.
 pub(in crate::commands) fn shown(settings: &RobotSettings) -> String {
     let mut texts = Vec::new();
     if let Ok(Value::Object(values)) = serde_json::to_value(settings) {

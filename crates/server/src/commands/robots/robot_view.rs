@@ -1,4 +1,4 @@
-//! How robots look to a person at the terminal. Text only; what is shown was asked for elsewhere.
+//! Formats robots for the terminal. Text only; the caller has requested the data.
 
 use task_proto::api::{PendingRobot, RobotTask, RobotView};
 use task_proto::id::Labels;
@@ -64,7 +64,7 @@ pub(in crate::commands) fn pending_row(robot: &PendingRobot) -> Vec<String> {
     ]
 }
 
-/// Under which accounts tasks run, for people.
+/// The accounts that run tasks, in words.
 fn task_accounts(accounts: TaskAccounts) -> &'static str {
     match accounts {
         TaskAccounts::PerTask => "one for each task",
@@ -78,7 +78,7 @@ fn shown_labels(labels: &Labels) -> String {
     if labels.is_empty() { "-".to_owned() } else { labels.join(" ") }
 }
 
-/// A task and where it stands, in a word or two.
+/// A task and its state, in a word or two.
 fn standing(task: &RobotTask) -> String {
     let health = match (&task.degraded, still_running(task)) {
         (Some(_), _) => "/degraded",
@@ -89,7 +89,7 @@ fn standing(task: &RobotTask) -> String {
     format!("{}:{}{health}{age}", task.task, task.phase)
 }
 
-/// The version that goes on although a newer order has failed or can't begin.
+/// The version that keeps running although a newer order has failed or can't begin.
 fn still_running(task: &RobotTask) -> Option<&ActiveVersion> {
     let is_over = task.phase.is_final() && task.phase != Phase::RolledBack;
     task.active.as_ref().filter(|active| is_over && active.deployment != task.deployment)
@@ -173,7 +173,7 @@ pub(in crate::commands) fn describe(robot: &RobotView, output: &Output) -> Strin
     text
 }
 
-/// By whose word a robot runs packages, in words.
+/// The publishers whose packages a robot runs, in words.
 fn publishers(version: Option<u64>) -> String {
     match version {
         None => "not asked for: it runs what the server orders".to_owned(),
@@ -182,7 +182,7 @@ fn publishers(version: Option<u64>) -> String {
     }
 }
 
-/// What transfers have shown of a robot's way to the server, in words.
+/// Measurements by transfers of a robot's link to the server, in words.
 fn measured(link: &LinkFacts) -> String {
     let counted = |count: u32, one: &str, many: &str| {
         format!("{count} {}", if count == 1 { one } else { many })
@@ -196,7 +196,7 @@ fn measured(link: &LinkFacts) -> String {
     parts.into_iter().flatten().collect::<Vec<_>>().join(", ")
 }
 
-/// How tasks meet ROS, in words.
+/// The ROS setup of tasks, in words.
 fn ros_in_use(ros: &RosFacts) -> String {
     let domain = ros.domain_id.map(|domain| format!("domain {domain}"));
     let range = ros.localhost_only.then(|| "this host only".to_owned());
@@ -225,7 +225,7 @@ fn task_row(task: &RobotTask) -> Vec<String> {
     ]
 }
 
-/// Why a task failed or waits, or else why it runs not as it should.
+/// Why a task failed or waits, or else why the task does not run normally.
 fn problem(task: &RobotTask) -> String {
     match (&task.failure, &task.degraded) {
         (Some(failure), _) => match still_running(task) {

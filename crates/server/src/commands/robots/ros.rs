@@ -1,6 +1,5 @@
-//! `taskd node|topic|param|lifecycle`: what a robot's ROS graph shows, and what can be done to its
-//! nodes from here. Each asks the robot itself, once; nothing of it lasts beyond a restart of the
-//! task.
+//! `taskd node|topic|param|lifecycle`: shows a robot's ROS graph, and acts on its nodes. Each
+//! command sends one request to the robot; nothing lasts beyond a restart of the task.
 
 use clap::Subcommand;
 use task_proto::RobotName;
@@ -226,7 +225,7 @@ fn say_age(answer: &Answer) {
     }
 }
 
-/// A value as it is typed: JSON where it is JSON, otherwise a text.
+/// A value from the command line: JSON if the text is valid JSON, otherwise a string.
 fn parameter_value(text: &str) -> Result<serde_json::Value, CommandError> {
     match serde_json::from_str(text) {
         Ok(serde_json::Value::Object(_)) => {

@@ -1,5 +1,4 @@
-//! The robots that a selector or a name means, as the server knows them now. Nothing is done to
-//! them here.
+//! Resolves a selector or a name to robots known to the server now. The robots are not changed.
 
 use task_proto::RobotName;
 use task_proto::api::{MatchedRobot, MatchedRobots, RobotList, RobotView};
@@ -8,7 +7,7 @@ use task_proto::selector::Selector;
 use crate::commands::api::client::{nobody, unknown};
 use crate::commands::{CommandError, Session};
 
-/// The robots that `selector` means now.
+/// The robots that `selector` matches now.
 pub(in crate::commands) async fn matching(
     session: &Session,
     selector: &Selector,
@@ -16,7 +15,7 @@ pub(in crate::commands) async fn matching(
     Ok(session.client.get("/robots", &[("selector", selector.to_string())]).await?)
 }
 
-/// The same by name; nobody, and a name that no robot has, are mistakes in the command.
+/// The selected robots by name; an empty selection and an unknown name are mistakes in the command.
 pub(in crate::commands) async fn matched(
     session: &Session,
     selector: &Selector,
@@ -38,7 +37,7 @@ pub(in crate::commands) fn named(robots: Vec<RobotView>) -> MatchedRobots {
     MatchedRobots { robots: robots.into_iter().map(matched).collect() }
 }
 
-/// The one robot of this name or id.
+/// The robot with this name or id.
 pub(in crate::commands) async fn one(
     session: &Session,
     name: &RobotName,

@@ -1,4 +1,4 @@
-//! `taskd robot top`: how robots' machines do, the busiest first; once, or again and again.
+//! `taskd robot top`: load of the robots' machines, the busiest first; once, or repeatedly.
 
 use std::time::Duration;
 
@@ -16,9 +16,9 @@ use crate::commands::display::output::{Format, bytes, say, stderr_is_terminal, s
 use crate::commands::{CommandError, Outcome, Session};
 use crate::system::clock::Clock;
 
-/// Between two looks; robots speak once a minute.
+/// Interval between two polls; robots report once a minute.
 const PAUSE: Duration = Duration::from_secs(5);
-/// Home, and everything below is gone.
+/// Cursor home, and clear to the end of the screen.
 const CLEAR: &str = "\x1b[H\x1b[J";
 
 /// Whose machines.
@@ -44,7 +44,7 @@ pub(in crate::commands) async fn run(
     loop {
         match selection::matching(session, &order.selector).await {
             Ok(list) => {
-                // Where it does not stay on a screen, each look stands below the one before.
+                // Without a screen to overwrite, each table is printed below the previous one.
                 let stays =
                     session.output.has_colours() && session.output.format() == Format::Table;
                 if !stream_text(if stays { CLEAR } else { "" })? || !print(session, &sorted(list))?
@@ -63,7 +63,7 @@ pub(in crate::commands) async fn run(
     }
 }
 
-/// The busiest first, and at the end those that say nothing.
+/// The busiest first, robots without vitals last.
 fn sorted(mut list: RobotList) -> RobotList {
     let busy =
         |robot: &RobotView| robot.vitals.and_then(|vitals| vitals.cpu_percent).unwrap_or(-1.0);
@@ -79,7 +79,7 @@ const COLUMNS: Columns = Columns {
     wide: &["load", "battery", "temperature", "rtt", "agent"],
 };
 
-/// False when nobody reads any more.
+/// False once the reader has closed the pipe.
 fn print(session: &Session, list: &RobotList) -> Result<bool, CommandError> {
     let now_ms = Clock::system().now_ms();
     session
@@ -112,7 +112,7 @@ fn row(robot: &RobotView, now_ms: u64) -> Vec<String> {
     ]
 }
 
-/// How a machine does, in a line.
+/// Load of a machine, in a line.
 pub(in crate::commands) fn summary(vitals: &Vitals) -> String {
     let parts = [
         vitals.cpu_percent.map(|percent| format!("processors {percent:.0}%")),

@@ -1,4 +1,4 @@
-//! `taskd broker`: what an external broker has to know, for its own files.
+//! `taskd broker`: the settings of an external broker, in the formats of its own files.
 
 use clap::Subcommand;
 use task_proto::api::{BrokerFiles, NatsFile};
@@ -30,7 +30,7 @@ pub(in crate::commands) async fn run(
         Action::Conf => files().await?.conf,
         Action::Nats => session.client.get::<NatsFile>("/broker/nats", &[]).await?.authorization,
     };
-    // The broker reads it, so it is the same in every format.
+    // The broker reads this text, so the text is the same in every output format.
     stream_text(&text)?;
     Ok(Outcome::Succeeded)
 }

@@ -1,4 +1,4 @@
-//! `taskd server`: what the server is and what went over it.
+//! `taskd server`: the server's description and its traffic.
 
 use clap::Subcommand;
 use task_proto::api::{ServerInfo, Traffic};
@@ -67,12 +67,12 @@ fn describe(info: &ServerInfo) -> String {
     ])
 }
 
-/// What came in, in words.
+/// Incoming traffic, in words.
 pub(in crate::commands) fn inward(traffic: &Traffic) -> String {
     words(traffic.bytes_in, traffic.packets_in, traffic.messages_in, traffic.acks_in)
 }
 
-/// What went out, in words.
+/// Outgoing traffic, in words.
 pub(in crate::commands) fn outward(traffic: &Traffic) -> String {
     words(traffic.bytes_out, traffic.packets_out, traffic.messages_out, traffic.acks_out)
 }

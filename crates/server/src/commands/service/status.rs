@@ -1,5 +1,5 @@
-//! `taskd status`, and what `taskd server` shows of sessions and rules: how the server and the ways
-//! to the robots do.
+//! `taskd status`, and the sessions and rules of `taskd server`: the health of the server and of
+//! the links to the robots.
 
 use std::time::Duration;
 
@@ -13,12 +13,12 @@ use crate::commands::display::output::table::Columns;
 use crate::commands::display::output::{bytes, facts, time};
 use crate::commands::{CommandError, Outcome, Session};
 
-/// Sessions that are asked for at a time.
+/// Sessions requested at a time.
 const PAGE: u64 = 1000;
 
 const SITES: Columns = Columns::of(&["site", "robots", "online", "throughput", "rtt"]);
 
-/// How the server does now.
+/// The server's current status.
 pub(in crate::commands) async fn status(session: &Session) -> Result<Outcome, CommandError> {
     let status: ServerStatus = session.client.get("/server/status", &[]).await?;
     let name = |status: &ServerStatus| status.version.clone();
@@ -117,7 +117,7 @@ fn describe(status: &ServerStatus) -> String {
     ])
 }
 
-/// For the line about the database: whether it is sound, as far as that is known.
+/// For the line about the database: whether its structure is sound, as far as known.
 fn integrity(
     DatabaseStatus { problem, fully_checked_at_ms, guard, .. }: &DatabaseStatus,
 ) -> String {
@@ -146,7 +146,7 @@ const SESSIONS: Columns = Columns {
     wide: &["id", "in", "out"],
 };
 
-/// Who is connected, and to what each listens.
+/// The connected clients, and the subscriptions of each.
 pub(in crate::commands) async fn sessions(session: &Session) -> Result<Outcome, CommandError> {
     let mut all = SessionList::default();
     loop {
@@ -184,7 +184,7 @@ const RULES: Columns = Columns {
 };
 const LIMITS: Columns = Columns::of(&["limit", "value"]);
 
-/// By what rules bytes travel, and the limits that hold.
+/// The delivery rules, and the limits in force.
 pub(in crate::commands) async fn rules(session: &Session) -> Result<Outcome, CommandError> {
     let rules: ServerRules = session.client.get("/server/rules", &[]).await?;
     let names = |rules: &ServerRules| {

@@ -1,4 +1,4 @@
-//! `taskd version`: which version this program is, and which the server is where one answers.
+//! `taskd version`: the version of this program, and of the server if one answers.
 
 use std::time::Duration;
 
@@ -9,7 +9,7 @@ use crate::commands::api::client::Client;
 use crate::commands::display::output::{Output, facts};
 use crate::commands::{CommandError, Connection, Outcome};
 
-/// How long the server may take to say it.
+/// Time limit for the server's answer.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 #[derive(Serialize)]

@@ -1,5 +1,4 @@
-//! Owns the routes about people, how they sign in and their tokens; it never decides what they may
-//! do.
+//! Owns the routes about people, their sign-in and their tokens; never decides on permissions.
 
 pub(super) mod oidc;
 pub(super) mod people;

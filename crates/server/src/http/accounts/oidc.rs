@@ -1,6 +1,6 @@
-//! Signing in by the provider: the browser is sent there, and comes back with a code that is
-//! exchanged for a session like any other. Whatever comes of it, the browser ends at the page,
-//! which says it in words of its own.
+//! Signing in by the OpenID provider: the browser is sent to the provider and comes back with a
+//! code, which is exchanged for an ordinary session. In every case the browser ends at the page,
+//! which shows the result in its own words.
 
 use std::error::Error;
 use std::net::{IpAddr, SocketAddr};
@@ -20,14 +20,14 @@ use crate::http::extract::QueryParams;
 use crate::orders::actions::ActionError;
 use crate::orders::actions::sign_in::ProviderUser;
 
-/// The cookie of a browser that is away at the provider. It has to be sent when that sends the
-/// browser back.
+/// The cookie of a browser that is away at the provider. The cookie has to be sent when the
+/// provider redirects the browser back.
 const COOKIE: &str = "taskd_sign_in";
 const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Lax; Path=/api/v1/oidc";
-/// How long it may be away.
+/// How long the browser may be away, in seconds.
 const AWAY_S: u64 = 600;
 
-/// Sends the browser to the provider.
+/// Redirects the browser to the OpenID provider.
 #[utoipa::path(get, path = "/api/v1/oidc/sign-in", tag = "session",
     responses((status = 303, description = "To the provider; or to the page, which says what is wrong."),
         (status = 404, description = "No provider is configured.")))]
@@ -40,20 +40,20 @@ pub(in crate::http) async fn begin(State(app): State<App>) -> Result<Response, A
     })
 }
 
-/// What the provider says by way of the browser. It may say more.
+/// The provider's authorization response, delivered by the browser. Other parameters are allowed.
 #[derive(Deserialize, IntoParams)]
 pub(in crate::http) struct Answered {
-    /// What the provider was sent.
+    /// The state sent with the authorization request.
     state: Option<String>,
-    /// To be exchanged for who it is.
+    /// Authorization code, exchanged for the user's identity.
     code: Option<String>,
-    /// Why there is no code.
+    /// Error code, if the provider issued no authorization code.
     error: Option<String>,
-    /// RFC 9207: who answers.
+    /// Issuer identifier of the provider (RFC 9207).
     iss: Option<String>,
 }
 
-/// Takes the browser back from the provider.
+/// Completes the sign-in when the provider redirects the browser back.
 #[utoipa::path(get, path = "/api/v1/oidc/callback", tag = "session",
     responses((status = 303, description = "To the page, signed in or told why not."),
         (status = 404, description = "No provider is configured.")))]
@@ -77,7 +77,7 @@ fn configured(app: &App) -> Result<&Provider, ApiError> {
         .ok_or_else(|| ApiError::not_found("no provider is configured to sign in by"))
 }
 
-/// The session's cookie; or else the code of what the page is to say.
+/// The session's cookie, or the error code for the page to explain.
 async fn sign_in(
     app: &App,
     provider: &Provider,
@@ -85,13 +85,14 @@ async fn sign_in(
     answered: Answered,
     address: IpAddr,
 ) -> Result<String, &'static str> {
-    // In another browser, or a second time, an answer is worth nothing: nobody signs somebody else
-    // in.
+    // An answer is valid only once and only in the browser that began the sign-in: no user can sign
+    // another person in.
     let attempt = cookie(headers, COOKIE).and_then(Attempt::kept);
     let is_own =
         |attempt: &Attempt| answered.state.as_deref().is_some_and(|state| attempt.has_state(state));
     let attempt = attempt.filter(is_own).ok_or("expired")?;
-    // Only now, or a foreign page could have its visitors' address blocked.
+    // Counted only after this check: otherwise a foreign page could get its visitors' address
+    // blocked.
     app.actions.begin_provider_sign_in(address).await.map_err(|error| refused(app, error))?;
     if answered.iss.is_some_and(|issuer| issuer != provider.settings().issuer) {
         return Err(failed(&OidcError::Unusable {

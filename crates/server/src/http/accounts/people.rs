@@ -1,5 +1,5 @@
-//! People: who they are, how they sign in by the command line, their tokens, and what they did.
-//! What concerns someone's rights ends the MQTT sessions that they have by their old ones.
+//! People: their identity, sign-in at the command line, tokens and audit log. A change of a
+//! person's rights ends the MQTT sessions that were opened with the old rights.
 
 use std::net::SocketAddr;
 
@@ -22,7 +22,7 @@ use crate::http::error::ApiError;
 use crate::http::extract::{JsonBody, PathParam, QueryParams};
 use crate::http::openapi::Created;
 
-/// Says who is asking, and what they may.
+/// Shows the caller's identity and permissions.
 #[utoipa::path(get, path = "/api/v1/me", tag = "people")]
 pub(in crate::http) async fn me(by: Person) -> Json<Me> {
     let permissions =
@@ -49,7 +49,7 @@ pub(in crate::http) async fn add_user(
     Ok(Created(app.actions.add_user(&by, &order).await?))
 }
 
-/// Changes what a user may do.
+/// Changes a user's permissions.
 #[utoipa::path(patch, path = "/api/v1/users/{user}", tag = "people",
     responses((status = 409, description = "`last_administrator`, or `of_provider`: the provider says what they may.")))]
 pub(in crate::http) async fn edit_user(
@@ -63,7 +63,7 @@ pub(in crate::http) async fn edit_user(
     Ok(Json(view))
 }
 
-/// Removes a user; their tokens and sessions end.
+/// Removes a user and ends their tokens and sessions.
 #[utoipa::path(delete, path = "/api/v1/users/{user}", tag = "people",
     responses((status = 409, description = "`last_administrator`: somebody has to be able to administer.")))]
 pub(in crate::http) async fn remove_user(
@@ -76,7 +76,7 @@ pub(in crate::http) async fn remove_user(
     Ok(NoContent)
 }
 
-/// Sets anybody's password. What was signed in with the old one has ended.
+/// Sets any user's password and ends the sign-ins made with the old one.
 #[utoipa::path(put, path = "/api/v1/users/{user}/password", tag = "people",
     responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here.")))]
 pub(in crate::http) async fn set_password(
@@ -90,7 +90,7 @@ pub(in crate::http) async fn set_password(
     Ok(NoContent)
 }
 
-/// Sets one's own password. What was signed in with the old one has ended.
+/// Sets the caller's own password and ends the sign-ins made with the old one.
 #[utoipa::path(put, path = "/api/v1/password", tag = "people",
     responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here."),
         (status = 429, description = "The old password was wrong too often.")))]
@@ -104,7 +104,7 @@ pub(in crate::http) async fn change_password(
     Ok(NoContent)
 }
 
-/// Exchanges name and password for a token.
+/// Exchanges a name and a password for a token.
 #[utoipa::path(post, path = "/api/v1/login", tag = "session",
     responses((status = 401, description = "Name or password is not right."),
         (status = 429, description = "Too many attempts failed, of this user or from this address.")))]
@@ -124,12 +124,12 @@ pub(in crate::http) async fn log_in(
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct TokensQuery {
-    /// Everybody's, which takes the permission `administer`.
+    /// Lists the tokens of all users. Requires the permission `administer`.
     #[serde(default)]
     all: bool,
 }
 
-/// Lists one's own tokens, or everybody's.
+/// Lists the caller's own tokens, or those of all users.
 #[utoipa::path(get, path = "/api/v1/tokens", tag = "people")]
 pub(in crate::http) async fn tokens(
     State(app): State<App>,
@@ -142,7 +142,7 @@ pub(in crate::http) async fn tokens(
     Ok(Json(app.actions.tokens(&by, query.all).await?))
 }
 
-/// Makes a token that may do as much as one may oneself, or less.
+/// Creates a token with the caller's permissions or fewer.
 #[utoipa::path(post, path = "/api/v1/tokens", tag = "people",
     responses((status = 404, description = "There is no such user.")))]
 pub(in crate::http) async fn create_token(
@@ -165,7 +165,7 @@ pub(in crate::http) async fn revoke_token(
     Ok(NoContent)
 }
 
-/// Reads what was done, by whom and from where.
+/// Lists the audit log: actions with their user and source.
 #[utoipa::path(get, path = "/api/v1/audit", tag = "people")]
 pub(in crate::http) async fn audit(
     State(app): State<App>,

@@ -1,6 +1,6 @@
-//! Signing in at the page: a name and a password, or a person's token, is exchanged for a cookie
-//! that scripts can't read. Sessions are kept in memory only, so a restart of the server signs
-//! everybody out.
+//! Sessions of the web page: a name and a password, or a person's token, is exchanged for a cookie
+//! that scripts can't read. Sessions live in memory only, so a restart of the server signs all
+//! people out.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -23,19 +23,20 @@ use crate::http::extract::JsonBody;
 use crate::orders::actions::sign_in::PAGE_LIFETIME_MS;
 use crate::store::TokenHolder;
 
-/// Scripts can't read it, and no other page makes the browser send it.
+/// Unreadable for scripts, and not sent with requests from other sites.
 const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Strict; Path=/";
-/// How long a session lasts.
+/// Lifetime of a session, in milliseconds.
 const LIFETIME_MS: u64 = PAGE_LIFETIME_MS;
-/// Sessions at a time; one more ends the oldest.
+/// The most sessions at a time; one more ends the oldest.
 const MOST_SESSIONS: usize = 1_024;
-/// Sessions of one person at a time, likewise: nobody signs everybody else out.
+/// The most sessions of one person at a time; one more ends the person's oldest. One person
+/// therefore can't sign the others out.
 const MOST_OF_ONE: usize = 32;
 
-/// Who is signed in. A session is found by the SHA-256 of its id.
+/// The live sessions, keyed by the SHA-256 of the session id.
 #[derive(Debug)]
 pub struct Sessions {
-    /// What this run of the server begins every id with, so that it knows those of earlier ones.
+    /// Random prefix of the ids of this server run, which tells them from ids of earlier runs.
     run: String,
     entries: Mutex<HashMap<Digest, Entry>>,
 }
@@ -46,7 +47,7 @@ impl Default for Sessions {
     }
 }
 
-/// A session that lives: what is streamed in it ends when this is dropped.
+/// A live session: its streams end when the entry is dropped.
 #[derive(Debug)]
 struct Entry {
     session: Session,
@@ -56,18 +57,18 @@ struct Entry {
 /// One signed-in page.
 #[derive(Debug, Clone)]
 pub struct Session {
-    /// The token it was begun with: a session ends when its token does.
+    /// The token that began the session: a session ends with its token.
     pub token: Token,
-    /// Whose it is.
+    /// The signed-in user.
     pub user: UserName,
-    /// When it ends by itself.
+    /// Expiry time, in milliseconds.
     pub expires_at_ms: u64,
-    /// Cancelled when it ends before that.
+    /// Cancelled when the session ends before its expiry.
     pub ended: CancellationToken,
 }
 
 impl Sessions {
-    /// Begins a session and gives the cookie's value.
+    /// Begins a session and returns the cookie's value.
     fn begin(&self, token: Token, user: UserName, now_ms: u64) -> String {
         let id =
             format!("{}.{:032x}{:032x}", self.run, rand::random::<u128>(), rand::random::<u128>());
@@ -90,7 +91,7 @@ impl Sessions {
         id
     }
 
-    /// The session of a request's cookie, if it has one that lives.
+    /// The live session of a request's cookie, if any.
     pub fn find(&self, headers: &HeaderMap, now_ms: u64) -> Option<Session> {
         let key = Digest::of(cookie(headers, COOKIE)?.as_bytes());
         self.lock()
@@ -100,7 +101,7 @@ impl Sessions {
             .cloned()
     }
 
-    /// Whether a request's cookie is that of a session that an earlier run of the server began.
+    /// True if a request's cookie belongs to a session of an earlier server run.
     fn is_of_earlier_run(&self, headers: &HeaderMap) -> bool {
         let run = cookie(headers, COOKIE)
             .filter(|id| !id.is_empty())
@@ -127,7 +128,7 @@ pub(in crate::http) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Optio
     pairs.find(|(name, _)| *name == wanted).map(|(_, value)| value)
 }
 
-/// A cookie as it is set. Where browsers come by an encrypted way they are to send it on no other.
+/// The `Set-Cookie` header. Where the page is served over TLS, the cookie is marked as secure.
 pub(in crate::http) fn set_cookie(
     app: &App,
     name: &str,
@@ -141,7 +142,7 @@ pub(in crate::http) fn set_cookie(
     format!("{name}={value}; {attributes}; Max-Age={max_age_s}{secure}")
 }
 
-/// Begins a session in place of the one that these headers came with, if any, and gives its cookie.
+/// Begins a session in place of the one in these headers, if any, and returns its cookie.
 pub(in crate::http) fn begin_session(
     app: &App,
     headers: &HeaderMap,
@@ -154,7 +155,7 @@ pub(in crate::http) fn begin_session(
     set_cookie(app, COOKIE, &id, COOKIE_ATTRIBUTES, LIFETIME_MS / 1000)
 }
 
-/// Signs in at the page: gives a cookie for a name and a password, or for a token.
+/// Signs in to the page: exchanges a name and a password, or a token, for a session cookie.
 #[utoipa::path(post, path = "/api/v1/session", tag = "session",
     responses((status = 200, description = "The session; its cookie is in `Set-Cookie`.", body = SessionView),
         (status = 401, description = "Name, password or token are not right."),
@@ -166,8 +167,8 @@ pub(in crate::http) async fn sign_in(
     headers: HeaderMap,
     JsonBody(request): JsonBody<SignIn>,
 ) -> Result<Response, ApiError> {
-    // A foreign page must not sign its visitor in as someone else. Programs send no Origin and are
-    // not concerned.
+    // A foreign page must not sign its visitor in as another user. Programs send no Origin and are
+    // not affected.
     if headers.contains_key(header::ORIGIN) {
         require_same_origin(&headers)?;
     }
@@ -203,15 +204,14 @@ async fn known_token(app: &App, text: &str, now_ms: u64) -> Result<(Token, UserN
     }
 }
 
-/// Where to sign in by the provider, for who is not signed in.
+/// The provider's sign-in link, for people without a session.
 fn provider_view(app: &App) -> Option<ProviderView> {
     let settings = app.provider.as_ref()?.settings();
     let url = format!("{}/api/v1/oidc/sign-in", settings.public_url);
     Some(ProviderView { title: settings.title.clone(), url })
 }
 
-/// Tells until when the caller is signed in, or else whether they were until the server was
-/// restarted.
+/// Shows when the caller's session expires, or else whether a server restart ended the session.
 #[utoipa::path(get, path = "/api/v1/session", tag = "session")]
 pub(in crate::http) async fn show(
     State(app): State<App>,
@@ -228,7 +228,7 @@ pub(in crate::http) async fn show(
     Ok(Json(SessionView { expires_at_ms, provider, ended_by_restart: false }))
 }
 
-/// Signs out, the page or whoever signed in at the command line.
+/// Signs out the page's session or the command line's sign-in.
 #[utoipa::path(delete, path = "/api/v1/session", tag = "session",
     responses((status = 204, description = "Signed out; the cookie is taken back.")))]
 pub(in crate::http) async fn sign_out(
@@ -240,7 +240,7 @@ pub(in crate::http) async fn sign_out(
     app.actions.sign_out(&by).await?;
     app.broker.disconnect_person(&by.name);
     let cookie = (header::SET_COOKIE, set_cookie(&app, COOKIE, "", COOKIE_ATTRIBUTES, 0));
-    // What the browser has kept is not for whoever uses it next.
+    // The browser's cache must not be available to its next user.
     let forget = (HeaderName::from_static("clear-site-data"), "\"cache\"".to_owned());
     Ok((StatusCode::NO_CONTENT, [cookie, forget]).into_response())
 }

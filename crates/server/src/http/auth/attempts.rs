@@ -1,5 +1,5 @@
-//! Failed authentications, counted by address in windows of a minute. A token that is good always
-//! gets in; only the answers to wrong ones change. Memory is bounded: beyond the most addresses,
+//! Failed authentications, counted per address in windows of a minute. A valid token is always
+//! accepted; only the answers to wrong tokens change. Memory is bounded: beyond the most addresses,
 //! all others share one count.
 
 use std::collections::HashMap;
@@ -7,14 +7,14 @@ use std::net::IpAddr;
 use std::sync::{Mutex, PoisonError};
 
 const WINDOW_MS: u64 = 60_000;
-/// Failures from one address in a window that are answered in the ordinary way. A NAT may hide a
-/// fleet, so it is high.
+/// Failures per address and window that are answered in the ordinary way. The number is high
+/// because a NAT may hide a fleet.
 const MOST_FAILURES: u32 = 1_000;
 const MOST_ADDRESSES: usize = 4_096;
-/// Whose count addresses share that came too late for their own.
+/// The shared count of addresses beyond the limit.
 const EVERYBODY_ELSE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::UNSPECIFIED);
 
-/// The counts.
+/// The counts of the current window.
 #[derive(Debug, Default)]
 pub struct FailedAttempts(Mutex<Window>);
 
@@ -25,7 +25,7 @@ struct Window {
 }
 
 impl FailedAttempts {
-    /// Counts a failure from `address`. Returns whether there have been too many.
+    /// Counts a failure from `address`. Returns true if the address has too many.
     pub fn record(&self, address: IpAddr, now_ms: u64) -> bool {
         let mut window = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if now_ms.saturating_sub(window.began_ms) >= WINDOW_MS {

@@ -1,5 +1,5 @@
-//! Holds robots up that ask or report too often, each on its own, and refuses those that go on with
-//! it. What tells a robot to stop something is never refused for long.
+//! Delays robots that request or report too often, each robot separately, and refuses robots that
+//! persist. Desired states, which may tell a robot to stop a task, are never refused for long.
 
 use http::Method;
 use task_proto::RobotId;
@@ -9,7 +9,7 @@ use crate::http::App;
 use crate::http::error::ApiError;
 use crate::limits::conduct::{Verdict, Way};
 
-/// Waits until it is the robot's turn; an error says when it is.
+/// Waits for the robot's next allowed request time. A refusal names that time.
 pub(in crate::http) async fn hold_up(
     app: &App,
     robot: &RobotId,
@@ -18,7 +18,7 @@ pub(in crate::http) async fn hold_up(
 ) -> Result<(), ApiError> {
     let now = Instant::now();
     let watched = app.conduct.watch(robot, way, now);
-    // Whoever only asks is told what to do, as often as it is its turn.
+    // A robot that only polls gets its answer at each allowed time, even while barred.
     if *method != Method::GET
         && let Some(until) = watched.barred_until(now)
     {

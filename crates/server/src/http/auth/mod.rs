@@ -1,7 +1,7 @@
-//! Owns the guard before every route, who is calling and whether they may; it never decides what a
-//! caller's order means.
+//! Owns the guard before every route: authentication and authorization of callers; never decides
+//! the effect of an order.
 //!
-//! Every route names its [`Access`]; the guard finds the [`Caller`] and refuses the rest.
+//! Every route names its [`Access`]; the guard finds the [`Caller`] and refuses all others.
 
 pub mod attempts;
 pub(super) mod conduct;
@@ -37,45 +37,45 @@ use crate::net::http_connections::{Connection, Holder};
 use crate::net::tls::ClientProof;
 use crate::store::{Admitted, Fault, StoreError, TokenHolder, with_shared_reads};
 
-/// The name of a session's cookie.
+/// The name of the session cookie.
 pub(super) const COOKIE: &str = "taskd_session";
 
-/// Who may call a route.
+/// The callers that a route admits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Everybody, known or not.
+    /// Every caller, authenticated or not.
     Anyone,
-    /// A person, by a token or a signed-in page, who has the permission. Which robots it holds for
-    /// is the handler's to look at.
+    /// A person with this permission, by a token or a signed-in page. The handler checks for which
+    /// robots the permission holds.
     Person(Permission),
-    /// The robot that the path's `{robot}` names, and no other.
+    /// Only the robot that the path's `{robot}` names.
     OwnRobot,
-    /// A machine with an enrolment token that is still good.
+    /// A machine with a valid enrollment token.
     Enrolment,
-    /// A person or any robot; the handler narrows what each of them gets.
+    /// A person or any robot; the handler narrows the access of each.
     PersonOrRobot,
 }
 
-/// Which of its tokens a robot called with, by number. Handlers for robots may take it as an
+/// The number of the token that a robot called with. Handlers for robots may take this as an
 /// extension.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TokenNumber(pub u64);
 
-/// Who is calling, as the guard found out. Handlers take it as an argument.
+/// The authenticated caller, as found by the guard. Handlers take this as an argument.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Caller {
-    /// Nobody known: only on routes for anyone.
+    /// An unauthenticated caller: only on routes for anyone.
     Anyone,
-    /// A person.
+    /// An authenticated person.
     Person(Person),
-    /// A robot.
+    /// An authenticated robot.
     Robot(RobotId),
-    /// The holder of an enrolment token.
+    /// The holder of an enrollment token.
     Enrolment(Box<Token>),
 }
 
 impl Caller {
-    /// The robot that calls; `None` for everybody else.
+    /// The calling robot; `None` for all other callers.
     pub fn robot(&self) -> Option<&RobotId> {
         match self {
             Self::Robot(robot) => Some(robot),
@@ -83,7 +83,7 @@ impl Caller {
         }
     }
 
-    /// The person that calls; `None` for everybody else.
+    /// The calling person; `None` for all other callers.
     pub fn person(&self) -> Option<&Person> {
         match self {
             Self::Person(person) => Some(person),
@@ -91,7 +91,8 @@ impl Caller {
         }
     }
 
-    /// For whom the connection of such a request counts; `None`: for nobody known.
+    /// The holder for which the connection of this caller counts; `None` for unauthenticated
+    /// callers and enrollments.
     fn holder(&self) -> Option<Holder> {
         match self {
             Self::Anyone => None,
@@ -118,7 +119,7 @@ impl<S: Sync> FromRequestParts<S> for Caller {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, _state: &S) -> Result<Self, ApiError> {
-        // Absent only if a handler was mounted without the guard: then nobody is let in.
+        // Absent only if a handler was mounted without the guard: then every caller is refused.
         parts
             .extensions
             .get::<Self>()
@@ -138,7 +139,7 @@ impl<S: Sync> FromRequestParts<S> for Person {
     }
 }
 
-/// What the guard of one route knows.
+/// State of one route's guard.
 #[derive(Clone)]
 pub(super) struct Gate {
     pub(super) app: App,
@@ -147,8 +148,8 @@ pub(super) struct Gate {
     pub(super) waits_for_robot: bool,
 }
 
-/// Stands before every handler: finds the caller, refuses whoever may not, and ends what takes too
-/// long.
+/// Runs before every handler: authenticates the caller, refuses callers without access, and
+/// enforces the route's deadline.
 pub(super) async fn guard(
     State(gate): State<Gate>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
@@ -157,7 +158,7 @@ pub(super) async fn guard(
     next: Next,
 ) -> Response {
     let is_oci = request.uri().path().starts_with("/v2");
-    // A path that is no text names nobody; the handler says that there is no such thing.
+    // A path that is not text names no robot; the handler answers with "not found".
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
     let begun = match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
@@ -188,20 +189,20 @@ pub(super) async fn guard(
     })
 }
 
-/// A request whose turn it is.
+/// A request that passed the rate limits.
 struct Begun {
     caller: Caller,
     counted: Option<Counted>,
 }
 
-/// A person's request, while it counts as under way.
+/// A person's request, counted while under way.
 struct Counted {
     person: UserName,
     kind: RequestKind,
     under_way: UnderWay,
 }
 
-/// Holds up or refuses a caller that sends too much.
+/// Delays or refuses a caller that exceeds a rate limit.
 async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, ApiError> {
     let counted = match &caller {
         Caller::Person(person) => {
@@ -223,8 +224,8 @@ async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, Ap
     Ok(Begun { caller, counted })
 }
 
-/// By which way a robot that asks for this comes; none if it pulls a package's bytes, which has
-/// limits of its own.
+/// The way under which a robot's request is rate-limited. `None` for pulls of package bytes, which
+/// have limits of their own.
 fn way_of(access: Access, method: &Method) -> Option<Way> {
     match access {
         Access::OwnRobot => Some(Way::Http),
@@ -233,9 +234,9 @@ fn way_of(access: Access, method: &Method) -> Option<Way> {
     }
 }
 
-/// The handler's answer. What changes something goes on to its end even if nobody waits for it any
-/// more: what is done after a commit, like cutting off whoever has lost their rights, belongs to
-/// it. Only its body has to have come by then.
+/// Runs the handler. A request that changes state runs to its end even if the client disconnects,
+/// because steps after the commit, such as cutting off callers without rights, belong to the
+/// request. Only its body has to arrive within the deadline.
 async fn answered(
     request: Request,
     next: Next,
@@ -255,8 +256,8 @@ async fn answered(
     }
 }
 
-/// Runs the handler. What people only ask for leaves some of the database's connections to robots
-/// and orders.
+/// Runs the handler. People's requests other than orders leave some of the database connections to
+/// robots and orders.
 async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> Response {
     let Some((app, Counted { person, kind, under_way })) = counted else {
         return next.run(request).await;
@@ -272,7 +273,7 @@ async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> R
     response
 }
 
-/// A body that breaks off where it takes longer.
+/// A body that fails when its end has not arrived by the deadline.
 fn arriving_within(deadline: Duration, body: Body) -> Body {
     let end = Instant::now() + deadline;
     Body::from_stream(stream::unfold(body.into_data_stream(), move |mut chunks| async move {
@@ -283,7 +284,7 @@ fn arriving_within(deadline: Duration, body: Body) -> Body {
     }))
 }
 
-/// What a request shows of who sent it.
+/// The parts of a request that identify its sender.
 struct Showing<'a> {
     method: &'a Method,
     headers: &'a HeaderMap,
@@ -320,7 +321,7 @@ async fn admit(
             Err(not_permitted(&person, permission))
         }
         Ok(_) => Err(ApiError::forbidden("this token may not do that")),
-        // Its token was known, so nobody is guessing.
+        // The robot's token was known, so this is no guessing attempt.
         Err(error) if error.code == ROBOT_REVOKED => Err(error),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
             let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
@@ -334,7 +335,7 @@ async fn admit(
     }
 }
 
-/// Says what is missing, so that people know whom to ask for what.
+/// Names the missing permission, so that people know which right to ask for.
 pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError {
     let (name, roles) = (&person.name, &person.roles);
     ApiError::forbidden(if person.roles.allow(permission) {
@@ -347,9 +348,9 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     })
 }
 
-/// Who calls. From now on the connection counts for them, and if it is a robot, it is cut when the
-/// robot is put out. What comes without a token changes nothing: a connection stays with the last
-/// one that was shown on it.
+/// Identifies the caller and assigns the connection to this caller; a robot's connection is cut
+/// when the robot is removed or revoked. A request without a token changes nothing: the connection
+/// stays with the last token shown.
 async fn identify_on_connection(
     app: &App,
     showing: &Showing<'_>,
@@ -367,15 +368,16 @@ async fn identify_on_connection(
     }
 }
 
-/// Who sent this request. `Anyone` if it does not say; an error if it says it wrongly.
+/// Identifies the sender of a request. `Anyone` without credentials; an error for invalid
+/// credentials.
 async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
     let &Showing { method, headers, .. } = showing;
     let now_ms = app.clock.now_ms();
     let is_read = matches!(*method, Method::GET | Method::HEAD);
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
         let Presented { text, is_from_browser } = presented(value)?;
-        // Browsers keep a password for a site and send it along with whatever another page makes
-        // them send. Programs send no origin.
+        // Browsers keep a site's password and attach it to requests that another page triggers.
+        // Programs send no origin.
         if is_from_browser && !is_read && comes_from_page(headers) {
             require_same_origin(headers)?;
         }
@@ -404,8 +406,9 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
     })
 }
 
-/// Whose token this is, if it is good. Goes on to its end even if the client does not wait for it:
-/// a robot's first use of a token has ended its others by then, and who came in by those has to go.
+/// The holder of this token, if valid. Runs to the end even if the client disconnects: a robot's
+/// first use of a token has then ended its other tokens, and connections made with those have to be
+/// closed.
 async fn let_in(
     app: &App,
     token: &Token,
@@ -432,7 +435,7 @@ async fn let_in(
         if let TokenHolder::Robot { robot, .. } = &holder
             && is_first_use
         {
-            // Whoever is connected came in by the token that has just ended; this request's own
+            // Existing connections used the token that has just ended. This request's own
             // connection stays.
             app.broker.disconnect(robot);
             if let Some(connection) = connection {
@@ -448,7 +451,7 @@ async fn let_in(
     }
 }
 
-/// The token that these headers show.
+/// The token in these headers.
 pub(super) fn shown_token(headers: &HeaderMap) -> Result<Token, ApiError> {
     let value = headers.get(header::AUTHORIZATION);
     let value = value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?;
@@ -463,7 +466,8 @@ fn parsed(token: &str) -> Result<Token, ApiError> {
 #[derive(Debug, PartialEq, Eq)]
 struct Presented {
     text: String,
-    /// It came as a password (`Basic`), which a browser adds by itself once it knows one.
+    /// True for a password (`Basic`), which a browser attaches by itself once the user has entered
+    /// one.
     is_from_browser: bool,
 }
 
@@ -490,12 +494,12 @@ fn presented_token(value: &str) -> Option<Presented> {
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
-/// Whether a browser sent this for a page.
+/// True if a browser sent this request for a page.
 fn comes_from_page(headers: &HeaderMap) -> bool {
     headers.contains_key(SEC_FETCH_SITE) || headers.contains_key(header::ORIGIN)
 }
 
-/// Refuses what a foreign page could have made a signed-in browser send.
+/// Refuses requests that a foreign page could have triggered in a signed-in browser.
 pub(super) fn require_same_origin(headers: &HeaderMap) -> Result<(), ApiError> {
     let text = |name| headers.get(name).and_then(|value: &http::HeaderValue| value.to_str().ok());
     let is_same = match (text(SEC_FETCH_SITE), text(header::ORIGIN)) {

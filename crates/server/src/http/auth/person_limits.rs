@@ -1,7 +1,7 @@
-//! How much one person may ask of the server at a time, with all of their tokens and sessions
-//! together, so that nobody's requests wait long behind those of another: requests per second, and
-//! requests under way. Orders are counted apart from everything else, so that a person's own reads
-//! never keep them from stopping a robot.
+//! Request limits per person, over all tokens and sessions of that person: requests per second, and
+//! requests under way. The limits keep one person's requests from delaying those of others. Orders
+//! are counted apart from all other requests, so that a person's own reads never keep them from
+//! stopping a robot.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -18,36 +18,37 @@ use crate::config::PersonRates;
 use crate::http::error::ApiError;
 use crate::limits::rate_limit::{RateLimiter, Turn};
 
-/// Requests of one kind that one person may have under way. A browser has six.
+/// Limit on one person's requests of one kind under way. A browser sends up to six in parallel.
 const UNDER_WAY: usize = 8;
-/// The same of questions to robots, each of which may wait for long. There may be 1,024 in all.
+/// Limit on one person's questions to robots under way; each may wait for long. The server allows
+/// 1,024 in all.
 const QUESTIONS_UNDER_WAY: usize = 64;
-/// How long a further one waits until another has ended.
+/// How long a request above the limit waits for another to end.
 const PATIENCE: Duration = Duration::from_secs(15);
-/// An answer counts as one request more for each of these bytes.
+/// A long answer counts as one further request for each of these bytes.
 const BYTES_A_REQUEST: u64 = 64 * 1024;
-/// Above this number of people and kinds those are forgotten that have nothing under way.
+/// Above this number of entries, one per person and kind, we drop those without requests under way.
 const SWEEP_ABOVE: usize = 1_024;
 
-/// What a request of a person is counted with.
+/// The class under which a person's request is counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(in crate::http) enum RequestKind {
-    /// It changes what robots do.
+    /// Changes the work or the settings of robots.
     Order,
-    /// It changes something else.
+    /// Changes other state.
     Change,
-    /// It is answered from the database.
+    /// Answered from the database.
     Read,
-    /// It brings a part of a package.
+    /// Uploads a part of a package.
     Upload,
-    /// It waits for a robot's answer.
+    /// Waits for a robot's answer.
     Question,
-    /// It goes on for long: its number is bounded elsewhere.
+    /// Runs for long; the number of streams is bounded elsewhere.
     Stream,
 }
 
 impl RequestKind {
-    /// Of a request for a route with this access. `is_stream`: the route has no deadline.
+    /// The kind of a request for a route with this access. `is_stream`: the route has no deadline.
     pub(in crate::http) fn of(access: Access, method: &Method, is_stream: bool) -> Self {
         match access {
             Access::Person(Permission::Operate | Permission::Maintain) if !method.is_safe() => {
@@ -60,7 +61,7 @@ impl RequestKind {
         }
     }
 
-    /// How many of them one person may have under way.
+    /// The most requests of this kind that one person may have under way.
     fn limit(self) -> usize {
         match self {
             Self::Order | Self::Change | Self::Read | Self::Upload => UNDER_WAY,
@@ -70,7 +71,7 @@ impl RequestKind {
     }
 }
 
-/// What all people have asked for.
+/// The request counts of all people.
 #[derive(Debug)]
 pub struct PersonLimits {
     orders: RateLimiter<UserName>,
@@ -78,20 +79,21 @@ pub struct PersonLimits {
     under_way: Mutex<HashMap<(UserName, RequestKind), Arc<Semaphore>>>,
 }
 
-/// A request under way; dropping it ends that.
+/// Guard of a request under way; dropping it frees the slot.
 #[derive(Debug)]
 pub(in crate::http) struct UnderWay(
     #[expect(dead_code, reason = "it is held, not read")] Option<OwnedSemaphorePermit>,
 );
 
 impl PersonLimits {
-    /// Nobody has asked for anything yet.
+    /// Limits without any counted requests.
     pub fn new(rates: PersonRates) -> Self {
         let limiter = || RateLimiter::new(rates.requests_per_s);
         Self { orders: limiter(), others: limiter(), under_way: Mutex::default() }
     }
 
-    /// Waits for the turn of a request, for a moment.
+    /// Waits until the rate and the number of requests under way admit this request. The wait is
+    /// bounded.
     pub(in crate::http) async fn begin(
         &self,
         person: &UserName,
@@ -110,7 +112,6 @@ impl PersonLimits {
             }
         }
         let ended = timeout(PATIENCE, self.under_way(person, kind).acquire_owned()).await;
-        // The semaphore is never closed.
         ended.map(|permit| UnderWay(permit.ok())).map_err(|_| {
             let message = format!(
                 "{person} has {} requests under way already: try again when one has ended",
@@ -120,7 +121,7 @@ impl PersonLimits {
         })
     }
 
-    /// The answer to a request had this length.
+    /// Charges a long answer of this many bytes to the person's rate.
     pub(in crate::http) fn answered(&self, person: &UserName, kind: RequestKind, bytes: u64) {
         let more = bytes / BYTES_A_REQUEST;
         if more > 0 {
@@ -135,7 +136,7 @@ impl PersonLimits {
     fn under_way(&self, person: &UserName, kind: RequestKind) -> Arc<Semaphore> {
         let mut all = self.lock();
         if all.len() >= SWEEP_ABOVE {
-            // Whoever waits for one or has one holds it too.
+            // Each holder of a permit and each waiter also holds the semaphore.
             all.retain(|_, semaphore| Arc::strong_count(semaphore) > 1);
         }
         all.entry((person.clone(), kind))
@@ -144,8 +145,8 @@ impl PersonLimits {
     }
 
     fn lock(&self) -> MutexGuard<'_, HashMap<(UserName, RequestKind), Arc<Semaphore>>> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
-        // half-done.
+        // Every change under this lock is complete in itself, so a panic elsewhere leaves no
+        // inconsistent state.
         self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

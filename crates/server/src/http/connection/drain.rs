@@ -1,7 +1,7 @@
-//! Reads to its end what a handler left of a request's body. Otherwise the connection would have to
-//! be closed under a client that was refused early: it would see a reset instead of the refusal, or
-//! its next request would get no answer. Many clients read no answer before all of their body is
-//! sent, so how long it is does not matter, but how long it takes.
+//! Reads the unread rest of a request's body. Otherwise the connection of a client that was refused
+//! early would have to be closed: the client would see a reset instead of the refusal, or its next
+//! request would get no answer. Many clients read no answer before they have sent their whole body,
+//! so the limit is on the time that the rest takes, not on its length.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -14,12 +14,12 @@ use futures_util::StreamExt as _;
 use http::header;
 use http_body::{Frame, SizeHint};
 
-/// How long the rest may take to arrive.
+/// Time limit for the rest of the body.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// How long its sender may be silent.
+/// How long the sender may be silent.
 const SILENCE: Duration = Duration::from_secs(5);
-/// After how long the refusal has gone out: asked for more before it, a client that has announced
-/// its body sends all of it.
+/// Time by which the refusal has gone out. A client that has announced its body would send the
+/// whole body if asked for more before the refusal.
 const HEAD_START: Duration = Duration::from_millis(100);
 
 /// Wraps the body of a request; for `axum::middleware::map_request`, outermost.
@@ -29,9 +29,10 @@ pub async fn drain_unread(request: Request) -> Request {
 }
 
 struct DrainedBody {
-    /// Taken when it has ended.
+    /// Taken when the body has ended.
     body: Option<Body>,
-    /// The client sends none of it before it is asked for some, or has waited for that in vain.
+    /// The client sends no body before the server asks for the body, or before the client's wait
+    /// for that request ends.
     announced: bool,
 }
 

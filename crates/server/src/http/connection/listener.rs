@@ -1,5 +1,5 @@
-//! The accept loop: how many connections there are, how long a client may dawdle, also in its TLS
-//! handshake, and how they end. It knows no routes.
+//! The accept loop: limits the number of connections, bounds the time a client may take, including
+//! the TLS handshake, and closes connections. Knows no routes.
 
 use std::convert::Infallible;
 use std::io;
@@ -32,85 +32,84 @@ use crate::net::anteroom::{Anteroom, Place};
 use crate::net::http_connections::{Connection, HttpConnections};
 use crate::net::tls::{ClientProof, Tls};
 
-/// How long a connection on which no good token was shown is left when its place is needed: enough
-/// to sign in, or to get a page.
+/// Grace period for a connection without a valid token when its place is needed: enough to sign in
+/// or to load a page.
 const GRACE: Duration = Duration::from_secs(3);
-/// How long a request's head may take, also the first one of a connection, and how long one is kept
-/// without a request.
+/// Time limit for a request's head, including the first one of a connection, and for an idle
+/// keep-alive connection.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
-/// How long a client may pause within a body it sends.
+/// Longest pause of a client within a request body.
 const BODY_PAUSE: Duration = Duration::from_secs(30);
-/// What has to come of a body in each [`BODY_PAUSE`] that it is waited for, less than the slowest
-/// of links brings.
+/// Minimum number of body bytes per [`BODY_PAUSE`] of waiting. Even the slowest links deliver more.
 const LEAST_BODY_BYTES: usize = 16 * 1024;
-/// How long a client may leave our bytes unread.
+/// How long a client may leave sent bytes unread.
 const WRITE_PAUSE: Duration = Duration::from_secs(60);
-/// A request's head may be no larger.
+/// Largest request head, in bytes.
 const MOST_HEAD_BYTES: usize = 64 * 1024;
-/// This share of all connections, one in so many, is kept free of holders that have more than
-/// theirs.
+/// One in this many connections is reserved for holders that are within their share.
 const RESERVED_SHARE: usize = 16;
-/// How long the listener rests after it has cut a connection for another.
+/// Pause of the listener after it has cut one connection for another.
 const CUT_PAUSE: Duration = Duration::from_millis(1);
-/// How long a place is waited for before the holders are looked at again.
+/// How long the listener waits for a free place before it checks the holders again.
 const LOOK_AGAIN: Duration = Duration::from_millis(250);
-/// Pause after an accept that failed because of us, for example for want of file descriptors.
+/// Pause after an accept that failed for a local reason, for example a lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// How many connections there may be.
+/// Limits on connections.
 #[derive(Debug, Clone)]
 pub struct Limits {
-    /// At a time. When nearly all are taken, the holder with the most loses its oldest. Where none
-    /// has more than its share, those without a request end, those without a good token in any
-    /// case, and more wait in the listener's backlog.
+    /// Concurrent connections. When nearly all are taken, the holder with the most loses its
+    /// oldest. When no holder exceeds its share, connections without a request are closed,
+    /// connections without a valid token are closed in any case, and new ones wait in the
+    /// listener's backlog.
     pub max_connections: usize,
-    /// Those of one address on which no good token was shown yet; a further one takes the place of
-    /// the oldest.
+    /// Connections per address that have shown no valid token yet. A further one replaces the
+    /// oldest.
     pub max_silent_per_address: usize,
-    /// Whose connections are many clients': they count as silent until their first request, and end
-    /// between requests only.
+    /// Addresses of reverse proxies, which carry many clients per connection. A proxy's connections
+    /// count as silent until their first request, and are closed between requests only.
     pub proxies: Arc<[IpAddr]>,
-    /// How long a TLS handshake may take.
+    /// Time limit for a TLS handshake.
     pub handshake_timeout: Duration,
 }
 
-/// What is served, and what is kept of it.
+/// The router to serve, and the records of its connections and traffic.
 pub struct Service {
     /// Answers requests.
     pub router: Router,
-    /// What connections speak, if they are encrypted.
+    /// TLS settings; `None` serves plain HTTP.
     pub tls: Option<Tls>,
-    /// Whose connections they are.
+    /// The register of connections by holder.
     pub connections: Arc<HttpConnections>,
-    /// What went over them.
+    /// Byte and connection totals.
     pub traffic: Arc<HttpTotals>,
 }
 
-/// What all connections share.
+/// State shared by all connections.
 struct Site {
     router: Router,
-    /// What they speak, if they are encrypted.
+    /// TLS settings; `None` serves plain HTTP.
     tls: Option<Tls>,
     handshake_timeout: Duration,
     proxies: Arc<[IpAddr]>,
     traffic: Arc<HttpTotals>,
     stop: CancellationToken,
-    /// Ends what `stop` did not end in time.
+    /// Aborts the connections that are still open after the patience of `stop`.
     abort: CancellationToken,
 }
 
-/// A client that has just come.
+/// A newly accepted client.
 struct Guest {
     peer: SocketAddr,
     silent: Place,
-    /// What it has proven.
+    /// The identity that the client has proven in the TLS handshake.
     proof: ClientProof,
-    /// Whether its place is needed.
+    /// True while the connection's place is needed.
     crowded: watch::Receiver<bool>,
     handle: Connection,
 }
 
-/// Serves until `stop`, then lets requests under way end, for at most `patience`.
+/// Serves until `stop`, then waits at most `patience` for requests under way.
 pub async fn serve(
     listener: TcpListener,
     service: Service,
@@ -148,8 +147,8 @@ pub async fn serve(
             handle: Connection::default(),
         };
         let site = site.clone();
-        // Two kinds of task, so that a plain connection's does not need the room of an encrypted
-        // one's.
+        // Two kinds of task: the task of a plain connection then does not reserve the memory of an
+        // encrypted one.
         if site.tls.is_some() {
             connections.spawn(async move {
                 site.attend_encrypted(stream, guest).await;
@@ -172,13 +171,13 @@ pub async fn serve(
 
 impl Site {
     fn patient(&self, stream: TcpStream, handle: Connection) -> PatientStream {
-        // Answers are small and wanted at once; a failure here costs only latency.
+        // Answers are small and latency-sensitive. A failure here costs only latency.
         let _ = stream.set_nodelay(true);
         self.traffic.connection();
         PatientStream { stream, stalled: None, traffic: self.traffic.clone(), handle }
     }
 
-    /// Shakes hands, then serves the connection to its end.
+    /// Completes the TLS handshake, then serves the connection until its end.
     async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
         let Some(tls) = &self.tls else { return };
         let shaken = tokio::select! {
@@ -186,13 +185,13 @@ impl Site {
             () = gives_way(&guest.silent, guest.crowded.clone()) => return,
             () = self.stop.cancelled() => return,
         };
-        // Whoever speaks no TLS, or none that counts, is no event worth a line in the log.
+        // Failed handshakes are not logged.
         if let Ok(Ok((stream, proof))) = shaken {
             self.attend(stream, Guest { proof, ..guest }).await;
         }
     }
 
-    /// Serves one connection to its end.
+    /// Serves one connection until its end.
     async fn attend<S>(&self, stream: S, guest: Guest)
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
@@ -209,7 +208,7 @@ impl Site {
                 () = handle.authenticated() => {}
                 () = spoken.cancelled(), if is_proxy => {}
                 () = gives_way(&silent, crowded.clone()) => {
-                    // What is being looked up by us is no reason to be cut.
+                    // A connection is not cut while our own token lookup is under way.
                     if !handle.is_authenticated_after_lookup().await {
                         return;
                     }
@@ -223,7 +222,7 @@ impl Site {
                 _ = connection.as_mut() => return,
                 () = asked_to_end(&self.stop, &spoken, crowded.clone()) => connection.as_mut().graceful_shutdown(),
             }
-            // A client that breaks off or dawdles is no event worth a line in the log.
+            // Clients that disconnect or stall are not logged.
             let _ = connection.await;
         };
         tokio::select! {
@@ -235,13 +234,13 @@ impl Site {
     }
 }
 
-/// The connections there may be.
+/// The limited set of connection places.
 struct Places {
     free: Arc<Semaphore>,
     most: usize,
-    /// Whether all are taken, or nearly all were since they last were.
+    /// True from the moment all places are taken until more than an eighth are free.
     crowded: watch::Sender<bool>,
-    /// Who has them.
+    /// The holders of the places.
     registry: Arc<HttpConnections>,
 }
 
@@ -255,9 +254,9 @@ impl Places {
         }
     }
 
-    /// Takes one. The last ones are not for a holder that has more than its share: it loses its
-    /// oldest connection for each newcomer. Where no holder has more and none is left, connections
-    /// without a request have to end.
+    /// Takes a place. The last places are reserved for holders within their share: a holder above
+    /// its share loses its oldest connection for each new one. When no holder exceeds its share and
+    /// no place is left, connections without a request have to end.
     async fn take(&self) -> Option<OwnedSemaphorePermit> {
         if let Ok(place) = self.free.clone().try_acquire_owned() {
             let left = self.free.available_permits();
@@ -272,18 +271,16 @@ impl Places {
             if !self.cut_one().await {
                 self.crowded.send_replace(true);
             }
-            // By the next look strangers may have shown whose they are. The semaphore is never
-            // closed, so there is always a permit; without one the connection would only be
-            // uncounted.
+            // By the next check, strangers may have authenticated. The semaphore is never closed,
+            // so a permit always arrives; without a permit the connection would only be uncounted.
             if let Ok(place) = timeout(LOOK_AGAIN, self.free.clone().acquire_owned()).await {
                 return place.ok();
             }
         }
     }
 
-    /// Cuts the oldest connection of the holder with the most, if that is more than its share. A
-    /// holder that comes again as soon as it is cut would otherwise keep the whole server busy with
-    /// it.
+    /// Cuts the oldest connection of the largest holder, if that holder exceeds its share. The
+    /// pause keeps a holder that reconnects immediately from occupying the whole server.
     async fn cut_one(&self) -> bool {
         let is_cut = self.registry.cut_oldest_of_largest(self.most);
         if is_cut {
@@ -293,8 +290,8 @@ impl Places {
     }
 }
 
-/// Resolves when a connection has to end as soon as it has no request: the server stops, or the
-/// places are needed and this one has had its turn.
+/// Resolves when a connection has to end after its current request: the server stops, or the places
+/// are needed and this connection has served a request.
 async fn asked_to_end(
     stop: &CancellationToken,
     spoken: &CancellationToken,
@@ -310,9 +307,9 @@ async fn asked_to_end(
     }
 }
 
-/// Resolves when a connection on which no good token was shown has to go, whatever it does: a
-/// neighbour needs its place, or anybody does. What it could do would otherwise take as long as
-/// whoever is behind it likes.
+/// Resolves when an unauthenticated connection has to end, even during a request: a neighbour or,
+/// after [`GRACE`], any other connection needs its place. Waiting for the request would not be
+/// bounded, because the client decides how long a request takes.
 async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
     let needed = async {
         needed(crowded).await;
@@ -324,10 +321,10 @@ async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
     }
 }
 
-/// Resolves when the places are needed.
+/// Resolves when places are needed.
 async fn needed(mut crowded: watch::Receiver<bool>) {
     if crowded.wait_for(|crowded| *crowded).await.is_err() {
-        // Nobody takes places any more.
+        // No connection takes places any more.
         std::future::pending().await
     }
 }
@@ -354,12 +351,11 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-/// Marks a request whose connection is not encrypted: only the kernel reads the bytes of its
-/// answer.
+/// Marks a request on an unencrypted connection: only the kernel reads the bytes of its answer.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::http) struct Unencrypted;
 
-/// What is known of every request of a connection.
+/// The connection's facts that are attached to each request.
 struct Origin {
     peer: SocketAddr,
     is_encrypted: bool,
@@ -411,8 +407,7 @@ where
         .with_upgrades()
 }
 
-/// A socket whose writes fail once the other side has read nothing for [`WRITE_PAUSE`], and whose
-/// bytes are counted.
+/// A socket that counts its bytes. Writes fail once the peer has read nothing for [`WRITE_PAUSE`].
 struct PatientStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
@@ -483,21 +478,21 @@ impl AsyncWrite for PatientStream {
     }
 }
 
-/// A request's body that fails once the client has sent nothing for [`BODY_PAUSE`] while it was
-/// waited for, or too little in all the time that it was waited for.
+/// A request body that fails once the client has sent nothing for [`BODY_PAUSE`] of waiting, or too
+/// little in the total time of waiting.
 struct PatientBody {
     body: Incoming,
     waiting: Option<Wait>,
     pace: BodyPace,
 }
 
-/// That more of a body is waited for.
+/// A wait for more of a body.
 struct Wait {
     since: Instant,
     timer: Pin<Box<Sleep>>,
 }
 
-/// How fast a body comes. Only the time in which it is waited for counts: a slow server is not the
+/// The pace of a body. Only the time spent waiting for the client counts: a slow server is not the
 /// client's fault.
 #[derive(Default)]
 struct BodyPace {
@@ -506,7 +501,7 @@ struct BodyPace {
 }
 
 impl BodyPace {
-    /// Counts a piece that was waited for. False if the client sends too slowly.
+    /// Counts a chunk that was waited for. False if the client sends too slowly.
     fn count(&mut self, waited: Duration, bytes: usize) -> bool {
         self.waited += waited;
         self.bytes = self.bytes.saturating_add(bytes);

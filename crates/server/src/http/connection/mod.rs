@@ -1,4 +1,4 @@
-//! Owns connections and bodies before a route is known; it never knows routes or callers.
+//! Owns connections and bodies before a route is known; never knows routes or callers.
 
 pub mod drain;
 pub mod listener;

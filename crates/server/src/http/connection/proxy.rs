@@ -1,6 +1,5 @@
-//! Where a request really came from when a reverse proxy stands before the server: what a proxy
-//! that is trusted by its address says in `X-Forwarded-For`. From anybody else the header says
-//! nothing.
+//! The original address of a request behind a reverse proxy, from `X-Forwarded-For`. The header is
+//! believed only from a proxy with a trusted address.
 
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
@@ -8,11 +7,10 @@ use std::sync::Arc;
 use axum::extract::{ConnectInfo, Request, State};
 use http::HeaderMap;
 
-/// The addresses of proxies that are believed.
+/// The addresses of trusted proxies.
 pub(in crate::http) type TrustedProxies = Arc<[IpAddr]>;
 
-/// Puts the address of whoever asked the proxy in the place of the proxy's. Of their port nothing
-/// is known.
+/// Replaces the proxy's address by the address of the proxy's client. The client's port is unknown.
 pub(in crate::http) async fn see_through(
     State(trusted): State<TrustedProxies>,
     mut request: Request,
@@ -27,15 +25,15 @@ pub(in crate::http) async fn see_through(
     request
 }
 
-/// The last address on the list that is not a trusted proxy's: what stands before it anybody could
-/// have written, and is not looked at.
+/// The last address on the list that is not a trusted proxy's. Addresses before it can be forged by
+/// any client and are ignored.
 fn forwarded_for(trusted: &[IpAddr], peer: IpAddr, headers: &HeaderMap) -> Option<IpAddr> {
     if !trusted.contains(&peer.to_canonical()) {
         return None;
     }
     let lines = headers.get_all("x-forwarded-for").iter().rev();
     for text in lines.flat_map(|line| line.as_bytes().rsplit(|&b| b == b',')) {
-        // What is no address was not written by a proxy that is to be believed.
+        // A trusted proxy writes only valid addresses.
         let address: IpAddr = std::str::from_utf8(text.trim_ascii()).ok()?.parse().ok()?;
         if !trusted.contains(&address.to_canonical()) {
             return Some(address.to_canonical());

@@ -1,11 +1,10 @@
-//! What goes over HTTP, counted at the sockets: heads, bodies and whatever was sent in vain. It
-//! only counts.
+//! Counts HTTP traffic at the sockets: heads, bodies and bytes sent in vain. Does nothing else.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use task_proto::api::HttpTraffic;
 
-/// All connections' figures since the server began.
+/// The totals of all connections since the server began.
 #[derive(Debug, Default)]
 pub struct HttpTotals {
     connections: AtomicU64,

@@ -1,5 +1,5 @@
-//! Questions to one robot: passed on, answered by the robot itself. What changes something takes
-//! more than looking.
+//! Questions to one robot: passed on by the server, answered by the robot itself. Questions that
+//! change something need more permission than those that read.
 
 use std::time::Duration;
 
@@ -20,10 +20,12 @@ use crate::http::error::ApiError;
 use crate::http::extract::{JsonBody, PathParam};
 use crate::orders::changes::Change;
 
-/// How long a robot may take. A lifecycle transition on a slow robot is what takes longest.
+/// Time limit for the robot's answer. The longest case is a lifecycle transition on a slow robot.
 const PATIENCE: Duration = Duration::from_secs(20);
 
-/// Asks the robot, and gives its answer. What changes something takes the permission `operate`.
+/// Sends a question to the robot and returns the answer.
+///
+/// Questions that change something require the permission `operate`.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/ask", tag = "robots",
     responses((status = 409, description = "`robot_offline`, or what the robot says of why it gives no answer: `no_ros`, `no_such_node`, …."),
         (status = 503, description = "Too many questions to it are under way."),
@@ -42,7 +44,7 @@ pub(in crate::http) async fn ask(
         if !by.may(Permission::Operate) {
             return Err(not_permitted(&by, Permission::Operate));
         }
-        // Every agent says so as soon as it is connected.
+        // Every agent announces its instance as soon as it connects.
         let instance = app.presence.instance(&id).ok_or(RequestError::NotConnected)?;
         let action = Action { robot_id: id.clone(), instance, id: RequestId::random(), ask };
         let signed = app.actions.sign_action(&by, &action).await?;
@@ -51,7 +53,7 @@ pub(in crate::http) async fn ask(
         app.requests.ask(&app.broker, &id, ask, PATIENCE).await?
     };
     if let Answer::Vitals(vitals) = &mut answer {
-        // Its clock may lie, and so may its figures.
+        // A robot's clock and figures are untrusted.
         *vitals = app.vitals.take(&id, *vitals, app.clock.now_ms());
         app.changes.announce(Change::Robot(id));
     }
@@ -73,7 +75,7 @@ impl From<RequestError> for ApiError {
     }
 }
 
-/// The robot's code, if it is one that this version knows.
+/// The robot's code, if this version knows the code.
 fn code(refusal: &Refusal) -> &'static str {
     const KNOWN: [&str; 10] = [
         "no_ros",

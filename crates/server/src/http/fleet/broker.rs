@@ -1,4 +1,4 @@
-//! What robots are told about the broker, and a broker that is not the server's own about robots.
+//! Tells robots where the broker is, and provides an external broker with the robots' accounts.
 
 use axum::Json;
 use axum::extract::State;
@@ -11,7 +11,7 @@ use crate::http::extract::PathParam;
 use crate::link::mqtt_access::MqttAccess;
 use crate::store::BrokerCredential;
 
-/// Says where the robot's MQTT session goes now.
+/// Returns the current endpoint for the robot's MQTT session.
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/mqtt", tag = "agent")]
 pub(in crate::http) async fn endpoint(
     State(app): State<App>,
@@ -20,7 +20,7 @@ pub(in crate::http) async fn endpoint(
     endpoint_of(&app, &robot).await.map(Json)
 }
 
-/// The same, for whoever answers the robot something else as well.
+/// The same endpoint, for handlers that answer the robot with more.
 pub(in crate::http) async fn endpoint_of(
     app: &App,
     robot: &RobotId,
@@ -31,7 +31,7 @@ pub(in crate::http) async fn endpoint_of(
     Ok(app.mqtt.endpoint_of(&credential))
 }
 
-/// Gives the files that a mosquitto needs.
+/// Returns the configuration files for a mosquitto broker.
 #[utoipa::path(get, path = "/api/v1/broker", tag = "server",
     responses((status = 409, description = "`no_external_broker`: the server uses its own."),
         (status = 503, description = "The files could not be made now.")))]
@@ -39,7 +39,7 @@ pub(in crate::http) async fn files(State(app): State<App>) -> Result<Json<Broker
     made(&app, MqttAccess::files).await
 }
 
-/// Gives the file that a NATS server needs.
+/// Returns the configuration file for a NATS server.
 #[utoipa::path(get, path = "/api/v1/broker/nats", tag = "server",
     responses((status = 409, description = "`no_external_broker`: the server uses its own."),
         (status = 503, description = "The file could not be made now.")))]
@@ -47,7 +47,7 @@ pub(in crate::http) async fn nats_file(State(app): State<App>) -> Result<Json<Na
     made(&app, MqttAccess::nats_file).await
 }
 
-/// What `make` makes for all robots.
+/// Runs `make` for all robots.
 async fn made<T: Send + 'static>(
     app: &App,
     make: fn(&MqttAccess, &[BrokerCredential]) -> Option<T>,
@@ -56,7 +56,7 @@ async fn made<T: Send + 'static>(
         return Err(no_external_broker());
     }
     let (robots, access) = (app.store.broker_credentials().await?, app.mqtt.clone());
-    // A hash for each robot: too long for a thread that serves others.
+    // One hash per robot takes too long for an async thread, which serves other requests.
     let made = tokio::task::spawn_blocking(move || make(&access, &robots)).await;
     made.ok()
         .flatten()
@@ -64,7 +64,7 @@ async fn made<T: Send + 'static>(
         .ok_or_else(|| ApiError::unavailable("the files could not be made"))
 }
 
-/// Tests the external brokers with two accounts that are there for nothing else.
+/// Tests the external brokers with two accounts reserved for this test.
 #[utoipa::path(get, path = "/api/v1/broker/check", tag = "server",
     responses((status = 409, description = "`no_external_broker`: the server uses its own.")))]
 pub(in crate::http) async fn check(State(app): State<App>) -> Result<Json<BrokerChecks>, ApiError> {

@@ -1,4 +1,4 @@
-//! What is done to many robots at once.
+//! Changes to many robots at once.
 
 use axum::Json;
 use axum::extract::State;
@@ -14,7 +14,7 @@ use crate::http::openapi::OrderKey;
 use crate::http::views::complete_matched;
 use crate::orders::actions::IdempotencyKey;
 
-/// Sets and removes labels of many robots, of all that are meant or of none.
+/// Sets and removes labels of many robots: of all the selected robots or of none.
 #[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
@@ -27,7 +27,7 @@ pub(in crate::http) async fn labels(
     Ok(completed(&app, app.actions.label_robots(&by, order_key(&headers)?.as_ref(), &order).await?))
 }
 
-/// Removes many robots, all that are meant or none.
+/// Removes many robots: all the selected robots or none.
 #[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
@@ -47,7 +47,7 @@ pub(in crate::http) async fn remove(
     Ok(answer)
 }
 
-/// The key by which an order that is sent again is known, if it has one.
+/// The idempotency key of an order, if present: it identifies a repeated order.
 fn order_key(headers: &HeaderMap) -> Result<Option<IdempotencyKey>, ApiError> {
     headers.get(IDEMPOTENCY_KEY).map(|key| idempotency_key(Some(key))).transpose()
 }

@@ -1,5 +1,5 @@
-//! Enrolment: tokens for robots to come, the robots that come with them, and those that wait to be
-//! approved.
+//! Enrollment: tokens for new robots, the registration of robots with such a token, and the
+//! approval of waiting robots.
 
 use std::net::SocketAddr;
 
@@ -54,7 +54,7 @@ pub(in crate::http) async fn enroll(
     Ok(Created(answer))
 }
 
-/// Makes an enrolment token.
+/// Creates an enrollment token.
 #[utoipa::path(post, path = "/api/v1/enrollment-tokens", tag = "enrolment",
     responses((status = 404, description = "There is no such robot.")))]
 pub(in crate::http) async fn create_token(
@@ -65,7 +65,7 @@ pub(in crate::http) async fn create_token(
     Ok(Created(app.actions.create_enrollment_token(&by, &order).await?))
 }
 
-/// Lists the enrolment tokens that are good for something.
+/// Lists the enrollment tokens that are still usable.
 #[utoipa::path(get, path = "/api/v1/enrollment-tokens", tag = "enrolment")]
 pub(in crate::http) async fn tokens(
     State(app): State<App>,
@@ -73,7 +73,7 @@ pub(in crate::http) async fn tokens(
     Ok(Json(app.actions.enrollment_tokens().await?))
 }
 
-/// Revokes an enrolment token.
+/// Revokes an enrollment token.
 #[utoipa::path(delete, path = "/api/v1/enrollment-tokens/{enrollment}", tag = "enrolment")]
 pub(in crate::http) async fn revoke_token(
     State(app): State<App>,
@@ -84,7 +84,7 @@ pub(in crate::http) async fn revoke_token(
     Ok(NoContent)
 }
 
-/// Lists the robots that wait to be approved.
+/// Lists the robots that wait for approval.
 #[utoipa::path(get, path = "/api/v1/pending-robots", tag = "enrolment")]
 pub(in crate::http) async fn pending(
     State(app): State<App>,
@@ -92,7 +92,7 @@ pub(in crate::http) async fn pending(
     Ok(Json(app.actions.pending_robots().await?))
 }
 
-/// Lets a robot in that waits.
+/// Approves a waiting robot.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/approve", tag = "enrolment")]
 pub(in crate::http) async fn approve(
     State(app): State<App>,
@@ -104,7 +104,7 @@ pub(in crate::http) async fn approve(
     Ok(NoContent)
 }
 
-/// Turns a robot away that waits.
+/// Rejects a waiting robot.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/reject", tag = "enrolment",
     responses((status = 409, description = "`not_pending`: it does not wait.")))]
 pub(in crate::http) async fn reject(

@@ -1,4 +1,4 @@
-//! The last things that are worth a look, as far as they concern the person who asks.
+//! The feed of recent events, filtered by the scope of the asking person.
 
 use std::collections::HashSet;
 
@@ -15,21 +15,21 @@ use crate::http::extract::QueryParams;
 use crate::orders::feed::FeedAudience;
 use crate::store::KnownRobot;
 
-/// How many are listed where nobody says how many.
+/// Default number of listed entries.
 const LISTED: usize = 100;
 
 /// The query of `GET /feed`.
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct Query {
-    /// Only those with a higher number.
+    /// Only entries with a higher number.
     after: Option<u64>,
-    /// At most so many; absent: 100.
+    /// Maximum number of entries. Default: 100.
     #[param(minimum = 1, maximum = 2000)]
     limit: Option<u32>,
 }
 
-/// Lists the last things that happened: the newest, or with `after` the next after it.
+/// Lists fleet events: the newest, or with `after` the next ones after that number.
 #[utoipa::path(get, path = "/api/v1/feed", tag = "server")]
 pub(in crate::http) async fn feed(
     State(app): State<App>,
@@ -48,8 +48,8 @@ pub(in crate::http) async fn feed(
         theirs.extend(app.store.robots_in(&by.scope).await?);
         known.extend(app.store.robots_in(&Scope::everything()).await?);
     }
-    // What a robot is labelled now counts, as everywhere else. An entry knows what it was labelled
-    // then: all that is left of one that was removed.
+    // A robot's current labels decide, as everywhere else. An entry also holds the labels at its
+    // time: for a removed robot, those are all that is left.
     let is_theirs_now = |robot: &KnownRobot| match known.contains(&robot.id) {
         true => theirs.contains(&robot.id),
         false => by.scope.covers(&robot.id, &robot.name, &robot.labels),

@@ -1,4 +1,4 @@
-//! What became of everything that was ordered for a robot.
+//! The history of a robot's orders and their outcomes.
 
 use axum::Json;
 use axum::extract::State;
@@ -14,7 +14,7 @@ use crate::http::error::ApiError;
 use crate::http::extract::{PathParam, QueryParams};
 use crate::store::HistoryQuery;
 
-/// How many assignments are listed where nobody says how many, and at most.
+/// The default and the largest number of listed assignments.
 const LISTED: u32 = 50;
 const MOST_LISTED: u32 = 200;
 
@@ -22,18 +22,18 @@ const MOST_LISTED: u32 = 200;
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct Query {
-    /// At most so many; absent: 50.
+    /// Maximum number of entries. Default: 50.
     #[param(minimum = 1, maximum = 200)]
     limit: Option<u32>,
-    /// Only what was ordered before this.
+    /// Only entries ordered before this deployment.
     #[param(inline)]
     before: Option<DeploymentId>,
-    /// Only of this task.
+    /// Only entries of this task.
     #[param(inline)]
     task: Option<TaskName>,
 }
 
-/// Lists what was ordered for a robot and what became of it, the newest first.
+/// Lists a robot's past and present assignments with their outcomes, the newest first.
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/tasks", tag = "robots",
     responses((status = 404, description = "There is no such robot, or no deployment `before`.")))]
 pub(in crate::http) async fn tasks(

@@ -1,6 +1,6 @@
-//! Robots' log lines: what was said, from the robot or else from memory, and what is said from now
-//! on. While anyone follows a robot one task here keeps asking it to publish; when nobody does, it
-//! ends.
+//! Robots' log lines: recent lines, from the robot or else from memory, and a stream of new lines.
+//! While a robot has followers, one task keeps asking the robot to publish. The task ends with the
+//! last follower.
 
 use std::convert::Infallible;
 use std::time::Duration;
@@ -26,18 +26,18 @@ use crate::http::error::ApiError;
 use crate::http::events::end_of_stream;
 use crate::http::extract::{PathParam, QueryParams};
 
-/// How long a robot may take to look its lines up, before memory has to do.
+/// Time limit for a robot to look up its lines, before memory is used instead.
 const PATIENCE: Duration = Duration::from_secs(10);
-/// For how long a robot publishes when it was asked once.
+/// How long a robot publishes after one request.
 const LEASE: Duration = Duration::from_secs(60);
-/// How often it is asked again.
+/// Interval at which the request is renewed.
 const RENEWAL: Duration = Duration::from_secs(20);
-/// How soon it is asked again when it could not be reached.
+/// Pause before the next request when the robot could not be reached.
 const RETRY: Duration = Duration::from_secs(3);
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const DEFAULT_LINES: u64 = 500;
 
-/// Gives a robot's newest log lines, or with `follow` streams those that come.
+/// Returns a robot's newest log lines, or with `follow` streams new lines.
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/logs", tag = "robots",
     responses((status = 200, description = "The lines; or server-sent events, each of which has a `LogEvent` as its data.",
             content((LogsView = "application/json"), (LogEvent = "text/event-stream"))),
@@ -59,7 +59,7 @@ pub(in crate::http) async fn show(
     Ok(Json(newest(&app, &id, filter, query.since_s, max_lines).await?).into_response())
 }
 
-/// Which lines are wanted.
+/// The selection of log lines.
 struct Filter {
     task: Option<TaskName>,
     level: LogLevel,
@@ -100,7 +100,7 @@ async fn newest(
     Ok(remembered(app, robot, &filter, since_ms, max_lines, reason))
 }
 
-/// Whether memory would be no answer either.
+/// True if the error concerns the question itself, so that memory has no answer either.
 fn is_about_the_question(error: &RequestError) -> bool {
     matches!(error, RequestError::Refused(refusal) if refusal.code == "no_such_task")
 }
@@ -124,7 +124,7 @@ fn remembered(
         };
     };
     let age_ms = app.clock.now_ms().saturating_sub(kept.received_ms);
-    // What the robot's clock shows now, if it goes on as it went.
+    // The robot's clock now, if it has run on evenly since its last message.
     let robot_now_ms = kept.robot_ms.saturating_add(age_ms);
     let oldest_ms = since_ms.map_or(0, |since_ms| robot_now_ms.saturating_sub(since_ms));
     let wanted =
@@ -156,22 +156,22 @@ fn stream(
     }
     let mut is_told = false;
     let events = BroadcastStream::new(told).filter_map(move |told| {
-        // The places are free again when the stream is dropped.
+        // The places are freed when the stream is dropped.
         let _held = (&place, &follower);
         let event = match told {
-            // A robot that goes on is news for whoever has come since.
+            // A follower that joined later has not been told yet that the robot publishes.
             Ok(Told::Following { again }) => {
                 (again || !std::mem::replace(&mut is_told, true)).then_some(LogEvent::Following)
             }
             Ok(Told::Away(reason)) => Some(LogEvent::Away { reason: reason.to_string() }),
             Ok(Told::Lines(batch)) => lines(&batch, &filter),
-            // Too slow, and so there is a gap.
+            // The listener lagged behind, so lines are missing.
             Err(_) => Some(LogEvent::Following),
         };
         std::future::ready(event.map(|event| Ok(sent(&event))))
     });
-    // A first line, so that proxies pass the headers on and the listener knows that it is
-    // connected.
+    // An immediate first line makes proxies pass the headers on, and tells the listener that the
+    // stream is connected.
     let greeting = futures_util::stream::iter([Ok(SentEvent::default()
         .retry(Duration::from_secs(2))
         .comment("hello"))]);
@@ -192,11 +192,11 @@ fn sent(event: &LogEvent) -> SentEvent {
         LogEvent::Away { .. } => "away",
         LogEvent::Lines { .. } => "lines",
     };
-    // Names, numbers and texts can always be written.
+    // Names, numbers and texts can always be serialized.
     SentEvent::default().event(name).data(serde_json::to_string(event).unwrap_or_default())
 }
 
-/// Keeps asking the robot to publish its lines, for as long as anyone follows.
+/// Keeps asking the robot to publish its lines while it has followers.
 async fn keep_following(app: App, robot: RobotId) {
     let mut connection = None;
     while let Some(level) = app.logs.wanted(&robot) {
@@ -206,14 +206,14 @@ async fn keep_following(app: App, robot: RobotId) {
             app.presence.get(&robot, app.clock.now_ms()).and_then(|sighting| sighting.connection);
         let pause = match app.requests.ask(&app.broker, &robot, ask, PATIENCE).await {
             Ok(_) => {
-                // By another connection than the last time: what it said in between is not known.
+                // The robot has a new connection: lines from the time in between are unknown.
                 let again = connection.is_some_and(|last| Some(last) != now);
                 connection = now;
                 app.logs.tell(&robot, Told::Following { again });
                 RENEWAL
             }
             Err(error) => {
-                // So that it counts as a gap, whatever connection it comes back by.
+                // Counts as a gap, whichever connection the robot comes back by.
                 connection = connection.map(|_| 0);
                 app.logs.tell(&robot, Told::Away(error.to_string().into()));
                 RETRY

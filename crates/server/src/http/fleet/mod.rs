@@ -1,5 +1,5 @@
-//! Owns the routes about robots, and those that robots call themselves; it never decides what a
-//! robot should run.
+//! Owns the routes about robots and the routes that robots call; never decides which tasks a robot
+//! should run.
 
 pub(super) mod ask;
 pub(super) mod broker;

@@ -1,5 +1,5 @@
-//! The way to MQTT over the HTTP port: a WebSocket, for robots that reach nothing else. Who comes
-//! in is the broker's own affair, as at its own port.
+//! MQTT over the HTTP port: a WebSocket, for robots that can't reach another port. The broker
+//! authenticates clients, as at its own port.
 
 use std::io;
 use std::net::SocketAddr;
@@ -15,7 +15,7 @@ use crate::http::App;
 use crate::http::error::ApiError;
 use crate::net::tls::ClientProof;
 
-/// Goes over to MQTT in a WebSocket. Who comes in is the broker's affair, as at its own port.
+/// Upgrades to MQTT over WebSocket. The broker authenticates the client, as at its own port.
 #[utoipa::path(get, path = "/mqtt", tag = "agent",
     responses((status = 101, description = "MQTT from here on."),
         (status = 426, description = "It is no WebSocket handshake for MQTT."),
@@ -46,7 +46,7 @@ pub(in crate::http) async fn upgrade(
     Ok(response)
 }
 
-/// Says as well what the request should have asked for.
+/// Adds the required upgrade headers to the error.
 fn upgrade_required(error: &WebSocketError) -> Response {
     let error = ApiError::new(StatusCode::UPGRADE_REQUIRED, "upgrade_required", error.to_string());
     let mut response = error.into_response();

@@ -1,5 +1,5 @@
-//! What tasks brought back, as the operator's commands and the page list it. The bytes are the
-//! registry's.
+//! Outputs of tasks, listed for the operator's commands and the page. The bytes belong to the
+//! registry.
 
 use axum::Json;
 use axum::extract::State;
@@ -18,15 +18,15 @@ use crate::http::extract::QueryParams;
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct ListQuery {
-    /// Only of this robot, by id or name.
+    /// Only outputs of this robot, by id or name.
     #[param(inline)]
     robot: Option<RobotName>,
-    /// Only of this task.
+    /// Only outputs of this task.
     #[param(inline)]
     task: Option<TaskName>,
 }
 
-/// Lists what came back, of one robot or of all.
+/// Lists the outputs of one robot or of all robots.
 #[utoipa::path(get, path = "/api/v1/outputs", tag = "outputs",
     responses((status = 404, description = "There is no such robot.")))]
 pub(in crate::http) async fn list(

@@ -1,4 +1,4 @@
-//! Robots: what operators see and change of them, and the two calls robots make themselves.
+//! Robots: reading and changing them for operators, and the two calls that robots make themselves.
 
 use std::net::SocketAddr;
 use std::str::FromStr;
@@ -35,18 +35,18 @@ use crate::orders::changes::Change;
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct ListQuery {
-    /// Only the robots that it means.
+    /// Only robots that match this selector.
     #[param(inline)]
     selector: Option<Selector>,
-    /// At most so many; absent: all.
+    /// Maximum number of robots. Default: all.
     #[param(minimum = 1, maximum = 1000)]
     limit: Option<u32>,
-    /// Only those whose names come after this one; takes a `limit`.
+    /// Only robots whose names come after this one. Requires `limit`.
     #[param(inline)]
     after: Option<RobotName>,
 }
 
-/// Lists all robots of the person's, or those of them a selector means, or a page of either.
+/// Lists the caller's robots, optionally filtered by a selector and in pages.
 #[utoipa::path(get, path = "/api/v1/robots", tag = "robots")]
 pub(in crate::http) async fn list(
     State(app): State<App>,
@@ -120,7 +120,7 @@ pub(in crate::http) async fn edit(
     view(&app, &id).await.map(Json)
 }
 
-/// Removes a robot; whoever is connected with its token has to go.
+/// Removes a robot and disconnects clients that use its token.
 #[utoipa::path(delete, path = "/api/v1/robots/{robot}", tag = "robots")]
 pub(in crate::http) async fn remove(
     State(app): State<App>,
@@ -133,7 +133,7 @@ pub(in crate::http) async fn remove(
     Ok(NoContent)
 }
 
-/// Ends a robot's tokens, and whatever is under way by them.
+/// Revokes a robot's tokens and ends the connections and transfers that use them.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/revoke", tag = "robots")]
 pub(in crate::http) async fn revoke(
     State(app): State<App>,
@@ -143,7 +143,7 @@ pub(in crate::http) async fn revoke(
     let id = find(&app, &by, &robot).await?;
     app.actions.revoke_robot(&by, &id).await?;
     put_out(&app, &id);
-    // One that polled would count as there for a while.
+    // A robot that polled would otherwise count as online for a while.
     app.presence.forget(&id);
     app.changes.happened(Happening::Robot(
         id.clone(),
@@ -154,7 +154,7 @@ pub(in crate::http) async fn revoke(
     Ok(NoContent)
 }
 
-/// Forgets a robot that was removed; whoever is connected with its token has to go.
+/// Cleans up after a removed robot: clients connected with its token are disconnected.
 pub(in crate::http) fn gone(app: &App, robot: &RobotId) {
     put_out(app, robot);
     app.logs.forget(robot);
@@ -162,13 +162,13 @@ pub(in crate::http) fn gone(app: &App, robot: &RobotId) {
     app.presence.forget(robot);
 }
 
-/// Ends a robot's session and its requests. To be called once its tokens have ended.
+/// Ends a robot's session and its requests. Call this once the robot's tokens have ended.
 fn put_out(app: &App, robot: &RobotId) {
     app.broker.disconnect(robot);
     app.http_connections.end(robot);
 }
 
-/// Gives the robot its signed desired state. Asking counts as being there.
+/// Returns the robot's signed desired state. The request counts as a sign of presence.
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/desired", tag = "agent",
     responses((status = 200, description = "The state, as a DSSE envelope; its tag is in `ETag`.", body = Envelope),
         (status = 304, description = "It is still the one that `If-None-Match` names."),
@@ -203,7 +203,7 @@ pub(in crate::http) async fn desired(
     Ok((caching, [(header::CONTENT_TYPE, "application/json")], body).into_response())
 }
 
-/// Stores a report of the robot; the answer comes after the commit.
+/// Stores a report of the robot. The response is sent after the commit.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/report", tag = "agent",
     responses((status = 409, description = "`instance_waits`, as of the desired state."),
         (status = 503, description = "Too many reports wait to be stored, or the database does not answer or is corrupt."),
@@ -234,7 +234,7 @@ pub(in crate::http) async fn report(
     Ok(Json(app.reports.submit(report, token_number).await?))
 }
 
-/// Gives the robot a token that it may go over to; the first use of it ends the one it called with.
+/// Issues the robot's next token. Its first use ends the token that this request was made with.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/token", tag = "agent",
     responses((status = 409, description = "`enrolled_anew`: another agent has enrolled as this robot meanwhile; `instance_waits`, as of the desired state.")))]
 pub(in crate::http) async fn next_token(
@@ -251,7 +251,7 @@ pub(in crate::http) async fn next_token(
     Ok(Created(RobotToken { token: token.reveal() }))
 }
 
-/// What the agent that makes a request says of itself; an older one says nothing.
+/// The instance that the requesting agent states in its headers; older agents state none.
 fn claim_in(headers: &HeaderMap) -> Result<Option<Claim>, ApiError> {
     fn read<T: FromStr>(headers: &HeaderMap, name: &str) -> Result<Option<T>, ApiError> {
         let Some(value) = headers.get(name) else { return Ok(None) };
@@ -262,7 +262,7 @@ fn claim_in(headers: &HeaderMap) -> Result<Option<Claim>, ApiError> {
     Ok(read(headers, INSTANCE_HEADER)?.map(|instance| Claim { instance, place }))
 }
 
-/// Whether what asks in the robot's name is the agent that has its work.
+/// True if the requesting agent is the one that has the robot's work.
 fn is_served(app: &App, robot: &RobotId, peer: SocketAddr, claim: Option<Claim>) -> bool {
     match claim {
         Some(claim) => uplink::claimed(
@@ -282,7 +282,7 @@ fn waits() -> ApiError {
     ApiError::conflict("instance_waits", message)
 }
 
-/// The robot that a person names, which must be one of theirs.
+/// The robot that a person names, which must be in the person's scope.
 pub(in crate::http) async fn find(
     app: &App,
     by: &Person,

@@ -1,4 +1,4 @@
-//! How robots' machines do: what robots without a session say, and what people see of it.
+//! Vitals of robots' machines: reports from robots without a session, and views for people.
 
 use std::net::SocketAddr;
 
@@ -17,7 +17,7 @@ use crate::http::extract::{PathParam, TolerantJson};
 use crate::link::uplink;
 use crate::orders::changes::Change;
 
-/// Takes how the robot's machine does, while it has no MQTT session.
+/// Receives the vitals of the robot's machine while the robot has no MQTT session.
 #[utoipa::path(post, path = "/api/v1/robots/{robot}/telemetry", tag = "agent")]
 pub(in crate::http) async fn telemetry(
     State(app): State<App>,
@@ -38,7 +38,7 @@ pub(in crate::http) async fn telemetry(
     Ok(NoContent)
 }
 
-/// Shows how a robot's machine did in the last hour.
+/// Shows the vitals of a robot's machine over the last hour.
 #[utoipa::path(get, path = "/api/v1/robots/{robot}/vitals", tag = "robots")]
 pub(in crate::http) async fn show(
     State(app): State<App>,

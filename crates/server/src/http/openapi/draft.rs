@@ -1,6 +1,6 @@
-//! One operation as it is described: what the handler's attribute says, what its arguments and its
-//! answer show, and what the table says of the route. What all routes of a kind answer is said here
-//! once.
+//! The description of one operation: from the handler's attribute, from the types of its arguments
+//! and its answer, and from the table of routes. Answers that all routes of a kind share are
+//! described here once.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ use utoipa::{IntoParams, PartialSchema as _, ToSchema};
 use super::super::Route;
 use super::super::auth::Access;
 
-/// The header of every order.
+/// The idempotency header of every order.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Header)]
 #[expect(
@@ -29,8 +29,8 @@ use super::super::auth::Access;
     reason = "it is read from the headers, after it is known whether the order is a dry run"
 )]
 pub(in crate::http) struct OrderKey {
-    /// Makes the order safe to repeat: the same key gives the same answer. 1 to 128 visible
-    /// characters. A dry run needs none.
+    /// Makes the order safe to retry: the same key returns the same response. 1 to 128 visible
+    /// characters. Not needed for a dry run.
     #[param(
         rename = "Idempotency-Key",
         required = false,
@@ -42,20 +42,20 @@ pub(in crate::http) struct OrderKey {
     idempotency_key: Option<String>,
 }
 
-/// What is known of an operation so far.
+/// The description of an operation, as collected so far.
 pub(in crate::http) struct Draft {
-    /// The path, as it is described: a parameter that takes all that is left is one like others.
+    /// The path as documented: a catch-all parameter is written like any other.
     pub(super) path: String,
     pub(super) method: HttpMethod,
     pub(super) operation: Operation,
-    /// The components it refers to, by name.
+    /// The components that the operation refers to, by name.
     pub(super) schemas: BTreeMap<String, RefOr<Schema>>,
     /// Parameters of the path that no argument has taken yet.
     path_parameters: std::vec::IntoIter<String>,
 }
 
 impl Draft {
-    /// That of a route, whole.
+    /// The complete description of a route.
     pub(super) fn of(route: &Route) -> Self {
         let path = route.path.replace("{*", "{");
         let names = path.split('/').filter_map(|part| part.strip_prefix('{')?.strip_suffix('}'));
@@ -91,7 +91,7 @@ impl Draft {
         draft
     }
 
-    /// Begins with what the handler's attribute says.
+    /// Begins with the contents of the handler's attribute.
     pub(in crate::http) fn begin<P>(&mut self, id: &str)
     where
         P: utoipa::Path + utoipa::__dev::SchemaReferences + for<'t> utoipa::__dev::Tags<'t>,
@@ -123,7 +123,7 @@ impl Draft {
         Ref::from_schema_name(T::name()).into()
     }
 
-    /// The body is JSON. Where only what is known is taken, the description says so.
+    /// Documents a JSON body. If unknown fields are refused, the description says so.
     pub(super) fn takes_json<T: ToSchema>(&mut self, is_closed: bool) {
         let schema = self.component::<T>();
         if let Some(RefOr::T(Schema::Object(object))) = self.schemas.get_mut(T::name().as_ref())
@@ -144,7 +144,7 @@ impl Draft {
         self.refusal(StatusCode::UNSUPPORTED_MEDIA_TYPE, "The body is not `application/json`.");
     }
 
-    /// The next parameter of the path is one of these.
+    /// Documents the type of the next path parameter.
     pub(super) fn takes_path<T: ToSchema>(&mut self) {
         let Some(name) = self.path_parameters.next() else { return };
         self.refusal(
@@ -164,7 +164,7 @@ impl Draft {
         self.add_parameter(parameter.description(text).schema(Some(schema)).build());
     }
 
-    /// The query has these parameters.
+    /// Documents the parameters of the query.
     pub(super) fn takes_query<T: IntoParams>(&mut self) {
         for parameter in T::into_params(|| Some(ParameterIn::Query)) {
             self.add_parameter(parameter);
@@ -179,7 +179,7 @@ impl Draft {
         self.operation.parameters.get_or_insert_default().push(RefOr::T(parameter));
     }
 
-    /// Answers with JSON of this type.
+    /// Documents a JSON answer of this type.
     pub(super) fn gives_json<T: ToSchema>(&mut self, status: StatusCode) {
         let schema = self.component::<T>();
         let content = ContentBuilder::new().schema(Some(schema)).build();
@@ -189,13 +189,13 @@ impl Draft {
         self.answer(status, response.content("application/json", content).build());
     }
 
-    /// Answers without a body.
+    /// Documents an answer without a body.
     pub(super) fn gives_nothing(&mut self) {
         self.answer(StatusCode::NO_CONTENT, ResponseBuilder::new().description("Done.").build());
     }
 
     fn answer(&mut self, status: StatusCode, response: Response) {
-        // What the attribute says of it is said with more knowledge.
+        // The attribute's own description is more specific and takes precedence.
         self.operation
             .responses
             .responses
@@ -203,12 +203,12 @@ impl Draft {
             .or_insert(RefOr::T(response));
     }
 
-    /// Answers so as well.
+    /// Documents a further refusal.
     pub(super) fn refusal(&mut self, status: StatusCode, text: &str) {
         self.answer(status, ResponseBuilder::new().description(text).build());
     }
 
-    /// What the guard before the handler asks for, and answers itself.
+    /// Documents the guard's requirements and its refusals.
     fn guarded_by(&mut self, access: Access) {
         let scheme = |name: &str| SecurityRequirement::new(name, [""; 0]);
         let (who, permission, schemes): (&str, Option<Permission>, &[&str]) = match access {
@@ -251,10 +251,10 @@ impl Draft {
         self.refusal(StatusCode::INTERNAL_SERVER_ERROR, "The server failed; its log says why.");
     }
 
-    /// Every refusal that does not say otherwise has the API's one error body, and the headers that
-    /// belong to it.
+    /// Adds the API's common error body and its headers to every refusal without a schema of its
+    /// own.
     fn complete_refusals(&mut self, access: Access) {
-        // The registry's errors are as its own specification says.
+        // The registry's errors follow the OCI specification.
         let error = match access {
             Access::PersonOrRobot => RefOr::T(Schema::Object(Object::new())),
             _ => self.component::<ErrorBody>(),
@@ -278,7 +278,7 @@ impl Draft {
     }
 }
 
-/// What a type says of itself, without the route that it may name first.
+/// A type's own description, without the route that the text may name first.
 fn description(schema: &RefOr<Schema>) -> Option<String> {
     let RefOr::T(Schema::Object(object)) = schema else { return None };
     let text = object.description.as_deref()?;
@@ -289,7 +289,8 @@ fn description(schema: &RefOr<Schema>) -> Option<String> {
     Some(text.replace('\n', " "))
 }
 
-/// A parameter that is not there is left out: there is no way to write null.
+/// Removes null from a parameter's schema: an absent parameter is left out, and null can't be
+/// written.
 fn without_null(schema: RefOr<Schema>) -> RefOr<Schema> {
     let is_null = |item: &RefOr<Schema>| matches!(item, RefOr::T(Schema::Object(object)) if matches!(object.schema_type, SchemaType::Type(Type::Null)));
     match schema {

@@ -1,5 +1,5 @@
-//! What a handler's own types say of it: each argument of what it takes, its answer of what it
-//! gives. A handler whose types say nothing of a body gets it from its attribute.
+//! Describes handlers by their own types: each argument describes the input, the return type
+//! describes the answer. If the types describe no body, the attribute does.
 
 use std::net::SocketAddr;
 
@@ -17,7 +17,7 @@ use super::super::shared_lists::SharedJson;
 use super::Draft;
 use crate::domain::person::Person;
 
-/// 201, with what was made.
+/// 201, with the created object.
 pub(in crate::http) struct Created<T>(pub(in crate::http) T);
 
 impl<T: serde::Serialize> IntoResponse for Created<T> {
@@ -26,9 +26,10 @@ impl<T: serde::Serialize> IntoResponse for Created<T> {
     }
 }
 
-/// Something a handler takes out of a request.
+/// An extractor argument of a handler.
 pub(in crate::http) trait Argument {
-    /// Says what of it the caller has to send. Most are found out by the server.
+    /// Describes the caller's part of this argument. Most arguments come from the server and
+    /// describe nothing.
     fn describe(_draft: &mut Draft) {}
 }
 
@@ -41,7 +42,7 @@ impl Argument for Request {}
 impl Argument for Caller {}
 impl Argument for Person {}
 
-/// A handler that answers in its own way to who does not send it.
+/// For a handler that answers in its own way when the argument is missing.
 impl<T: Argument, E> Argument for Result<T, E> {
     fn describe(draft: &mut Draft) {
         T::describe(draft);
@@ -85,9 +86,9 @@ impl<T: IntoParams> Argument for QueryParams<T> {
     }
 }
 
-/// Something a handler answers.
+/// An answer of a handler.
 pub(in crate::http) trait Answer {
-    /// Says what of it the caller gets.
+    /// Describes the answer to the caller.
     fn describe(_draft: &mut Draft) {}
 }
 
@@ -124,9 +125,9 @@ impl<T: Answer> Answer for Result<T, ApiError> {
     }
 }
 
-/// A handler, whose arguments are `T`.
+/// A handler with the arguments `T`.
 pub(in crate::http) trait Describe<T> {
-    /// Says what its arguments and its answer say.
+    /// Adds the descriptions of the arguments and the answer.
     fn describe(&self, draft: &mut Draft);
 }
 

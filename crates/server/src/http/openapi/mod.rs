@@ -1,5 +1,5 @@
-//! The API's description, OpenAPI 3.1: written from the table of routes, from what each handler
-//! takes and gives, and from what its attribute says beside that. It is the same for everybody, and
+//! The API's description, OpenAPI 3.1: generated from the table of routes, the input and output
+//! types of each handler, and the handler's attribute. The document is the same for all callers and
 //! holds no data.
 
 mod draft;
@@ -21,7 +21,7 @@ use super::auth::COOKIE;
 use super::{Route, routes};
 use crate::http::server::web::is_known;
 
-/// Operations are grouped by these.
+/// The groups of operations.
 const TAGS: [(&str, &str); 12] = [
     ("robots", "The robots there are: what they are, run, say and show."),
     ("deployments", "Orders of a package on robots."),
@@ -40,9 +40,10 @@ const TAGS: [(&str, &str); 12] = [
 const ABOUT: &str = "Distributes task packages to fleets of robots. Times are milliseconds since the Unix epoch by the \
      server's clock, sizes are bytes. A field that is not known is refused in a request and to be passed over in an answer.";
 
-/// The document's text and its tag; it is the same as long as the server runs.
+/// The document's text and its tag, fixed while the server runs.
 static DOCUMENT: LazyLock<(Bytes, String)> = LazyLock::new(|| {
-    // By way of a value, whose fields are sorted, it is the same text each time the server starts.
+    // Through a `Value`, which sorts its fields: the text is then the same at each start of the
+    // server.
     let text = serde_json::to_value(document(&routes()))
         .map(|document| document.to_string())
         .unwrap_or_default();
@@ -50,7 +51,7 @@ static DOCUMENT: LazyLock<(Bytes, String)> = LazyLock::new(|| {
     (Bytes::from(text), tag)
 });
 
-/// This description.
+/// Returns this OpenAPI description.
 #[utoipa::path(get, path = "/api/openapi.json", tag = "server",
     responses((status = 200, description = "An OpenAPI 3.1 document.", body = serde_json::Value),
         (status = 304, description = "The document is still the one that `If-None-Match` names.")))]
@@ -107,7 +108,7 @@ pub(super) fn document(routes: &[Route]) -> OpenApi {
         .build()
 }
 
-/// All of them, each once: what answers with and without a slash at its end is one.
+/// The routes to describe, each once: a route with and without a trailing slash counts as one.
 fn described(routes: &[Route]) -> impl Iterator<Item = &Route> {
     let has_longer =
         |path: &str| routes.iter().any(|other| other.path.strip_suffix('/') == Some(path));
@@ -140,7 +141,7 @@ mod tests {
         items.collect()
     }
 
-    /// Everything that a value refers to.
+    /// All references in a value.
     fn references(value: &Value, found: &mut BTreeSet<String>) {
         match value {
             Value::Object(fields) => {

@@ -1,4 +1,4 @@
-//! Deployments: order one, look at them, take one back, let a paused one go on.
+//! Deployments: order, list, show, cancel and retry them, and resume a paused one.
 
 use axum::Json;
 use axum::extract::State;
@@ -25,18 +25,18 @@ use crate::http::views::{complete_deployment, complete_matched, narrowed, withou
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct ListQuery {
-    /// At most so many; absent: 200.
+    /// Maximum number of deployments. Default: 200.
     #[param(minimum = 1, maximum = 1000)]
     limit: Option<u32>,
-    /// Only those that came before this one.
+    /// Only deployments created before this one.
     #[param(inline)]
     before: Option<DeploymentId>,
 }
 
-/// How many are listed where nobody says how many.
+/// Default number of listed deployments.
 const LISTED: u32 = 200;
 
-/// Lists the newest deployments, a page of them; of each only what concerns the person's robots.
+/// Lists deployments in pages, the newest first, each limited to the caller's robots.
 #[utoipa::path(get, path = "/api/v1/deployments", tag = "deployments",
     responses((status = 404, description = "There is no deployment `before`.")))]
 pub(in crate::http) async fn list(
@@ -70,13 +70,13 @@ async fn listed(app: &App, by: &Person, query: &ListQuery) -> Result<DeploymentL
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct ShowQuery {
-    /// Whether each assignment says when it came into its phases.
+    /// Whether each assignment includes the times at which it entered its phases.
     #[serde(default)]
     #[param(required = false)]
     timeline: bool,
 }
 
-/// Shows one deployment, with its assignments.
+/// Shows one deployment with its assignments.
 #[utoipa::path(get, path = "/api/v1/deployments/{deployment}", tag = "deployments")]
 pub(in crate::http) async fn show(
     State(app): State<App>,
@@ -88,7 +88,7 @@ pub(in crate::http) async fn show(
     app.lists.get(ListKey::new(&by.scope, &uri), seen(&app, &by, &id, query.timeline)).await
 }
 
-/// Orders a package on robots, or only says which robots that would be.
+/// Deploys a package to robots, or with a dry run only lists the robots.
 #[utoipa::path(post, path = "/api/v1/deployments", tag = "deployments", params(OrderKey),
     responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
         (status = 201, description = "The deployment.", body = DeploymentView),
@@ -123,7 +123,7 @@ pub(in crate::http) async fn create(
     Ok((StatusCode::CREATED, Json(view(&app, &by, &id).await?)).into_response())
 }
 
-/// Takes a deployment back.
+/// Cancels a deployment.
 #[utoipa::path(post, path = "/api/v1/deployments/{deployment}/cancel", tag = "deployments",
     responses((status = 409, description = "`nothing_to_cancel`: it is over on all of its robots.")))]
 pub(in crate::http) async fn cancel(
@@ -135,7 +135,7 @@ pub(in crate::http) async fn cancel(
     view(&app, &by, &id).await.map(Json)
 }
 
-/// Lets a paused deployment go on.
+/// Resumes a paused deployment.
 #[utoipa::path(post, path = "/api/v1/deployments/{deployment}/resume", tag = "deployments",
     responses((status = 409, description = "`deployment_cancelled`: it was taken back; `not_paused`: \
         nothing is to be resumed, and what it waits for.")))]
@@ -148,7 +148,7 @@ pub(in crate::http) async fn resume(
     view(&app, &by, &id).await.map(Json)
 }
 
-/// Orders once more what has ended badly, or only says on which robots that would be.
+/// Retries a deployment where it ended badly, or with a dry run only lists the robots.
 #[utoipa::path(post, path = "/api/v1/deployments/{deployment}/retry", tag = "deployments", params(OrderKey),
     responses((status = 200, description = "A dry run: the robots it would be.", body = MatchedRobots),
         (status = 201, description = "The new deployment.", body = DeploymentView),
@@ -172,7 +172,7 @@ pub(in crate::http) async fn retry(
     Ok((StatusCode::CREATED, Json(view(&app, &by, &id).await?)).into_response())
 }
 
-/// A deployment as far as it concerns the person, without timelines.
+/// The part of a deployment that concerns the person, without timelines.
 pub(in crate::http) async fn view(
     app: &App,
     by: &Person,

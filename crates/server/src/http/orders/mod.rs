@@ -1,4 +1,4 @@
-//! Owns the routes that order work for robots; it never decides what an order means.
+//! Owns the routes that order work for robots; never decides the effect of an order.
 
 pub(super) mod deployments;
 pub(super) mod tasks;

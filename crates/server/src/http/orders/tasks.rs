@@ -1,4 +1,5 @@
-//! Orders on tasks that robots have: start, restart, stop, remove, and back to the package before.
+//! Orders on tasks that robots have: start, restart, stop, remove, and roll back to the previous
+//! package.
 
 use axum::Json;
 use axum::extract::State;
@@ -15,7 +16,7 @@ use crate::http::openapi::OrderKey;
 use crate::http::views::complete_matched;
 use crate::orders::actions::{Rollback, TaskOrder};
 
-/// Starts a task on robots that have it; a job runs once more.
+/// Starts a task on robots that have it. A job runs once more.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/start", tag = "tasks", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
@@ -29,7 +30,7 @@ pub(in crate::http) async fn start(
     order(&app, &by, TaskOrder::Start, &task, &headers, &request).await
 }
 
-/// Runs a task anew on robots that have it: what runs is stopped before.
+/// Restarts a task on robots that have it. A running instance is stopped first.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/restart", tag = "tasks", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
@@ -43,7 +44,7 @@ pub(in crate::http) async fn restart(
     order(&app, &by, TaskOrder::Restart, &task, &headers, &request).await
 }
 
-/// Brings robots back to the package of a task that ran there before the one they have.
+/// Rolls robots back to the package of a task that ran there before the current one.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/rollback", tag = "tasks", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, `nothing_to_roll_back`: none of them had another package \
@@ -71,7 +72,7 @@ pub(in crate::http) async fn rollback(
     Ok(Json(RolledBack { deployments, robots, without }))
 }
 
-/// Stops a task on robots that have it; it stays installed.
+/// Stops a task on robots that have it. The task stays installed.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/stop", tag = "tasks", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
@@ -85,7 +86,7 @@ pub(in crate::http) async fn stop(
     order(&app, &by, TaskOrder::Stop, &task, &headers, &request).await
 }
 
-/// Takes a task off robots.
+/// Removes a task from robots.
 #[utoipa::path(post, path = "/api/v1/tasks/{task}/remove", tag = "tasks", params(OrderKey),
     responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
         (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]

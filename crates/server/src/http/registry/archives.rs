@@ -1,5 +1,5 @@
-//! Reads whole archives from the blob store for those who ask over HTTP: a few at a time, on
-//! threads of their own, and for no longer than the request is waited for.
+//! Reads whole archives from the blob store for HTTP requests: a few at a time, on threads of their
+//! own, and only while the request is waiting.
 
 use std::io::{self, Read};
 use std::sync::Arc;
@@ -11,12 +11,12 @@ use tokio::sync::Semaphore;
 
 use crate::blobs::Blob;
 
-/// How long a whole archive, or two, may take to be read.
+/// Time limit for reading one or two whole archives.
 pub(in crate::http) const READING: Duration = Duration::from_secs(10 * 60);
-/// How many are read at the same time: each keeps a processor busy.
+/// The most archives read at the same time: each keeps a processor busy.
 const AT_ONCE: usize = 2;
 
-/// The places of those who read.
+/// The limited places for readers.
 #[derive(Clone)]
 pub struct ArchiveReaders(Arc<Semaphore>);
 
@@ -49,7 +49,7 @@ impl ArchiveReaders {
     }
 }
 
-/// Says that nobody waits any more.
+/// Tells the reader on drop that no request waits for it.
 struct GiveUp(Arc<AtomicBool>);
 
 impl Drop for GiveUp {
@@ -58,7 +58,7 @@ impl Drop for GiveUp {
     }
 }
 
-/// Ends with an error once nobody waits any more: a request has a deadline, and a thread none.
+/// A reader that fails once no request waits for it: a request has a deadline, a thread has none.
 struct GivenUp<R> {
     inner: R,
     given_up: Arc<AtomicBool>,

@@ -1,4 +1,4 @@
-//! Owns the routes about packages and their bytes; it never decides where a package runs.
+//! Owns the routes about packages and their bytes; never decides where a package runs.
 
 pub mod archives;
 pub mod oci;

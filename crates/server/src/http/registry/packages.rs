@@ -1,5 +1,5 @@
-//! Packages, as the operator's commands and the page show them: versions, what is in them, what
-//! differs, where they run. Their bytes are the registry's.
+//! Packages, for the operator's commands and the page: versions, contents, differences, and the
+//! robots that run them. The bytes belong to the registry.
 
 use std::collections::HashSet;
 use std::fmt;
@@ -25,7 +25,7 @@ use crate::orders::changes::Change;
 use crate::package::contents;
 use crate::store::{Act, Deed, Deletion, PackageUsers, Reference};
 
-/// The most robots and deployments that are named where a package is in use.
+/// The most robots, and the most deployments, that the message about a package in use names.
 const MOST_NAMED: usize = 5;
 
 /// A version, or a manifest's digest.
@@ -33,7 +33,7 @@ const MOST_NAMED: usize = 5;
 #[schema(value_type = String, example = "1.2.0")]
 pub(in crate::http) struct PackageReference(Reference);
 
-/// A text that is neither.
+/// The error for a text that is neither.
 #[derive(Debug, thiserror::Error)]
 #[error("{0:?} is neither a version nor a manifest's digest")]
 pub(in crate::http) struct InvalidReference(String);
@@ -58,13 +58,13 @@ impl fmt::Display for PackageReference {
     }
 }
 
-/// Every package version.
+/// Lists all package versions.
 #[utoipa::path(get, path = "/api/v1/packages", tag = "packages")]
 pub(in crate::http) async fn list(State(app): State<App>) -> Result<Json<PackageList>, ApiError> {
     Ok(Json(PackageList { packages: app.store.packages().await? }))
 }
 
-/// The versions of a package, and how many robots should have which.
+/// Lists the versions of a package and how many robots should have each.
 #[utoipa::path(get, path = "/api/v1/packages/{package}", tag = "packages")]
 pub(in crate::http) async fn show(
     State(app): State<App>,
@@ -83,7 +83,7 @@ pub(in crate::http) async fn show(
     Ok(Json(PackageVersions { name, versions, running }))
 }
 
-/// What is in a package.
+/// Lists the contents of a package.
 #[utoipa::path(get, path = "/api/v1/packages/{package}/{version}/files", tag = "packages",
     responses((status = 422, description = "`archive_refused`: its content is nothing that a robot would unpack.")))]
 pub(in crate::http) async fn files(
@@ -100,11 +100,11 @@ pub(in crate::http) async fn files(
 pub(in crate::http) struct DiffQuery {
     /// A version, or a manifest's digest.
     from: String,
-    /// Another one.
+    /// The version, or manifest's digest, to compare with.
     to: String,
 }
 
-/// What differs between two versions of a package.
+/// Compares two versions of a package.
 #[utoipa::path(get, path = "/api/v1/packages/{package}/diff", tag = "packages",
     responses((status = 422, description = "`archive_refused`: the content of one is nothing that a robot would unpack.")))]
 pub(in crate::http) async fn diff(
@@ -152,8 +152,8 @@ pub(in crate::http) async fn remove(
         }
         Deletion::Deleted(parts) => {
             app.changes.announce(Change::Package(name));
-            // An order that looked the package up a moment ago still finds its bytes: they stay for
-            // a while.
+            // An order that looked the package up a moment ago still finds its bytes, because the
+            // bytes are kept for a while.
             for blob in parts.into_iter().chain([digest]) {
                 app.blobs.touch(blob, now_ms).await?;
             }
@@ -178,8 +178,8 @@ fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
     )
 }
 
-/// Says who keeps a package in use; of robots that are none of the person's, and deployments for
-/// none of theirs, only how many.
+/// Names the users of a package that is in use. Robots outside the person's scope, and deployments
+/// without robots in that scope, are only counted.
 pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
     let own =
         users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));

@@ -1,6 +1,6 @@
-//! A package's directory that the page brings as an archive: unpacked beside the blobs, packed like
-//! `taskd push` does, and put into the registry. The archive is by a browser, and believed in
-//! nothing.
+//! Packages uploaded from the page: a directory arrives as an archive, is unpacked beside the
+//! blobs, packed as by `taskd push`, and put into the registry. The archive comes from a browser
+//! and is untrusted.
 
 use std::collections::HashSet;
 use std::io::{self, Read};
@@ -32,38 +32,38 @@ use crate::http::extract::QueryParams;
 use crate::http::openapi::Created;
 use crate::package::{PackageError, Packed, pack_into};
 
-/// Archives that are unpacked and packed at the same time.
+/// The most archives that are unpacked and packed at the same time.
 const AT_ONCE: usize = 2;
-/// With whoever has a place.
+/// The time limits of a sender that holds a place.
 const PATIENCE: Patience =
     Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
-/// Pieces of a body that wait to be unpacked.
+/// Capacity of the channel between the body and the unpacker, in chunks.
 const WAITING: usize = 16;
-/// What an archive may have beside what is in it.
+/// Allowance for archive overhead beyond the contents, in bytes.
 const OVERHEAD_BYTES: u64 = 1 << 20;
 
-/// How long a sender may take.
+/// Time limits of a sender.
 #[derive(Debug, Clone, Copy)]
 struct Patience {
-    /// For the next piece.
+    /// For the next chunk.
     silence: Duration,
-    /// For all of it.
+    /// For the whole body.
     whole: Duration,
 }
 
-/// Where archives are unpacked, and who may read some.
+/// The workspace for unpacking, and the limits on its users.
 pub struct UploadSpace {
     directory: PathBuf,
     limits: Limits,
     places: Arc<Semaphore>,
-    /// Those whose archive is being unpacked.
+    /// People with an archive being unpacked.
     uploading: Arc<Mutex<HashSet<UserName>>>,
-    /// Those who read whole archives.
+    /// Readers of whole archives.
     pub(in crate::http) readers: ArchiveReaders,
 }
 
 impl UploadSpace {
-    /// In a directory that is empty; of an archive at most `most_bytes` are unpacked.
+    /// Uses this empty directory. At most `most_bytes` of an archive are unpacked.
     pub fn new(directory: PathBuf, most_bytes: u64) -> Self {
         let limits = Limits::default();
         let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
@@ -77,7 +77,7 @@ impl UploadSpace {
         }
     }
 
-    /// A place for one archive of this person, who may have one at a time.
+    /// Reserves a place for one archive of this person. One person may have one at a time.
     fn place(&self, person: &UserName) -> Result<UploadPlace, ApiError> {
         if !locked(&self.uploading).insert(person.clone()) {
             return Err(ApiError::too_many(format!(
@@ -94,13 +94,13 @@ impl UploadSpace {
     }
 }
 
-/// The place of an archive that is unpacked and packed; given back by dropping it.
+/// The place of an archive being unpacked and packed; released on drop.
 struct UploadPlace {
     _own: OwnUpload,
     _place: OwnedSemaphorePermit,
 }
 
-/// That a person uploads something.
+/// Marks a person with an upload under way; dropping the guard removes the mark.
 struct OwnUpload {
     uploading: Arc<Mutex<HashSet<UserName>>>,
     person: UserName,
@@ -113,11 +113,11 @@ impl Drop for OwnUpload {
 }
 
 fn locked(uploading: &Mutex<HashSet<UserName>>) -> MutexGuard<'_, HashSet<UserName>> {
-    // A set of names is sound whatever a panic left.
+    // A set of names stays valid after a panic.
     uploading.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Why an archive did not become a package.
+/// The reason why an archive did not become a package.
 #[derive(Debug, thiserror::Error)]
 enum UploadError {
     #[error(transparent)]
@@ -132,14 +132,14 @@ enum UploadError {
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct UploadQuery {
-    /// Whether the package may take its version from one with other content, which is outdated by
-    /// that.
+    /// Whether the package may take over a version that has other content. The earlier package is
+    /// then outdated.
     #[serde(default)]
     #[param(required = false)]
     force: bool,
 }
 
-/// Takes a package's directory as a tar archive, compressed with zstd or not, and packs it as
+/// Uploads a package's directory as a tar archive, optionally compressed with zstd, and packs it as
 /// `taskd push` would.
 #[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
     request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
@@ -186,8 +186,8 @@ fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
     }
 }
 
-/// Unpacks the body as it comes, and packs what was in it. The work goes on if the caller goes
-/// away, so its place must as well.
+/// Unpacks the body as it arrives, and packs the contents. The work goes on if the caller
+/// disconnects, so its place has to stay taken as well.
 async fn receive(
     app: &App,
     place: UploadPlace,
@@ -196,7 +196,7 @@ async fn receive(
 ) -> Result<(Packed, UploadPlace), ApiError> {
     let (sender, receiver) = mpsc::channel(WAITING);
     let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
-    // What is unpacked is packed again beside it.
+    // Half of the room: the unpacked contents and their package are on disk at the same time.
     let room = app.blobs.room_for_people() / 2;
     let (limits, is_short) =
         (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
@@ -213,7 +213,7 @@ async fn receive(
         }
         _ => error,
     };
-    // Where the body did not come whole, the archive in it was not whole either.
+    // Checked first: if the body is incomplete, so is its archive.
     fed.map_err(of_disk)?;
     match worked {
         Ok(worked) => worked.map_err(|error| of_disk(refused(error))),
@@ -221,7 +221,7 @@ async fn receive(
     }
 }
 
-/// Hands the body on, until it ends or nobody takes any more of it.
+/// Passes the body on until the body ends or the receiver is gone.
 async fn feed(
     body: Body,
     sender: mpsc::Sender<Bytes>,
@@ -254,7 +254,7 @@ async fn feed(
         .unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
 }
 
-/// A body as a thread reads it. It ends where the sender is gone.
+/// A body that a thread reads. The body ends when its sender is gone.
 struct Arriving {
     receiver: mpsc::Receiver<Bytes>,
     current: Bytes,
@@ -287,8 +287,8 @@ fn packed(
     Ok(pack_into(&package, directory)?)
 }
 
-/// The directory in `unpacked`, if there is nothing else: whoever archives a directory mostly has
-/// its name in the archive.
+/// The only directory in `unpacked`, if there is no other entry: archives of a directory mostly
+/// contain the directory's name.
 fn only_directory(unpacked: &Path) -> io::Result<Option<PathBuf>> {
     let mut entries = std::fs::read_dir(unpacked)?;
     match (entries.next().transpose()?, entries.next()) {
@@ -307,7 +307,7 @@ fn refused(error: UploadError) -> ApiError {
         UploadError::Unpack(UnpackError::Refused(refusal)) => {
             return unprocessable("archive_refused", refusal.to_string());
         }
-        // Its own text has the path of a directory that nobody else knows.
+        // The error's own text contains the path of an internal directory.
         UploadError::Package(PackageError::Invalid { problems, .. }) => {
             let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
             return unprocessable("package_invalid", lines.join("\n"));
@@ -334,7 +334,7 @@ mod tests {
     const LONG: Duration = Duration::from_secs(60);
     const SHORT: Duration = Duration::from_millis(20);
 
-    /// What a sender is told whose body is taken as it comes.
+    /// The answer that [`feed`] gives to the sender of this body.
     async fn told(body: Body, patience: Patience) -> String {
         let (sender, mut receiver) = mpsc::channel(WAITING);
         let fed = async {

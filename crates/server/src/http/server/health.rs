@@ -1,4 +1,4 @@
-//! Whether the process lives, whether it can do its work, and what it is.
+//! Liveness, readiness, and information about the server.
 
 use axum::Json;
 use axum::extract::State;
@@ -9,15 +9,15 @@ use task_proto::api::ServerInfo;
 
 use crate::http::App;
 
-/// Says that the process answers.
+/// Reports that the process responds.
 #[utoipa::path(get, path = "/healthz", tag = "server",
     responses((status = 200, description = "It does.", body = Value, example = json!({ "status": "ok" }))))]
 pub(in crate::http) async fn healthz() -> Json<Value> {
     Json(json!({ "status": "ok" }))
 }
 
-/// Says whether database, broker and disk were well when they were checked last, a few seconds ago,
-/// and names the problems.
+/// Reports whether database, broker and disk passed their last check, a few seconds ago, and names
+/// the problems.
 #[utoipa::path(get, path = "/readyz", tag = "server",
     responses((status = 200, description = "All of them were.", body = Value,
             example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
@@ -33,7 +33,7 @@ pub(in crate::http) async fn readyz(State(app): State<App>) -> Response {
         .into_response()
 }
 
-/// Says what the server is, where MQTT listens and what went over it.
+/// Shows information about the server, its MQTT listeners and their traffic.
 #[utoipa::path(get, path = "/api/v1/server", tag = "server")]
 pub(in crate::http) async fn server(State(app): State<App>) -> Json<ServerInfo> {
     Json(ServerInfo {

@@ -1,4 +1,4 @@
-//! Owns what the server says of itself, and the page's files; it never changes anything.
+//! Owns the routes about the server itself, and the page's files; never changes anything.
 
 pub(super) mod health;
 pub mod readiness;

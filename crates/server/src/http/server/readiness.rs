@@ -1,6 +1,6 @@
-//! Whether the server can do its work. One background job checks the parts that it needs and keeps
-//! the last verdict on each; `/readyz` only reads the verdicts, so a request costs nothing, however
-//! many come. Other jobs add components of their own.
+//! Health of the server's components. One background job checks the components and keeps the last
+//! verdict on each. `/readyz` only reads the verdicts, so requests cost nothing, regardless of
+//! their number. Other jobs add components of their own.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -16,23 +16,23 @@ use crate::broker::{Broker, Health};
 use crate::store::Store;
 use crate::system::data_directory::room;
 
-/// Time between two checks of the database and the disk.
+/// Interval between two checks of the database and the disk.
 const CHECK_INTERVAL: Duration = Duration::from_secs(5);
-/// How long one component may take to answer.
+/// Time limit for the answer of one component.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// A file system with less room than this is full.
+/// A file system with less free space than this, in bytes, counts as full.
 const LEAST_FREE_BYTES: u64 = 16 << 20;
-/// On a small file system it is this share.
+/// On a small file system, the threshold is the total size divided by this number.
 const LEAST_FREE_SHARE: u64 = 64;
 
-/// A part that the server cannot work without.
+/// A component that the server needs to work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Component {
-    /// The database answers.
+    /// Healthy if the database answers.
     Database,
-    /// The MQTT broker serves.
+    /// Healthy if the MQTT broker serves.
     Broker,
-    /// The data directory can be written.
+    /// Healthy if the data directory is writable.
     Disk,
 }
 
@@ -47,8 +47,8 @@ impl Component {
     }
 }
 
-/// The last verdict on each component: `None` where it is well, otherwise the problem. Clones share
-/// the verdicts.
+/// The last verdict on each component: `None` for a healthy one, otherwise the problem. Clones
+/// share the verdicts.
 #[derive(Debug, Clone, Default)]
 pub struct Readiness(Arc<Mutex<BTreeMap<Component, Option<String>>>>);
 
@@ -58,7 +58,7 @@ impl Readiness {
         self.lock().insert(component, problem);
     }
 
-    /// The verdicts on all components that were checked.
+    /// The verdicts on all components checked so far.
     pub fn verdicts(&self) -> BTreeMap<Component, Option<String>> {
         self.lock().clone()
     }
@@ -71,18 +71,18 @@ impl Readiness {
 
 /// The job that checks database, broker and disk.
 pub struct ReadinessCheck {
-    /// Where the verdicts go.
+    /// Receives the verdicts.
     pub readiness: Readiness,
     /// The database.
     pub store: Store,
     /// The MQTT broker.
     pub broker: Broker,
-    /// The data directory.
+    /// The probe of the data directory.
     pub disk: DiskProbe,
 }
 
 impl ReadinessCheck {
-    /// Checks everything once.
+    /// Checks all components once.
     pub async fn check(&mut self) {
         let (database, disk) =
             tokio::join!(timeout(PATIENCE, self.store.ping()), self.disk.problem());
@@ -108,7 +108,7 @@ impl ReadinessCheck {
         let mut health = self.broker.health();
         let mut ticks = interval(CHECK_INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        // The first would be due at once, and the server has checked before it listened.
+        // The first tick would be due at once, but the server has checked before it listened.
         ticks.reset();
         loop {
             tokio::select! {
@@ -129,8 +129,8 @@ fn broker_problem(health: &Health) -> Option<String> {
     }
 }
 
-/// Writes a small file into the data directory, one write at a time: a file system that hangs holds
-/// one thread, not one for each check.
+/// Writes a small file into the data directory, one write at a time: a file system that hangs
+/// blocks one thread, not one per check.
 pub struct DiskProbe {
     data: PathBuf,
     patience: Duration,
@@ -143,7 +143,7 @@ impl DiskProbe {
         Self { data, patience: PATIENCE, running: None }
     }
 
-    /// The reason why the directory can't be written, if it can't.
+    /// The reason why the data directory is not writable, or `None`.
     async fn problem(&mut self) -> Option<String> {
         let data = self.data.clone();
         let probe = self
@@ -170,7 +170,8 @@ impl DiskProbe {
 
 fn probe_disk(data: &Path) -> io::Result<()> {
     std::fs::write(data.join(".ready"), b"ready\n")?;
-    // The file is short and was there before, so it may be written again where nothing else can.
+    // The file is short and exists already, so this write may succeed where others fail. Therefore
+    // we also check the free space.
     match room(data) {
         Some((free, total)) if free < LEAST_FREE_BYTES.min(total / LEAST_FREE_SHARE) => {
             Err(io::ErrorKind::StorageFull.into())

@@ -1,5 +1,5 @@
-//! What holds for as long as the server runs: since when it does, where it listens, by which rules
-//! it decides and what it allows. Made once, from the configuration; nothing in it is secret.
+//! Facts that are fixed while the server runs: its start time, its listeners, its rules and its
+//! limits. Built once from the configuration; contains no secrets.
 
 use std::time::Duration;
 
@@ -13,16 +13,16 @@ use crate::domain::delivery::shown_bytes;
 /// Facts about this server.
 #[derive(Debug)]
 pub struct ServerFacts {
-    /// Since when it runs.
+    /// The start of this run.
     pub began: Instant,
-    /// Where it listens.
+    /// The addresses that the server listens on.
     pub listeners: Vec<ListenerView>,
-    /// How it decides, and what it allows.
+    /// The delivery rules and the limits.
     pub rules: ServerRules,
 }
 
 impl ServerFacts {
-    /// Of a server with this configuration that listens there.
+    /// The facts of a server with this configuration and these listeners.
     pub fn new(config: &Config, blobs: &Blobs, listeners: Vec<ListenerView>) -> Self {
         let rules = config.delivery.rules().views();
         Self {

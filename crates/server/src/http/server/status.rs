@@ -1,6 +1,6 @@
-//! How the server and its network do: figures gathered when somebody asks, who is connected, and
-//! the rules. The sizes of database and packages are found out at most every half minute, however
-//! many ask.
+//! Status of the server and its network: figures gathered on request, the connected robots, and the
+//! rules. The sizes of database and packages are computed at most every half minute, regardless of
+//! the number of requests.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -27,12 +27,12 @@ use crate::http::extract::{QueryParams, page_limit};
 use crate::store::{DatabaseSize, KnownRobot};
 use crate::system::data_directory::room;
 
-/// For how long what takes long to find out is believed.
+/// How long the slow figures stay valid.
 const BELIEVED: Duration = Duration::from_secs(30);
-/// How many sessions are listed where nobody says how many.
+/// Default number of listed sessions.
 const LISTED: u32 = 100;
 
-/// What was found out last of what takes long.
+/// The last result of the slow figures.
 #[derive(Debug, Default)]
 pub struct SlowFigures(Mutex<Option<(Instant, Slow)>>);
 
@@ -42,7 +42,7 @@ struct Slow {
     packages_bytes: u64,
 }
 
-/// Shows how the server and its network do.
+/// Shows the state of the server and its network.
 #[utoipa::path(get, path = "/api/v1/server/status", tag = "server")]
 pub(in crate::http) async fn status(
     State(app): State<App>,
@@ -87,7 +87,7 @@ pub(in crate::http) async fn status(
 }
 
 async fn slow_figures(app: &App) -> Result<Slow, ApiError> {
-    // Whoever asks meanwhile waits, and is answered by the same.
+    // Concurrent callers wait here and share one answer.
     let mut known = app.slow_figures.0.lock().await;
     if let Some((at, slow)) = &*known
         && at.elapsed() < BELIEVED
@@ -114,7 +114,7 @@ fn broker(app: &App) -> BrokerStatus {
     }
 }
 
-/// What transfers to robots have shown, by site.
+/// Figures of transfers to robots, by site.
 fn sites(
     app: &App,
     robots: &[(KnownRobot, Option<LinkFacts>)],
@@ -160,15 +160,15 @@ fn median(mut figures: Vec<u64>) -> Option<u64> {
 #[derive(Deserialize, IntoParams)]
 #[serde(deny_unknown_fields)]
 pub(in crate::http) struct SessionsQuery {
-    /// At most so many; absent: 100.
+    /// Maximum number of sessions. Default: 100.
     #[param(minimum = 1, maximum = 1000)]
     limit: Option<u32>,
-    /// Only those of robots whose names come after this one.
+    /// Only sessions of robots whose names come after this one.
     #[param(inline)]
     after: Option<RobotName>,
 }
 
-/// Lists robots' MQTT sessions, with what they listen to: the paper's subscription table.
+/// Lists the robots' MQTT sessions with their subscriptions: the paper's subscription table.
 #[utoipa::path(get, path = "/api/v1/server/sessions", tag = "server")]
 pub(in crate::http) async fn sessions(
     State(app): State<App>,
@@ -197,12 +197,12 @@ pub(in crate::http) async fn sessions(
             name,
         })
     };
-    // One that has gone meanwhile is left out.
+    // A robot that disconnected in the meantime is left out.
     let sessions = robots.into_iter().take(limit).filter_map(session).collect();
     Ok(Json(SessionList { sessions, total, next }))
 }
 
-/// Shows by which rules bytes travel, and the limits that hold.
+/// Shows the rules by which bytes travel, and the limits in force.
 #[utoipa::path(get, path = "/api/v1/server/rules", tag = "server")]
 pub(in crate::http) async fn rules(State(app): State<App>) -> Json<ServerRules> {
     Json(app.facts.rules.clone())

@@ -1,6 +1,5 @@
-//! The page: the files of `ui/`, embedded in the binary. It serves what was there when the server
-//! was built and never looks at the disk, so there is no path that could lead anywhere else. Who
-//! may do what is decided behind the API.
+//! The page: the files of `ui/`, embedded in the binary at build time. The handlers never read the
+//! disk, so no path can lead outside these files. Authorization happens in the API.
 
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
@@ -14,18 +13,18 @@ use crate::http::extract::PathParam;
 #[folder = "ui/"]
 struct Files;
 
-/// The browser asks each time and is told that nothing has changed: a new server brings a new page
-/// at once.
+/// The browser revalidates on each use and gets 304 for unchanged files, so a new server brings a
+/// new page at once.
 const REVALIDATED: &str = "no-cache";
-/// Paths below `vendor/` name the version, so what is there never changes.
+/// Paths below `vendor/` contain the version, so their content never changes.
 const IMMUTABLE: &str = "public, max-age=31536000, immutable";
 
-/// The page loads nothing from elsewhere and has no code but these files.
+/// The page loads nothing from other origins and runs no code but these files.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
      connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
      frame-ancestors 'none'";
 
-/// The page. It holds no data; that needs a session.
+/// Returns the page. The page holds no data; data needs a session.
 #[utoipa::path(get, path = "/", tag = "server",
     responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
         (status = 304, description = "It is still the one that `If-None-Match` names.")))]
@@ -33,7 +32,7 @@ pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("index.html", &headers)
 }
 
-/// The API's description, to read and to try out.
+/// Returns the interactive API documentation.
 #[utoipa::path(get, path = "/api/docs", tag = "server",
     responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
         (status = 304, description = "It is still the one that `If-None-Match` names.")))]
@@ -41,7 +40,7 @@ pub async fn docs(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("docs.html", &headers)
 }
 
-/// What the page consists of.
+/// Returns a file of the page.
 #[utoipa::path(get, path = "/ui/{file}", tag = "server",
     params(("file" = String, Path, description = "Its path, which may have slashes.")),
     responses((status = 200, description = "The file.", body = String, content_type = "text/plain"),
@@ -70,8 +69,8 @@ fn tag(file: &EmbeddedFile) -> String {
     format!("\"{}\"", Digest::from_sha256(file.metadata.sha256_hash()).hex())
 }
 
-/// Whether the caller has the file already: one of its tags is this one, compared weakly as RFC
-/// 9110 asks for.
+/// True if the caller has the file already: one of its tags matches, compared weakly as RFC 9110
+/// requires.
 pub fn is_known(headers: &HeaderMap, tag: &str) -> bool {
     let given =
         headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());

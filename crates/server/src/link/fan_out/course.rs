@@ -1,5 +1,5 @@
-//! The course of one package's fan-out: when to publish which parts, and which robots to give up
-//! on. It decides only; the time and what happens are told to it.
+//! The state machine of one package's fan-out: when to publish which parts, and which robots to
+//! give up on. This module only decides; time and events are passed in.
 //!
 //! ```text
 //! gathering ──all listen, or enough waited──► publishing ──all sent──► collecting ──nobody is left──► over
@@ -13,21 +13,21 @@ use std::ops::RangeInclusive;
 use task_proto::RobotId;
 use task_proto::part::PartRange;
 
-/// How long others are waited for after the last has begun to listen, and in all.
+/// How long to wait for more subscribers after the last one, and in total.
 const GATHER_MS: u64 = 2_000;
 const GATHER_MOST_MS: u64 = 10_000;
-/// How long a robot may be away before it is given up on.
+/// How long a robot may be away before the fan-out gives up on it.
 const AWAY_MS: u64 = 10_000;
-/// How long the slower ones are waited for once somebody has said what it lacks. Robots say so 2 s
+/// How long to wait for slower robots once the first has reported missing parts. Robots report 2 s
 /// after the last part.
 const COLLECT_MS: u64 = 3_000;
-/// How long a robot that listens may neither have all nor say what it lacks.
+/// How long a subscriber may neither have all parts nor report missing ones.
 const SILENT_MS: u64 = 30_000;
-/// How often parts are sent again to one robot, and how often in a row without any use.
+/// Maximum repeats to one robot, and maximum consecutive repeats without progress.
 const MAX_ROUNDS: u32 = 10;
 const MAX_USELESS: u32 = 2;
 
-/// One package on its way.
+/// One package in fan-out.
 #[derive(Debug)]
 pub(super) struct Course {
     parts: u32,
@@ -45,53 +45,53 @@ enum Stage {
     Publishing,
     Collecting {
         since_ms: u64,
-        /// When the first said what it lacks.
+        /// When the first robot reported missing parts.
         asked_ms: Option<u64>,
     },
 }
 
-/// Where one robot stands.
+/// The state of one robot.
 #[derive(Debug, Clone, Default)]
 struct Standing {
     is_listening: bool,
-    /// Since when it does, or does not.
+    /// Start of the current subscribed or unsubscribed period.
     since_ms: u64,
-    /// What it said it lacks since parts were sent last.
+    /// Missing parts reported since the last parts were sent.
     lacks: Option<Vec<PartRange>>,
-    /// What it said before that.
+    /// Missing parts reported before that.
     lacked: Option<Vec<PartRange>>,
     rounds: u32,
     useless: u32,
 }
 
-/// What to do next.
+/// The next action.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Step {
-    /// Publish these parts, and say when they are sent.
+    /// Publish these parts, then call `sent`.
     Publish(Vec<RangeInclusive<u32>>),
-    /// Look again when something has happened, or soon.
+    /// Call again after an event, or soon.
     Wait,
-    /// Nobody is left.
+    /// No robots are left.
     Over,
 }
 
-/// Why a robot gets its bytes in another way.
+/// The reason why a robot gets its bytes in another way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum GivenUp {
-    /// It held up the others.
+    /// The robot held up the others.
     HeldUp,
-    /// It does not listen.
+    /// The robot does not subscribe.
     Away,
-    /// It got parts again and again.
+    /// The robot received repeats too often.
     Rounds,
-    /// What it got made no difference.
+    /// The repeats brought no progress.
     Useless,
-    /// It says nothing.
+    /// The robot reports nothing.
     Silent,
 }
 
 impl GivenUp {
-    /// For people.
+    /// A description for people.
     pub(super) fn as_str(self) -> &'static str {
         match self {
             Self::HeldUp => "it held up the others",
@@ -104,14 +104,14 @@ impl GivenUp {
 }
 
 impl Course {
-    /// A package of so many parts.
+    /// Begins a package of this many parts.
     pub(super) fn begin(parts: u32, now_ms: u64) -> Self {
         let stage = Stage::Gathering { since_ms: now_ms, joined_ms: now_ms };
         Self { parts, stage, robots: BTreeMap::new(), given_up: Vec::new() }
     }
 
-    /// These robots, and no others, still need it. Returns the new ones and those that do not need
-    /// it any more.
+    /// Replaces the set of robots that still need the package. Returns the new robots and those
+    /// that no longer need it.
     pub(super) fn set_robots(
         &mut self,
         robots: &BTreeSet<RobotId>,
@@ -128,7 +128,7 @@ impl Course {
         (new, gone)
     }
 
-    /// Who listens now.
+    /// Updates which robots subscribe now.
     pub(super) fn set_listening(&mut self, is_listening: impl Fn(&RobotId) -> bool, now_ms: u64) {
         for (robot, standing) in &mut self.robots {
             let listens = is_listening(robot);
@@ -142,7 +142,7 @@ impl Course {
         }
     }
 
-    /// A robot says what it lacks.
+    /// A robot reports missing parts.
     pub(super) fn lacks(&mut self, robot: &RobotId, missing: Vec<PartRange>, now_ms: u64) {
         let Some(standing) = self.robots.get_mut(robot).filter(|_| !missing.is_empty()) else {
             return;
@@ -153,31 +153,31 @@ impl Course {
         }
     }
 
-    /// A robot was put out of the fan-out.
+    /// A robot was removed from the fan-out.
     pub(super) fn put_out(&mut self, robot: RobotId) {
         self.give_up(robot, GivenUp::HeldUp);
     }
 
-    /// All that was to be published is sent.
+    /// All parts of the last step are sent.
     pub(super) fn sent(&mut self, now_ms: u64) {
         self.stage = Stage::Collecting { since_ms: now_ms, asked_ms: None };
         for standing in self.robots.values_mut() {
-            // It says so again once nothing comes any more, and then knows better.
+            // The robot reports again once no more parts arrive, with newer information.
             standing.lacks = None;
         }
     }
 
-    /// Whether nobody is left to publish for.
+    /// Whether no robots are left to publish for.
     pub(super) fn is_over(&self) -> bool {
         self.robots.is_empty()
     }
 
-    /// Robots that were given up on since this was asked last.
+    /// Robots given up on since the last call.
     pub(super) fn take_given_up(&mut self) -> Vec<(RobotId, GivenUp)> {
         std::mem::take(&mut self.given_up)
     }
 
-    /// What to do now.
+    /// The next action now.
     pub(super) fn next(&mut self, now_ms: u64) -> Step {
         self.give_up_on_the_absent(now_ms);
         if self.robots.is_empty() || self.parts == 0 {
@@ -213,7 +213,7 @@ impl Course {
         if parts.is_empty() { self.next(now_ms) } else { Step::Publish(parts) }
     }
 
-    /// What somebody lacks, each part once, in order.
+    /// The missing parts of all robots, each part once, in order.
     fn repeated(&mut self) -> Vec<RangeInclusive<u32>> {
         let mut wanted: Vec<RangeInclusive<u32>> = Vec::new();
         let mut tired = Vec::new();

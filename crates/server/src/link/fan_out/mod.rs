@@ -1,7 +1,7 @@
-//! Direct-push: brings packages inside MQTT messages to the robots for which that was decided. What
-//! is to be done is read from the database, so a fan-out that a restart interrupted begins again; a
-//! robot that can't be kept up to date is told to pull instead. It decides for no robot how its
-//! bytes travel at first.
+//! Direct-push: brings packages inside MQTT messages to the robots for which that delivery was
+//! chosen. The work is read from the database, so a fan-out that a restart interrupted begins
+//! again. A robot that can't keep up is told to pull instead. This module never chooses a robot's
+//! initial delivery.
 
 mod course;
 mod package;
@@ -25,40 +25,40 @@ use crate::orders::actions::Actions;
 use crate::orders::changes::{Change, Changes};
 use crate::store::{Store, StoreError};
 
-/// Packages on their way at the same time; the broker takes no more.
+/// Maximum packages in fan-out at the same time; the broker permits no more.
 const MAX_AT_ONCE: usize = 4;
-/// How often it is looked for something to do, if nothing has changed.
+/// Interval between polls if nothing has changed.
 const LOOK_INTERVAL: Duration = Duration::from_secs(5);
-/// How long after one look comes the next, whatever changes: what changes meanwhile is looked at
-/// together. Robots that hear of an order ask for its parts at once, and are refused until it is
-/// seen here.
+/// Minimum interval between polls, whatever changes: changes in between are handled together.
+/// Robots that learn of an order request its parts at once, and are refused until a poll has seen
+/// the order.
 const LOOK_PAUSE: Duration = Duration::from_millis(25);
 
-/// What fanning out needs. Clones share it.
+/// The dependencies of a fan-out. Clones share them.
 #[derive(Clone)]
 pub struct FanOutWorker {
-    /// What is to be done.
+    /// The source of pending work.
     pub store: Store,
     /// Tells robots to pull instead.
     pub actions: Actions,
-    /// The bytes.
+    /// The bytes of packages.
     pub blobs: Blobs,
-    /// Who delivers them.
+    /// Delivers the parts.
     pub broker: Broker,
-    /// What has changed, and what robots lack.
+    /// Changes of orders, and robots' missing parts.
     pub changes: Changes,
     /// Part size and quality of service.
     pub settings: DeliverySettings,
 }
 
-/// Packages on their way, and how to tell their tasks that orders have changed.
+/// Packages in fan-out, and the channels that tell their tasks of changed orders.
 #[derive(Default)]
 struct UnderWay {
     tasks: JoinSet<Digest>,
     packages: HashMap<Digest, Arc<Notify>>,
 }
 
-/// One content to be fanned out, and the orders for it.
+/// One content to fan out, and the orders for it.
 #[derive(Debug)]
 struct Wanted {
     content: BlobRef,
@@ -66,9 +66,9 @@ struct Wanted {
 }
 
 impl FanOutWorker {
-    /// Fans out what there is, until `stop`.
+    /// Fans out all pending packages, until `stop`.
     pub async fn run(self, stop: CancellationToken) {
-        // Cut off half-way, robots lack parts and begin anew with the next fan-out.
+        // If this is cut off half-way, robots lack parts and begin anew with the next fan-out.
         tokio::select! {
             () = stop.cancelled() => {}
             () = self.work() => {}
@@ -105,7 +105,7 @@ impl FanOutWorker {
         }
     }
 
-    /// All contents that some robot is to hear and has not, the most urgent first.
+    /// All contents that some robot should receive by fan-out and has not, the most urgent first.
     async fn wanted(&self) -> Result<Vec<Wanted>, StoreError> {
         let mut wanted: Vec<Wanted> = Vec::new();
         for (deployment, package) in self.store.direct_pushes().await? {
@@ -141,7 +141,7 @@ impl UnderWay {
     fn ended(&mut self, ended: Result<Digest, tokio::task::JoinError>) {
         match ended {
             Ok(digest) => drop(self.packages.remove(&digest)),
-            // Of those that were told to end below.
+            // One of the tasks that are aborted below.
             Err(error) if error.is_cancelled() => {}
             Err(error) => {
                 tracing::error!(%error, "a fan-out has failed; all begin anew");

@@ -1,5 +1,5 @@
-//! One package's fan-out from its first listener to its last: reads slices of the blob, publishes
-//! them as parts, and keeps the broker's grant what the database says.
+//! One package's fan-out from its first subscriber to its last: reads slices of the blob, publishes
+//! them as parts, and keeps the broker's grant equal to the database's state.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
@@ -20,21 +20,22 @@ use crate::broker::{FanOut, FanOutError, FanOutSettings, Part, PartQos};
 use crate::fleet::part_requests::Listening;
 use crate::store::StoreError;
 
-/// How often it is looked who listens, and whether it is time for the next step.
+/// Interval of checks for subscribers and for the next step.
 const TURN: Duration = Duration::from_millis(250);
-/// How long to wait for others once somebody has begun to listen: they tend to come together.
+/// How long to wait for further subscribers after the first: they tend to come together.
 const JOIN_PAUSE: Duration = Duration::from_millis(20);
-/// How often the database is asked at most who still needs the package,
+/// Minimum interval between database queries for robots that still need the package,
 const SYNC_PAUSE: Duration = Duration::from_millis(200);
-/// and how often if nothing is known to have changed.
+/// and the interval if no change is known.
 const SYNC_INTERVAL: Duration = Duration::from_secs(2);
-/// How long the last parts may take to be acknowledged before robots are waited for in another way.
+/// Time limit for the acknowledgement of the last parts; afterwards we wait for the robots'
+/// reports.
 const SETTLE: Duration = Duration::from_secs(10);
 
-/// Before a fan-out that was interrupted is tried again.
+/// Pause before an interrupted fan-out is retried.
 const PAUSE: Duration = Duration::from_secs(2);
 
-/// A fan-out under way.
+/// A running fan-out.
 struct Package<'a> {
     worker: &'a FanOutWorker,
     content: BlobRef,
@@ -44,7 +45,7 @@ struct Package<'a> {
     requests: Listening,
     course: Course,
     started: Instant,
-    /// Whose part of which deployments it is.
+    /// The deployments of each robot that include the package.
     owners: BTreeMap<RobotId, Vec<DeploymentId>>,
     changed: Arc<Notify>,
     synced_at: Option<Instant>,
@@ -52,7 +53,7 @@ struct Package<'a> {
     is_stale: bool,
 }
 
-/// Why a fan-out ends before its time. It is tried again from the start.
+/// The reason why a fan-out ends early. It is retried from the start.
 #[derive(Debug, thiserror::Error)]
 enum Interrupted {
     #[error("the database failed")]
@@ -66,7 +67,7 @@ enum Interrupted {
 }
 
 impl FanOutWorker {
-    /// Fans out `content` until nobody is left who needs it so.
+    /// Fans out `content` until no robot needs it in this way.
     pub(super) async fn fan_out(&self, content: BlobRef, changed: Arc<Notify>) {
         let done = match self.prepare(content, changed).await {
             Ok(Some(package)) => package.run().await,
@@ -86,7 +87,7 @@ impl FanOutWorker {
         }
     }
 
-    /// `None`: there is nothing that could be sent.
+    /// `None`: there is nothing to send.
     async fn prepare(
         &self,
         content: BlobRef,
@@ -97,7 +98,7 @@ impl FanOutWorker {
         else {
             return Ok(None);
         };
-        // So many parts that a robot could not remember them would be made larger.
+        // A robot can track only a limited number of parts, so parts grow with the package.
         let least = u32::try_from(content.size.div_ceil(u64::from(MAX_PARTS))).unwrap_or(u32::MAX);
         let Ok(cut) = Cut::new(content.size, self.settings.part_bytes.max(least)) else {
             return Ok(None);
@@ -142,14 +143,14 @@ impl Package<'_> {
                 Step::Wait => self.wait().await,
                 Step::Over => {
                     self.tell_to_pull().await?;
-                    // Whoever was released meanwhile is found by the next look.
+                    // Robots that were released meanwhile are found by the next check.
                     return Ok(());
                 }
             }
         }
     }
 
-    /// Waits until something has happened, or the next turn.
+    /// Waits for an event, or for the next check.
     async fn wait(&self) {
         tokio::select! {
             () = self.changed.notified() => {}
@@ -159,13 +160,13 @@ impl Package<'_> {
         }
     }
 
-    /// Publishes `parts` in their order. Between them orders may change, and robots come and go.
+    /// Publishes `parts` in order. Meanwhile orders may change, and robots come and go.
     async fn publish(&mut self, parts: Vec<RangeInclusive<u32>>) -> Result<(), Interrupted> {
         for index in parts.into_iter().flatten() {
             let range = self.cut.range(index);
             let bytes = self.blob.slice(range).await?;
             let part = Part { header: Bytes::copy_from_slice(&self.cut.header(index)), bytes };
-            // Cut off, nothing was sent.
+            // A cancelled call has sent nothing.
             loop {
                 match timeout(TURN, self.fan_out.publish(part.clone())).await {
                     Ok(sent) => break sent?,
@@ -184,8 +185,7 @@ impl Package<'_> {
         Ok(())
     }
 
-    /// Takes note of everything that may have happened, and tells those that were given up on to
-    /// pull.
+    /// Processes all pending changes, and tells robots that were given up on to pull.
     async fn sync(&mut self) -> Result<(), Interrupted> {
         let now_ms = self.now_ms();
         self.is_stale |= tokio::select! {

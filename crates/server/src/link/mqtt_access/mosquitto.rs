@@ -10,16 +10,16 @@ use super::{Account, External};
 use crate::broker::CANARY_LEVEL;
 use crate::domain::broker_url::BrokerUrl;
 
-/// As many as `mosquitto_passwd` makes. They only make guessing slower, and nobody guesses 256
-/// bits.
+/// The default of `mosquitto_passwd`. Iterations only slow down guessing, and 256 bits can't be
+/// guessed.
 const DERIVED_ITERATIONS: u32 = 101;
-/// The server's own password was thought up by a person.
+/// More iterations, because a person chose the server's own password.
 const SERVER_ITERATIONS: u32 = 20_000;
-/// The length mosquitto reads.
+/// The salt length that mosquitto reads.
 const SALT_BYTES: usize = 12;
 
-/// One line of a mosquitto password file. The salt follows from user and password, so that the same
-/// robots make the same file and a changed file means a changed password.
+/// One line of a mosquitto password file. The salt is derived from user and password, so that the
+/// same robots make the same file and a changed file means a changed password.
 pub(super) fn passwd_line(external: &External, account: &Account) -> String {
     let Account { user_name, password, .. } = account;
     let iterations = if account.is_derived() { DERIVED_ITERATIONS } else { SERVER_ITERATIONS };
@@ -28,7 +28,7 @@ pub(super) fn passwd_line(external: &External, account: &Account) -> String {
     format!("{user_name}:$7${iterations}${}${}\n", STANDARD.encode(salt), STANDARD.encode(hash))
 }
 
-/// PBKDF2 with HMAC-SHA-512, of which mosquitto uses just the first block.
+/// PBKDF2 with HMAC-SHA-512; mosquitto uses only the first block.
 fn pbkdf2(password: &[u8], salt: &[u8], iterations: u32) -> [u8; 64] {
     let keyed = Hmac::<Sha512>::new_from_slice(password).expect("HMAC takes keys of any length");
     let block = |input: &[&[u8]]| -> [u8; 64] {
@@ -46,7 +46,7 @@ fn pbkdf2(password: &[u8], salt: &[u8], iterations: u32) -> [u8; 64] {
 }
 
 /// A mosquitto ACL file: robots on their own topics by name, `%u` being the robot id; the server on
-/// what it needs of all. Patterns hold for every user of the broker, of whom only robots have such
+/// all topics that it needs. Patterns apply to every user of the broker, but only robots have such
 /// names.
 pub(super) fn acl(user_name: &str, prefix: &TopicPrefix) -> String {
     format!(
@@ -104,8 +104,8 @@ mod tests {
 
     #[test]
     fn the_hash_is_the_known_one() {
-        // PBKDF2-HMAC-SHA-512 of "password" and "salt", one and two iterations, begins so in every
-        // implementation.
+        // PBKDF2-HMAC-SHA-512 of "password" and "salt" with one and two iterations begins with
+        // these bytes in every implementation.
         let hex = |iterations| {
             let bytes = pbkdf2(b"password", b"salt", iterations);
             bytes[..8].iter().map(|byte| format!("{byte:02x}")).collect::<String>()

@@ -1,9 +1,8 @@
 //! The `authorization` block of a NATS server: each account with a bcrypt hash of its password and
-//! the subjects that MQTT maps its topics to. What is not in the lists is denied, NATS' own
-//! subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`) included; and so is every protocol but MQTT: a NATS
-//! client with a robot's password could read other robots' sessions there. There is no list of what
-//! is denied: one with `$MQTT.>` would also deny the subscriptions that NATS makes for each MQTT
-//! session.
+//! the subjects to which MQTT maps its topics. Subjects outside the lists are denied, including
+//! NATS' own subjects (`$MQTT.>`, `$JS.>`, `$SYS.>`). Every protocol but MQTT is denied too: a NATS
+//! client with a robot's password could read other robots' sessions there. There is no deny list:
+//! one with `$MQTT.>` would also deny the subscriptions that NATS makes for each MQTT session.
 
 use std::fmt::Write as _;
 
@@ -12,9 +11,9 @@ use task_proto::topic::{RobotTopic, TopicPrefix};
 use super::{Account, External, Role};
 use crate::broker::CANARY_LEVEL;
 
-/// The least that bcrypt knows: nobody guesses 256 bits.
+/// The lowest cost that bcrypt supports: 256 bits can't be guessed.
 const DERIVED_COST: u32 = 4;
-/// The server's own password was thought up by a person.
+/// A higher cost, because a person chose the server's own password.
 const SERVER_COST: u32 = 11;
 /// The whole block.
 pub(super) fn authorization(
@@ -27,8 +26,7 @@ pub(super) fn authorization(
     for account in accounts {
         let hash = hash(external, account)?;
         let (publish, subscribe) = subjects(account, prefix);
-        // Names are letters, digits and a few signs, and so are subjects: nothing needs to be
-        // escaped.
+        // Names and subjects consist of letters, digits and a few signs: no escaping is needed.
         let _ = writeln!(
             text,
             "    {{ user: \"{}\", password: \"{hash}\", allowed_connection_types: [\"MQTT\"], permissions: {{\n      \
@@ -40,7 +38,7 @@ pub(super) fn authorization(
     Ok(text)
 }
 
-/// The salt follows from user and password, so that the same robots make the same file.
+/// The salt is derived from user and password, so that the same robots make the same file.
 fn hash(external: &External, account: &Account) -> Result<String, bcrypt::BcryptError> {
     let Account { user_name, password, .. } = account;
     let cost = if account.is_derived() { DERIVED_COST } else { SERVER_COST };
@@ -49,7 +47,7 @@ fn hash(external: &External, account: &Account) -> Result<String, bcrypt::Bcrypt
     Ok(bcrypt::hash_with_salt(password, cost, salt)?.format_for_version(bcrypt::Version::TwoA))
 }
 
-/// What the account may publish and subscribe to, as lists of quoted subjects.
+/// The account's publish and subscribe permissions, as lists of quoted subjects.
 fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
     let prefix = subject(prefix.as_str());
     let list = |subjects: Vec<String>| {
@@ -75,7 +73,7 @@ fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
             subscribe.push(parts);
             (list(of_robot(&account.user_name, &from_robots)), list(subscribe))
         }
-        // Without a list of what is allowed everything would be.
+        // Without an allow list every subject would be allowed.
         Role::Probe => {
             let own = format!("{prefix}.probe.{}", account.user_name);
             (list(vec![own.clone()]), list(vec![own]))
@@ -83,7 +81,7 @@ fn subjects(account: &Account, prefix: &TopicPrefix) -> (String, String) {
     }
 }
 
-/// A topic as NATS maps it: a level is a token, and a dot in a level is written `//`.
+/// A topic in NATS' mapping: a level is a token, and a dot in a level is written `//`.
 fn subject(topic: &str) -> String {
     topic.replace('.', "//").replace('/', ".").replace("..", "//")
 }

@@ -1,5 +1,4 @@
-//! The body of a robot's transfer: as fast as the limits allow, and part of the count until its
-//! end.
+//! The body of a robot's transfer: paced by the limits, and counted until its end.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -11,18 +10,18 @@ use tokio::time::{Instant, Sleep, sleep_until};
 
 use super::Transfer;
 
-/// Another body, paced.
+/// A paced body around another one.
 pub struct TransferBody<B> {
     body: B,
     transfer: Transfer,
-    /// What came from the other body and has not gone on.
+    /// Bytes received from the inner body and not yet passed on.
     held: Bytes,
-    /// How many bytes of it are next, and when.
+    /// The number of those bytes that are next, and when.
     next: Option<(usize, Pin<Box<Sleep>>)>,
 }
 
 impl Transfer {
-    /// Lets `body` go as this transfer.
+    /// Sends `body` as this transfer.
     pub fn carry<B>(self, body: B) -> TransferBody<B> {
         TransferBody { body, transfer: self, held: Bytes::new(), next: None }
     }

@@ -1,6 +1,7 @@
-//! Robots that pull blobs over HTTP: how many at once, how fast together, and who is next. A robot
-//! that has to wait does so for a moment; then it is told when to come back, and keeps its place.
-//! One that takes next to nothing while others wait is cut off. It knows no blobs and no answers.
+//! Robots' pulls of blobs over HTTP: how many at once, how fast together, and in which order. A
+//! robot that must wait does so for a moment. Then it is told when to come back, and keeps its
+//! place. A robot that makes almost no progress while others wait is cut off. This module knows no
+//! blobs and no HTTP responses.
 
 mod body;
 mod pace;
@@ -26,12 +27,12 @@ use crate::net::http_connections::Connection;
 
 /// How long a request waits for its turn.
 const PATIENCE: Duration = Duration::from_secs(2);
-/// Over how many looks the speed is shown.
+/// Number of samples for the displayed speed.
 const LOOKS: usize = 6;
-/// When a robot should come back for which there was no place.
+/// When a robot should retry if the queue had no place.
 const NO_PLACE_MS: u64 = 30_000;
 
-/// All transfers of robots. Clones are the same.
+/// All transfers of robots. Clones share the same state.
 #[derive(Clone)]
 pub struct Transfers {
     shared: Arc<Shared>,
@@ -42,22 +43,22 @@ struct Shared {
     site_label: LabelKey,
     turns: Mutex<Turns>,
     paces: Mutex<Paces>,
-    /// Bytes that went to robots.
+    /// Bytes sent to robots.
     sent: AtomicU64,
-    /// How many they were, and when.
+    /// Samples of the sent bytes, with their times.
     looks: Mutex<VecDeque<(Instant, u64)>>,
 }
 
 struct Turns {
     queue: Queue,
-    /// Whom to tell that it is their turn.
+    /// Channels to the pending requests.
     asking: HashMap<Asking, oneshot::Sender<Transfer>>,
-    /// Those whose bytes are on their way.
+    /// Transfers whose bytes are being sent.
     carried: HashMap<u64, Carried>,
     last_number: u64,
 }
 
-/// A transfer and the connection it goes by.
+/// A transfer and its connection.
 struct Carried {
     robot: RobotId,
     connection: Connection,
@@ -69,26 +70,26 @@ struct Paces {
     sites: HashMap<LabelValue, Pace>,
 }
 
-/// It is not this robot's turn.
+/// The robot's turn has not come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("other robots come first; come back in {retry_after_s} s")]
 pub struct NotYet {
-    /// When to come back.
+    /// Seconds after which to retry.
     pub retry_after_s: u64,
 }
 
-/// A robot's turn; it ends when this is dropped.
+/// A robot's turn, which ends when this is dropped.
 pub struct Transfer {
     shared: Arc<Shared>,
     turn: Turn,
     begun_ms: u64,
-    /// Its number among those that are carried.
+    /// The number among the carried transfers.
     number: Option<u64>,
 }
 
 impl Transfers {
-    /// None yet, and no more than `limits` allow. The value of `site_label` says on which site a
-    /// robot is.
+    /// Starts without transfers, bounded by `limits`. The value of `site_label` names a robot's
+    /// site.
     pub fn new(limits: &TransferLimits, site_label: LabelKey) -> Self {
         let now = Instant::now();
         let pace =
@@ -109,22 +110,22 @@ impl Transfers {
         Self { shared: Arc::new(Shared { started: now, site_label, turns, paces, sent, looks }) }
     }
 
-    /// Where a robot with these labels is.
+    /// The site of a robot with these labels.
     pub fn site_of(&self, labels: &Labels) -> Option<LabelValue> {
         labels.get(&self.shared.site_label).cloned()
     }
 
-    /// How many run now.
+    /// The number of running transfers.
     pub fn running(&self) -> u64 {
         self.shared.turns().queue.running()
     }
 
-    /// How many wait for their turn.
+    /// The number of waiting robots.
     pub fn waiting(&self) -> u64 {
         self.shared.turns().queue.waiting()
     }
 
-    /// What all together got a second, lately; see [`Transfers::look`].
+    /// Recent bytes per second of all transfers together; see [`Transfers::look`].
     pub fn bytes_per_s(&self) -> u64 {
         let looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
         let (Some((from, sent_before)), Some((to, sent))) = (looks.front(), looks.back()) else {
@@ -134,8 +135,8 @@ impl Transfers {
         if seconds > 0.0 { (sent.saturating_sub(*sent_before) as f64 / seconds) as u64 } else { 0 }
     }
 
-    /// Looks how much was sent so far, and ends transfers that take next to nothing while others
-    /// wait. To be called every second or so: the speed shown is over the last looks.
+    /// Samples the sent bytes, and ends transfers that make almost no progress while others wait.
+    /// Call this about every second: the displayed speed covers the last samples.
     pub fn look(&self) {
         self.shared.end_too_slow(self.shared.now_ms());
         let mut looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
@@ -170,7 +171,7 @@ impl Transfers {
         }
         match request.leave() {
             Some(away_ms) => Err(come_back(away_ms)),
-            // Its turn has come just now, or it asked a second time meanwhile.
+            // The turn has come just now, or the robot sent a second request meanwhile.
             None => told.await.map_err(|_| come_back(jittered(0, rand::random()))),
         }
     }
@@ -180,14 +181,15 @@ fn come_back(away_ms: u64) -> NotYet {
     NotYet { retry_after_s: away_ms.div_ceil(1000) }
 }
 
-/// A request that waits. Dropped, because its client has gone, it waits no longer.
+/// A waiting request. When its client disconnects, the value is dropped and the request stops
+/// waiting.
 struct Request<'a> {
     shared: &'a Arc<Shared>,
     asking: Option<Asking>,
 }
 
 impl Request<'_> {
-    /// For how long the robot should stay away; `None` if it does not wait any more.
+    /// How long the robot should stay away; `None` if the request no longer waits.
     fn leave(&mut self) -> Option<u64> {
         let asking = self.asking.take()?;
         let mut turns = self.shared.turns();
@@ -213,8 +215,8 @@ impl Shared {
         }
     }
 
-    /// Begins what may begin. Whoever is told and has gone meanwhile gives the turn back by
-    /// dropping it.
+    /// Begins the permitted transfers. A request that has ended meanwhile returns its turn by
+    /// dropping the transfer.
     fn begin_what_may(self: &Arc<Self>) {
         let now_ms = self.now_ms();
         let told: Vec<_> = {
@@ -225,7 +227,7 @@ impl Shared {
         };
         for (tell, turn) in told {
             let transfer = Transfer { shared: self.clone(), turn, begun_ms: now_ms, number: None };
-            // Without anybody to tell it is dropped, and its turn is another's.
+            // Without a receiver the transfer is dropped, and its turn passes to another robot.
             drop(tell.map(|tell| tell.send(transfer)));
         }
     }
@@ -246,7 +248,7 @@ impl Shared {
 }
 
 impl Transfer {
-    /// Goes by this connection, which ends if too little of it is taken while others wait.
+    /// Uses this connection, which is cut if the transfer is too slow while others wait.
     pub fn by(mut self, connection: Option<&Connection>) -> Self {
         let Some(connection) = connection.cloned() else { return self };
         let progress = Progress::from(self.shared.now_ms(), connection.bytes_out());
@@ -265,7 +267,7 @@ impl Transfer {
         self.shared.sent.fetch_add(bytes, Ordering::Relaxed);
     }
 
-    /// How many of `bytes` may go next, and when; `None`: all, and now.
+    /// How many of `bytes` may be sent next, and when; `None`: all, and now.
     fn reserve(&self, bytes: u64) -> Option<(u64, Instant)> {
         let mut paces = self.shared.paces();
         let Paces { all, sites } = &mut *paces;

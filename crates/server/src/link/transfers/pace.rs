@@ -1,16 +1,16 @@
-//! How fast bytes may go: a token bucket that says when the next ones are due. Who asks first goes
-//! first, so transfers that take turns get equal shares. It never waits.
+//! Bandwidth pacing: a token bucket that returns the due time of the next bytes. Requests are
+//! served in order, so transfers that take turns get equal shares. This module never waits.
 
 use std::time::Duration;
 
 use tokio::time::Instant;
 
-/// What may go at once after a pause.
+/// Burst after a pause.
 const BURST: Duration = Duration::from_millis(100);
-/// The largest and the smallest piece that is asked for at a time.
+/// The largest and the smallest piece of a request.
 const MAX_PIECE_BYTES: u64 = 256 * 1024;
 const MIN_PIECE_BYTES: u64 = 1024;
-/// How many pieces a second each transfer should get: long pauses would look like a dead
+/// Target number of pieces per second for each transfer: long pauses would look like a dead
 /// connection.
 const PIECES_PER_S: u64 = 4;
 
@@ -26,12 +26,12 @@ impl Pace {
         Self { bytes_per_s: bytes_per_s.max(1), next_at: now }
     }
 
-    /// How many bytes one of `transfers` should ask for at a time.
+    /// The number of bytes that one of `transfers` should request at a time.
     pub(super) fn piece(&self, transfers: u64) -> u64 {
         (self.bytes_per_s / PIECES_PER_S / transfers.max(1)).clamp(MIN_PIECE_BYTES, MAX_PIECE_BYTES)
     }
 
-    /// When the next `bytes` may go; they count as gone.
+    /// The due time of the next `bytes`; they count as sent.
     pub(super) fn reserve(&mut self, bytes: u64, now: Instant) -> Instant {
         let at = self.next_at.max(now.checked_sub(BURST).unwrap_or(now));
         self.next_at = at + Duration::from_secs_f64(bytes as f64 / self.bytes_per_s as f64);

@@ -1,12 +1,12 @@
-//! Who pulls next: transfers that run, robots that wait for one, and in which order. It decides
-//! only; time and chance are given to it, and it neither waits nor sends.
+//! The queue of pulls: running transfers, waiting robots, and their order. This module only
+//! decides; time and randomness are passed in, and it neither waits nor sends.
 //!
-//! A place in the queue belongs to a robot and a blob, whether the robot asks just now or was told
-//! to come back later. Where the next in line is away, one behind it that is there goes first;
-//! after a few times its transfer is kept free.
+//! A place in the queue belongs to a robot and a blob, whether the robot's request is pending or
+//! the robot was told to come back later. If the next robot in line is away, a present robot behind
+//! it goes first. After a few such passes a transfer is reserved for the absent robot.
 //!
-//! A robot that has a turn gets another only while there is more room than all others that wait
-//! would take, and loses one in which it takes next to nothing while others wait.
+//! A robot with a running transfer gets another one only while there is more room than all other
+//! waiting robots would take. It loses a transfer that makes almost no progress while others wait.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -16,39 +16,39 @@ use task_proto::{Digest, RobotId};
 
 use crate::config::{SiteLimits, TransferLimits};
 
-/// Robots that have a place; a further one is told to come back later without one.
+/// Maximum places in the queue; a further robot is told to come back later without a place.
 const MAX_PLACES: usize = 20_000;
-/// How often others may go before one that is away.
+/// How often others may pass an absent robot.
 const MAX_PASSED: u32 = 8;
-/// How much later than it was told a robot may come back before its place is lost.
+/// Grace period after the announced return time, after which the robot loses its place.
 const GRACE_MS: u64 = 30_000;
-/// How often it is looked whose place is lost.
+/// Interval between checks for lost places.
 const LOOK_INTERVAL_MS: u64 = 1_000;
-/// The shortest and the longest time to stay away.
+/// The minimum and the maximum time to stay away.
 const MIN_AWAY_MS: u64 = 1_000;
 const MAX_AWAY_MS: u64 = 60_000;
-/// What a transfer has to take, and in which time, as robots ask it of the server; else it ends
-/// when others wait.
+/// Minimum progress of a transfer and the period for it, the same that robots demand of the server.
+/// A slower transfer ends when others wait.
 const LEAST_BYTES: u64 = 16 * 1024;
 const LEAST_WITHIN_MS: u64 = 30_000;
-/// What a transfer is taken to last before any has ended.
+/// Assumed duration of a transfer before any has ended.
 const FIRST_GUESS_MS: u64 = 1_000;
 
-/// Who wants what.
+/// A robot and the blob that it requests.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub(super) struct Place {
     pub(super) robot: RobotId,
     pub(super) blob: Digest,
 }
 
-/// What decides when it is somebody's turn.
+/// The attributes that determine the order of a place.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Claim {
-    /// The deployment's: the higher comes first.
+    /// The deployment's priority: higher comes first.
     pub priority: i32,
-    /// The deployment's number: the older comes first.
+    /// The deployment's number: lower, which means older, comes first.
     pub deployment: u64,
-    /// Where the robot is, if it says.
+    /// The robot's site, if known.
     pub site: Option<LabelValue>,
 }
 
@@ -56,14 +56,14 @@ pub struct Claim {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Asking(u64);
 
-/// A transfer that runs.
+/// A running transfer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Turn {
     pub(super) robot: RobotId,
     pub(super) site: Option<LabelValue>,
 }
 
-/// What a transfer took lately.
+/// Recent progress of a transfer.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Progress {
     since_ms: u64,
@@ -71,12 +71,13 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// From now on, with so much taken already.
+    /// Starts measuring now, with this many bytes already taken.
     pub(super) fn from(now_ms: u64, taken_before: u64) -> Self {
         Self { since_ms: now_ms, taken_before }
     }
 
-    /// Whether it has taken too little while others waited, all of the time. `taken`: in all.
+    /// Whether the transfer was too slow while others waited for the whole period. `taken`: total
+    /// bytes.
     pub(super) fn is_too_slow(&mut self, taken: u64, others_wait: bool, now_ms: u64) -> bool {
         let is_enough = taken.saturating_sub(self.taken_before) >= LEAST_BYTES;
         if is_enough || !others_wait {
@@ -98,15 +99,15 @@ struct Rank {
 struct Waiting {
     place: Place,
     site: Option<LabelValue>,
-    /// The request that is there; `None`: away.
+    /// The pending request; `None`: the robot is away.
     asking: Option<Asking>,
-    /// When an absent robot's place is lost.
+    /// When an absent robot loses its place.
     lost_at_ms: u64,
     /// How often others went first.
     passed: u32,
 }
 
-/// What runs, of all or on one site.
+/// Running transfers, in total or on one site.
 #[derive(Debug, Clone, Copy, Default)]
 struct Load {
     limits: SiteLimits,
@@ -119,7 +120,7 @@ impl Load {
     }
 }
 
-/// What may begin yet, of all and on each site with limits.
+/// Remaining capacity, in total and on each site with limits.
 struct Free<'a> {
     all: u64,
     sites: HashMap<&'a LabelValue, u64>,
@@ -149,18 +150,18 @@ impl<'a> Free<'a> {
 #[derive(Debug)]
 pub(super) struct Queue {
     all: Load,
-    /// Sites that have limits.
+    /// Sites with limits.
     sites: HashMap<LabelValue, Load>,
-    /// How many transfers of each robot run.
+    /// Number of running transfers of each robot.
     turns: HashMap<RobotId, u64>,
     waiting: BTreeMap<Rank, Waiting>,
     ranks: HashMap<Place, Rank>,
-    /// Where those stand that are there.
+    /// The rank of each pending request.
     asking: HashMap<Asking, Rank>,
-    /// When it was last looked whose place is lost.
+    /// Time of the last check for lost places.
     looked_at_ms: u64,
     numbers: u64,
-    /// Moving average of what transfers last.
+    /// Moving average of transfer durations.
     lasts_ms: u64,
 }
 
@@ -180,24 +181,24 @@ impl Queue {
         }
     }
 
-    /// Transfers that run.
+    /// The number of running transfers.
     pub(super) fn running(&self) -> u64 {
         self.all.running
     }
 
-    /// Robots that wait for their turn, here or away.
+    /// The number of robots that wait for their turn, present or away.
     pub(super) fn waiting(&self) -> u64 {
         self.waiting.len() as u64
     }
 
-    /// Whether any robot but this one waits for its turn, here or away.
+    /// Whether any other robot waits for its turn, present or away.
     pub(super) fn others_wait(&self, robot: &RobotId) -> bool {
         self.waiting.values().any(|waiting| waiting.place.robot != *robot)
     }
 
-    /// A robot asks. Its request waits from now on, in the place that it has if it was here before;
-    /// an earlier request of the same place waits no longer. `None`: there are as many places as
-    /// there may be.
+    /// Adds a robot's request. The request waits in the robot's existing place if there is one; an
+    /// earlier request of the same place stops waiting. `None`: the queue has reached its maximum
+    /// number of places.
     pub(super) fn ask(&mut self, place: Place, claim: &Claim, now_ms: u64) -> Option<Asking> {
         self.forget_lost(now_ms);
         let before = self.ranks.remove(&place);
@@ -223,7 +224,8 @@ impl Queue {
         Some(asking)
     }
 
-    /// Begins the transfers that may begin now. To be called after whatever may have made room.
+    /// Begins the transfers that may begin now. Call this after every change that may have made
+    /// room.
     pub(super) fn begin(&mut self, now_ms: u64) -> Vec<(Asking, Turn)> {
         if self.all.free() == 0 {
             return Vec::new();
@@ -249,7 +251,8 @@ impl Queue {
                     begun.push((*rank, away.len()));
                     served.insert(robot);
                 }
-                // One that others have passed too often is waited for, in one of its places.
+                // A robot that others have passed too often gets a reserved transfer, in one of its
+                // places.
                 None if waiting.passed >= MAX_PASSED && kept_for.insert(robot) => {}
                 None => {
                     away.push(*rank);
@@ -258,7 +261,7 @@ impl Queue {
             }
             free.take(waiting.site.as_ref());
         }
-        // Those that are away would take as much, each robot once.
+        // Absent robots would take as much, each robot once.
         for waiting in away.iter().filter_map(|rank| self.waiting.get(rank)) {
             let robot = &waiting.place.robot;
             if free.is_on(waiting.site.as_ref())
@@ -288,8 +291,8 @@ impl Queue {
         begun.into_iter().filter_map(|(rank, _)| self.start(rank)).collect()
     }
 
-    /// The request waits no longer. For how long its robot should stay away, with its place kept;
-    /// `None` if it does not wait. `chance` is from 0 to 1.
+    /// Removes the pending request and keeps the robot's place. Returns how long the robot should
+    /// stay away; `None` if the request does not wait. `chance` is from 0 to 1.
     pub(super) fn send_away(&mut self, asking: Asking, now_ms: u64, chance: f64) -> Option<u64> {
         let rank = self.asking.remove(&asking)?;
         let on_site = self.waiting.get(&rank)?.site.as_ref().and_then(|site| self.sites.get(site));
@@ -299,7 +302,7 @@ impl Queue {
             .filter_map(|load| load.limits.most())
             .min();
         let (at_once, lasts_ms) = (at_once.unwrap_or(1).max(1), self.lasts_ms.max(1));
-        // Beyond the longest time to stay away it does not matter how many there are.
+        // Beyond the maximum time to stay away the exact number does not matter.
         let enough = usize::try_from((MAX_AWAY_MS / lasts_ms + 1).saturating_mul(at_once))
             .unwrap_or(usize::MAX);
         let ahead = self.waiting.range(..rank).take(enough).count() as u64;
@@ -310,7 +313,7 @@ impl Queue {
         Some(away_ms)
     }
 
-    /// A transfer has ended after so long.
+    /// Ends a transfer after this duration.
     pub(super) fn end(&mut self, turn: &Turn, lasted_ms: u64) {
         self.all.running -= 1;
         if let Some(load) = turn.site.as_ref().and_then(|site| self.sites.get_mut(site)) {
@@ -360,7 +363,7 @@ impl Queue {
     }
 }
 
-/// A time to stay away: at least what is expected, up to half as much again, so that those sent
+/// A time to stay away: at least the expected wait, up to half as much again, so that robots sent
 /// away together come back one by one.
 pub(super) fn jittered(expected_ms: u64, chance: f64) -> u64 {
     let expected_ms = expected_ms.clamp(MIN_AWAY_MS, MAX_AWAY_MS);
@@ -461,7 +464,7 @@ mod tests {
         let again = queue.ask(place(2), &claim(0), 3_000).expect("room");
         queue.end(&turn(0), 1_000);
         assert_eq!(queue.begin(3_000), [(again, turn(2))], "first in its old place");
-        // Who does not come back loses its place.
+        // A robot that does not come back loses its place.
         queue.end(&turn(1), 1_000);
         queue.end(&turn(2), 1_000);
         assert_eq!(queue.begin(3_000).len(), 2);
@@ -485,9 +488,9 @@ mod tests {
     }
 
     proptest! {
-        /// However robots come and go, and however many newcomers ask meanwhile: never more
-        /// transfers than the limit, and one that keeps coming back when it was told gets its turn
-        /// after at most those before it, each of which may be passed a few times.
+        /// For any order of robots and newcomers: never more transfers than the limit. A robot that
+        /// returns on time gets its turn after at most the robots before it, each of which may be
+        /// passed a few times.
         #[test]
         fn nobody_starves(max in 1u64..5, others in 1u8..20, newcomers in proptest::collection::vec(0u64..3, 300), seed in any::<u64>()) {
             let mut queue = Queue::new(&limits(max));
@@ -524,7 +527,7 @@ mod tests {
                 if is_done {
                     break;
                 }
-                // Sometimes it is not there when its turn could have come.
+                // Sometimes the robot is absent when its turn could have come.
                 if let Some(asking) = mine.filter(|_| random(2) == 0) {
                     back_at_ms = now_ms + queue.send_away(asking, now_ms, 0.5).expect("waits");
                     mine = None;
@@ -533,8 +536,8 @@ mod tests {
             prop_assert!(begun_in_all <= u64::from(others) + u64::from(MAX_PASSED) + max);
         }
 
-        /// However many blobs a robot asks for: what it gets beyond one turn is what nobody without
-        /// a turn could have had, and all that is asked for is had in the end.
+        /// For any number of requested blobs: a robot gets more than one turn only from capacity
+        /// that no robot without a turn could have used, and all requests are served in the end.
         #[test]
         fn one_robot_does_not_take_the_turns_of_others(max in 1u64..5, acts in proptest::collection::vec((0u8..4, 0u8..6, 0u8..6), 1..200)) {
             let mut queue = Queue::new(&limits(max));

@@ -1,6 +1,6 @@
-//! The private certificate authority: made on the first start, kept for ever, known to robots by
-//! its pin. It vouches for this server alone; the keys of the certificates it makes live in memory
-//! and are replaced at every start.
+//! The private certificate authority: created on the first start, kept for ever, known to robots by
+//! its pin. The authority certifies this server alone. The keys of issued certificates live in
+//! memory and are replaced at every start.
 
 use std::net::IpAddr;
 use std::time::Duration;
@@ -19,28 +19,28 @@ use task_transport::pin_of;
 use super::TlsError;
 use crate::system::data_directory::DataDirectory;
 
-/// The authority's certificate is good from this year on, and so are those it makes for robots: no
-/// clock that could be right stands before it.
+/// The first year of validity of the authority's certificate and of certificates for robots: no
+/// plausible clock is earlier.
 const FIRST_YEAR: i32 = 2020;
-/// It has no successor.
+/// The last year of validity; the authority has no successor.
 const LAST_YEAR: i32 = 2120;
-/// How long a robot's clock may run ahead.
+/// How far a robot's clock may be ahead.
 const ROBOTS_LIFETIME: Duration = Duration::from_secs(3650 * 86_400);
-/// Browsers do not take certificates that are good for longer than 398 days.
+/// Browsers reject certificates that are valid for longer than 398 days.
 const BROWSERS_LIFETIME: Duration = Duration::from_secs(397 * 86_400);
 /// How far a browser's clock may be behind.
 const BROWSERS_SLACK: Duration = Duration::from_secs(86_400);
 
-/// For whom a certificate is made.
+/// The clients for which a certificate is issued.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Audience {
-    /// Those who know the pin.
+    /// Clients that know the pin.
     Robots,
-    /// Those who have imported the authority's certificate.
+    /// Clients that have imported the authority's certificate.
     Browsers,
 }
 
-/// The authority.
+/// The authority's certificate and key.
 pub(super) struct Authority {
     issuer: Issuer<'static, KeyPair>,
     certificate: CertificateDer<'static>,
@@ -48,7 +48,7 @@ pub(super) struct Authority {
 }
 
 impl Authority {
-    /// Reads it, or makes it.
+    /// Reads the authority, or creates it.
     pub(super) fn open(data: &DataDirectory) -> Result<Self, TlsError> {
         let key = data.authority_key(KeyPair::generate()?.serialize_pem())?;
         let key = KeyPair::from_pem(&key).map_err(|_| data.authority_is_wrong(true))?;
@@ -65,7 +65,7 @@ impl Authority {
         self.pin
     }
 
-    /// A certificate for the server under these names, with a key of its own.
+    /// Issues a certificate for the server under these names, with a new key.
     pub(super) fn issue(
         &self,
         audience: Audience,
@@ -86,15 +86,16 @@ impl Authority {
         let key = KeyPair::generate()?;
         let certificate = params.signed_by(&key, &self.issuer)?.der().clone();
         let key = PrivatePkcs8KeyDer::from(key.serialize_der());
-        // With the authority's own: only so can whoever knows its pin recognize it.
+        // Includes the authority's own certificate: without it a client that knows only the pin
+        // can't recognize the authority.
         let chain = vec![certificate, self.certificate.clone()];
         CertifiedKey::from_der(chain, key.into(), &ring::default_provider())
             .map_err(TlsError::Unusable)
     }
 }
 
-/// Whatever the authority's certificate says follows from its key, so that certificates it makes
-/// fit a copy of any age.
+/// The content of the authority's certificate depends only on its key, so issued certificates fit a
+/// copy of any age.
 fn authority_params(pin: &CaPin) -> Result<CertificateParams, rcgen::Error> {
     let mut params = CertificateParams::new(Vec::new())?;
     params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
@@ -111,7 +112,7 @@ fn named(common_name: &str) -> DistinguishedName {
     name
 }
 
-/// The name as certificates have it; `None` for what can't stand in one.
+/// The name in the form of certificates; `None` if it can't be represented.
 fn subject(name: &str) -> Option<SanType> {
     match name.parse::<IpAddr>() {
         Ok(address) => Some(SanType::IpAddress(address)),

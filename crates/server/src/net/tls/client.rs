@@ -1,5 +1,6 @@
-//! What clients prove about themselves. Anybody may show any certificate with an ed25519 key, by
-//! whomever it was made; what counts is that they hold the key, and whose key that is others know.
+//! Clients' proof of identity in the handshake. A client may present any certificate with an
+//! ed25519 key, from any issuer. The certificate only proves possession of the key; other modules
+//! know the owner of the key.
 
 use std::sync::Arc;
 
@@ -13,20 +14,20 @@ use rustls::{CertificateError, DigitallySignedStruct, DistinguishedName, Error, 
 use task_proto::envelope::PublicKey;
 use task_transport::key_in;
 
-/// What a client has proven by a certificate of its own.
+/// A client's proof by a certificate of its own.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum ClientProof {
-    /// It was not asked to.
+    /// The server did not request a certificate.
     #[default]
     NotAsked,
-    /// Nothing.
+    /// The client presented none.
     Nothing,
-    /// That it holds this key.
+    /// The client holds this key.
     Holds(PublicKey),
 }
 
 impl ClientProof {
-    /// Whether it is enough for who has registered this key, if any.
+    /// Whether the proof is sufficient for a client that has registered this key, if any.
     pub fn suffices(&self, registered: Option<&PublicKey>) -> bool {
         match (self, registered) {
             (Self::NotAsked, _) | (_, None) => true,
@@ -35,13 +36,13 @@ impl ClientProof {
         }
     }
 
-    /// Of the certificates that a client has shown, when it was asked.
+    /// The proof from the certificates that a client presented on request.
     pub(super) fn of(shown: Option<&[CertificateDer<'_>]>) -> Self {
         shown.and_then(<[_]>::first).and_then(key_in).map_or(Self::Nothing, Self::Holds)
     }
 }
 
-/// Takes every certificate with an ed25519 key, and none at all.
+/// Accepts every certificate with an ed25519 key, and also none.
 #[derive(Debug)]
 pub(super) struct AnyKey(WebPkiSupportedAlgorithms);
 

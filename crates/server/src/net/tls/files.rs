@@ -1,5 +1,5 @@
-//! The operator's own certificate: a chain and its key in two PEM files, which somebody else
-//! replaces when they like. It takes what fits together and nothing else.
+//! The operator's own certificate: a chain and its key in two PEM files, which other programs
+//! replace at any time. Only a matching pair is accepted.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -13,10 +13,10 @@ use task_proto::Digest;
 
 use super::TlsError;
 
-/// A longer file holds something else.
+/// Maximum file size; a longer file is not a certificate or key.
 const MAX_FILE_BYTES: u64 = 1024 * 1024;
 
-/// Where the two files are, and what was in them when they were last looked at.
+/// The paths of the two files, and their content at the last check.
 #[derive(Debug)]
 pub(super) struct Files {
     certificate: PathBuf,
@@ -29,8 +29,8 @@ impl Files {
         Self { certificate, key, seen: None }
     }
 
-    /// What is in the files; `None` if it is what was there the last time. What can't be used is
-    /// said once.
+    /// The content of the files; `None` if unchanged since the last call. An error is reported
+    /// once.
     pub(super) fn read_news(&mut self) -> Result<Option<CertifiedKey>, TlsError> {
         let (certificate, key) = (read(&self.certificate)?, read(&self.key)?);
         let content = [&certificate, &key].map(|bytes| Digest::of(bytes));

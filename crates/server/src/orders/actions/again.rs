@@ -1,4 +1,5 @@
-//! Orders that follow from earlier ones: what failed once more, and back to what was there before.
+//! Orders that follow from earlier ones: retries of failed deployments, and rollbacks to the
+//! previous package.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -16,14 +17,14 @@ use crate::domain::person::Person;
 use crate::orders::changes::Consequences;
 use crate::store::{Act, Deed, KnownRobot, Write};
 
-/// Who goes back to what.
+/// The result of a rollback, or its preview.
 #[derive(Debug, Clone, Default, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Rollback {
-    /// The deployments by which they do, one for each package.
+    /// The deployments of the rollback, one for each package.
     pub deployments: Vec<DeploymentId>,
-    /// Who does, sorted by name. `online` is left false.
+    /// Robots that are rolled back, sorted by name. `online` is left false.
     pub robots: Vec<MatchedRobot>,
-    /// Who has nothing to go back to, likewise.
+    /// Robots without an earlier package, sorted by name. `online` is left false.
     pub without: Vec<MatchedRobot>,
 }
 
@@ -34,12 +35,12 @@ impl Remembered for Rollback {
     }
 }
 
-/// Those who go back to one package.
+/// Robots that go back to one package.
 type Goal = (PackageRef, TaskKind, Vec<RobotId>);
 
 impl Actions {
-    /// Orders once more what `id` has brought, the same way, on the robots where that has ended
-    /// badly. The same key with the same order gives the same deployment.
+    /// Orders the package of deployment `id` once more, in the same way, on the robots where the
+    /// deployment ended badly. The same key with the same order gives the same deployment.
     pub async fn retry_deployment(
         &self,
         by: &Person,
@@ -81,8 +82,8 @@ impl Actions {
             )
         };
         self.check_fits(&order, &package)?;
-        // What was taken over from robots after the database was put back never had a time of its
-        // own.
+        // Deployments taken over from robots after the database was restored have no lifetime of
+        // their own.
         let lifetime_ms = match past.expires_at_ms.saturating_sub(past.created_at_ms) {
             0 => self.settings.assignment_lifetime_ms,
             lifetime_ms => lifetime_ms,
@@ -111,7 +112,7 @@ impl Actions {
         Ok(new)
     }
 
-    /// Whom [`Actions::retry_deployment`] would mean; an error if nobody.
+    /// The robots that [`Actions::retry_deployment`] would retry; an error if there are none.
     pub async fn robots_to_retry(
         &self,
         by: &Person,
@@ -119,13 +120,13 @@ impl Actions {
         retry: &RetryDeployment,
     ) -> Result<Vec<MatchedRobot>, ActionError> {
         let past = self.past_deployment(id).await?;
-        // What is written here is never committed.
+        // This transaction is never committed.
         let mut write = self.store.begin_keeping_rights().await?;
         Ok(to_retry(&mut write, by, &past, retry).await?.into_iter().map(matched).collect())
     }
 
-    /// Orders the robots that match back to the package of `task` that ran there before the one
-    /// they should have now; one deployment for each package. The same key gives the same answer.
+    /// Rolls the matching robots back to the package of `task` that ran there before the one they
+    /// should have now; one deployment for each package. The same key gives the same answer.
     pub async fn roll_back(
         &self,
         by: &Person,
@@ -166,14 +167,14 @@ impl Actions {
         Ok(rollback)
     }
 
-    /// What [`Actions::roll_back`] would do.
+    /// Previews [`Actions::roll_back`].
     pub async fn rollback(
         &self,
         by: &Person,
         task: &TaskName,
         selector: &Selector,
     ) -> Result<Rollback, ActionError> {
-        // What is written here is never committed.
+        // This transaction is never committed.
         let mut write = self.store.begin_keeping_rights().await?;
         Ok(rollback(&mut write, by, task, selector, self.clock.now_ms()).await?.0)
     }
@@ -212,7 +213,7 @@ async fn to_retry(
     Ok(robots)
 }
 
-/// Who goes back, and to what; an error if nobody has the task.
+/// The robots to roll back, with their packages; an error if no robot has the task.
 async fn rollback(
     write: &mut Write,
     by: &Person,

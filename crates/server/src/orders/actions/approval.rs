@@ -1,4 +1,4 @@
-//! Robots that wait to be approved, and what becomes of them.
+//! Robots that wait for approval: approving and rejecting them.
 
 use task_proto::RobotId;
 use task_proto::api::PendingRobotList;
@@ -9,7 +9,7 @@ use crate::domain::person::Person;
 use crate::orders::changes::Change;
 use crate::store::{Act, Deed, KnownRobot, StoreError, Write};
 
-/// How long one may wait.
+/// How long a robot may wait for approval.
 const PENDING_LIFETIME_MS: u64 = 7 * DAY_MS;
 
 impl Actions {
@@ -18,7 +18,7 @@ impl Actions {
         Ok(PendingRobotList { robots: self.store.pending_robots().await? })
     }
 
-    /// Lets a robot in that waits. Doing it twice is harmless.
+    /// Approves a waiting robot. The call is idempotent.
     pub async fn approve_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -35,8 +35,8 @@ impl Actions {
         Ok(())
     }
 
-    /// Turns a robot away that waits, and forgets it. One that does not wait is not meant: that
-    /// would be removing it.
+    /// Rejects a waiting robot and removes its records. A robot that does not wait is not affected:
+    /// that would be a removal.
     pub async fn reject_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -51,7 +51,7 @@ impl Actions {
     }
 }
 
-/// Turns away whoever has waited for too long, and says who that was.
+/// Rejects robots that have waited for too long, and returns them.
 pub(super) async fn give_up_pending(
     write: &mut Write,
     now_ms: u64,

@@ -1,4 +1,4 @@
-//! What is done to many robots at once: to all that are meant, or to none.
+//! Changes to many robots at once: to all that match, or to none.
 
 use task_proto::api::{BulkLabels, MatchedRobot};
 use task_proto::id::Labels;
@@ -12,9 +12,9 @@ use crate::orders::changes::{Change, Consequences};
 use crate::store::{Act, Deed, KnownRobot, Write};
 
 impl Actions {
-    /// Sets labels of the robots that match, and takes labels away. Before and after they have to
-    /// be the person's. Gives the robots meant, also those that had it all before; `online` is left
-    /// false. A dry run only looks whether it could be done.
+    /// Sets and removes labels of the matching robots. The robots have to be in the person's scope
+    /// before and after. Returns the matching robots, also those without a change; `online` is left
+    /// false. A dry run only checks whether the change is possible.
     pub async fn label_robots(
         &self,
         by: &Person,
@@ -129,7 +129,8 @@ impl Actions {
     }
 }
 
-/// The robots that a selector means; an error if nobody, or if one of them is not the person's.
+/// The robots that match a selector; an error if there are none, or if one is outside the person's
+/// scope.
 async fn meant(
     write: &mut Write,
     by: &Person,

@@ -19,7 +19,7 @@ use crate::orders::changes::{Change, Consequences};
 use crate::orders::chooser::{Chooser, travelling_bytes};
 use crate::store::{Act, Deed, NewDeployment, Revocable, StillRunning, Write};
 
-/// How long an idempotency key is remembered.
+/// Lifetime of an idempotency key.
 const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
 
 impl Actions {
@@ -78,7 +78,7 @@ impl Actions {
         Ok(id)
     }
 
-    /// What is ordered to ride inside an announcement must fit into one.
+    /// Inline packages must fit into one announcement.
     pub(super) fn check_fits(
         &self,
         order: &CreateDeployment,
@@ -99,8 +99,8 @@ impl Actions {
         Err(ActionError::TooLargeForInline { package, size: exact(size), most: exact(most) })
     }
 
-    /// The deployment that `key` with this `order` gave before. A repeated order is answered also
-    /// when its package is gone.
+    /// The deployment that an earlier order with this `key` and `order` created. A repeated order
+    /// is answered even if its package was deleted.
     pub async fn deployment_ordered_before(
         &self,
         by: &Person,
@@ -111,9 +111,9 @@ impl Actions {
         self.answered_before(&mut write, by, key, &creation(order)).await
     }
 
-    /// Interrupts a deployment: where it has not settled, what it replaced is desired again; a
-    /// service that runs goes on. Doing it twice is harmless; one that is over everywhere is left
-    /// as it is.
+    /// Cancels a deployment: where the deployment has not settled, the package it replaced is
+    /// desired again; a running service goes on. The call is idempotent; a deployment that is over
+    /// everywhere is left unchanged.
     pub async fn cancel_deployment(
         &self,
         by: &Person,
@@ -144,8 +144,8 @@ impl Actions {
         Ok(())
     }
 
-    /// Lets a paused deployment go on; the failures so far are forgiven. Of one that is not paused
-    /// the error says why nothing more begins there.
+    /// Resumes a paused deployment; the failures so far no longer count. If the deployment is not
+    /// paused, the error says why no further batch begins.
     pub async fn resume_deployment(
         &self,
         by: &Person,
@@ -174,7 +174,7 @@ impl Actions {
         Ok(())
     }
 
-    /// Says why a deployment that is not paused can't be resumed.
+    /// The error for resuming a deployment that is not paused, with the reason.
     async fn not_paused(&self, id: &DeploymentId) -> Result<ActionError, ActionError> {
         let found = self.store.deployment(id, false).await?;
         let mut view = found.ok_or_else(|| ActionError::DeploymentNotFound(id.clone()))?;
@@ -188,8 +188,8 @@ impl Actions {
         Ok(ActionError::NotPaused { id: id.clone(), why: view.awaited().to_string() })
     }
 
-    /// Begins batches that are due because robots have come back or stay away. To be called when a
-    /// robot has come, and every few seconds.
+    /// Begins batches that are due because robots have reconnected or stay offline. To be called
+    /// when a robot has connected, and every few seconds.
     pub async fn advance_rollouts(&self) -> Result<(), ActionError> {
         let open = self.store.open_rollouts().await?;
         if open.is_empty() {
@@ -199,7 +199,7 @@ impl Actions {
         let mut write = self.store.begin_keeping_rights().await?;
         let mut consequences = Consequences::default();
         advance(&mut write, &self.chooser, open, now_ms, &mut consequences).await?;
-        // Where nothing has moved, nothing is to be committed.
+        // Without a change there is nothing to commit.
         if !consequences.deployments.is_empty() {
             write.commit().await?;
             self.changes.publish(consequences);
@@ -207,9 +207,9 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends what was not done in time, and forgets old idempotency keys, tokens that have ended and
-    /// robots that nobody approved. To be called about once a minute. Gives the users whose tokens
-    /// those were.
+    /// Ends assignments past their time limit, and removes old idempotency keys, tokens that have
+    /// ended and robots that were never approved. To be called about once a minute. Returns the
+    /// users of those tokens.
     pub async fn expire(&self) -> Result<BTreeSet<UserName>, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -232,15 +232,15 @@ impl Actions {
 pub(super) struct Placed<'a> {
     pub(super) package: &'a PackageRef,
     pub(super) kind: TaskKind,
-    /// How.
+    /// The order to place.
     pub(super) order: &'a CreateDeployment,
     pub(super) robots: &'a [RobotId],
     pub(super) expires_at_ms: u64,
 }
 
 impl Placed<'_> {
-    /// Stores the deployment with its assignments, and moves on all deployments that may go on now,
-    /// itself among them. Where its package runs already, nothing begins unless `restart` is set.
+    /// Stores the deployment with its assignments, and advances all deployments that may go on now,
+    /// including this one. Where the package runs already, nothing begins unless `restart` is set.
     pub(super) async fn place(
         &self,
         write: &mut Write,
@@ -269,7 +269,7 @@ impl Placed<'_> {
     }
 }
 
-/// An order to create a deployment, as its idempotency key remembers it.
+/// An order to create a deployment, in the form stored with its idempotency key.
 fn creation(order: &CreateDeployment) -> String {
     format!("Create {}", serde_json::to_string(order).expect("an order always has a JSON form"))
 }
@@ -291,7 +291,8 @@ async fn check_deployment(
     check_scope(by, &robots, || format!("deployment {id}"))
 }
 
-/// Ends `taken` in `phase`, puts back what it had replaced, and moves on the rollouts this touches.
+/// Ends `taken` in `phase`, restores the assignments that they replaced, and advances the rollouts
+/// this touches.
 async fn take_back(
     write: &mut Write,
     chooser: &Chooser,

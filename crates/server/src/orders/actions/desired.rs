@@ -1,4 +1,5 @@
-//! A robot's desired state: read, signed, and kept until it changes or half its lifetime is over.
+//! A robot's desired state: read, signed, and cached until the state changes or half its lifetime
+//! is over.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, PoisonError};
@@ -10,7 +11,7 @@ use task_proto::{Generation, RobotId};
 use super::{ActionError, Actions};
 use crate::store::DesiredTasks;
 
-/// The most signed states that are kept. At the limit all are forgotten: signing again is cheap.
+/// Capacity of the cache of signed states. At the limit all are dropped: signing again is cheap.
 const MAX_KEPT: usize = 16 * 1024;
 
 /// A robot's signed desired state.
@@ -20,11 +21,11 @@ pub struct Desired {
     pub generation: Generation,
     /// The signed document.
     pub envelope: Envelope,
-    /// Blobs that are to ride along with it where it is pushed.
+    /// Blobs that are sent along with a pushed state.
     pub along: Vec<BlobRef>,
 }
 
-/// A signed state and when it was signed.
+/// A signed state and the time of its signature.
 #[derive(Debug)]
 struct Kept {
     issued_at_ms: u64,
@@ -65,19 +66,19 @@ impl Envelopes {
 }
 
 impl Actions {
-    /// Everybody who may have a desired state.
+    /// All robots that may have a desired state.
     pub async fn every_robot(&self) -> Result<Vec<RobotId>, ActionError> {
         Ok(self.store.robot_ids().await?)
     }
 
-    /// What `robot` should be running, signed. Refused as `diverged` while the robot is ahead of
-    /// the database.
+    /// The signed desired state of `robot`. Refused as `diverged` while the robot is ahead of the
+    /// database.
     pub async fn desired(&self, robot: &RobotId) -> Result<Desired, ActionError> {
         let found = self.store.desired_tasks(std::slice::from_ref(robot)).await?.pop();
         self.sign(found.ok_or_else(|| ActionError::RobotNotFound(robot.to_string()))?)
     }
 
-    /// The same for many robots; those that were removed or are diverged are left out.
+    /// The signed states of many robots; removed and diverged robots are left out.
     pub async fn desired_of(
         &self,
         robots: &[RobotId],

@@ -1,4 +1,4 @@
-//! The server's own order to robots that could not be kept up to date in a fan-out: pull.
+//! The server's own order to robots that fell behind in a fan-out: pull.
 
 use task_proto::{DeploymentId, RobotId};
 
@@ -7,8 +7,8 @@ use crate::domain::delivery::FELL_BEHIND;
 use crate::orders::changes::Consequences;
 
 impl Actions {
-    /// Tells robots that still wait for the parts of a package to pull it, `because`. The new
-    /// decision is stored, and their state signed anew.
+    /// Tells robots that still wait for the parts of a package to pull the package, `because`. The
+    /// new decision is stored, and their state signed anew.
     pub async fn pull_instead(
         &self,
         parts: &[(DeploymentId, RobotId)],

@@ -1,5 +1,6 @@
-//! What people and robots may order. Each order is one write to the store; after its commit the
-//! change is announced and the robots concerned are rung. No HTTP and no MQTT here, and no SQL.
+//! Orders of users and requests of robots. Each order is one write to the store; after its commit
+//! the change is announced and the robots concerned are notified. No HTTP and no MQTT here, and no
+//! SQL.
 
 mod again;
 mod approval;
@@ -41,7 +42,7 @@ pub use again::Rollback;
 pub use desired::Desired;
 pub use robots::Enrolled;
 
-/// The orders. Clones are the same.
+/// The order service. Clones share their state.
 #[derive(Clone)]
 pub struct Actions {
     store: Store,
@@ -56,7 +57,7 @@ pub struct Actions {
     enrolments: Arc<Enrolments>,
 }
 
-/// How often robots enrol.
+/// Rate limits of enrollments.
 struct Enrolments {
     by_token: Pace,
     all: Pace,
@@ -65,25 +66,24 @@ struct Enrolments {
 /// Lifetimes the operator may set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ActionSettings {
-    /// How long an assignment may take when the order does not say.
+    /// Default time limit of an assignment.
     pub assignment_lifetime_ms: u64,
-    /// How long a signed desired state may be acted upon.
+    /// How long a signed desired state is valid.
     pub desired_lifetime_ms: u64,
-    /// How long an enrolment token is good for when its maker does not say.
+    /// Default lifetime of an enrollment token.
     pub enrolment_token_lifetime_ms: u64,
-    /// How many robots it is good for when its maker does not say.
+    /// Default number of uses of an enrollment token.
     pub enrolment_token_uses: u64,
-    /// How many robots may enrol in a minute; by one token half of them.
+    /// Maximum number of enrollments per minute; half of them by one token.
     pub enrolments_per_minute: u64,
-    /// The certificate authority that robots are told to trust, if they are to trust the server's
-    /// own.
+    /// The certificate authority that robots pin, if they are to trust the server's own authority.
     pub ca_pin: Option<CaPin>,
     /// Whether every new robot waits to be approved.
     pub enrolment_approval: bool,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
-/// The longest lifetime anyone may ask for.
+/// The longest lifetime a request may set.
 const MAX_LIFETIME_MS: u64 = 10 * 365 * DAY_MS;
 
 impl Default for ActionSettings {
@@ -101,8 +101,8 @@ impl Default for ActionSettings {
 }
 
 impl Actions {
-    /// Orders that go to `store` and are announced to `changes`; desired states are signed with
-    /// `key`, and how packages travel is up to `chooser`.
+    /// Orders write to `store` and are announced to `changes`; desired states are signed with
+    /// `key`, and `chooser` selects delivery mechanisms.
     pub fn new(
         store: Store,
         clock: Clock,
@@ -130,8 +130,9 @@ impl Actions {
         }
     }
 
-    /// What was answered when `key` came with this `request` before; an error if it came with
-    /// another, or from someone else. Robots that are no longer the person's are left out.
+    /// The stored answer if `key` came with this `request` before; an error if the key came with
+    /// another request, or from another user. Robots that the person may no longer see are left
+    /// out.
     async fn answered_before<T: Remembered>(
         &self,
         write: &mut Write,
@@ -155,7 +156,7 @@ impl Actions {
         Ok(Some(answer))
     }
 
-    /// Remembers the answer to `request`, so that a retry gets the same.
+    /// Stores the answer to `request`, so that a retry gets the same answer.
     async fn remember_answer<T: Remembered>(
         &self,
         write: &mut Write,
@@ -172,9 +173,9 @@ impl Actions {
     }
 }
 
-/// An answer that is given again when its order comes again.
+/// An answer that is stored and returned when its order is repeated.
 trait Remembered: Serialize + DeserializeOwned {
-    /// Leaves out the robots that are not among these.
+    /// Removes all robots except `own`.
     fn keep_robots(&mut self, own: &HashSet<RobotId>);
 }
 
@@ -185,19 +186,19 @@ impl Remembered for Vec<MatchedRobot> {
 }
 
 impl Remembered for DeploymentId {
-    /// It names none: what is shown of the deployment is a question of its own.
+    /// No robots to remove: the deployment's view is read separately.
     fn keep_robots(&mut self, _own: &HashSet<RobotId>) {}
 }
 
-/// A request as it is remembered with its answer. That of the first token is remembered as it was
-/// before there were users.
+/// The request text stored with its answer. Requests of the first token are stored in the form used
+/// before users existed.
 fn remembered(by: &Person, request: &str) -> String {
     let text = if by.is_first() { request.to_owned() } else { format!("{} {request}", by.name) };
     Digest::of(text.as_bytes()).to_string()
 }
 
-/// Refuses an order as a whole if one of the robots it means is not the person's: a part of it
-/// would be a surprise. `what` says what means them.
+/// Refuses a whole order if one of its robots is outside the person's scope: a partial order would
+/// be a surprise. `what` names the selection in the error.
 fn check_scope(
     by: &Person,
     robots: &[KnownRobot],
@@ -225,7 +226,7 @@ fn all_known(matching: Matching) -> Result<Vec<KnownRobot>, ActionError> {
     }
 }
 
-/// The first names of a list that may be long.
+/// The first names of a possibly long list.
 fn listed(names: &[RobotName]) -> String {
     const MAX_NAMES: usize = 20;
     let listed: Vec<&str> = names.iter().take(MAX_NAMES).map(RobotName::as_str).collect();
@@ -256,13 +257,13 @@ fn quoted(selector: &Selector) -> String {
     format!("{text:?}")
 }
 
-/// Why an order was not carried out. Nothing of it was.
+/// Why an order was refused. No part of a refused order is carried out.
 #[derive(Debug, thiserror::Error)]
 pub enum ActionError {
-    /// The selector means nobody, or nobody who has the task.
+    /// The selector matches no robot, or no robot that has the task.
     #[error("no robots match {0}")]
     NoRobotsMatch(String),
-    /// The selector names robots that there are not, or that are none of the person's.
+    /// The selector names robots that do not exist or are outside the person's scope.
     #[error("selector: no robot that takes orders has the name or id {}; nothing was done", listed(.0))]
     UnknownRobots(Vec<RobotName>),
     /// The key came with another order before.
@@ -271,50 +272,50 @@ pub enum ActionError {
     /// Text that is no idempotency key.
     #[error("an idempotency key has 1 to 128 visible ASCII characters")]
     InvalidIdempotencyKey,
-    /// Some of the robots meant are not the person's.
+    /// Some of the selected robots are outside the person's scope.
     #[error("{}", out_of_scope(*outside, *meant, what, person, scope))]
     OutOfScope {
-        /// How many are not.
+        /// Number of robots outside the scope.
         outside: usize,
-        /// How many are meant.
+        /// Number of selected robots.
         meant: usize,
-        /// By what.
+        /// The part of the request that selects the robots.
         what: String,
-        /// Whose scope.
+        /// The user with the limited scope.
         person: UserName,
         /// The scope.
         scope: String,
     },
-    /// It takes something else than the person has.
+    /// The person lacks the named permission.
     #[error("{0}")]
     NotPermitted(String),
-    /// Name and password don't belong together, or there is no such user.
+    /// The password does not match, or the user does not exist.
     #[error("the user name or the password is wrong")]
     SignInRefused,
     /// Too many were wrong.
     #[error("too many wrong passwords; try again in {seconds} s")]
     SignInBlocked {
-        /// When the next one is looked at.
+        /// Seconds until the next attempt is allowed.
         seconds: u64,
     },
     /// More at once than can be checked.
     #[error("too many sign-ins at once; try again")]
     TooManySignIns,
-    /// No rule gives whoever came by the provider a role.
+    /// No OIDC rule gives the user a role.
     #[error("nothing that the provider says of you gives you a role here; ask an administrator")]
     NoRole {
-        /// Who was a user until now.
+        /// The existing user who was removed for this reason.
         removed: Option<UserName>,
     },
-    /// The provider does not say what to call them.
+    /// The provider sends no name that is usable here.
     #[error("the provider has no name for you that is a user name here; ask an administrator")]
     NoName,
-    /// The provider and the rules for it decide.
+    /// The provider and the OIDC rules decide this.
     #[error(
         "{0} signs in by the provider: what {0} may is for oidc.rules in the configuration to say"
     )]
     OfProvider(UserName),
-    /// It could not be hashed.
+    /// The password could not be hashed.
     #[error("the password could not be hashed")]
     PasswordFailed,
     /// The name is taken.
@@ -323,10 +324,10 @@ pub enum ActionError {
     /// No such user.
     #[error("there is no user {0}")]
     UserNotFound(UserName),
-    /// No such token, or somebody else's.
+    /// No such token, or the token belongs to another user.
     #[error("there is no token {0} of yours")]
     TokenNotFound(TokenId),
-    /// Without them nobody could administer the server any more.
+    /// Without this user the server would have no administrator.
     #[error("{0} is the last administrator with a way in; give another one a password first")]
     LastAdministrator(UserName),
     /// A request that makes no sense.
@@ -334,99 +335,99 @@ pub enum ActionError {
     Invalid {
         /// The request's key.
         key: &'static str,
-        /// What is wrong with its value.
+        /// Why the value is invalid.
         reason: String,
     },
-    /// More than an announcement may carry was ordered to ride inside one.
+    /// The inline package exceeds the size limit of an announcement.
     #[error("delivery: {package} has {size}, inline carries at most {most}")]
     TooLargeForInline {
         /// Name and version.
         package: String,
-        /// What it has.
+        /// Its size.
         size: String,
-        /// What is possible.
+        /// The largest size possible.
         most: String,
     },
-    /// Someone is registered by this MAC.
+    /// A robot with this MAC is registered.
     #[error(
         "a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot"
     )]
     MacKnown {
         /// The MAC.
         mac: MacAddress,
-        /// Who has it.
+        /// Name of the registered robot.
         name: RobotName,
     },
-    /// A token made for one robot was used by another.
+    /// A token made for one robot was used by another robot.
     #[error("this token is for the robot {name} with MAC {mac}")]
     TokenForOther {
-        /// Whose it is.
+        /// The robot that the token was made for.
         name: RobotName,
         /// The MAC of that robot.
         mac: MacAddress,
     },
-    /// Someone has this name.
+    /// Another robot has this name.
     #[error("a robot named {0} exists")]
     NameTaken(RobotName),
-    /// It was approved before, or never had to be.
+    /// The robot was approved before, or never needed approval.
     #[error("robot {0} does not wait to be approved; taskd robot rm removes it")]
     NotPending(RobotName),
-    /// So many wait that no other may.
+    /// The number of robots waiting for approval is at its limit.
     #[error("{0} robots wait to be approved: approve or reject some of them first")]
     TooManyPending(u64),
-    /// So many enrol that this one has to wait.
+    /// Too many concurrent enrollments: this one has to wait.
     #[error("too many robots enrol at once; try again in {seconds} s (enrolment.per_minute)")]
     TooManyEnrolments {
-        /// When there is room.
+        /// Seconds until the next enrollment is allowed.
         seconds: u64,
     },
-    /// No such enrolment token, or it has ended.
+    /// No such enrollment token, or the token has ended.
     #[error("there is no enrolment token {0}")]
     EnrolmentNotFound(TokenId),
-    /// The enrolment token is unknown, used up, expired or revoked.
+    /// The enrollment token is unknown, used up, expired or revoked.
     #[error("the enrolment token is unknown, used up, expired or revoked")]
     TokenRefused,
-    /// The robot was registered again and the token made then waits for its first use: the old
-    /// agent gets no other.
+    /// The robot was registered again and its new token waits for its first use: the old agent gets
+    /// no further token.
     #[error("robot {0} was registered again and its new token was not used yet")]
     EnrolledAnew(RobotId),
-    /// There is no such robot.
+    /// The robot does not exist.
     #[error("there is no robot {0:?}")]
     RobotNotFound(String),
-    /// There is no such deployment.
+    /// The deployment does not exist.
     #[error("there is no deployment {0}")]
     DeploymentNotFound(DeploymentId),
-    /// It has ended well everywhere, or something else was ordered since.
+    /// The deployment ended well everywhere, or a later order replaced it.
     #[error(
         "there is no such robot for which deployment {0} has ended badly and of which nothing else was ordered since"
     )]
     NothingToRetry(DeploymentId),
-    /// Nobody had another package of the task before.
+    /// No robot ran another package of the task before.
     #[error(
         "none of these robots had another package of {0} before that has run there and is still on the server"
     )]
     NothingToRollBack(TaskName),
-    /// It was deleted.
+    /// The package was deleted.
     #[error("{0} {1} is no longer on the server: push it again")]
     PackageNotFound(TaskName, Version),
     /// The deployment was cancelled before.
     #[error("deployment {0} was cancelled")]
     DeploymentCancelled(DeploymentId),
-    /// It is over, and nothing of it can be put back.
+    /// The deployment is over, and no part of it can be reverted.
     #[error(
         "deployment {0} is over: nothing of it is under way or has failed, so it is left as it is; stop, remove or roll back the task instead"
     )]
     NothingToCancel(DeploymentId),
-    /// It does not wait for the operator.
+    /// The deployment does not wait for the operator.
     #[error("deployment {id} is not paused: {why}")]
     NotPaused {
         /// The deployment.
         id: DeploymentId,
-        /// What it waits for.
+        /// The condition the deployment waits for.
         why: String,
     },
-    /// The robot's generation is higher than ours: the database was restored. It is left alone
-    /// until its next order.
+    /// The robot's generation is higher than ours: the database was restored. The robot is left
+    /// alone until its next order.
     #[error(
         "robot {0} reports a later state than the server knows; it is left alone until its next order"
     )]
@@ -479,7 +480,7 @@ impl ActionError {
     }
 }
 
-/// What makes an order safe to repeat: 1 to 128 visible ASCII characters.
+/// Makes an order safe to repeat: 1 to 128 visible ASCII characters.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct IdempotencyKey(String);
 

@@ -1,5 +1,5 @@
-//! People come, change and go, sign out, and get and lose tokens. Whoever had more rights before
-//! such a change is served with them no longer.
+//! Users: creating, changing and removing them, signing them out, their tokens. After a change that
+//! reduces a user's rights, no request is served with the old rights.
 
 use std::net::IpAddr;
 
@@ -20,16 +20,16 @@ use crate::store::{Act, Deed, NewToken, User, Write};
 
 /// The most users.
 const MOST_USERS: usize = 10_000;
-/// The most access tokens of one user; of those from signing in, the oldest goes for a newer one.
+/// Maximum number of access tokens of one user; a new sign-in replaces the oldest sign-in token.
 pub(super) const MOST_TOKENS: usize = 100;
-/// How long a token lives that was made without saying so.
+/// Default lifetime of a token.
 const TOKEN_LIFETIME_MS: u64 = 90 * DAY_MS;
 /// The longest title of a token, in characters.
 const MOST_TITLE: usize = 200;
 /// A selector as long as that is a list of robots that belongs into a label.
 const MOST_SCOPE_BYTES: usize = 1_024;
 
-/// Names that stand for something else in the audit.
+/// Names with another meaning in the audit.
 const RESERVED: [&str; 3] = ["operator.token", "enrolment", "server"];
 
 impl Actions {
@@ -58,7 +58,7 @@ impl Actions {
         Ok(user.view())
     }
 
-    /// Changes what a user may.
+    /// Changes a user's role and scope.
     pub async fn edit_user(
         &self,
         by: &Person,
@@ -100,15 +100,15 @@ impl Actions {
         Ok(())
     }
 
-    /// Sets a user's password. What was signed in with the old one is signed out; tokens that were
-    /// made stay.
+    /// Sets a user's password. Sessions from the old password end; tokens that were created
+    /// explicitly stay.
     pub async fn set_password(
         &self,
         by: &Person,
         name: &UserName,
         password: &str,
     ) -> Result<(), ActionError> {
-        // Told before the work of hashing.
+        // Refused before the expensive hashing.
         check_own(
             &self.store.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))?,
         )?;
@@ -130,7 +130,7 @@ impl Actions {
         Ok(())
     }
 
-    /// Sets one's own password, if one knows the old one.
+    /// Changes the user's own password, after a check of the old one.
     pub async fn change_password(
         &self,
         by: &Person,
@@ -149,7 +149,7 @@ impl Actions {
         self.set_password(by, &by.name, &order.new).await
     }
 
-    /// Ends the token of whoever signed in with a password; any other is left as it is.
+    /// Ends the token of a sign-in; a token of any other origin stays.
     pub async fn sign_out(&self, by: &Person) -> Result<(), ActionError> {
         if !matches!(by.origin, TokenOrigin::Login | TokenOrigin::Page) {
             return Ok(());
@@ -163,13 +163,13 @@ impl Actions {
         Ok(())
     }
 
-    /// One's own tokens, or everybody's.
+    /// The user's own tokens, or all users' tokens.
     pub async fn tokens(&self, by: &Person, all: bool) -> Result<TokenList, ActionError> {
         let of = (!all).then_some(&by.name).filter(|_| !by.is_first());
         Ok(TokenList { tokens: self.store.person_tokens(of, self.clock.now_ms()).await? })
     }
 
-    /// Makes a token: for oneself, or by an administrator for anybody.
+    /// Creates a token: for the caller, or by an administrator for any user.
     pub async fn create_token(
         &self,
         by: &Person,
@@ -190,7 +190,7 @@ impl Actions {
             }
             None => &by.name,
         };
-        // Or else one that leaked would never end.
+        // Otherwise a leaked token could renew itself forever.
         if by.origin == TokenOrigin::Token && !by.may(Permission::Administer) {
             let reason =
                 "a token can't be made with a token: sign in with the password (taskd login)";
@@ -207,8 +207,8 @@ impl Actions {
             };
         let mut write = self.store.begin().await?;
         let owner = known_user(&mut write, user).await?;
-        // It would outlast what the provider says of its user, which is only heard when they sign
-        // in.
+        // The token would outlast the provider's statement about its user, which is refreshed only
+        // at sign-in.
         if owner.subject.is_some() && !by.may(Permission::Administer) {
             let reason = format!(
                 "{user} signs in by the provider: an administrator makes tokens for {user}"
@@ -251,9 +251,9 @@ impl Actions {
         Ok(AccessToken { id, token: token.reveal(), user: user.clone(), expires_at_ms })
     }
 
-    /// Ends a token: one of one's own, or by an administrator anybody's. Doing it twice is
-    /// harmless. Gives whose it was. A token made for something that is less than its user ends
-    /// itself alone: it may have leaked.
+    /// Ends a token: one of the caller's own, or by an administrator any user's. The call is
+    /// idempotent. Returns the token's user. A token that was not made by a sign-in may end only
+    /// itself: it may have leaked.
     pub async fn revoke_token(&self, by: &Person, id: &TokenId) -> Result<UserName, ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -288,14 +288,14 @@ impl From<PasswordError> for ActionError {
 }
 
 impl Deed {
-    /// With what the user may.
+    /// Adds the user's roles and scope.
     pub(super) fn described(self, user: &User) -> Self {
         let scope = user.scope.as_ref().map_or_else(|| "*".to_owned(), Selector::to_string);
         self.with("roles", &user.roles).with("scope", scope)
     }
 }
 
-/// A scope as it is stored: everything is no limit.
+/// A scope as stored: a selector for all robots means no limit.
 fn limit(scope: Option<&Selector>) -> Result<Option<Selector>, ActionError> {
     let Some(scope) = scope else { return Ok(None) };
     let text = scope.to_string();
@@ -321,7 +321,7 @@ pub(super) async fn check_new(write: &mut Write, name: &UserName) -> Result<(), 
     Ok(())
 }
 
-/// Refuses to change by hand what the provider and the rules for it decide.
+/// Refuses manual changes of fields that the provider and the OIDC rules decide.
 fn check_own(user: &User) -> Result<(), ActionError> {
     match user.subject {
         Some(_) => Err(ActionError::OfProvider(user.name.clone())),
@@ -333,8 +333,8 @@ async fn known_user(write: &mut Write, name: &UserName) -> Result<User, ActionEr
     write.user(name).await?.ok_or_else(|| ActionError::UserNotFound(name.clone()))
 }
 
-/// Refuses to end the last way in: another administrator with a password, or the first token, has
-/// to be left. `except` goes, or else the first token.
+/// Refuses to remove the last administrator: another administrator with a password, or the first
+/// token, has to remain. `except` is being removed, or else the first token.
 async fn check_not_last(write: &mut Write, except: Option<&UserName>) -> Result<(), ActionError> {
     if except.is_some() && write.has_first_token().await? {
         return Ok(());

@@ -1,4 +1,4 @@
-//! Robots come, are edited and go; and the tokens they come with.
+//! Robots enroll, are edited and removed; enrollment tokens.
 
 use std::net::IpAddr;
 use std::time::Instant;
@@ -22,9 +22,9 @@ use crate::orders::advance::advance;
 use crate::orders::changes::{Change, Consequences};
 use crate::store::{Act, Deed, EnrolmentTerms, KnownRobot, StoreError, Write};
 
-/// The most labels a robot may have.
+/// Maximum number of labels of a robot.
 const MAX_LABELS: usize = 64;
-/// The most robots that may wait to be approved.
+/// Maximum number of robots waiting for approval.
 const MOST_PENDING: u64 = 1_000;
 
 /// A robot that has just registered.
@@ -32,19 +32,20 @@ const MOST_PENDING: u64 = 1_000;
 pub struct Enrolled {
     /// Its identity.
     pub robot_id: RobotId,
-    /// The name it got.
+    /// The assigned name.
     pub name: RobotName,
     /// Its token, shown this once.
     pub token: Token,
-    /// Whether it waits to be approved.
+    /// Whether the robot waits for approval.
     pub awaits_approval: bool,
 }
 
 impl Actions {
-    /// Registers a robot that holds the enrolment token `token`. A robot that is known by its MAC
-    /// may register again with a token made for it, and by the same token as before while the
-    /// answer to that may have been lost: nobody has used what was in it. It keeps its id, name and
-    /// labels; its old token ends when the new one is first used. `address` is where it asks from.
+    /// Registers a robot that holds the enrollment token `token`. A robot with a known MAC may
+    /// register again with a token made for that robot, and with the same token as before while the
+    /// answer to the first request may have been lost: its credentials have not been used. The
+    /// robot keeps its id, name and labels; its old token ends when the new one is first used.
+    /// `address` is the source address of the request.
     pub async fn enroll(
         &self,
         token: &Token,
@@ -71,7 +72,7 @@ impl Actions {
         }
         let robot = match known {
             Some(known) if is_retry || terms.robot.as_ref() == Some(&known.id) => {
-                // A disk that was lost or copied holds the old one.
+                // A lost or copied disk holds the old credential.
                 write.renew_broker_credential(&known.id).await?;
                 write.readmit(&known.id).await?;
                 known
@@ -110,8 +111,8 @@ impl Actions {
         Ok(Enrolled { robot_id: robot.id, name: robot.name, token: robot_token, awaits_approval })
     }
 
-    /// Makes a token that `robot` may go over to. The one it uses, which is that of `token_number`,
-    /// ends when that one is first used.
+    /// Makes the next token of `robot`. The current token, `token_number`, ends when the next one
+    /// is first used.
     pub async fn next_robot_token(
         &self,
         robot: &RobotId,
@@ -130,7 +131,7 @@ impl Actions {
         Ok(token)
     }
 
-    /// Makes an enrolment token.
+    /// Makes an enrollment token.
     pub async fn create_enrollment_token(
         &self,
         by: &Person,
@@ -176,12 +177,12 @@ impl Actions {
         Ok(EnrollmentToken { id: token.id(), token: token.reveal(), uses_left, expires_at_ms })
     }
 
-    /// The enrolment tokens that are good for something.
+    /// The enrollment tokens that can still be used.
     pub async fn enrollment_tokens(&self) -> Result<EnrollmentTokenList, ActionError> {
         Ok(EnrollmentTokenList { tokens: self.store.enrolment_tokens(self.clock.now_ms()).await? })
     }
 
-    /// Ends an enrolment token now. Robots that came by it stay.
+    /// Ends an enrollment token now. Robots enrolled with the token stay.
     pub async fn revoke_enrollment_token(
         &self,
         by: &Person,
@@ -196,8 +197,8 @@ impl Actions {
         Ok(write.commit().await?)
     }
 
-    /// Changes a robot's name, labels or settings. Before and after it has to be one of the
-    /// person's.
+    /// Changes a robot's name, labels or settings. The robot has to be in the person's scope before
+    /// and after the change.
     pub async fn edit_robot(
         &self,
         by: &Person,
@@ -262,9 +263,9 @@ impl Actions {
         Ok(())
     }
 
-    /// Ends all tokens of a robot and those made for it, now; its name, its history and what is
-    /// ordered of it stay. There is no way back by the same tokens, for who has them is in doubt:
-    /// it has to be registered anew. Doing it twice is harmless.
+    /// Ends all tokens of a robot and those made for the robot, now; its name, its history and its
+    /// desired state stay. The same tokens never become valid again, because their holder is in
+    /// doubt: the robot has to be registered anew. The call is idempotent.
     pub async fn revoke_robot(&self, by: &Person, robot: &RobotId) -> Result<(), ActionError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
@@ -276,7 +277,7 @@ impl Actions {
         let deed =
             Deed::by(by, Act::RobotRevoke, robot).with("name", &known.name).with("mac", known.mac);
         write.audit(&deed, now_ms).await?;
-        // No batch waits for it any more.
+        // No batch waits for this robot any more.
         let touched = write.begun_on(robot).await?;
         let mut consequences = Consequences::default();
         advance(&mut write, &self.chooser, touched, now_ms, &mut consequences).await?;
@@ -286,8 +287,8 @@ impl Actions {
         Ok(())
     }
 
-    /// Writes down that a robot is about to be asked to change something, which it then may or may
-    /// not do, and signs that for the robot.
+    /// Records in the audit that a robot is about to be asked to change something, whether or not
+    /// the robot then does so, and signs the action for the robot.
     pub async fn sign_action(&self, by: &Person, action: &Action) -> Result<Envelope, ActionError> {
         let mut write = self.store.begin_keeping_rights().await?;
         let ask = serde_json::to_string(&action.ask).expect("a question always has a JSON form");
@@ -302,8 +303,8 @@ impl Actions {
         Ok(Envelope::seal(ACTION_TYPE, &payload, &self.key))
     }
 
-    /// The robots an order with this selector would mean now, sorted by name; an error if nobody,
-    /// or if one of them is not the person's. `online` is left false.
+    /// The robots that match this selector now, sorted by name; an error if none match, or if one
+    /// is outside the person's scope. `online` is left false.
     pub async fn matching_robots(
         &self,
         by: &Person,
@@ -318,7 +319,7 @@ impl Actions {
     }
 }
 
-/// A robot as the answer to an order lists it.
+/// A robot in the form used by answers to orders.
 pub(super) fn matched(robot: KnownRobot) -> MatchedRobot {
     MatchedRobot { id: robot.id, name: robot.name, online: false }
 }
@@ -329,7 +330,7 @@ pub(super) fn shown_labels(labels: &Labels) -> String {
     pairs.join(",")
 }
 
-/// A lifetime that a request gives in seconds under `key`.
+/// A lifetime from a request, in seconds under `key`.
 pub(super) fn lifetime_ms(key: &'static str, seconds: u64) -> Result<u64, ActionError> {
     match seconds.checked_mul(1000) {
         Some(ms @ 1..=MAX_LIFETIME_MS) => Ok(ms),
@@ -337,7 +338,7 @@ pub(super) fn lifetime_ms(key: &'static str, seconds: u64) -> Result<u64, Action
     }
 }
 
-/// Registers a robot that is not known yet.
+/// Registers an unknown robot.
 async fn register(
     write: &mut Write,
     terms: EnrolmentTerms,
@@ -346,7 +347,7 @@ async fn register(
 ) -> Result<KnownRobot, ActionError> {
     if let Some(other) = &terms.robot {
         let other = known_robot(write, other.as_str()).await.map_err(|error| match error {
-            // Its robot is gone, so the token is good for nothing.
+            // The token's robot was removed, so the token is useless.
             ActionError::RobotNotFound(_) => ActionError::TokenRefused,
             error => error,
         })?;
@@ -360,7 +361,7 @@ async fn register(
         }
         None => default_name(write, &request.mac, &id).await?,
     };
-    // What the operator put on the token wins over what the robot says of itself.
+    // Labels that the operator put on the token win over labels that the robot reports.
     let mut labels = request.labels.clone();
     labels.extend(terms.labels);
     check_labels(&labels)?;
@@ -380,7 +381,7 @@ async fn default_name(
     Ok(if is_free { by_mac } else { name(format!("robot-{id}")) })
 }
 
-/// A name must be free, and must not look like an id, or a selector could mean two robots by it.
+/// A name must be free, and must not look like an id: otherwise a selector could match two robots.
 async fn check_name(write: &mut Write, name: &RobotName) -> Result<(), ActionError> {
     if name.as_str().parse::<RobotId>().is_ok() {
         let reason = format!("{name:?} has the form of a robot id", name = name.as_str());
@@ -402,13 +403,13 @@ pub(super) fn check_labels(labels: &Labels) -> Result<(), ActionError> {
     })
 }
 
-/// The robot with this id or name, or the error that there is none.
+/// The robot with this id or name; an error if there is none.
 pub(super) async fn known_robot(
     write: &mut Write,
     id_or_name: &str,
 ) -> Result<KnownRobot, ActionError> {
-    // An id has the form of a name. What has not is no matter for the database, which might not
-    // even take the text.
+    // An id has the form of a name. Any other text is not passed to the database, which might
+    // reject the text.
     let robot = match id_or_name.parse::<RobotName>() {
         Ok(name) => write.known_robot(name.as_str()).await?,
         Err(_) => None,
@@ -436,7 +437,7 @@ fn shown_settings(settings: Option<&RobotSettings>) -> String {
     })
 }
 
-/// An error if so many wait that no other may.
+/// An error if the number of robots waiting for approval is at its limit.
 async fn check_room(write: &mut Write) -> Result<(), ActionError> {
     if write.count_pending().await? < MOST_PENDING {
         Ok(())
@@ -445,7 +446,7 @@ async fn check_room(write: &mut Write) -> Result<(), ActionError> {
     }
 }
 
-/// What is written down of a robot's removal: it is all that is left of it.
+/// The audit event of a robot's removal: the only record left of the robot.
 pub(super) fn removal(by: &Person, robot: &KnownRobot) -> Deed {
     Deed::by(by, Act::RobotRemove, &robot.id).with("name", &robot.name).with("mac", robot.mac)
 }

@@ -1,5 +1,5 @@
-//! Signing in: with a password, or by what a provider says. Whoever has signed in has a token of
-//! their own that ends by itself. How often it may fail is counted before anything is looked at.
+//! Sign-in with a password, or through an OpenID provider. Each sign-in creates a token that
+//! expires by itself. Failed attempts are limited before any credential is checked.
 
 use std::net::IpAddr;
 
@@ -14,30 +14,29 @@ use crate::auth::sign_ins::Blocked;
 use crate::config::RoleRule;
 use crate::store::{Act, Deed, NewToken, StoreError, User, Write};
 
-/// How long one lives that came from `taskd login`, if it does not say, and at the most.
+/// Default and maximum lifetime of a token from `taskd login`.
 const LOGIN_LIFETIME_MS: u64 = 30 * DAY_MS;
-/// How long a page is signed in.
+/// Lifetime of a page session.
 pub const PAGE_LIFETIME_MS: u64 = DAY_MS / 2;
 
-/// Someone who has just signed in.
+/// A user who has just signed in.
 pub struct SignedIn {
     /// As this user,
     pub user: UserName,
     /// by this token,
     pub token: Token,
-    /// which ends then.
+    /// Expiry of the token.
     pub expires_at_ms: u64,
-    /// Whether they may do something else than until now.
+    /// Whether the user's rights differ from those before.
     pub has_other_rights: bool,
 }
 
-/// Somebody whom a provider knows.
+/// A user authenticated by the OpenID provider.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ProviderUser {
-    /// Who they are there, behind the issuer.
+    /// The subject at the provider, with the issuer in front.
     pub subject: String,
-    /// What they are called if they are new here; `None`: the provider has no name for them that is
-    /// one here.
+    /// The user name for a new user; `None`: the provider has no name that is valid here.
     pub name: Option<UserName>,
 }
 
@@ -57,7 +56,7 @@ impl Actions {
         let checked = self.check_password(&order.user, &order.password, address).await?;
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;
-        // The password may have been changed while it was checked.
+        // The password may have been changed during the check.
         if write.user(&order.user).await?.is_none_or(|user| user.password != checked.password) {
             return Err(ActionError::SignInRefused);
         }
@@ -69,8 +68,8 @@ impl Actions {
         Ok(signed_in)
     }
 
-    /// Signs in somebody of whom a provider says who they are. Their user is the one that the
-    /// provider's name for them had the last time; what that may is what `rule` says now.
+    /// Signs in a user authenticated by the OpenID provider. The user is the one that this subject
+    /// had at the last sign-in; the permissions are those that `rule` gives now.
     pub async fn sign_in_by_provider(
         &self,
         who: &ProviderUser,
@@ -83,7 +82,7 @@ impl Actions {
         let deed =
             |act, name: &UserName| Deed::new("server".to_owned(), None, Some(address), act, name);
         let Some(rule) = rule else {
-            // What they were signed in to ends, too.
+            // The user's existing sessions end, too.
             if let Some(user) = &before {
                 write.remove_user(&user.name).await?;
                 let deed = deed(Act::UserRemove, &user.name)
@@ -156,9 +155,9 @@ impl Actions {
         let hash = user.as_ref().and_then(|user| user.password.as_ref());
         let now_ms = self.clock.now_ms();
         if let Err(blocked) = self.sign_ins.begin(name, hash.is_some(), address, now_ms) {
-            // A name that nobody has may be a password in the wrong field.
+            // An unknown user name may be a password in the wrong field.
             let whose = if user.is_some() { name.as_str() } else { "nobody" };
-            // Or the time would tell which names are known at this address.
+            // Otherwise the response time would reveal which names are known at this address.
             self.passwords.pretend().await;
             self.blocked(whose, address, blocked, now_ms).await?;
         }
@@ -178,7 +177,7 @@ impl Actions {
         user.ok_or(ActionError::SignInRefused)
     }
 
-    /// Never succeeds; the first time it is written down.
+    /// Always an error; the first time it is recorded in the audit.
     async fn blocked(
         &self,
         whose: &str,
@@ -189,7 +188,7 @@ impl Actions {
         let Blocked { until_ms, is_news } = blocked;
         if is_news {
             let mut write = self.store.begin_keeping_rights().await?;
-            // Nobody knows who it is, so nobody is named as the one who did it.
+            // The user is unknown, so the audit event names no actor.
             let deed =
                 Deed::new("server".to_owned(), None, Some(address), Act::SignInBlocked, whose);
             write.audit(&deed.with("until_ms", until_ms), now_ms).await?;
@@ -203,7 +202,7 @@ fn too_many_failures(blocked: Blocked, now_ms: u64) -> ActionError {
     ActionError::SignInBlocked { seconds: blocked.until_ms.saturating_sub(now_ms).div_ceil(1000) }
 }
 
-/// Stores the token of whoever has signed in, and writes down that they have.
+/// Stores the token of a signed-in user, and records the sign-in in the audit.
 async fn begin_session(
     write: &mut Write,
     user: &UserName,

@@ -14,8 +14,8 @@ use crate::orders::changes::Consequences;
 use crate::store::{Act, Deed, KnownRobot, Write};
 
 impl Actions {
-    /// Orders `task` started, restarted, stopped or removed on the robots that match and have it.
-    /// The same key gives the same answer, and orders nothing twice. `online` is left false.
+    /// Orders `task` started, restarted, stopped or removed on the robots that match and have the
+    /// task. The same key gives the same answer, and orders nothing twice. `online` is left false.
     pub async fn order_task(
         &self,
         by: &Person,
@@ -54,7 +54,7 @@ impl Actions {
         Ok(answer)
     }
 
-    /// Whom [`Actions::order_task`] would mean; an error if nobody.
+    /// The robots that [`Actions::order_task`] would affect; an error if there are none.
     pub async fn robots_with_task(
         &self,
         by: &Person,
@@ -77,8 +77,8 @@ fn act(order: TaskOrder) -> Act {
     }
 }
 
-/// The robots that match and have the task, each of which must be this person's; an error if
-/// nobody.
+/// The robots that match and have the task, each of which must be in this person's scope; an error
+/// if there are none.
 pub(super) async fn meant(
     write: &mut Write,
     by: &Person,

@@ -1,4 +1,5 @@
-//! What happened and is not told yet. Few of a kind are told one by one, many together.
+//! Events that the feed has not reported yet. A few events of one kind are reported one by one,
+//! many together.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::sync::Arc;
@@ -12,21 +13,23 @@ use super::{FeedAudience, Said};
 use crate::domain::happening::{Happening, TaskNews};
 use crate::store::{KnownRobot, Store, StoreError};
 
-/// More of a kind than this are told as one.
+/// More entries of one kind than this are combined into one.
 const MOST_ALONE: usize = 5;
-/// Robots that come or go are told of once nobody has for so many turns, or after so many.
+/// Presence changes are reported after `QUIET_TURNS` turns without a change, and after `MOST_TURNS`
+/// turns at the latest.
 const QUIET_TURNS: u32 = 3;
 const MOST_TURNS: u32 = 60;
-/// Failed tasks and unsettled deployments remembered; beyond it all are forgotten, and their ends
-/// are not told.
+/// Failed tasks and unsettled deployments remembered; above this limit all are forgotten, and their
+/// ends are not reported.
 const MOST_REMEMBERED: usize = 10_000;
-/// A deployment that is older when it is first seen is not new.
+/// A deployment older than this when first seen is not new.
 const NEW_MS: u64 = 60_000;
 
-/// What is to be told.
+/// Pending entries.
 #[derive(Default)]
 pub(super) struct Pending {
-    /// The first and the last that was heard of each: whoever is back where they were is no news.
+    /// The first and the last state of each robot: a robot that is back in its first state is no
+    /// news.
     presence: HashMap<RobotId, (bool, bool)>,
     quiet_turns: u32,
     presence_turns: u32,
@@ -34,9 +37,9 @@ pub(super) struct Pending {
     robots: HashMap<FeedKind, HashMap<RobotId, Vec<String>>>,
     removed: Vec<KnownRobot>,
     deployments: BTreeSet<DeploymentId>,
-    /// Where deployments stood.
+    /// The last known state of each deployment.
     states: HashMap<DeploymentId, DeploymentState>,
-    /// Whose part of which has failed.
+    /// The assignments that failed, by robot and deployment.
     failed: HashSet<(RobotId, DeploymentId)>,
 }
 
@@ -62,7 +65,7 @@ impl Pending {
         self.removed.push(robot);
     }
 
-    /// What is to be told now. What can't be read is left out.
+    /// The entries due now. Objects that can't be read are left out.
     pub(super) async fn due(&mut self, store: &Store, now_ms: u64) -> Vec<Said> {
         let mut said = about_removed(std::mem::take(&mut self.removed));
         for (kind, news) in std::mem::take(&mut self.robots) {
@@ -90,7 +93,7 @@ impl Pending {
             self.states.clear();
         }
         let before = self.states.get(&view.id).copied();
-        // What has settled is not told of again because a service in it was restarted.
+        // A settled deployment is not reported again because one of its services was restarted.
         if before == Some(DeploymentState::Settled) && view.state != DeploymentState::Cancelled {
             return None;
         }
@@ -187,7 +190,7 @@ impl Pending {
     }
 }
 
-/// What was read, if there is such a thing.
+/// The object read, if it exists.
 fn read<T>(found: Result<Option<T>, StoreError>) -> Option<T> {
     found.unwrap_or_else(|error| {
         error.log("the feed could not read what it was to tell of");
@@ -228,7 +231,7 @@ async fn about_robots(
     let mut said = Vec::new();
     for (id, texts) in news {
         if let Some(robot) = read(store.find_robot(id.as_str()).await) {
-            // Whoever says more than this at once does not push out what others said.
+            // A robot with more texts than this at once does not push out other robots' texts.
             for text in texts.into_iter().take(MOST_ALONE) {
                 let text = format!("{}: {text}", robot.name);
                 said.push(about_robot(robot.clone(), kind, level, text));

@@ -1,7 +1,7 @@
-//! What the writer remembers of the database from one batch to the next, so that robots that keep
+//! The writer's cache of the database from one batch to the next, so that robots that keep
 //! reporting are not read again each time. Every write takes the next turn: as long as this writer
-//! had the last one too, nobody else, in this process or another, has changed anything. Otherwise
-//! all is forgotten. It never decides anything.
+//! also had the previous turn, no other writer, in this process or another, has changed anything.
+//! Otherwise the cache is cleared. The cache never decides anything.
 
 use std::collections::{HashMap, HashSet};
 
@@ -10,35 +10,34 @@ use task_proto::{DeploymentId, RobotId};
 
 use crate::store::{OpenAssignment, ReportedRobot, StoreError, Write};
 
-/// Robots remembered before a batch; it may add its own.
+/// Robots cached before a batch; a batch may add its own.
 const MAX_ROBOTS: usize = 20_000;
-/// Conditions remembered of one robot; its others are no news.
+/// Maximum number of cached conditions per robot; further ones are not reported as new.
 const MAX_CONDITIONS: usize = 16;
 
-/// What is known to be stored.
+/// Cached copies of stored rows.
 #[derive(Default)]
 pub(super) struct Memory {
     /// The turn of the last write that is remembered.
     turn: u64,
     robots: HashMap<RobotId, Remembered>,
-    /// Deployments without a robot whose batch has not begun: nothing moves them on.
+    /// Deployments in which every robot's batch has begun: they need no further advance.
     begun: HashSet<DeploymentId>,
-    /// The codes of what is wrong with robots. No write of others changes them, so they are not
-    /// forgotten.
+    /// Codes of the conditions that robots report. No other writer changes them, so clearing the
+    /// cache keeps them.
     conditions: HashMap<RobotId, Vec<FailureCode>>,
 }
 
-/// One robot as it is stored.
+/// One robot as stored.
 pub(super) struct Remembered {
     pub(super) robot: ReportedRobot,
     pub(super) open: Vec<OpenAssignment>,
-    /// The fingerprint of the stored report; `None`: not known.
+    /// The fingerprint of the stored report; `None`: unknown.
     pub(super) fingerprint: Option<u64>,
 }
 
 impl Memory {
-    /// Makes sure that all is known of those of `robots` that are registered, as it stands in
-    /// `write`.
+    /// Loads the registered ones of `robots` that are not cached, as they stand in `write`.
     pub(super) async fn learn(
         &mut self,
         write: &mut Write,
@@ -77,12 +76,12 @@ impl Memory {
         !self.begun.contains(deployment)
     }
 
-    /// The deployment has no robot left whose batch has not begun.
+    /// Every robot's batch of the deployment has begun.
     pub(super) fn has_begun(&mut self, deployment: DeploymentId) {
         self.begun.insert(deployment);
     }
 
-    /// Takes in what a robot says is wrong with it. Gives what it did not say before.
+    /// Stores the conditions that a robot reports. Returns the conditions that are new.
     pub(super) fn new_conditions<'a>(
         &mut self,
         robot: &RobotId,
@@ -104,7 +103,7 @@ impl Memory {
         new
     }
 
-    /// The write with this turn was committed, and what it changed is remembered.
+    /// The write with this turn was committed, and the cache contains its changes.
     pub(super) fn committed(&mut self, turn: u64) {
         self.turn = turn;
     }

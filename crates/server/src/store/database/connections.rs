@@ -1,6 +1,6 @@
-//! Connections to the database, and how long one may be silent. One whose other end was lost, or
-//! that stalls on its way, would keep whoever waits for it, and with the writer everybody, for as
-//! long as the kernel hopes; here it is given up, and whoever comes next gets another.
+//! Connections to the database, with time limits for their answers. A connection with a lost or
+//! stalled peer would block its user until the kernel gives up, and the writer's connection would
+//! block every user. Here such a connection is dropped, and the next user gets another.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -19,40 +19,40 @@ use tokio::time::timeout;
 use super::fault::Fault;
 use super::state::DatabaseState;
 
-/// What the connections of one set have in common.
+/// The settings shared by one set of connections.
 pub(in crate::store) struct Terms {
     /// The database's URL.
     pub(in crate::store) url: String,
     /// Statements that prepare a new connection.
     pub(in crate::store) session: String,
-    /// How many there may be.
+    /// The most connections.
     pub(in crate::store) count: u32,
-    /// How many of them [`with_shared_reads`] may have at once.
+    /// The most connections that [`with_shared_reads`] may use at once.
     pub(in crate::store) shared: u32,
-    /// How long each part of a statement's answer may take.
+    /// Time limit for each part of a statement's answer.
     pub(in crate::store) answer: Duration,
-    /// How long an idle connection may take to show that it is alive.
+    /// Time limit for an idle connection to show that it is alive.
     pub(in crate::store) greeting: Duration,
-    /// How long a new connection may take.
+    /// Time limit for opening a connection.
     pub(in crate::store) connect: Duration,
-    /// How long another's connection is waited for to become free.
+    /// Time limit for waiting until a connection in use becomes free.
     pub(in crate::store) wait: Duration,
-    /// Where the outcome of statements is noted. Nothing is lent before the database is open.
+    /// Receives the outcome of statements. No connection is lent before the database is open.
     pub(in crate::store) state: DatabaseState,
 }
 
 tokio::task_local! {
-    /// Set where reads are not urgent.
+    /// Set in tasks without urgent reads.
     static SHARES_READS: ();
 }
 
-/// Runs what is not urgent: of each set of connections it gets only a part, so that the rest is
-/// free for what is. Tasks that it spawns are urgent again.
+/// Runs work that is not urgent. This work gets only a part of each set of connections, so that the
+/// rest stays free for urgent work. Tasks that it spawns are urgent again.
 pub async fn with_shared_reads<F: Future>(future: F) -> F::Output {
     SHARES_READS.scope((), future).await
 }
 
-/// A set of connections to one database, each lent to one user at a time. Clones share them.
+/// A set of connections to one database, each lent to one user at a time. Clones share the set.
 #[derive(Debug, Clone)]
 pub(in crate::store) struct Connections {
     terms: Arc<Terms>,
@@ -61,10 +61,10 @@ pub(in crate::store) struct Connections {
     idle: Arc<Mutex<Vec<AnyConnection>>>,
 }
 
-/// A connection while it is lent. What it was in the middle of when it is dropped is not done: a
-/// transaction is rolled back before anybody else gets the connection.
+/// A lent connection. Dropping it cancels unfinished work: a transaction is rolled back before
+/// another user gets the connection.
 pub(in crate::store) struct Lent {
-    /// `None` once it was given back.
+    /// `None` once the connection was given back.
     held: Option<Held>,
     terms: Arc<Terms>,
     in_transaction: bool,
@@ -72,7 +72,7 @@ pub(in crate::store) struct Lent {
 
 struct Held {
     connection: AnyConnection,
-    /// It has not failed.
+    /// Whether the connection has not failed.
     is_sound: bool,
     idle: Arc<Mutex<Vec<AnyConnection>>>,
     _place: OwnedSemaphorePermit,
@@ -80,14 +80,14 @@ struct Held {
 }
 
 impl fmt::Debug for Terms {
-    /// The URL may hold a password.
+    /// The URL is left out, because it may hold a password.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Terms").field("count", &self.count).finish_non_exhaustive()
     }
 }
 
 impl Connections {
-    /// None is made yet.
+    /// Creates an empty set: no connection is open yet.
     pub(in crate::store) fn new(terms: Terms) -> Self {
         let places = Arc::new(Semaphore::new(terms.count as usize));
         let shared = Arc::new(Semaphore::new(terms.shared as usize));
@@ -144,7 +144,7 @@ impl Connections {
         Ok(connection)
     }
 
-    /// Ends all connections, once those that are lent have come back. None is lent any more.
+    /// Closes all connections once the lent ones have come back. No connection is lent any more.
     pub(in crate::store) async fn close(&self) {
         let all = self.places.acquire_many(self.terms.count).await;
         self.places.close();
@@ -159,7 +159,7 @@ impl Connections {
 }
 
 impl Lent {
-    /// Where the next statement runs.
+    /// The connection on which the next statement runs.
     pub(in crate::store) fn connection(&mut self) -> Statement<'_> {
         let held = self.held.as_mut().expect("it is given back when it is dropped");
         Statement {
@@ -202,7 +202,8 @@ impl Drop for Lent {
 }
 
 impl Held {
-    /// Another may have it. One that has failed ends here, and its place is free.
+    /// Makes the connection available to others. A failed connection ends here, and its place is
+    /// free.
     fn give_back(self) {
         if self.is_sound {
             lock(&self.idle).push(self.connection);
@@ -210,7 +211,7 @@ impl Held {
     }
 }
 
-/// What runs one statement, and notices when the connection fails.
+/// Runs one statement, and notices when the connection fails.
 #[derive(Debug)]
 pub(in crate::store) struct Statement<'c> {
     connection: &'c mut AnyConnection,
@@ -219,7 +220,7 @@ pub(in crate::store) struct Statement<'c> {
 }
 
 impl Statement<'_> {
-    /// Takes note of an error. A connection whose database is away is not used again.
+    /// Records an error. A connection whose database is away is not used again.
     fn failed(terms: &Terms, is_sound: &mut bool, error: &Error) {
         terms.state.note(error);
         *is_sound &= is_refusal(error);
@@ -275,8 +276,7 @@ impl<'c> Executor<'c> for Statement<'c> {
     }
 }
 
-/// Statements that each run on whichever connection is free, which is lent until all their rows are
-/// there.
+/// Each statement runs on any free connection, which is lent until all rows have arrived.
 impl<'c> Executor<'c> for &'c Connections {
     type Database = Any;
 
@@ -319,7 +319,7 @@ fn is_refusal(error: &Error) -> bool {
     matches!(error, Error::Database(_)) && Fault::of(error) != Some(Fault::Away)
 }
 
-/// What the database answers, if it does in time.
+/// The database's answer, or an error if the time limit passes first.
 pub(in crate::store) async fn bounded<T>(
     time: Duration,
     answer: impl Future<Output = Result<T, Error>>,
@@ -330,7 +330,7 @@ pub(in crate::store) async fn bounded<T>(
 }
 
 fn lock(idle: &Mutex<Vec<AnyConnection>>) -> MutexGuard<'_, Vec<AnyConnection>> {
-    // A list of connections is sound whatever a panic left.
+    // A list of connections is sound after a panic elsewhere.
     idle.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -343,8 +343,8 @@ mod tests {
 
     use super::*;
 
-    /// Something between us and a real Postgres. What is told to stall passes nothing on any more,
-    /// and ends nothing either.
+    /// A proxy in front of a real Postgres. A stalled connection passes nothing on, and is not
+    /// closed either.
     struct Between {
         url: String,
         stalled: watch::Sender<()>,
@@ -403,7 +403,7 @@ mod tests {
             connections
         }
 
-        /// All connections that are there now.
+        /// Stalls all present connections.
         fn stall(&self) {
             self.stalled.send_replace(());
         }
@@ -429,14 +429,14 @@ mod tests {
         drop(lent);
         assert_eq!(answers(&connections).await.expect("another answers"), 1);
 
-        // Whoever asked is gone before it was noticed.
+        // The user is gone before the failure was noticed.
         let mut lent = connections.lend().await.expect("lent");
         lent.begin().await.expect("begun");
         between.stall();
         drop(lent);
         assert_eq!(answers(&connections).await.expect("another answers"), 1);
 
-        // One that was idle.
+        // An idle connection.
         between.stall();
         assert_eq!(answers(&connections).await.expect("another answers"), 1);
     }

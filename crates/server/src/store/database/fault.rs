@@ -1,22 +1,21 @@
-//! Faults of the database itself, told apart by the codes of its errors: a corrupt file, a full
-//! disk, a server that is away or busy. It decides only which fault an error shows, never what is
-//! done about it.
+//! Faults of the database itself, identified by their error codes: a corrupt file, a full disk, a
+//! server that is away or busy. This module only classifies errors and never reacts to them.
 
 use std::io;
 
 use sqlx::Error;
 use sqlx::migrate::MigrateError;
 
-/// A fault that an operator mends, or that passes by itself.
+/// A fault that an operator repairs, or that passes by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
-    /// Pages of the database hold something else than was written.
+    /// Pages of the database are damaged.
     Corrupt,
-    /// There is no room for what was to be written.
+    /// The disk is full.
     Full,
     /// The database server can't be reached, or takes no statements now.
     Away,
-    /// Others hold what a statement needs, for too long.
+    /// Other users hold the resources of a statement for too long.
     Busy,
 }
 
@@ -32,7 +31,7 @@ impl Fault {
         }
     }
 
-    /// Likewise of a migration that failed.
+    /// The fault that a failed migration shows.
     pub(in crate::store) fn of_migration(error: &MigrateError) -> Option<Self> {
         match error {
             MigrateError::Execute(error) | MigrateError::ExecuteMigration(error, _) => {
@@ -50,9 +49,9 @@ impl Fault {
         }
     }
 
-    /// By SQLite's extended result code, whose low byte is the primary one.
+    /// Classifies SQLite's extended result code, whose low byte is the primary one.
     fn of_sqlite(code: u16) -> Option<Self> {
-        /// A checksum of the file system, and one of the database, that does not match.
+        /// A checksum mismatch: one of the file system, and one of the database.
         const DAMAGED_READS: [u16; 2] = [8458, 8202];
         /// The index of the write-ahead log could not be extended.
         const SHARED_MEMORY_SIZE: u16 = 4874;
@@ -65,7 +64,7 @@ impl Fault {
         }
     }
 
-    /// By SQLSTATE.
+    /// Classifies an SQLSTATE.
     fn of_postgres(code: &str) -> Option<Self> {
         match code {
             "XX001" | "XX002" => Some(Self::Corrupt),
@@ -73,7 +72,7 @@ impl Fault {
             // Shut down, crashed, starting up, cut off for being idle, a standby.
             "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Away),
             // Too many connections, too little memory, a lock or a statement that took too long, a
-            // deadlock. Connections that are there go on.
+            // deadlock. The open connections remain usable.
             "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => {
                 Some(Self::Busy)
             }

@@ -1,6 +1,6 @@
-//! Checks of a SQLite file: a quick one before it is served, a full one beside the service. Each
-//! has a connection of its own that only reads. Postgres checks its pages itself as it reads them,
-//! where they have checksums: this is asked for.
+//! Checks of a SQLite file: a quick one before the service starts, and a full one beside the
+//! service. Each uses a separate read-only connection. Postgres checks its pages as it reads them,
+//! if they have checksums: we ask whether they do.
 
 use std::borrow::Cow;
 use std::path::Path;
@@ -13,28 +13,27 @@ use tokio_util::sync::CancellationToken;
 use super::fault::Fault;
 use crate::store::{Store, StoreError, sqlite_url};
 
-/// How long the check at start may take. What it did not come to is checked beside the service.
+/// Time limit of the check at start. The rest is checked beside the service.
 const QUICK_TIME: Duration = Duration::from_secs(10);
-/// How often a check looks whether it has to end: after so many pages or steps of SQLite's virtual
-/// machine.
+/// Pages, or steps of SQLite's virtual machine, between two looks at whether a check has to end.
 const STEPS_PER_LOOK: i32 = 1000;
 /// A full check works for this long, then leaves disk and processor to the service for as long.
 const TURN: Duration = Duration::from_millis(20);
-/// SQLite's code for a statement that was told to end.
+/// SQLite's code for an interrupted statement.
 const INTERRUPTED: &str = "9";
 
 /// The outcome of a check.
 #[derive(Debug, PartialEq, Eq)]
 pub(in crate::store) enum Checked {
-    /// Nothing is wrong with what was looked at.
+    /// The check found no damage in the pages that it read.
     Sound,
-    /// The first finding.
+    /// The check found damage; holds the first finding.
     Damaged(String),
-    /// It was told to end before it had come to everything.
+    /// The check was interrupted before its end.
     Interrupted,
 }
 
-/// Looks for damage in the structure of the file, for at most [`QUICK_TIME`].
+/// Checks the structure of the file, for at most [`QUICK_TIME`].
 pub(in crate::store) async fn check_quickly(url: &str) -> Result<Checked, Error> {
     let mut connection = SqliteConnection::connect(url).await?;
     let end = Instant::now() + QUICK_TIME;
@@ -47,7 +46,7 @@ pub(in crate::store) async fn check_quickly(url: &str) -> Result<Checked, Error>
     checked
 }
 
-/// A quick check of a SQLite file that nobody serves: the first finding, if there is one.
+/// Checks a SQLite file that is not in use, quickly. Returns the first finding.
 pub async fn check_at_rest(path: &Path) -> Result<Option<String>, StoreError> {
     match check_quickly(&sqlite_url(path)).await {
         Ok(Checked::Damaged(finding)) => Ok(Some(finding)),
@@ -57,8 +56,8 @@ pub async fn check_at_rest(path: &Path) -> Result<Option<String>, StoreError> {
     }
 }
 
-/// Checks all tables and indices of the file against each other, a table at a time so that no read
-/// lasts for long.
+/// Checks all tables and indices of the file against each other, one table at a time so that no
+/// read lasts for long.
 async fn check_fully(url: &str, stop: CancellationToken) -> Result<Checked, Error> {
     let mut connection = SqliteConnection::connect(url).await?;
     let mut turn_began = Instant::now();
@@ -74,7 +73,7 @@ async fn check_fully(url: &str, stop: CancellationToken) -> Result<Checked, Erro
     checked
 }
 
-/// In the thread of the connection, which does nothing else.
+/// Runs in the thread of the connection, which does nothing else.
 #[expect(clippy::disallowed_methods, reason = "a statement that SQLite runs can't await")]
 fn pause() {
     std::thread::sleep(TURN);
@@ -108,8 +107,8 @@ async fn run(connection: &mut SqliteConnection, check: &str) -> Result<Checked, 
     let text: String = row.try_get(0)?;
     Ok(match text.as_str() {
         "ok" => Checked::Sound,
-        // A row of foreign_key_check has the table, the row, the table that it refers to, and by
-        // which key.
+        // A row of foreign_key_check has the table, the row, the referenced table, and the number
+        // of the key.
         table if row.len() > 1 => {
             Checked::Damaged(format!("a row of {table} refers to one that is not there"))
         }
@@ -118,7 +117,7 @@ async fn run(connection: &mut SqliteConnection, check: &str) -> Result<Checked, 
     })
 }
 
-/// A check that ends at a page which can't be understood has found something.
+/// A check that ends at an unreadable page has found damage.
 fn broken_off(error: Error) -> Result<Checked, Error> {
     let code = error.as_database_error().and_then(|error| error.code().map(Cow::into_owned));
     match Fault::of(&error) {
@@ -134,7 +133,7 @@ async fn close(connection: SqliteConnection) {
     }
 }
 
-/// How Postgres guards its pages.
+/// Asks Postgres how it protects its pages.
 pub(in crate::store) async fn postgres_guard(connection: &mut AnyConnection) -> &'static str {
     match sqlx::query_scalar::<_, String>("SHOW data_checksums")
         .fetch_one(connection)
@@ -147,8 +146,8 @@ pub(in crate::store) async fn postgres_guard(connection: &mut AnyConnection) -> 
 }
 
 impl Store {
-    /// Checks a SQLite file in full, slowly, unless `stop` comes first;
-    /// [`crate::store::DatabaseState`] has the outcome.
+    /// Checks a SQLite file in full, slowly, unless `stop` comes first.
+    /// [`crate::store::DatabaseState`] holds the outcome.
     pub async fn check(&self, now_ms: u64, stop: CancellationToken) -> Result<(), StoreError> {
         if self.is_postgres || !self.state.is_there() {
             return Ok(());
@@ -196,7 +195,7 @@ mod tests {
             Some("a row of tokens refers to one that is not there")
         );
         assert!(matches!(store.begin().await.err(), Some(StoreError::Corrupt)));
-        // A row that can't be found does not mean that nobody needs the blob.
+        // A row that can't be found does not mean that the blob is unused.
         let collected = store.forget_unneeded(vec![task_proto::Digest::of(b"a blob")]).await;
         assert!(matches!(collected, Err(StoreError::Corrupt)));
     }

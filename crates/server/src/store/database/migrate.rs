@@ -1,6 +1,6 @@
-//! The tables, as a list of migrations that only grows: a migration that has shipped is never
-//! edited. Each is one SQL text for both databases, so it keeps to TEXT and BIGINT columns. A
-//! noun's tables are in its own file.
+//! The tables, as a list of migrations that only grows: a shipped migration is never edited. Each
+//! is one SQL text for both databases, so it only uses TEXT and BIGINT columns. Each noun's tables
+//! have their own file.
 
 use std::borrow::Cow;
 
@@ -32,7 +32,7 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (21, "replaced", include_str!("../migrations/0021_replaced.sql")),
 ];
 
-/// Applies what has not been applied yet.
+/// Applies the pending migrations.
 pub(in crate::store) async fn run(connection: &mut AnyConnection) -> Result<(), MigrateError> {
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
         Migration::new(
@@ -43,6 +43,6 @@ pub(in crate::store) async fn run(connection: &mut AnyConnection) -> Result<(), 
             false,
         )
     });
-    // `run` itself does not promise a future that other threads may take over.
+    // The future of `run` itself is not guaranteed to be `Send`.
     Migrator::with_migrations(migrations.collect()).run_direct(None, connection, false).await
 }

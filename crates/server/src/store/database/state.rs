@@ -1,6 +1,6 @@
-//! The state of the database as its users found it: whether it answers, whether it is corrupt, when
-//! it was last checked in full. Each change is logged once, here. A database that was found corrupt
-//! stays so until the next start, which checks it.
+//! The state of the database as seen by its users: whether it answers, whether it is corrupt, and
+//! the time of the last full check. Each change is logged once, here. A database that was found
+//! corrupt stays so until the next start, which checks it.
 
 use std::fmt::Display;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,7 +11,7 @@ use tokio::sync::watch;
 
 use super::fault::Fault;
 
-/// What is known of one database. Clones share it.
+/// The known state of one database. Clones share it.
 #[derive(Debug, Clone)]
 pub struct DatabaseState(Arc<Inner>);
 
@@ -20,20 +20,20 @@ struct Inner {
     /// The first finding.
     corruption: OnceLock<String>,
     is_there: watch::Sender<bool>,
-    /// Somebody was told that it does not answer.
+    /// Whether a caller was told that the database does not answer.
     was_missed: AtomicBool,
-    /// There was no room for the last write.
+    /// Whether the last write found the disk full.
     is_full: AtomicBool,
-    /// Its tables are those of this version.
+    /// Whether the tables are those of this version.
     is_open: AtomicBool,
-    /// 0 before the first.
+    /// Time of the last full check without a finding; 0 before the first.
     fully_checked_at_ms: AtomicU64,
-    /// How the database itself guards its pages.
+    /// The database's own protection of its pages.
     guard: OnceLock<&'static str>,
 }
 
 impl DatabaseState {
-    /// Of a database that has not answered yet.
+    /// The state of a database that has not answered yet.
     pub(in crate::store) fn unknown() -> Self {
         Self(Arc::new(Inner {
             corruption: OnceLock::new(),
@@ -46,7 +46,7 @@ impl DatabaseState {
         }))
     }
 
-    /// What was found first, if the database is corrupt.
+    /// The first finding, if the database is corrupt.
     pub fn corruption(&self) -> Option<&str> {
         self.0.corruption.get().map(String::as_str)
     }
@@ -58,7 +58,7 @@ impl DatabaseState {
 
     /// Resolves when the database is open and answers. Cancel-safe.
     pub async fn there(&self) {
-        // The sender lives as long as this.
+        // The sender lives as long as this value.
         let _ = self.0.is_there.subscribe().wait_for(|is_there| *is_there).await;
     }
 
@@ -67,7 +67,7 @@ impl DatabaseState {
         let _ = self.0.is_there.subscribe().wait_for(|is_there| !is_there).await;
     }
 
-    /// For people: why orders are not taken; `None` where nothing is known against it.
+    /// For people: the reason why orders are refused; `None` if no problem is known.
     pub fn problem(&self) -> Option<String> {
         match self.corruption() {
             Some(finding) => Some(format!("it is corrupt: {finding}")),
@@ -76,23 +76,22 @@ impl DatabaseState {
         }
     }
 
-    /// When a full check last found nothing wrong.
+    /// The time of the last full check without a finding.
     pub fn fully_checked_at_ms(&self) -> Option<u64> {
         Some(self.0.fully_checked_at_ms.load(Ordering::Relaxed)).filter(|at_ms| *at_ms > 0)
     }
 
-    /// For people: how the database itself guards its pages, where it is not for this server to
-    /// check them.
+    /// For people: the database's own protection of its pages, if this server can't check them.
     pub fn guard(&self) -> Option<&'static str> {
         self.0.guard.get().copied()
     }
 
-    /// Whether it was opened.
+    /// Whether the database was opened.
     pub fn is_open(&self) -> bool {
         self.0.is_open.load(Ordering::Acquire)
     }
 
-    /// From now on it may be used.
+    /// Marks the database as open for use.
     pub(in crate::store) fn opened(&self) {
         self.0.is_open.store(true, Ordering::Release);
     }
@@ -105,7 +104,7 @@ impl DatabaseState {
         self.0.fully_checked_at_ms.store(now_ms, Ordering::Relaxed);
     }
 
-    /// The database has answered.
+    /// Records that the database has answered.
     pub(in crate::store) fn answers(&self) {
         let came = |is_there: &mut bool| !std::mem::replace(is_there, true);
         let has_come = !self.is_there() && self.0.is_there.send_if_modified(came);
@@ -114,7 +113,7 @@ impl DatabaseState {
         }
     }
 
-    /// Takes note of what an error shows.
+    /// Records the fault that an error shows.
     pub(in crate::store) fn note(&self, error: &Error) {
         match Fault::of(error) {
             Some(Fault::Corrupt) => self.is_corrupt(error),
@@ -132,14 +131,14 @@ impl DatabaseState {
         }
     }
 
-    /// A write has come to its end.
+    /// Records a completed write.
     pub(in crate::store) fn committed(&self) {
         if self.0.is_full.load(Ordering::Relaxed) && self.0.is_full.swap(false, Ordering::Relaxed) {
             tracing::info!("the database's disk has room again");
         }
     }
 
-    /// Something was found that should not be.
+    /// Records a finding of damage.
     pub(in crate::store) fn is_corrupt(&self, finding: impl Display) {
         let finding = finding.to_string();
         if self.0.corruption.set(finding.clone()).is_ok() {

@@ -1,6 +1,6 @@
-//! Diverged robots: the database was put back to an older copy, and a robot reports a generation it
-//! does not know. Before the next order for such a robot is applied, what the robot has is taken
-//! over as what it should have.
+//! Diverged robots: after the database was restored from an older copy, a robot reports a
+//! generation that the database does not know. Before the next order for such a robot is applied,
+//! its reported tasks become its desired state.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -13,7 +13,7 @@ use crate::store::rows::{from_json, id, json, number, stored, word};
 use crate::store::timelines::{grown, grown_by, step};
 use crate::store::{StoreError, Write};
 
-/// The highest run that is taken over. Beyond it a made-up one would leave no room above it, and an
+/// The highest run that is adopted. A made-up one beyond this would leave no room above it, and an
 /// order for this robot and others would fail for all of them.
 const MAX_RUN: u64 = 1 << 53;
 
@@ -52,8 +52,8 @@ impl Write {
         observed: Generation,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        // What we believed it should have is out of date, all of it; what is also reported comes
-        // back below.
+        // The stored desired state is out of date as a whole. Tasks that the robot also reports
+        // come back below.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET desired = 0, ended = 1, progress = NULL, updated_at_ms = $2,
                  phase = CASE ended WHEN 1 THEN phase ELSE 'stopped' END,
@@ -65,7 +65,7 @@ impl Write {
         .bind(stored(now_ms))
         .execute(self.connection())
         .await?;
-        // A robot could list a task twice; the database would refuse that, and the whole order with
+        // A robot could list a task twice. The database would refuse that, and the whole order with
         // it.
         let tasks: BTreeMap<&TaskName, &TaskReport> =
             report.tasks.iter().map(|task| (&task.task, task)).collect();
@@ -86,9 +86,10 @@ impl Write {
         task: &TaskReport,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        // Older than what is ordered in this write: it can be rolled back to.
+        // The number is older than the orders of this write, so that the task can be rolled back to
+        // this deployment.
         let number = stored(self.turn().saturating_sub(1));
-        // The order itself may be lost as well; then the robot's word is all there is of it.
+        // The order itself may be lost as well. Then the robot's report is its only record.
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, created_at_ms,
                  expires_at_ms)

@@ -1,5 +1,4 @@
-//! Enrolment tokens as an administrator looks after them, robots that wait to be approved, and
-//! robots that are put out.
+//! Enrollment tokens for administrators, robots that wait for approval, and revoked robots.
 
 use sqlx::Row as _;
 use std::net::IpAddr;
@@ -13,11 +12,11 @@ use super::robots::known_robot;
 use crate::store::rows::{from_json, from_optional_json, id, number, optional, stored};
 use crate::store::{KnownRobot, Store, StoreError, Write};
 
-/// The most that are listed.
+/// The most entries in a list.
 const MOST_LISTED: i64 = 1_000;
 
 impl Store {
-    /// The enrolment tokens that are good for something at `now_ms`, the newest first.
+    /// The enrollment tokens that are valid at `now_ms`, the newest first.
     pub async fn enrolment_tokens(
         &self,
         now_ms: u64,
@@ -37,7 +36,7 @@ impl Store {
         rows.iter().map(enrolment_token).collect()
     }
 
-    /// The robots that wait to be approved, who has waited for longest first.
+    /// The robots that wait for approval, the longest wait first.
     pub async fn pending_robots(&self) -> Result<Vec<PendingRobot>, StoreError> {
         let rows = sqlx::query(
             "SELECT id, name, mac, labels, enrolled_at_ms, enrolled_by, enrolled_from FROM robots
@@ -49,7 +48,8 @@ impl Store {
         rows.iter().map(pending_robot).collect()
     }
 
-    /// Whether `token` is one that a robot had when it was revoked: whoever shows it is told so.
+    /// Whether `token` belonged to a robot when the robot was revoked: a client that presents the
+    /// token is told so.
     pub async fn is_of_revoked_robot(&self, token: &Token) -> Result<bool, StoreError> {
         if token.kind() != TokenKind::Robot {
             return Ok(false);
@@ -68,7 +68,7 @@ impl Store {
 }
 
 impl Write {
-    /// Ends an enrolment token; false if there is none.
+    /// Revokes an enrollment token; false if there is none.
     pub async fn revoke_enrolment_token(
         &mut self,
         token: &TokenId,
@@ -85,14 +85,14 @@ impl Write {
         Ok(ended.is_some())
     }
 
-    /// How many robots wait to be approved.
+    /// The number of robots that wait for approval.
     pub async fn count_pending(&mut self) -> Result<u64, StoreError> {
         let sql = "SELECT COUNT(*) FROM robots WHERE awaits_approval = 1 AND removed_at_ms IS NULL";
         let count: i64 = sqlx::query_scalar(sql).fetch_one(self.connection()).await?;
         Ok(number(count))
     }
 
-    /// Whether the robot waits to be approved.
+    /// Whether the robot waits for approval.
     pub async fn is_pending(&mut self, robot: &RobotId) -> Result<bool, StoreError> {
         let sql =
             "SELECT id FROM robots WHERE id = $1 AND awaits_approval = 1 AND removed_at_ms IS NULL";
@@ -101,7 +101,7 @@ impl Write {
         Ok(found.is_some())
     }
 
-    /// Those who have waited since before `before_ms`.
+    /// The robots that have waited for approval since before `before_ms`.
     pub async fn pending_since(&mut self, before_ms: u64) -> Result<Vec<KnownRobot>, StoreError> {
         let rows = sqlx::query(
             "SELECT id, name, mac, labels FROM robots
@@ -113,7 +113,8 @@ impl Write {
         rows.iter().map(known_robot).collect()
     }
 
-    /// The robot, just registered, came by this token and from there. It may have to wait.
+    /// Records the token and the address of a robot's enrollment, just after its registration. The
+    /// robot may have to wait for approval.
     pub async fn note_enrolment(
         &mut self,
         robot: &RobotId,
@@ -131,7 +132,7 @@ impl Write {
         Ok(())
     }
 
-    /// The robot waits no longer: it is one like any other.
+    /// Approves the robot: from now on it is a robot like any other.
     pub async fn approve_robot(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query("UPDATE robots SET awaits_approval = 0 WHERE id = $1")
             .bind(robot.as_str())
@@ -140,10 +141,9 @@ impl Write {
         Ok(())
     }
 
-    /// Ends whatever `robot` could come in by; what is ordered of it stays. False if that was done
-    /// before.
+    /// Revokes all tokens of `robot`; its orders stay. False if the robot was revoked before.
     pub async fn revoke_robot(&mut self, robot: &RobotId, now_ms: u64) -> Result<bool, StoreError> {
-        // Reports that came by its tokens and are not stored yet come too late.
+        // Reports under the revoked tokens that are not stored yet come too late.
         let last_token = stored(self.turn());
         let revoked: Option<String> = sqlx::query_scalar(
             "UPDATE robots SET revoked_at_ms = $2, token_number = $3, broker_credential = broker_credential + 1
@@ -160,8 +160,7 @@ impl Write {
         Ok(revoked.is_some())
     }
 
-    /// Takes a robot back that was revoked and is registered anew. The tokens from before stay
-    /// ended.
+    /// Readmits a revoked robot that is registered anew. The earlier tokens stay revoked.
     pub async fn readmit(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query("UPDATE robots SET revoked_at_ms = NULL WHERE id = $1")
             .bind(robot.as_str())

@@ -1,4 +1,4 @@
-//! The robots that a selector means, and the names in it that mean none.
+//! The robots that match a selector, and the names in the selector that match none.
 
 use task_proto::RobotName;
 use task_proto::selector::Selector;
@@ -7,21 +7,21 @@ use super::robots::{KNOWN, known_robot};
 use crate::domain::person::Scope;
 use crate::store::{KnownRobot, Store, StoreError, Write};
 
-/// Those that can be ordered something.
+/// Selects the robots that can take orders.
 const ORDERABLE: &str =
     "SELECT id, name, mac, labels FROM robots WHERE removed_at_ms IS NULL AND awaits_approval = 0";
 
-/// The robots that a selector means.
+/// The result of a selector.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Matching {
-    /// Those that match, of all scopes, sorted by name.
+    /// The matching robots of all scopes, sorted by name.
     pub robots: Vec<KnownRobot>,
-    /// Names and ids in the selector that no robot of the scope has, sorted.
+    /// Names and ids in the selector that belong to no robot of the scope, sorted.
     pub unknown: Vec<RobotName>,
 }
 
 impl Store {
-    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
+    /// The robots that match `selector` now, sorted by name, without those that wait for approval.
     pub async fn matching_robots(
         &self,
         selector: &Selector,
@@ -30,7 +30,7 @@ impl Store {
         matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector, scope)
     }
 
-    /// The names and ids in a selector that no robot of a scope has, sorted.
+    /// The names and ids in a selector that belong to no robot of a scope, sorted.
     pub async fn unknown_robots(
         &self,
         selector: &Selector,
@@ -44,7 +44,7 @@ impl Store {
 }
 
 impl Write {
-    /// The robots that `selector` means now, sorted by name; none that waits to be approved.
+    /// The robots that match `selector` now, sorted by name, without those that wait for approval.
     pub async fn matching_robots(
         &mut self,
         selector: &Selector,

@@ -1,5 +1,4 @@
-//! Reports: what is known about a batch of robots, read at once, and what they said, written at
-//! once.
+//! Reports: reads the known state of a batch of robots at once, and writes their reports at once.
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
@@ -16,63 +15,63 @@ use crate::store::rows::{
 use crate::store::timelines::{grown, step};
 use crate::store::{Store, StoreError, Write};
 
-/// Columns of where an assignment stands in a statement.
+/// Columns of an assignment's state in a statement.
 const STANDING: &[&str] =
     &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];
-/// The highest generation a robot is believed. Beyond it a made-up one would leave no room above
-/// it.
+/// The highest generation that we accept from a robot. A made-up one beyond this would leave no
+/// room above it.
 const MAX_GENERATION: Generation = Generation(1 << 53);
 
-/// A robot that has reported, as it is stored.
+/// The stored state of a robot that has reported.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReportedRobot {
-    /// Its identity.
+    /// The robot's id.
     pub id: RobotId,
-    /// Its name here.
+    /// The robot's name on the server.
     pub name: RobotName,
-    /// Its labels here.
+    /// The robot's labels on the server.
     pub labels: Labels,
-    /// The generation it should have.
+    /// The generation of the robot's desired state.
     pub generation: Generation,
-    /// Start and number of its last report.
+    /// Start and number of the robot's last report.
     pub last_report: (u64, u64),
-    /// The number of the token it uses.
+    /// The number of the token in use.
     pub token_number: u64,
 }
 
 /// A released assignment that has not ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OpenAssignment {
-    /// The order.
+    /// The deployment.
     pub deployment: DeploymentId,
     /// The robot.
     pub robot: RobotId,
-    /// Service or job.
+    /// Whether the task is a service or a job.
     pub kind: TaskKind,
-    /// The generation in which it was taken out of the desired state.
+    /// The generation in which the assignment left the desired state.
     pub removed: Option<Generation>,
-    /// Where it stands.
+    /// The progress of the assignment.
     pub standing: Standing,
 }
 
-/// What a stored report says of the agent that it is by.
+/// The agent that wrote a stored report.
 #[derive(Debug, Deserialize)]
 pub struct ReportedBy {
-    /// Its start.
+    /// The agent's instance id, which identifies its start.
     pub instance: InstanceId,
-    /// Where it ran, if it said so.
+    /// A digest of the place where the agent ran, if reported.
     #[serde(default)]
     pub place: Option<Digest>,
 }
 
 impl Store {
-    /// Which agent each robot's last report is by. One that can't be read is left out.
+    /// The agent of each robot's last report. Unreadable reports are left out.
     pub async fn last_agents(&self) -> Result<Vec<(RobotId, ReportedBy)>, StoreError> {
         let sql =
             "SELECT id, report FROM robots WHERE report IS NOT NULL AND removed_at_ms IS NULL";
         let mut rows = sqlx::query(sql).fetch(&self.reads);
         let mut found = Vec::new();
-        // A report may be large, and there is one of each robot.
+        // A report may be large, and each robot has one.
         while let Some(row) = rows.try_next().await? {
             if let Ok(by) = from_json("robots.report", row.try_get("report")?) {
                 found.push((id("robots.id", row.try_get("id")?)?, by));
@@ -174,8 +173,8 @@ impl Write {
         Ok(())
     }
 
-    /// The same for reports that say nothing new: only which each was. The stored ones stay, with
-    /// the times and the progress of when they were written.
+    /// Stores only the numbers of reports without news. The stored reports stay, with the times and
+    /// the progress of when they were written.
     pub async fn store_repeated(
         &mut self,
         reports: &[&Report],
@@ -202,8 +201,8 @@ impl Write {
         Ok(())
     }
 
-    /// Stores where assignments stand now, and that they came there or try again. One that has run
-    /// or ended does not expire any more.
+    /// Stores the new phases of assignments, and records phase changes and retries in their
+    /// timelines. An assignment that has run or ended no longer expires.
     pub async fn store_standings(
         &mut self,
         assignments: &[OpenAssignment],
@@ -239,7 +238,8 @@ impl Write {
         Ok(())
     }
 
-    /// The same for assignments that are still in the phase they were in: what no index is made of.
+    /// Stores the progress of assignments in an unchanged phase: writes only columns without an
+    /// index.
     pub async fn store_progress(
         &mut self,
         assignments: &[OpenAssignment],

@@ -1,4 +1,4 @@
-//! A list of robots in pages, cut by name: nothing comes twice when one is added meanwhile.
+//! A list of robots in pages, cut by name: an insertion meanwhile repeats no robot.
 
 use task_proto::api::RobotView;
 use task_proto::selector::Selector;
@@ -7,20 +7,20 @@ use task_proto::{RobotId, RobotName};
 use crate::domain::person::Scope;
 use crate::store::{Store, StoreError};
 
-/// Some of the robots, sorted by name.
+/// A page of robots, sorted by name.
 #[derive(Debug)]
 pub struct RobotPage {
-    /// As [`Store::robots`] has them.
+    /// The robots, as returned by [`Store::robots`].
     pub robots: Vec<RobotView>,
-    /// The last one's name, if there are further ones.
+    /// The last robot's name, if there are more pages.
     pub next: Option<RobotName>,
-    /// How many all pages have.
+    /// The number of robots in all pages.
     pub total: u64,
 }
 
 impl Store {
-    /// The first `limit` robots in a scope that `selector` means, whose names come after `after`.
-    /// All are looked at, of few is everything read.
+    /// The first `limit` robots in a scope that match `selector` and have a name after `after`. The
+    /// query checks all robots, but reads the full rows of these few only.
     pub async fn robots_page(
         &self,
         scope: &Scope,

@@ -1,4 +1,4 @@
-//! Robots: who they are, and how the operator sees them.
+//! Robots: their identities, and the operator's view of them.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
@@ -18,53 +18,53 @@ use crate::store::rows::{
 };
 use crate::store::{Store, StoreError, Write};
 
-/// Who a robot is.
+/// A robot's identity.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct KnownRobot {
-    /// Its identity.
+    /// The robot's id.
     pub id: RobotId,
-    /// Its name.
+    /// The robot's name.
     pub name: RobotName,
-    /// The MAC it was registered by.
+    /// The MAC address of its registration.
     pub mac: MacAddress,
-    /// Its labels.
+    /// The robot's labels.
     pub labels: Labels,
 }
 
-/// Which password a robot has at an external broker.
+/// The version of a robot's password at an external broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BrokerCredential {
-    /// Whose.
+    /// The robot.
     pub robot: RobotId,
-    /// The password's number; a higher one comes with each further enrolment.
+    /// The password's number; each further enrollment raises it.
     pub number: u64,
 }
 
-/// What a robot should have, read at one moment.
+/// A robot's desired state, read at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DesiredTasks {
-    /// Whose they are.
+    /// The robot.
     pub robot: RobotId,
     /// The number of this state.
     pub generation: Generation,
-    /// The generation the robot last reported.
+    /// The generation of the robot's last report.
     pub observed_generation: Generation,
-    /// Its tasks, sorted by name.
+    /// The tasks, sorted by name.
     pub tasks: Vec<DesiredTask>,
-    /// Blobs that are to ride along with its state: it does not have them yet.
+    /// Blobs sent along with the state: the robot does not have them yet.
     pub along: Vec<BlobRef>,
-    /// What publishers have signed about these tasks' packages.
+    /// The publishers' signed documents on these tasks' packages.
     pub evidence: Evidence,
-    /// What was set for it.
+    /// The robot's settings.
     pub settings: RobotSettings,
 }
 
-/// An order for which a robot fetches something.
+/// The order for which a robot fetches a blob.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FetchedBy {
     /// The deployment's priority.
     pub priority: i32,
-    /// The deployment's number: later ones have higher ones.
+    /// The deployment's number: a later deployment has a higher one.
     pub number: u64,
     /// The robot's labels.
     pub labels: Labels,
@@ -78,13 +78,14 @@ const KNOWN_BY_ID_OR_NAME: &str = "SELECT id, name, mac, labels FROM robots WHER
 impl Store {
     /// All robots, sorted by name. `online` and `address` are left empty: only presence knows them.
     pub async fn robots(&self) -> Result<Vec<RobotView>, StoreError> {
-        // The tasks first: no phase stands beside a report that is older than it.
+        // The tasks first: no phase stands beside a report that is older than the phase.
         let tasks = sqlx::query(TASK_ROWS).fetch_all(&self.reads).await?;
         let robots = sqlx::query(ROBOT_ROWS).fetch_all(&self.reads).await?;
         robot_views(robots, tasks, &self.outdated_deployments().await?)
     }
 
-    /// Those of `robots` that are registered, likewise.
+    /// Those of `robots` that are registered, sorted by name. `online` and `address` are left
+    /// empty.
     pub async fn robots_among(&self, robots: &[RobotId]) -> Result<Vec<RobotView>, StoreError> {
         let mut views = Vec::with_capacity(robots.len());
         let outdated = self.outdated_deployments().await?;
@@ -105,7 +106,7 @@ impl Store {
         Ok(views)
     }
 
-    /// One robot; `None` if there is none or it was removed.
+    /// One robot; `None` if there is none or the robot was removed.
     pub async fn robot(&self, robot: &RobotId) -> Result<Option<RobotView>, StoreError> {
         Ok(self.robots_among(std::slice::from_ref(robot)).await?.pop())
     }
@@ -122,7 +123,7 @@ impl Store {
         Ok(self.known_robots(scope).await?.into_iter().map(|robot| robot.id).collect())
     }
 
-    /// The robots of a scope, with what transfers to them have shown.
+    /// The robots of a scope, with the measured facts of their links.
     pub async fn robots_and_links(
         &self,
         scope: &Scope,
@@ -153,15 +154,15 @@ impl Store {
         rows.iter().map(|row| id("robots.id", row)).collect()
     }
 
-    /// The robots' credentials at an external broker, sorted by robot; those that were revoked or
-    /// wait to be approved have none there.
+    /// The robots' credentials at an external broker, sorted by robot. Revoked robots and robots
+    /// that wait for approval have none there.
     pub async fn broker_credentials(&self) -> Result<Vec<BrokerCredential>, StoreError> {
         let approved = format!("{CREDENTIALS} AND awaits_approval = 0 ORDER BY id");
         let rows = sqlx::query(AssertSqlSafe(approved)).bind("");
         rows.fetch_all(&self.reads).await?.iter().map(broker_credential).collect()
     }
 
-    /// One robot's; `None` if it is not registered, or was revoked.
+    /// One robot's credential; `None` if the robot is not registered, or was revoked.
     pub async fn broker_credential(
         &self,
         robot: &RobotId,
@@ -177,8 +178,8 @@ impl Store {
         rows.iter().map(|row| id("assignments.robot_id", row)).collect()
     }
 
-    /// What each of `robots` should have; those that are not registered, were revoked or wait to be
-    /// approved are left out.
+    /// The desired state of each of `robots`. Robots that are not registered, were revoked or wait
+    /// for approval are left out.
     pub async fn desired_tasks(&self, robots: &[RobotId]) -> Result<Vec<DesiredTasks>, StoreError> {
         let mut found: Vec<DesiredTasks> = Vec::with_capacity(robots.len());
         for group in groups(robots) {
@@ -227,9 +228,9 @@ impl Store {
         Ok(found)
     }
 
-    /// By which order `robot` may fetch the blob, the one that comes first; `None`: by none, as it
-    /// belongs to no package that the robot should have. What was taken over from a robot's report,
-    /// which has no time limit, only counts if such a package is here.
+    /// The order by which `robot` may fetch the blob: the first one if there are several. `None` if
+    /// the blob belongs to no package that the robot should have. An order adopted from a robot's
+    /// report, which has no time limit, only counts if its package is here.
     pub async fn fetched_by(
         &self,
         robot: &RobotId,
@@ -267,7 +268,7 @@ impl Store {
 }
 
 impl Write {
-    /// The robots of a scope, and those that were when they were removed.
+    /// The robots of a scope, including removed robots that were in it at their removal.
     pub async fn robots_ever_in(&mut self, scope: &Scope) -> Result<Vec<RobotId>, StoreError> {
         let rows = sqlx::query("SELECT id, name, mac, labels FROM robots")
             .fetch_all(self.connection())
@@ -352,8 +353,8 @@ impl Write {
         Ok(())
     }
 
-    /// Stores what is set for a robot, if that is something else than what was. It is part of its
-    /// desired state, whose generation is raised then.
+    /// Stores a robot's settings, if they differ from the stored ones. The settings are part of the
+    /// desired state, so a change raises its generation.
     pub async fn update_settings(
         &mut self,
         robot: &RobotId,
@@ -387,8 +388,8 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets what a robot has reported: it registers again, perhaps with an empty disk, and
-    /// counts from 1.
+    /// Forgets a robot's reports: the robot registers again, perhaps with an empty disk, and counts
+    /// from 1.
     pub async fn forget_report(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query(
             "UPDATE robots SET report_start = 0, report_seq = 0, observed_generation = 0, report = NULL,
@@ -400,7 +401,7 @@ impl Write {
         Ok(())
     }
 
-    /// Gives a robot another password at an external broker.
+    /// Raises the number of a robot's password at an external broker.
     pub async fn renew_broker_credential(&mut self, robot: &RobotId) -> Result<(), StoreError> {
         sqlx::query("UPDATE robots SET broker_credential = broker_credential + 1 WHERE id = $1")
             .bind(robot.as_str())
@@ -409,7 +410,7 @@ impl Write {
         Ok(())
     }
 
-    /// Marks robots as removed: their MACs and names are free, their ids are not.
+    /// Marks robots as removed. Their MAC addresses and names become free, their ids do not.
     pub async fn remove_robots(
         &mut self,
         robots: &[RobotId],
@@ -440,8 +441,8 @@ const ROBOT_ROWS: &str =
          r.report, r.link, r.last_seen_ms, r.revoked_at_ms, r.awaits_approval, r.settings
      FROM robots r WHERE r.removed_at_ms IS NULL";
 
-/// What each robot should have, and what it is still getting rid of. The first condition is that of
-/// an index, word for word: without it all that was ever ordered would be read.
+/// The desired tasks of each robot, and the tasks that it is still removing. The first condition
+/// repeats that of an index, word for word: without it all past orders would be read.
 const TASK_ROWS: &str =
     "SELECT a.robot_id, a.task, a.deployment_id, a.wanted, a.run, a.phase, a.progress, a.failure,
          a.mechanism, a.rule, a.because, d.version
@@ -462,7 +463,7 @@ fn broker_credential(row: &sqlx::any::AnyRow) -> Result<BrokerCredential, StoreE
     Ok(BrokerCredential { robot: id("robots.id", row.try_get("id")?)?, number })
 }
 
-/// What was set for a robot; `None`: nothing.
+/// A robot's settings; `None` if there are none.
 fn settings(row: &sqlx::any::AnyRow) -> Result<Option<RobotSettings>, StoreError> {
     from_optional_json("robots.settings", row.try_get("settings")?)
 }
@@ -480,7 +481,7 @@ fn desired_task(row: &sqlx::any::AnyRow) -> Result<Option<DesiredTask>, StoreErr
     }))
 }
 
-/// The blobs of a task that ride along with the state which orders it.
+/// The blobs of a task that are sent along with the state which orders it.
 fn riding(task: &DesiredTask) -> Vec<BlobRef> {
     let PackageRef { config, content, .. } = task.package;
     match task.delivery {

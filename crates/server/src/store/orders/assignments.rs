@@ -1,6 +1,6 @@
 //! Assignments: each deployment's part for each robot, and which of them is desired. Every change
-//! is a few statements over sets of rows, whatever the number of robots. Whoever changes what is
-//! desired of a robot raises its generation in the same write.
+//! is a few statements over sets of rows, whatever the number of robots. A write that changes a
+//! robot's desired state also raises the robot's generation.
 
 use std::collections::BTreeSet;
 
@@ -12,32 +12,32 @@ use crate::store::rows::{groups, id, parts_of, stored, values};
 use crate::store::timelines::{grown_by, step};
 use crate::store::{StoreError, Write};
 
-/// What may be ordered about a task that a robot has.
+/// An order on a task that a robot has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TaskOrder {
-    /// Run it, if it does not.
+    /// Run the task, if it does not run.
     Start,
-    /// Run it anew.
+    /// Run the task anew.
     Restart,
-    /// Stop it, keep it installed.
+    /// Stop the task and keep it installed.
     Stop,
-    /// Take it off the robot.
+    /// Remove the task from the robot.
     Remove,
 }
 
-/// A batch that has begun.
+/// The outcome of beginning a batch.
 #[derive(Debug, Default)]
 pub struct Released {
-    /// Whose desired state is new.
+    /// The robots with a new desired state.
     pub robots: Vec<RobotId>,
-    /// Deployments whose place was taken on some of them.
+    /// The deployments that were replaced on some of these robots.
     pub superseded: BTreeSet<DeploymentId>,
 }
 
 impl Write {
     /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released
-    /// yet; older parts of the same task that wait for their batch give way, and their deployments
-    /// are returned.
+    /// yet. Older parts of the same task that wait for their batch end, and their deployments are
+    /// returned.
     pub async fn assign(
         &mut self,
         deployment: &DeploymentId,
@@ -81,9 +81,9 @@ impl Write {
         deployments(superseded)
     }
 
-    /// Settles a new deployment on the robots that run its package already, as they last said:
-    /// nothing begins there. What they should have stays the earlier deployment, so that they hear
-    /// of nothing.
+    /// Settles a new deployment on the robots that run its package already, as of their last
+    /// report: nothing begins there. Their desired state stays the earlier deployment, so that they
+    /// receive nothing new.
     pub async fn settle_running(
         &mut self,
         deployment: &DeploymentId,
@@ -109,7 +109,7 @@ impl Write {
         Ok(())
     }
 
-    /// Moves robots that wait for their batch behind all others, in their order.
+    /// Moves waiting robots behind all others, and keeps their order.
     pub async fn postpone(
         &mut self,
         deployment: &DeploymentId,
@@ -137,8 +137,8 @@ impl Write {
         Ok(())
     }
 
-    /// Lets the time of all robots run that wait for their batch, where it does not yet: nothing
-    /// but them is waited for. Says whether there were any.
+    /// Starts the expiry of all robots that wait for their batch, unless it has started: the
+    /// deployment waits for no other robots. Returns whether there were any.
     pub async fn await_offline(
         &mut self,
         deployment: &DeploymentId,
@@ -156,8 +156,8 @@ impl Write {
         Ok(begun.rows_affected() > 0)
     }
 
-    /// Begins the next batch of at most `count` robots: what they had of the task gives way. Their
-    /// time begins now.
+    /// Begins the next batch of at most `count` robots, and replaces their present assignment of
+    /// the task. Their time begins now.
     pub async fn release(
         &mut self,
         deployment: &DeploymentId,
@@ -204,7 +204,7 @@ impl Write {
         .bind(stored(now_ms))
         .fetch_all(self.connection())
         .await?;
-        // Of the first batch it was just said.
+        // The first batch has just got this entry in its timeline.
         sqlx::query(AssertSqlSafe(format!(
             "UPDATE assignments SET released = 1, desired = 1, updated_at_ms = $3,
                  expires_at_ms = CAST($3 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1),
@@ -221,8 +221,8 @@ impl Write {
         Ok(Released { robots, superseded: deployments(superseded)? })
     }
 
-    /// Carries out an order on `task` where it changes anything on `robots`. Returns the
-    /// assignments it changed.
+    /// Applies an order on `task` to those of `robots` where it changes anything. Returns the
+    /// changed assignments.
     pub async fn order_on_task(
         &mut self,
         order: TaskOrder,
@@ -273,8 +273,8 @@ impl Write {
         Ok(changed)
     }
 
-    /// Ends the parts that wait for their batch on `robots`, of `task` or of all: what is stopped
-    /// or removed must not come back with a later batch. Returns their deployments.
+    /// Ends the parts that wait for their batch on `robots`, of `task` or of all tasks: a stopped
+    /// or removed task must not come back with a later batch. Returns their deployments.
     pub async fn drop_waiting(
         &mut self,
         task: Option<&TaskName>,
@@ -302,8 +302,7 @@ impl Write {
         deployments(dropped)
     }
 
-    /// Ends everything that is ordered of robots which are being removed. Returns the deployments
-    /// concerned.
+    /// Ends all assignments of robots that are being removed. Returns their deployments.
     pub async fn end_all_of_robots(
         &mut self,
         robots: &[RobotId],

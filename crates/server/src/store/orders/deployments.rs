@@ -1,4 +1,4 @@
-//! Deployments: the operators' orders, and how far they have come.
+//! Deployments: the operators' orders and their progress.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 
@@ -19,67 +19,67 @@ use crate::store::rows::{
 use crate::store::{Store, StoreError, Write};
 use crate::store::{deliveries, timelines};
 
-/// An order to be stored.
+/// A deployment to be stored.
 #[derive(Debug)]
 pub struct NewDeployment<'a> {
-    /// Its identity.
+    /// The deployment's id.
     pub id: &'a DeploymentId,
-    /// What it brings.
+    /// The package to deploy.
     pub package: &'a PackageRef,
-    /// Service or job.
+    /// Whether the task is a service or a job.
     pub kind: TaskKind,
-    /// What the operator asked for.
+    /// The operator's request.
     pub order: &'a CreateDeployment,
-    /// When what is left of it expires.
+    /// The time at which unfinished assignments expire.
     pub expires_at_ms: u64,
 }
 
-/// A deployment that has robots whose batch has not begun.
+/// A deployment with robots that wait for their batch.
 #[derive(Debug)]
 pub struct OpenRollout {
-    /// Its pace.
+    /// The deployment's pace.
     pub rollout: Rollout,
-    /// Robots on which it has failed.
+    /// The number of robots on which the deployment has failed.
     pub failed: u64,
-    /// Those on which it has not settled, in the order of their turns.
+    /// The unsettled robots, in the order of their turns.
     pub robots: Vec<OpenRobot>,
 }
 
-/// A robot on which a deployment has not settled.
+/// A robot with an unsettled assignment of a deployment.
 #[derive(Debug)]
 pub struct OpenRobot {
-    /// Its identity.
+    /// The robot's id.
     pub robot: RobotId,
-    /// Where it stands.
+    /// The progress of the assignment.
     pub standing: Standing,
     /// Whether the deployment's service has run there before.
     pub has_run: bool,
-    /// Whether the robot was revoked: it does nothing any more.
+    /// Whether the robot was revoked, and so does nothing any more.
     pub is_revoked: bool,
 }
 
-/// Some of the deployments, the newest first.
+/// One page of deployments, the newest first.
 #[derive(Debug)]
 pub struct DeploymentPage {
-    /// Without assignments.
+    /// The deployments, without assignments.
     pub deployments: Vec<DeploymentView>,
-    /// The last one that was looked at, if there are older ones.
+    /// The last deployment of this page, if there are older ones.
     pub next: Option<DeploymentId>,
 }
 
-/// What is read of each deployment. The selector may name thousands of robots, which is too much
-/// for lists and events.
+/// The columns read of each deployment. The selector may name thousands of robots, which is too
+/// much for lists and events.
 const ROWS: &str =
     "SELECT id, number, package, kind, CASE WHEN length(selector) <= 1000 THEN selector END AS selector, delivery,
          priority, batch, max_failures, paused, created_at_ms, expires_at_ms, cancelled_at_ms
      FROM deployments";
 
-/// Those with numbers from $1 to $2, so that what is ordered meanwhile is not counted.
+/// Deployments with numbers from $1 to $2, so that deployments ordered meanwhile are not counted.
 const LISTED: &str = "(SELECT id FROM deployments WHERE number BETWEEN $1 AND $2)";
 
 impl Store {
     /// The newest `limit` deployments, or the newest older than `before`; `None` if there is no
-    /// such deployment. With `robots` of them those that concern one of these, as far as they do.
+    /// such deployment. With `robots`, only deployments and assignments of these robots.
     pub async fn deployments(
         &self,
         robots: Option<&[RobotId]>,
@@ -97,7 +97,7 @@ impl Store {
             }
             None => i64::MAX,
         };
-        // Those of one write have the same number.
+        // Deployments of the same write have the same number.
         let older = "number < $1 OR (number = $1 AND id < $2)";
         let sql = format!("{ROWS} WHERE {older} ORDER BY number DESC, id DESC LIMIT $3");
         let mut rows = sqlx::query(AssertSqlSafe(sql))
@@ -126,8 +126,8 @@ impl Store {
         Ok(self.deployment_views(&query.fetch_all(&self.reads).await?, None).await?.pop())
     }
 
-    /// One deployment with its assignments, sorted by robot name; their `online` is left false, and
-    /// most don't ask for their timelines.
+    /// One deployment with its assignments, sorted by robot name. Their `online` is left false, and
+    /// most callers don't ask for timelines.
     pub async fn deployment(
         &self,
         id: &DeploymentId,
@@ -161,7 +161,7 @@ impl Store {
         selector.map(|selector| id("deployments.selector", &selector)).transpose()
     }
 
-    /// Batched deployments that may go on by themselves: they have robots waiting and are not
+    /// Batched deployments that may proceed on their own: they have waiting robots and are not
     /// paused.
     pub async fn open_rollouts(&self) -> Result<BTreeSet<DeploymentId>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
@@ -173,7 +173,7 @@ impl Store {
         rows.iter().map(|row| id("deployments.id", row)).collect()
     }
 
-    /// The deployments whose package lost its version to another: mostly none.
+    /// The deployments whose package lost its version to another one. Mostly there are none.
     pub(in crate::store) async fn outdated_deployments(
         &self,
     ) -> Result<HashSet<String>, StoreError> {
@@ -187,7 +187,7 @@ impl Store {
         Ok(rows.into_iter().collect())
     }
 
-    /// The packages some robot should have, or may get (back): what must not be collected.
+    /// The packages that a robot should have, or may get (back): they must not be collected.
     pub async fn packages_in_use(&self) -> Result<Vec<PackageRef>, StoreError> {
         let rows: Vec<String> = sqlx::query_scalar(
             "SELECT DISTINCT d.package FROM deployments d WHERE d.id IN (
@@ -199,8 +199,7 @@ impl Store {
         rows.iter().map(|row| from_json("deployments.package", row)).collect()
     }
 
-    /// The views of these rows, which follow each other, as far as they concern `robots`, or in
-    /// whole.
+    /// The views of consecutive rows, limited to `robots` if that is given.
     async fn deployment_views(
         &self,
         rows: &[sqlx::any::AnyRow],
@@ -237,8 +236,8 @@ impl Store {
         rows.iter().map(view).collect()
     }
 
-    /// How many assignments of each deployment with one of these numbers stand in which phase: of
-    /// all robots or of some.
+    /// The number of assignments in each phase, for each deployment with one of these numbers: of
+    /// all robots, or of some.
     async fn counted(
         &self,
         numbers: (i64, i64),
@@ -306,7 +305,7 @@ impl Write {
         Ok(())
     }
 
-    /// Whether the operator took a deployment back; `None` if there is none.
+    /// Whether the operator cancelled a deployment; `None` if there is no such deployment.
     pub async fn is_cancelled(&mut self, id: &DeploymentId) -> Result<Option<bool>, StoreError> {
         let row: Option<(Option<i64>,)> =
             sqlx::query_as("SELECT cancelled_at_ms FROM deployments WHERE id = $1")
@@ -316,7 +315,7 @@ impl Write {
         Ok(row.map(|(cancelled_at_ms,)| cancelled_at_ms.is_some()))
     }
 
-    /// The pace and the open robots of a deployment that has robots waiting; `None` for any other.
+    /// The pace and the open robots of a deployment with waiting robots; `None` for any other.
     pub async fn rollout(&mut self, id: &DeploymentId) -> Result<Option<OpenRollout>, StoreError> {
         let row = sqlx::query(
             "SELECT kind, batch, max_failures, forgiven, paused FROM deployments
@@ -347,7 +346,7 @@ impl Write {
         Ok(Some(OpenRollout { rollout, failed, robots: self.open_robots(id, kind).await? }))
     }
 
-    /// The robots of a deployment that have not settled, in the order of their turns.
+    /// The unsettled robots of a deployment, in the order of their turns.
     async fn open_robots(
         &mut self,
         deployment: &DeploymentId,
@@ -373,8 +372,8 @@ impl Write {
                 Phase::Assigned | Phase::Deferred => Standing::Released,
                 _ => Standing::Begun,
             };
-            // A service that ran has shown what its batch was to show, whatever is ordered of it
-            // since.
+            // A service that ran has given the result that its batch waits for, whatever was
+            // ordered since.
             let has_run = ran == 1 && kind == TaskKind::Service;
             robots.push(OpenRobot { robot, standing, has_run, is_revoked: is_revoked == 1 });
         }
@@ -400,7 +399,7 @@ impl Write {
         self.update_deployment("UPDATE deployments SET paused = $2 WHERE id = $1", id, 1).await
     }
 
-    /// Lets a deployment begin batches again and forgives it `failures`.
+    /// Lets a deployment begin batches again, and sets its forgiven failures to `failures`.
     pub async fn resume(&mut self, id: &DeploymentId, failures: u64) -> Result<(), StoreError> {
         self.update_deployment(
             "UPDATE deployments SET paused = 0, forgiven = $2 WHERE id = $1",
@@ -410,7 +409,7 @@ impl Write {
         .await
     }
 
-    /// Marks a deployment as taken back by the operator.
+    /// Marks a deployment as cancelled by the operator.
     pub async fn mark_cancelled(
         &mut self,
         id: &DeploymentId,

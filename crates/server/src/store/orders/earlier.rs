@@ -1,5 +1,5 @@
-//! What was ordered before, as far as it matters for the next order: what ended badly, and what ran
-//! before what is there now.
+//! Earlier orders that matter for the next one: unsuccessful assignments, and the packages that ran
+//! before the present ones.
 
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::desired::PackageRef;
@@ -11,29 +11,30 @@ use crate::store::fleet::robots::known_robot;
 use crate::store::rows::{from_json, from_optional_json, from_word, groups, id, values};
 use crate::store::{KnownRobot, StoreError, Write};
 
-/// A robot for which a deployment has ended badly.
+/// A robot on which a deployment has ended without success: failed, expired or cancelled, for
+/// example.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unsuccessful {
-    /// Which robot.
+    /// The robot.
     pub robot: KnownRobot,
-    /// Why, if it failed.
+    /// The cause, if the deployment failed there.
     pub failure: Option<Failure>,
 }
 
-/// What a robot had before.
+/// A robot's earlier package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EarlierPackage {
-    /// Which robot.
+    /// The robot's id.
     pub robot: RobotId,
-    /// The package, which still is there.
+    /// The package, which is still stored.
     pub package: PackageRef,
-    /// Service or job.
+    /// Whether the task is a service or a job.
     pub kind: TaskKind,
 }
 
 impl Write {
-    /// The robots for which `deployment` has ended badly and that nothing else was ordered of
-    /// since, to stop or remove it neither, sorted by name.
+    /// The robots on which `deployment` has ended without success, sorted by name. Robots with a
+    /// later order for the task, including one to stop or remove it, are left out.
     pub async fn unsuccessful(
         &mut self,
         deployment: &DeploymentId,
@@ -60,8 +61,8 @@ impl Write {
         Ok(found)
     }
 
-    /// Of each of `robots` the newest package of `task` that ran there before the one it should
-    /// have now, is another, and still is here. Those that have none are left out.
+    /// For each of `robots`, the newest package of `task` that ran there before the desired one,
+    /// differs from it, and is still stored. Robots without such a package are left out.
     pub async fn earlier_packages(
         &mut self,
         task: &TaskName,

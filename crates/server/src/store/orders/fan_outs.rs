@@ -1,5 +1,5 @@
-//! Direct-push: which robots still wait for a package inside MQTT messages, and which are to pull
-//! it instead.
+//! Direct-push: the robots that still wait for a package inside MQTT messages, and those that are
+//! to pull the package instead.
 
 use sqlx::AssertSqlSafe;
 use task_proto::desired::{Delivery, PackageRef};
@@ -8,8 +8,8 @@ use task_proto::{DeploymentId, Digest, RobotId};
 use crate::store::rows::{from_json, groups, id, parts_of, stored, values};
 use crate::store::{Store, StoreError, Write};
 
-/// Assignments whose robot is to hear the package, and has not got all of it. Diverged robots are
-/// left alone.
+/// Assignments of robots that receive the package in parts and still miss some. Diverged robots
+/// are left alone.
 const AWAITING: &str = "assignments.mechanism = 'direct-push' AND assignments.desired = 1
     AND assignments.released = 1 AND assignments.ended = 0 AND assignments.phase IN ('assigned', 'fetching')
     AND EXISTS (SELECT 1 FROM robots r WHERE r.id = assignments.robot_id AND r.removed_at_ms IS NULL
@@ -31,7 +31,7 @@ impl Store {
         rows.iter().map(read).collect()
     }
 
-    /// The robots that wait for parts of `content`, and by which deployments.
+    /// The robots that wait for parts of `content`, with their deployments.
     pub async fn awaiting_parts(
         &self,
         content: &Digest,
@@ -56,8 +56,8 @@ impl Store {
 }
 
 impl Write {
-    /// Decides anew for those of `parts` that still wait for parts: they pull, by `rule`,
-    /// `because`. Returns the robots whose desired state is new.
+    /// Changes the delivery decision for those of `parts` that still wait for parts: they pull, by
+    /// `rule`, `because`. Returns the robots with a new desired state.
     pub async fn pull_instead(
         &mut self,
         parts: &[(DeploymentId, RobotId)],

@@ -1,4 +1,4 @@
-//! Idempotency keys of orders, and the answers that were given.
+//! Idempotency keys of orders, and the answers to them.
 
 use crate::store::rows::stored;
 use crate::store::{StoreError, Write};
@@ -6,9 +6,9 @@ use crate::store::{StoreError, Write};
 /// An order that was carried out before.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PastOrder {
-    /// What was asked.
+    /// The request.
     pub request: String,
-    /// What was answered.
+    /// The answer.
     pub answer: String,
 }
 
@@ -23,7 +23,7 @@ impl Write {
         Ok(row.map(|(request, answer)| PastOrder { request, answer }))
     }
 
-    /// Remembers the order that came with `key`.
+    /// Stores the order that came with `key`.
     pub async fn remember_order(
         &mut self,
         key: &str,
@@ -42,7 +42,7 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets the keys that came before `before_ms`.
+    /// Deletes the keys that came before `before_ms`.
     pub async fn forget_orders(&mut self, before_ms: u64) -> Result<(), StoreError> {
         sqlx::query("DELETE FROM orders WHERE created_at_ms < $1")
             .bind(stored(before_ms))

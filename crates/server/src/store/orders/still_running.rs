@@ -1,6 +1,6 @@
 //! Orders for a package that a robot still runs although a later one was ordered there: the later
-//! one failed, and the robot kept the earlier one or went back to it. The earlier deployment is
-//! then the desired one again, so that the robot starts nothing anew.
+//! one failed, and the robot kept the earlier one or went back to it. The earlier deployment then
+//! becomes the desired one again, so that the robot starts nothing anew.
 
 use sqlx::Row as _;
 use task_proto::desired::Wanted;
@@ -14,7 +14,7 @@ use crate::store::{StoreError, Write};
 /// A robot that still runs an ordered package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StillRunning {
-    /// Which robot.
+    /// The robot's id.
     pub robot: RobotId,
     /// The deployment that has failed, and was desired until now.
     pub failed: DeploymentId,
@@ -23,8 +23,8 @@ pub struct StillRunning {
 }
 
 impl Write {
-    /// Settles a new deployment of `task` on the robots that, by their last reports, still run its
-    /// package after a later one failed. Returns these robots: their desired state is new.
+    /// Settles a new deployment of `task` on the robots that, as of their last reports, still run
+    /// its package after a later one failed. Returns these robots: their desired state is new.
     pub async fn settle_still_running(
         &mut self,
         deployment: &DeploymentId,
@@ -36,7 +36,7 @@ impl Write {
             return Ok(found);
         }
         self.changes_access();
-        // One of a robot's deployments is desired at a time, so this comes first.
+        // Only one of a robot's deployments is desired at a time, so this comes first.
         let give_way = "SET desired = 0, superseded_by = $2, updated_at_ms = $1";
         self.set_pairs(
             give_way,

@@ -1,6 +1,6 @@
-//! Assignments that end before they were done: somebody cancels them, or their time is up. What
-//! they had replaced is desired again. Where a task has run, and only its start or restart did not
-//! come to it, nothing is replaced: it is left as it is.
+//! Assignments that end before they were done, because they were cancelled or expired. The
+//! assignment that each had replaced becomes desired again. If a task has run and only its start or
+//! restart was not carried out, nothing is replaced: the task is left as it is.
 
 use std::collections::BTreeSet;
 
@@ -15,29 +15,29 @@ use crate::store::rows::{
 use crate::store::timelines::grown_by;
 use crate::store::{StoreError, Write};
 
-/// An assignment that is to be taken back.
+/// An assignment that is to be revoked.
 #[derive(Debug, Clone)]
 pub struct Revocable {
     /// The deployment.
     pub deployment: DeploymentId,
     /// The robot.
     pub robot: RobotId,
-    /// What it took the place of, and is desired again.
+    /// The deployment that this one replaced, which becomes desired again.
     pub previous: Option<DeploymentId>,
     desired: bool,
     wanted: Wanted,
     left: Option<Left>,
 }
 
-/// How an assignment is left whose robot keeps what it has.
+/// The final state of an assignment after which the robot keeps its task.
 #[derive(Debug, Clone)]
 struct Left {
     run: u64,
     wanted: Wanted,
-    /// `None`: that in which it ends.
+    /// `None`: the phase in which the assignment ends.
     phase: Option<Phase>,
     failure: Option<Failure>,
-    /// Whether its robot is to hear of it. A diverged one is left alone.
+    /// Whether the robot is told about the change. A diverged robot is left alone.
     is_told: bool,
 }
 
@@ -45,15 +45,16 @@ struct Left {
 const PAIR: &[&str] = &["TEXT", "TEXT"];
 /// Columns of [`Left`] in a statement.
 const LEFT: &[&str] = &["TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "TEXT"];
-/// What [`revocable`] reads. A robot's report is only read where the task has run there.
+/// The columns that [`revocable`] reads. A robot's report is only read if the task has run there.
 const COLUMNS: &str =
     "a.deployment_id, a.robot_id, a.desired, a.previous, a.wanted, a.run, a.ran, a.phase,
      CASE WHEN a.ran = 1 THEN r.report END AS report,
      CAST(CASE WHEN r.observed_generation > r.generation THEN 1 ELSE 0 END AS BIGINT) AS diverged";
 
 impl Write {
-    /// What a cancel takes back: all that has not settled, and what ended badly but is still what
-    /// its robot should have. A service that runs has settled: there is nothing left to interrupt.
+    /// The assignments that a cancel revokes: all unsettled ones, and those that ended without
+    /// success but are still desired. A running service has settled: there is nothing left to
+    /// interrupt.
     pub async fn revocable(
         &mut self,
         deployment: &DeploymentId,
@@ -68,12 +69,12 @@ impl Write {
         .bind(deployment.as_str())
         .fetch_all(self.connection())
         .await?;
-        // What is on its way to run or runs is interrupted; what was only told to run once more is
+        // A task that is on its way to run, or runs, is interrupted. An order to run once more is
         // not undone.
         rows.iter().map(|row| revocable(row, |phase| phase == Phase::Assigned)).collect()
     }
 
-    /// Whether the cancel of a later deployment would put this one back somewhere.
+    /// Whether the cancel of a later deployment would restore this one on a robot.
     pub async fn may_be_put_back(&mut self, deployment: &DeploymentId) -> Result<bool, StoreError> {
         let count: i64 = sqlx::query_scalar(
             "SELECT COUNT(*) FROM assignments a JOIN deployments d ON d.id = a.deployment_id
@@ -86,7 +87,7 @@ impl Write {
         Ok(count > 0)
     }
 
-    /// What was not done in time.
+    /// The expired assignments.
     pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT {COLUMNS} FROM assignments a JOIN robots r ON r.id = a.robot_id
@@ -98,8 +99,8 @@ impl Write {
         rows.iter().map(|row| revocable(row, |_| true)).collect()
     }
 
-    /// Takes assignments back, those that have not ended in `phase`, and makes desired again what
-    /// they had replaced. Returns the robots whose desired state is new.
+    /// Revokes assignments: those that have not ended take the phase `phase`. Makes the assignments
+    /// that they had replaced desired again. Returns the robots with a new desired state.
     pub async fn take_back(
         &mut self,
         taken: &[Revocable],
@@ -122,9 +123,9 @@ impl Write {
             taken.iter().map(|row| (&row.deployment, &row.robot)),
         )
         .await?;
-        // What was stopped since stays so, whatever version of it comes back.
+        // A task that was stopped since stays stopped, whatever version of it comes back.
         for (wanted, stop) in [(Wanted::Running, ""), (Wanted::Stopped, "wanted = 'stopped', ")] {
-            // Where the replaced one stands is what the robot's next report says; $2 is what it is
+            // The robot's next report gives the phase of the restored assignment; $2 is the phase
             // until then.
             let revive = format!(
                 "SET {stop}desired = 1, superseded_by = NULL, removed_generation = NULL, updated_at_ms = $1,
@@ -148,8 +149,8 @@ impl Write {
         Ok(robots)
     }
 
-    /// Ends what was ordered of tasks that stay on their robots. A run that a robot never spoke of
-    /// may have begun there, so its number is not given out again.
+    /// Ends the orders on tasks that stay on their robots. A run that a robot never reported may
+    /// have begun there, so its number is not used again.
     async fn leave(
         &mut self,
         rows: &[&Revocable],
@@ -184,8 +185,8 @@ impl Write {
         Ok(())
     }
 
-    /// After `deployment` was cancelled, no later cancel may put it back: whoever replaced it puts
-    /// back what it had replaced itself.
+    /// Keeps later cancels from restoring the cancelled `deployment`. A deployment that replaced it
+    /// now restores the predecessor of `deployment` instead.
     pub async fn skip_as_previous(&mut self, deployment: &DeploymentId) -> Result<(), StoreError> {
         let changed: Vec<(String, String)> = sqlx::query_as(
             "UPDATE assignments SET previous = (
@@ -203,9 +204,10 @@ impl Write {
         self.pass_over_deleted(&changed).await
     }
 
-    /// Has these put back nothing that was deleted, but what that had replaced itself. A deleted
-    /// package's bytes are kept while it is desired, or what a cancel of that puts back; these
-    /// become that only now, so theirs may be gone.
+    /// Keeps these assignments from restoring a deleted package: they restore its own predecessor
+    /// instead. A deleted package's bytes are kept while the package is desired, or while the
+    /// cancel of a desired one would restore it. These assignments only become restorable now, so
+    /// the bytes may be gone.
     async fn pass_over_deleted(
         &mut self,
         pairs: &[(&DeploymentId, &RobotId)],
@@ -224,7 +226,7 @@ impl Write {
                          SELECT 1 FROM packages p WHERE p.name = d.task AND p.package = d.package))",
                 values(1, group.len(), PAIR)
             );
-            // What is next may be gone as well.
+            // The next predecessor may be deleted as well.
             let mut changed = 1;
             while changed > 0 {
                 let mut query = sqlx::query(AssertSqlSafe(sql.as_str()));
@@ -237,7 +239,8 @@ impl Write {
         Ok(())
     }
 
-    /// Runs `UPDATE assignments` with `set`, whose $1 is the time and $2 `word`, on the given rows.
+    /// Runs `UPDATE assignments` with `set` on the given rows. Its $1 is the time, and $2 is
+    /// `word`.
     pub(super) async fn set_pairs<'a>(
         &mut self,
         set: &str,
@@ -262,8 +265,7 @@ impl Write {
     }
 }
 
-/// Reads [`COLUMNS`]. A task that has run where it is, in a phase that `stays` tells, is left
-/// there.
+/// Reads [`COLUMNS`]. A task that has run stays as it is if its phase satisfies `stays`.
 fn revocable(
     row: &sqlx::any::AnyRow,
     stays: impl Fn(Phase) -> bool,
@@ -295,8 +297,8 @@ fn revocable(
     })
 }
 
-/// A robot that never heard of the last order on its task keeps what it said that it has. One that
-/// has heard of it, and has not come to it in time, does not come to it later.
+/// A robot that never received the last order on its task keeps the state that it reported. A robot
+/// that received the order, and did not carry it out in time, does not do so later.
 fn as_reported(report: Option<Report>, deployment: &DeploymentId, ordered: Left) -> Left {
     let tasks = report.into_iter().flat_map(|report| report.tasks);
     match tasks.into_iter().find(|task| task.deployment == *deployment) {

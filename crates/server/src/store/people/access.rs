@@ -1,8 +1,8 @@
-//! Who was let in a moment ago, so that a robot's thousand requests ask the database once, and what
-//! publishers have signed, which robots are told each time they ask what they should have. An
-//! answer is remembered until the next write that could change it has ended, at most for some
-//! seconds, and never beyond a token's own end: what is revoked here is revoked at once. Refusals
-//! are not remembered. It never decides who may do what.
+//! Caches recent admissions, so that a robot's thousand requests ask the database once. Also caches
+//! the publishers' signatures, which robots are told with each request for their desired state. An
+//! answer is cached until the next write that could change it has ended, for at most some seconds,
+//! and never beyond a token's own expiry. Revoking therefore takes effect at once. Refusals are not
+//! cached. The cache never decides about permissions.
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -14,14 +14,14 @@ use task_proto::{Digest, RobotId};
 
 use crate::store::{FetchedBy, TokenHolder};
 
-/// Answers remembered of each kind; beyond it all are forgotten.
+/// The most cached answers of each kind; beyond this number all are dropped.
 const MAX_ANSWERS: usize = 32 * 1024;
-/// Packages whose signatures are remembered.
+/// The most packages with cached signatures.
 const MAX_PACKAGES: usize = 1024;
-/// How long an answer counts in any case: somebody else could write to the same database.
+/// The longest life of an answer: another process could write to the same database.
 const MAX_AGE: Duration = Duration::from_secs(5);
 
-/// What is remembered. Clones are the same.
+/// The cache. Clones share one cache.
 #[derive(Debug, Clone, Default)]
 pub(in crate::store) struct Access {
     answers: Arc<Mutex<Answers>>,
@@ -37,8 +37,8 @@ struct Answers {
     signatures: HashMap<Digest, Vec<BlobRef>>,
 }
 
-/// A token by its kind, its id and the digest of its secret. Whoever could make use of how long a
-/// look-up takes would have to choose secrets by their SHA-256.
+/// A token by its kind, its id and the digest of its secret. An attacker who could exploit the
+/// timing of a look-up would have to choose secrets by their SHA-256.
 type Shown = (TokenKind, String, Digest);
 
 #[derive(Debug)]
@@ -47,14 +47,14 @@ struct Holder {
     expires_at_ms: Option<u64>,
 }
 
-/// When a question was asked. Its answer is remembered only if nothing has ended since.
+/// The epoch of a question. Its answer is cached only if no write has ended since.
 #[derive(Debug, Clone, Copy)]
 pub(in crate::store) struct Asked {
     epoch: u64,
 }
 
-/// A write that is under way. When it ends, however it ends, all answers are forgotten, if that is
-/// due.
+/// Guards a write in progress. When the write ends, in any way, this drops all answers if `is_due`
+/// is set.
 #[derive(Debug)]
 pub(in crate::store) struct Ending {
     access: Access,
@@ -62,12 +62,12 @@ pub(in crate::store) struct Ending {
 }
 
 impl Access {
-    /// To be called before the database is asked.
+    /// Must be called before the database is asked.
     pub(in crate::store) fn ask(&self) -> Asked {
         Asked { epoch: self.answers().epoch }
     }
 
-    /// Whom the token stands for, if that is known.
+    /// The cached holder of the token.
     pub(in crate::store) fn holder(&self, token: &Token, now_ms: u64) -> Option<TokenHolder> {
         let shown = shown(token);
         let answers = self.answers();
@@ -76,7 +76,7 @@ impl Access {
         is_current.then(|| known.holder.clone())
     }
 
-    /// Remembers whom the token, of which that has just been proven, stands for.
+    /// Caches the holder of the token. The secret has just been verified.
     pub(in crate::store) fn remember_holder(
         &self,
         asked: Asked,
@@ -93,7 +93,7 @@ impl Access {
         }
     }
 
-    /// By which order the robot may fetch the blob, if that is known.
+    /// The cached order by which the robot may fetch the blob.
     pub(in crate::store) fn fetched_by(
         &self,
         robot: &RobotId,
@@ -102,7 +102,7 @@ impl Access {
         self.answers().fetches.get(&(robot.clone(), *digest)).cloned()
     }
 
-    /// Remembers by which order the robot may fetch the blob, and gives it back.
+    /// Caches the order by which the robot may fetch the blob, and returns it.
     pub(in crate::store) fn remember_fetch(
         &self,
         asked: Asked,
@@ -121,12 +121,12 @@ impl Access {
         order
     }
 
-    /// The lists of publishers that robots are told of, if they are known.
+    /// The cached lists of publishers for robots.
     pub(in crate::store) fn lists(&self) -> Option<Vec<BlobRef>> {
         self.answers().lists.clone()
     }
 
-    /// Remembers the lists of publishers that robots are told of.
+    /// Caches the lists of publishers for robots.
     pub(in crate::store) fn remember_lists(&self, asked: Asked, lists: &[BlobRef]) {
         let mut answers = self.answers();
         if answers.epoch == asked.epoch {
@@ -134,12 +134,12 @@ impl Access {
         }
     }
 
-    /// The signatures of the package with this manifest, if they are known.
+    /// The cached signatures of the package with this manifest.
     pub(in crate::store) fn signatures(&self, manifest: &Digest) -> Option<Vec<BlobRef>> {
         self.answers().signatures.get(manifest).cloned()
     }
 
-    /// Remembers the signatures of a package.
+    /// Caches the signatures of a package.
     pub(in crate::store) fn remember_signatures(
         &self,
         asked: Asked,
@@ -155,7 +155,7 @@ impl Access {
         }
     }
 
-    /// A write begins. It changes nobody's rights until it says that it may.
+    /// Begins a write. The write changes no access rights until [`Ending::is_due`] is set.
     pub(in crate::store) fn until_ended(&self) -> Ending {
         Ending { access: self.clone(), is_due: false }
     }
@@ -231,7 +231,7 @@ mod tests {
         let end = || access.until_ended().is_due = true;
         end();
         assert_eq!(known(), (None, false));
-        // What was read before a write ended says nothing about the time after it.
+        // An answer read before a write ended says nothing about the time after the write.
         let asked = access.ask();
         end();
         remember(asked);

@@ -1,6 +1,6 @@
-//! The audit's entries: each is added by the write that it tells of, and none is ever changed or
-//! removed. So that it does not grow without bound, what a person does to themselves alone is done
-//! so often a day and no more.
+//! The audit log. Each entry is added by the write that it describes, and none is ever changed or
+//! removed. To bound its size, we limit the number of acts per day that a person does on their own
+//! account.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -19,19 +19,19 @@ use crate::store::{KnownRobot, Store, StoreError, Write};
 
 /// The most entries in one answer.
 const MOST_RECORDS: u64 = 1_000;
-/// The most bytes of them.
+/// The most bytes of entries in one answer.
 const MOST_BYTES: usize = 4 * 1024 * 1024;
-/// The longest text kept of a target or a detail: a selector may be as long as 64 KiB.
+/// The longest stored text of a target or a detail: a selector may be as long as 64 KiB.
 const MOST_CHARACTERS: usize = 1_000;
 
-/// What can be done that the audit tells of.
+/// An act that the audit log records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Act {
-    /// A robot came, or came back.
+    /// A robot enrolled, for the first time or again.
     RobotEnroll,
-    /// A robot that waited was let in.
+    /// A waiting robot was approved.
     RobotApprove,
-    /// A robot that waited was turned away.
+    /// A waiting robot was rejected.
     RobotReject,
     /// A robot's name or labels were changed.
     RobotEdit,
@@ -43,29 +43,29 @@ pub enum Act {
     BulkRemove,
     /// A robot's tokens were ended.
     RobotRevoke,
-    /// A robot was asked to change something at once, like a parameter.
+    /// A robot was asked for an immediate change, like one of a parameter.
     RobotAsk,
-    /// An enrolment token was made.
+    /// An enrollment token was made.
     EnrolmentCreate,
-    /// An enrolment token was revoked.
+    /// An enrollment token was revoked.
     EnrolmentRevoke,
     /// A package was ordered.
     DeploymentCreate,
-    /// An order was taken back.
+    /// An order was cancelled.
     DeploymentCancel,
-    /// A paused order was let go on.
+    /// A paused order was resumed.
     DeploymentResume,
-    /// What had ended badly was ordered once more.
+    /// An order that had ended without success was retried.
     DeploymentRetry,
     /// A task was ordered to start.
     TaskStart,
-    /// A task was ordered to run anew.
+    /// A task was ordered to restart.
     TaskRestart,
-    /// A task was ordered back to the package before.
+    /// A task was ordered back to its previous package.
     TaskRollBack,
     /// A task was ordered to stop.
     TaskStop,
-    /// A task was ordered to go.
+    /// A task was ordered to be removed.
     TaskRemove,
     /// A manifest was pushed.
     ManifestPush,
@@ -73,7 +73,7 @@ pub enum Act {
     ManifestDelete,
     /// A tag was deleted.
     TagDelete,
-    /// A blob was taken out of a repository.
+    /// A blob was removed from a repository.
     BlobDelete,
     /// A user was added.
     UserAdd,
@@ -83,11 +83,11 @@ pub enum Act {
     UserRemove,
     /// A password was set.
     UserPassword,
-    /// Someone signed in with a password.
+    /// A user signed in with a password.
     SignIn,
-    /// Someone signed out.
+    /// A user signed out.
     SignOut,
-    /// So many sign-ins failed that no more are tried for a while.
+    /// Sign-ins are blocked for a while after too many failures.
     SignInBlocked,
     /// An access token was made.
     TokenCreate,
@@ -96,7 +96,7 @@ pub enum Act {
 }
 
 impl Act {
-    /// Its name in the audit.
+    /// The name of the act in the audit log.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::RobotEnroll => "robot.enroll",
@@ -137,27 +137,27 @@ impl Act {
 }
 
 impl Act {
-    /// Whether everybody may do it again and again, whatever their role, and to nobody but
-    /// themselves. Of what they began by it, signing out and revoking a token end each once. All
-    /// else takes somebody who is trusted with more than the length of the audit, and an order must
-    /// not wait.
+    /// Whether every person may do the act repeatedly, whatever their role, and only to their own
+    /// account. Signing out and revoking a token are excluded: each ends once something that such
+    /// an act began. All other acts take a role that we trust with more than the length of the
+    /// audit log, and an order must not wait.
     fn is_everybodys(self) -> bool {
         matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
     }
 }
 
-/// How often a person may do what everybody may: so often after a rest, and then 2,000 times a day.
+/// The rate limit of one person for such acts: a burst after a rest, and then 2,000 a day.
 pub(in crate::store) fn everybodys_pace() -> Pace {
     Pace::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
 }
 
-/// An act that is being done, as whoever does it tells of it. A secret never belongs in here.
+/// An act in progress, described by its caller. A secret must never be part of it.
 #[derive(Debug, Clone)]
 pub struct Deed {
     who: String,
     token: Option<TokenId>,
     address: Option<IpAddr>,
-    /// By whose rights; `None`: by nobody's, like signing in.
+    /// The person whose rights are used; `None`: the act uses no rights, like signing in.
     by: Option<Person>,
     act: Act,
     target: String,
@@ -171,7 +171,7 @@ impl Deed {
         Self { by: Some(person.clone()), ..Self::new(who, token, person.address, act, target) }
     }
 
-    /// Someone who is no user, or not yet known to be one.
+    /// An act without a user, or before the user is known.
     pub fn new(
         who: String,
         token: Option<TokenId>,
@@ -190,13 +190,13 @@ impl Deed {
         }
     }
 
-    /// With this as well.
+    /// Adds a detail.
     pub fn with(mut self, key: &str, value: impl ToString) -> Self {
         self.detail.insert(key.to_owned(), shortened(&value.to_string()));
         self
     }
 
-    /// With this as well, if there is such a thing.
+    /// Adds a detail, if there is a value.
     pub fn with_some(self, key: &str, value: Option<impl ToString>) -> Self {
         match value {
             Some(value) => self.with(key, value),
@@ -206,14 +206,14 @@ impl Deed {
 }
 
 impl Deed {
-    /// Whether a robot is in the scope of the person who does it.
+    /// Whether a robot is in the scope of the acting person.
     pub(in crate::store) fn covers(&self, robot: &KnownRobot) -> bool {
         self.by.as_ref().is_some_and(|by| by.scope.covers(&robot.id, &robot.name, &robot.labels))
     }
 }
 
-/// As much of a text as an entry keeps. Neither a terminal nor Postgres takes every control
-/// character.
+/// Shortens a text to the stored length and replaces control characters with spaces: neither a
+/// terminal nor Postgres takes every one.
 fn shortened(text: &str) -> String {
     let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
     let mut kept: String = characters.by_ref().take(MOST_CHARACTERS).collect();
@@ -224,9 +224,10 @@ fn shortened(text: &str) -> String {
 }
 
 impl Write {
-    /// Writes down what this write does. It is there if and only if the write is; and the write is
-    /// not, if whoever does it may no longer: a request's body can come long after its head. So
-    /// this comes before one's own rights are changed.
+    /// Records the act of this write. The entry exists if and only if the write is committed. The
+    /// write fails if the person's rights have ended meanwhile: a request's body can come long
+    /// after its head. A write that changes the rights of its own caller therefore has to call this
+    /// first.
     pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
         if let Some(by) = &deed.by {
             self.check_rights(by, now_ms).await?;
@@ -273,7 +274,7 @@ impl Write {
         Ok(())
     }
 
-    /// Writes it down, if there is something to, and makes it so.
+    /// Records the act, if there is one, and commits the write.
     pub(in crate::store) async fn commit_with(
         mut self,
         deed: Option<&Deed>,
@@ -287,7 +288,7 @@ impl Write {
 }
 
 impl Store {
-    /// Entries of the audit: those after a number, the oldest first, or else the newest first.
+    /// Reads entries of the audit log: those after a number, oldest first, or else newest first.
     pub async fn audit(&self, query: &AuditQuery) -> Result<AuditPage, StoreError> {
         let last: Option<i64> =
             sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.reads).await?;

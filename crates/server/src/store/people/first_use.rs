@@ -1,7 +1,7 @@
-//! The first use of a robot's token, which ends its other ones. When a fleet comes for the first
-//! time, thousands happen at once: whoever finds nobody writing writes for all who wait, so that
-//! they share one commit, and what others remember of the database is out of date once and not
-//! thousands of times.
+//! The first use of a robot's token, which ends the robot's other tokens. When a fleet connects for
+//! the first time, thousands of first uses happen at once. A caller that finds no write in progress
+//! writes for all waiting callers, so that they share one commit. Caches of the database are then
+//! invalidated once and not thousands of times.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -13,10 +13,10 @@ use tokio::sync::oneshot;
 use crate::store::rows::{id, stored};
 use crate::store::{Store, StoreError, Write};
 
-/// The most first uses of one write: others wait for it as well.
+/// The most first uses of one write: others wait for that write as well.
 const MAX_BATCH: usize = 256;
 
-/// Those who wait for their first use to be written. Clones are the same.
+/// The queue of first uses to be written. Clones share one queue.
 #[derive(Debug, Clone, Default)]
 pub(in crate::store) struct FirstUses {
     waiting: Arc<Mutex<Vec<Waiting>>>,
@@ -37,7 +37,7 @@ impl FirstUses {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The next of them; none if nobody waits.
+    /// The next batch of the queue; `None` if the queue is empty.
     fn next_batch(&self) -> Option<Vec<Waiting>> {
         let mut waiting = self.waiting();
         let rest = waiting.len().min(MAX_BATCH);
@@ -47,8 +47,8 @@ impl FirstUses {
 }
 
 impl Store {
-    /// Marks a robot's token as the one it uses; false if it is used or ended already. Goes on to
-    /// its end even if the caller does not wait for it.
+    /// Marks a robot's token as the one in use; false if the token is already used or ended. The
+    /// write runs to its end even if the caller does not wait for it.
     pub(in crate::store) async fn use_first(
         &self,
         token: &Token,
@@ -76,7 +76,7 @@ impl Store {
             match self.use_together(&batch).await {
                 Ok(used) => {
                     for (waiting, used) in batch.into_iter().zip(used) {
-                        // Who has gone away does not need to know.
+                        // A caller that has gone away does not need the result.
                         let _ = waiting.told.send(Ok(used));
                     }
                 }

@@ -1,6 +1,5 @@
-//! Tokens: stored as digests of their secrets, with what each may do. A robot has at most two that
-//! are valid: the one it uses, and one that was made for it and ends the other when it is first
-//! used.
+//! Tokens: stored as digests of their secrets, with their permissions. A robot has at most two
+//! valid tokens: the one in use, and a new one that ends the other on its first use.
 
 use std::collections::BTreeSet;
 
@@ -21,27 +20,27 @@ use crate::store::rows::{
 };
 use crate::store::{Store, StoreError, Write};
 
-/// Whom a valid token stands for.
+/// The holder of a valid token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TokenHolder {
-    /// A person.
+    /// A user.
     Person(Person),
-    /// Someone who may enrol.
+    /// The holder of an enrollment token.
     Enrolment,
     /// A robot.
     Robot {
-        /// Which.
+        /// The robot's id.
         robot: RobotId,
-        /// The number of its token: a later one has a higher number.
+        /// The number of the token: a later one has a higher number.
         token_number: u64,
-        /// The key that it registered when it was given the token.
+        /// The public key that the robot registered with the token.
         key: Option<PublicKey>,
     },
-    /// A robot that waits to be approved, which may nothing yet.
+    /// A robot that waits for approval and has no permissions yet.
     Pending {
-        /// Which.
+        /// The robot's id.
         robot: RobotId,
-        /// The key that it registered when it was given the token.
+        /// The public key that the robot registered with the token.
         key: Option<PublicKey>,
     },
 }
@@ -55,28 +54,29 @@ impl TokenHolder {
     }
 }
 
-/// A token that was shown and is good.
+/// A token that was presented and is valid.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Admitted {
-    /// Whom it stands for.
+    /// The holder of the token.
     pub holder: TokenHolder,
-    /// Whether a robot used it for the first time, which has just ended the robot's other tokens.
+    /// Whether this is a robot's first use of the token, which has just ended the robot's other
+    /// tokens.
     pub is_first_use: bool,
 }
 
-/// What an enrolment token is good for.
+/// The terms of an enrollment token.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct EnrolmentTerms {
     /// Only this robot may use it.
     pub robot: Option<RobotId>,
-    /// Labels that whoever uses it gets.
+    /// Labels given to each robot that enrolls with the token.
     pub labels: Labels,
-    /// Enrolments left; `None`: any number. With none left it is only good for an enrolment whose
-    /// answer was lost.
+    /// Enrollments left; `None`: any number. At zero the token is only valid for an enrollment
+    /// whose answer was lost.
     pub uses_left: Option<u64>,
-    /// When it ends.
+    /// The time at which the token expires.
     pub expires_at_ms: u64,
-    /// Whether a new robot that comes by it waits to be approved.
+    /// Whether a new robot that enrolls with the token waits for approval.
     pub approval: bool,
 }
 
@@ -88,14 +88,14 @@ struct TokenRow {
     expires_at_ms: Option<u64>,
     is_used: bool,
     approval: bool,
-    /// Of a robot's token: whether the robot waits to be approved.
+    /// For a robot's token: whether the robot waits for approval.
     is_pending: bool,
     number: u64,
     user: Option<UserPart>,
     key: Option<PublicKey>,
 }
 
-/// Of a user's token: the user as they are now, and what the token is limited to.
+/// For a user's token: the user's present rights, and the limits of the token.
 struct UserPart {
     name: UserName,
     /// Roles and scope; `None` if the user was removed.
@@ -105,8 +105,8 @@ struct UserPart {
     origin: TokenOrigin,
 }
 
-/// An enrolment token without a use left is still good while a token that it made was never used:
-/// the answer with that one may have been lost.
+/// Selects a valid token. An enrollment token without a use left stays valid while a token
+/// that came from it was never used, because the answer with that token may have been lost.
 const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t.expires_at_ms, t.used_at_ms, t.number,
          t.client_key, t.user_name, t.roles, t.scope, t.origin, t.approval, u.roles AS user_roles, u.scope AS user_scope,
          r.awaits_approval
@@ -116,8 +116,8 @@ const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t
             WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
 
 impl Store {
-    /// Whom `token` stands for at `now_ms`; `None` if it is unknown, wrong, used up, expired or
-    /// revoked. Changes nothing.
+    /// The holder of `token` at `now_ms`; `None` if the token is unknown, wrong, used up, expired
+    /// or revoked. Changes nothing.
     pub async fn token_holder(
         &self,
         token: &Token,
@@ -127,9 +127,10 @@ impl Store {
         Ok(row.and_then(|row| row.holder(token)))
     }
 
-    /// The same for whoever shows the token to come in. A robot's first use of a token ends its
-    /// other ones. Who has registered a key has to have proven that it holds it, if it was asked
-    /// to: else the token is as if unknown.
+    /// Finds the holder of `token` as [`Self::token_holder`] does, and admits the client. A robot's
+    /// first use of a token ends its other tokens. A robot that has registered a key must have
+    /// proven its possession, if the server asked for the proof. Otherwise the token counts as
+    /// unknown.
     pub async fn admit(
         &self,
         token: &Token,
@@ -147,12 +148,12 @@ impl Store {
         let holder = row.holder(token).filter(|holder| holder.is_proven_by(proof));
         let Some(holder) = holder else { return Ok(None) };
         if is_unused && !self.use_first(token, now_ms).await? {
-            // Somebody was faster: either with this token or with a later one.
+            // A concurrent request was first, either with this token or with a later one.
             let holder =
                 self.token_holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
             return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
         }
-        // How often an enrolment token may be used is counted by those who use it.
+        // The uses of an enrollment token are counted by the code that enrolls.
         if !is_unused && holder != TokenHolder::Enrolment {
             self.access.remember_holder(asked, token, &holder, expires_at_ms);
         }
@@ -186,7 +187,7 @@ impl Store {
 }
 
 impl Write {
-    /// What the enrolment token `token` is good for now; `None` if it is good for nothing.
+    /// The present terms of the enrollment token `token`; `None` if the token is not valid.
     pub async fn enrolment_terms(
         &mut self,
         token: &Token,
@@ -211,8 +212,8 @@ impl Write {
         }))
     }
 
-    /// An error unless `by` may now what they might when they were let in. What this write changes
-    /// itself does not count.
+    /// Fails unless `by` still has the rights that they had at admission. Changes by this write
+    /// itself do not count.
     pub(in crate::store) async fn check_rights(
         &mut self,
         by: &Person,
@@ -235,7 +236,7 @@ impl Write {
         Ok(())
     }
 
-    /// Counts one enrolment by `token`.
+    /// Counts one enrollment by `token`.
     pub async fn use_enrolment_token(&mut self, token: &Token) -> Result<(), StoreError> {
         sqlx::query(
             "UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL",
@@ -246,7 +247,7 @@ impl Write {
         Ok(())
     }
 
-    /// Stores an enrolment token.
+    /// Stores an enrollment token.
     pub async fn create_enrolment_token(
         &mut self,
         token: &Token,
@@ -265,9 +266,9 @@ impl Write {
         Ok(())
     }
 
-    /// Makes `token` the one that `robot` may go over to, in the place of another that it never
-    /// used. `made_by` is the enrolment token it came by; `None`: the robot itself asked for it.
-    /// Who has to show a key with it has `key`.
+    /// Makes `token` the robot's next token, in place of an earlier offer that was never used.
+    /// `made_by` is the enrollment token of the request; `None`: the robot itself asked for the
+    /// token. With `key`, the robot has to prove that key when it uses the token.
     pub async fn offer_robot_token(
         &mut self,
         token: &Token,
@@ -291,7 +292,7 @@ impl Write {
         Ok(())
     }
 
-    /// Refuses what `robot` asked by a token that has ended since.
+    /// Refuses a request of `robot` if its token has ended since.
     pub async fn check_token(
         &mut self,
         robot: &RobotId,
@@ -308,7 +309,7 @@ impl Write {
         found.map(drop).ok_or(StoreError::RightsEnded)
     }
 
-    /// The key that `robot` registered when it was given the token it uses.
+    /// The public key that `robot` registered with the token in use.
     pub async fn client_key(&mut self, robot: &RobotId) -> Result<Option<PublicKey>, StoreError> {
         let row = sqlx::query(
             "SELECT client_key FROM tokens
@@ -320,8 +321,8 @@ impl Write {
         row.map(|row| client_key(&row)).transpose().map(Option::flatten)
     }
 
-    /// Whether `robot` was given a token by an enrolment, by `made_by` or by any, that nobody has
-    /// used yet.
+    /// Whether an enrollment has given `robot` a token that was never used. `made_by` limits the
+    /// check to one enrollment token.
     pub async fn awaits_first_use(
         &mut self,
         robot: &RobotId,
@@ -338,7 +339,7 @@ impl Write {
         Ok(found.is_some())
     }
 
-    /// Ends all tokens made for `robots`.
+    /// Revokes all tokens of `robots`.
     pub async fn revoke_tokens(
         &mut self,
         robots: &[RobotId],
@@ -358,10 +359,10 @@ impl Write {
         Ok(())
     }
 
-    /// Forgets tokens that are good for nothing any more, and says whose they were if they were
-    /// users'. The first token stays when it was revoked: it is in the data directory, and must not
-    /// come back to life at the next start. Those of a revoked robot stay as well, so that it can
-    /// be told.
+    /// Deletes tokens that are no longer valid, and returns the holders of those that belonged to
+    /// users. The first token stays when it was revoked: its secret is in the data directory, and
+    /// must not become valid again at the next start. The tokens of a revoked robot stay as well,
+    /// so that the robot can be told.
     pub async fn forget_ended_tokens(
         &mut self,
         now_ms: u64,
@@ -422,8 +423,8 @@ impl TokenRow {
         }
     }
 
-    /// What the token allows is what both it and its user are allowed now; `None` if that is
-    /// nothing.
+    /// The rights of the token: the intersection of its limits and its user's present rights;
+    /// `None` if that is empty.
     fn person(self, token: &TokenId) -> Option<Person> {
         let token = token.clone();
         let Some(UserPart { name, user, roles, scope, origin }) = self.user else {

@@ -1,4 +1,4 @@
-//! People and their access tokens. A token without a user is the first one, which lies in the data
+//! Users and their access tokens. The token without a user is the first one, which lies in the data
 //! directory.
 
 use sqlx::Row as _;
@@ -14,33 +14,34 @@ use crate::domain::person::first_name;
 use crate::store::rows::{from_word, id, number, optional, stored, word};
 use crate::store::{Store, StoreError, Write};
 
-/// The most tokens that are listed.
+/// The most tokens in a list.
 const MOST_LISTED: i64 = 10_000;
 
 /// A user, as stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct User {
-    /// What they sign in with.
+    /// The name for signing in.
     pub name: UserName,
-    /// What they may do.
+    /// The user's roles.
     pub roles: Roles,
-    /// To which robots they are limited; `None`: to none.
+    /// The robots that the user is limited to; `None`: no limit.
     pub scope: Option<Selector>,
-    /// What is kept of their password.
+    /// The hash of the user's password.
     pub password: Option<PasswordHash>,
-    /// Who they are at the provider by which they sign in, behind its issuer; `None`: they don't.
+    /// The user's subject at the OpenID provider, after its issuer; `None`: the user does not sign
+    /// in by a provider.
     pub subject: Option<String>,
-    /// When they were added.
+    /// The time at which the user was added.
     pub created_at_ms: u64,
 }
 
 impl User {
-    /// Whether they may do what concerns everybody.
+    /// Whether the user may change things that concern all users.
     pub fn is_administrator(&self) -> bool {
         self.roles.allow(Permission::Administer) && self.scope.is_none()
     }
 
-    /// As others see them.
+    /// The view shown to others, without the password.
     pub fn view(self) -> UserView {
         let Self { name, roles, scope, password, subject, created_at_ms } = self;
         UserView { name, roles, scope, has_password: password.is_some(), subject, created_at_ms }
@@ -52,17 +53,17 @@ impl User {
 pub struct NewToken<'a> {
     /// The token.
     pub token: &'a Token,
-    /// Whose it is.
+    /// The user that the token belongs to.
     pub user: &'a UserName,
-    /// Where it comes from.
+    /// The origin of the token.
     pub origin: TokenOrigin,
-    /// What it is for.
+    /// The title that describes the token's purpose.
     pub title: &'a str,
-    /// The roles it is limited to.
+    /// The roles that the token is limited to.
     pub roles: Option<&'a Roles>,
-    /// The robots it is limited to.
+    /// The robots that the token is limited to.
     pub scope: Option<&'a Selector>,
-    /// When it ends.
+    /// The time at which the token expires.
     pub expires_at_ms: u64,
 }
 
@@ -73,7 +74,7 @@ const TOKENS: &str =
      FROM tokens WHERE kind = 'operator'";
 
 impl Store {
-    /// Everybody, sorted by name.
+    /// All users, sorted by name.
     pub async fn users(&self) -> Result<Vec<User>, StoreError> {
         let rows = sqlx::query(USERS).fetch_all(&self.reads).await?;
         let mut users = rows.iter().map(user).collect::<Result<Vec<_>, _>>()?;
@@ -81,15 +82,15 @@ impl Store {
         Ok(users)
     }
 
-    /// One user.
+    /// The user with this name.
     pub async fn user(&self, name: &UserName) -> Result<Option<User>, StoreError> {
         let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
             .bind(name.as_str());
         row.fetch_optional(&self.reads).await?.as_ref().map(user).transpose()
     }
 
-    /// Everybody's tokens or one user's, the newest first; of those that have ended only the first
-    /// token.
+    /// The tokens of all users or of one, the newest first. Of the ended tokens only the first
+    /// token is included.
     pub async fn person_tokens(
         &self,
         of: Option<&UserName>,
@@ -109,32 +110,32 @@ impl Store {
 }
 
 impl Write {
-    /// One user.
+    /// The user with this name.
     pub async fn user(&mut self, name: &UserName) -> Result<Option<User>, StoreError> {
         let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
             .bind(name.as_str());
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
-    /// The user who signs in by the provider as `subject`.
+    /// The user with `subject` at the provider.
     pub async fn user_by_subject(&mut self, subject: &str) -> Result<Option<User>, StoreError> {
         let row =
             sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE subject = $1"))).bind(subject);
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
-    /// Everybody.
+    /// All users.
     pub async fn users(&mut self) -> Result<Vec<User>, StoreError> {
         sqlx::query(USERS).fetch_all(self.connection()).await?.iter().map(user).collect()
     }
 
-    /// Whether the first token is good.
+    /// Whether the first token is valid.
     pub async fn has_first_token(&mut self) -> Result<bool, StoreError> {
         let good = "SELECT id FROM tokens WHERE kind = 'operator' AND user_name IS NULL AND revoked_at_ms IS NULL";
         Ok(sqlx::query(good).fetch_optional(self.connection()).await?.is_some())
     }
 
-    /// Stores a user in the place of one of that name, if there is one.
+    /// Stores a user, and replaces a user of the same name.
     pub async fn put_user(&mut self, user: &User) -> Result<(), StoreError> {
         sqlx::query(
             "INSERT INTO users (name, roles, scope, password, subject, created_at_ms) VALUES ($1, $2, $3, $4, $5, $6)
@@ -184,7 +185,7 @@ impl Write {
         Ok(())
     }
 
-    /// One person's token, whether it is good or not.
+    /// One user's token, valid or not.
     pub async fn person_token(&mut self, token: &TokenId) -> Result<Option<TokenView>, StoreError> {
         let row =
             sqlx::query(sqlx::AssertSqlSafe(format!("{TOKENS} AND id = $1"))).bind(token.as_str());
@@ -202,7 +203,7 @@ impl Write {
         rows.iter().map(token_view).collect()
     }
 
-    /// Ends a person's token.
+    /// Revokes a user's token.
     pub async fn revoke_person_token(
         &mut self,
         token: &TokenId,

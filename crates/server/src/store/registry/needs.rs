@@ -1,6 +1,6 @@
-//! Which blobs somebody needs: a manifest that has them as parts or is one itself, or a package
-//! that a robot should have or may get back. What nobody needs is forgotten here; its bytes are
-//! others' to delete.
+//! Blobs that are still needed: parts of a manifest, manifests themselves, and blobs of a package
+//! that a robot should have or may get back. References to unneeded blobs are deleted here; other
+//! modules delete the bytes.
 
 use std::collections::HashSet;
 
@@ -12,7 +12,8 @@ use crate::store::rows::{groups, id, values};
 use crate::store::{Store, StoreError};
 
 impl Store {
-    /// Every blob that somebody needs now. More may be needed as soon as this is known.
+    /// Every blob that is needed now. More blobs may be needed by the time the caller has the
+    /// result.
     pub async fn needed_blobs(&self) -> Result<HashSet<Digest>, StoreError> {
         let texts: Vec<String> = sqlx::query_scalar(
             "SELECT digest FROM manifests UNION SELECT digest FROM manifest_parts",
@@ -25,9 +26,9 @@ impl Store {
         Ok(needed)
     }
 
-    /// Those of `candidates` that nobody needs. Repositories that hold one without need forget it;
-    /// where there is none, nothing is written. The caller holds back everybody who could come to
-    /// rely on one.
+    /// Those of `candidates` that are unneeded. Repositories drop their references to them; if
+    /// there is no such reference, nothing is written. The caller blocks all callers that could
+    /// come to rely on such a blob.
     pub async fn forget_unneeded(
         &self,
         candidates: Vec<Digest>,

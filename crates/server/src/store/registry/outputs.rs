@@ -1,5 +1,5 @@
-//! Outputs of runs: which files came back from which robot. The bytes lie in the blob store, under
-//! the robot's repository.
+//! Outputs of runs: the files that came back from each robot. Their bytes lie in the blob store,
+//! under the robot's repository.
 
 use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
@@ -13,25 +13,25 @@ use crate::store::{Store, StoreError, Write, rows};
 
 /// The newest runs kept of one task on one robot.
 const KEPT: usize = 10;
-/// The newest runs kept of one robot: the names of tasks are in its own hands.
+/// The newest runs kept of one robot: the robot itself chooses the names of its tasks.
 const KEPT_OF_ROBOT: usize = 200;
 /// The most outputs listed.
 const MAX_LISTED: usize = 1000;
-/// The most bytes of JSON listed: an output of many files with long names takes a lot of room.
+/// The most bytes of JSON in a list: an output of many files with long names takes a lot of room.
 const MAX_LISTED_BYTES: usize = 16 * 1024 * 1024;
 
 /// An output to be stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NewOutput {
-    /// What it says.
+    /// The description of the output.
     pub set: OutputSet,
-    /// How many bytes of its robot's outputs stay.
+    /// The limit on the bytes of its robot's outputs.
     pub max_bytes: u64,
 }
 
 impl Store {
-    /// The newest outputs first, of one robot or of all in a scope, of one task or of all; at most
-    /// 1,000, and fewer if they are large.
+    /// The newest outputs first, of one robot or of all in a scope, of one task or of all. Returns
+    /// at most 1,000, and fewer if they are large.
     pub async fn outputs(
         &self,
         robot: Option<&RobotId>,
@@ -46,7 +46,7 @@ impl Store {
         )
         .bind(robot.map_or("", RobotId::as_str))
         .bind(task.map_or("", TaskName::as_str))
-        // How many of a scope's are among the newest is not known before they are looked at.
+        // The share of the scope among the newest outputs is not known before they are read.
         .bind(if scope.is_everything() { MAX_LISTED as i64 } else { i64::MAX })
         .fetch(lent.connection());
         let (mut views, mut bytes) = (Vec::new(), 0);
@@ -79,8 +79,8 @@ impl Store {
 }
 
 impl Write {
-    /// Notes an output, which takes the place of an earlier one of the same run. Gives the
-    /// manifests of the robot's repositories that are too many now, or have too many bytes.
+    /// Stores an output, which replaces an earlier one of the same run. Returns the manifests of
+    /// the robot's repositories that now exceed the limits on number or bytes.
     pub(in crate::store) async fn insert_output(
         &mut self,
         repository: &RepositoryName,
@@ -125,7 +125,7 @@ impl Write {
                 kept += 1;
                 kept_bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
             }
-            // Where one has no room, no older one has.
+            // If one output has no room, no older one has.
             if is_outlived || kept > KEPT_OF_ROBOT || kept_bytes > *max_bytes {
                 let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
                 surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));

@@ -1,5 +1,5 @@
-//! Which packages there are of a name, who should have them, and that nothing of a package is
-//! deleted that someone should have: whichever way the deletion comes, it is decided here.
+//! The packages of a name and the robots that should have them. Every deletion is decided here: no
+//! part of a package is deleted while a robot should have the package.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
@@ -13,21 +13,21 @@ use crate::store::fleet::robots::{KNOWN, known_robot};
 use crate::store::rows::{from_json, id};
 use crate::store::{Deed, KnownRobot, Store, StoreError, Write};
 
-/// How deleting a manifest, a tag or a blob ended.
+/// The outcome of deleting a manifest, a tag or a blob.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Deletion {
-    /// It is gone; these blobs were parts of it.
+    /// Deleted; these blobs were parts of it.
     Deleted(Vec<Digest>),
-    /// Nothing is deleted: robots should have the package it belongs to, or are to get it.
+    /// Not deleted: robots should have the package, or are to get it.
     InUse(PackageUsers),
-    /// There is no such thing.
+    /// There is no such manifest, tag or blob.
     Unknown,
 }
 
-/// Who keeps a package in use.
+/// The users of a package.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PackageUsers {
-    /// By which orders, each with those of the robots that it is for.
+    /// The deployments that use the package, each with its robots.
     pub deployments: Vec<(DeploymentId, Vec<RobotId>)>,
     /// The robots, sorted by name.
     pub robots: Vec<KnownRobot>,
@@ -38,14 +38,14 @@ impl PackageUsers {
         self.deployments.is_empty() && self.robots.is_empty()
     }
 
-    /// Whether some are none of the robots of the person who does this.
+    /// Whether some of the robots are outside the acting person's scope.
     fn are_others_than_of(&self, deed: &Deed) -> bool {
         self.robots.iter().any(|robot| !deed.covers(robot))
     }
 }
 
 impl Store {
-    /// Every package of a name: those with a tag first, each the newest first.
+    /// Every package of a name: tagged ones first, each group newest first.
     pub async fn package_versions(&self, name: &TaskName) -> Result<Vec<PackageView>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!("{PACKAGE_ROWS} WHERE p.name = $1")))
             .bind(name.as_str())
@@ -54,8 +54,8 @@ impl Store {
         ranked(&rows)
     }
 
-    /// The package that a version or a digest means: a version is what its tag points to, or the
-    /// newest that says so.
+    /// The package of a version or a digest. A version means the target of its tag, or else the
+    /// newest package with that version.
     pub async fn find_package(
         &self,
         name: &TaskName,
@@ -77,7 +77,8 @@ impl Store {
         Ok(at.map(|at| versions.swap_remove(at)))
     }
 
-    /// How many robots, of all or of `robots`, should have which package of a name.
+    /// The number of robots that should have each package of a name, among all robots or among
+    /// `robots`.
     pub async fn package_uses(
         &self,
         name: &TaskName,
@@ -112,8 +113,9 @@ impl Store {
         Ok(uses.map(|(manifest, robots)| PackageUse { manifest, robots }).collect())
     }
 
-    /// Removes a manifest with all its tags, unless robots should have a package that it is, is a
-    /// part of, or signs. A signature is also removed by a person whose robots all of those are.
+    /// Removes a manifest with all its tags. Refuses if robots should have a package that the
+    /// manifest is, is a part of, or signs. A person whose scope has all of those robots may remove
+    /// a signature.
     pub async fn delete_manifest(
         &self,
         repository: &RepositoryName,
@@ -132,7 +134,7 @@ impl Store {
         Ok(Deletion::Deleted(parts))
     }
 
-    /// Removes a tag, unless it is refused by [`Write::refusal_to_move`].
+    /// Removes a tag, unless [`Write::refusal_to_move`] refuses.
     pub async fn delete_tag(
         &self,
         repository: &RepositoryName,
@@ -151,7 +153,7 @@ impl Store {
         Ok(Deletion::Deleted(Vec::new()))
     }
 
-    /// Takes a blob out of a repository, on the terms of [`Self::delete_manifest`].
+    /// Removes a blob from a repository, on the terms of [`Self::delete_manifest`].
     pub async fn unlink_blob(
         &self,
         repository: &RepositoryName,
@@ -172,7 +174,7 @@ impl Store {
 }
 
 impl Write {
-    /// Who keeps this manifest or blob from being deleted out of `repository`.
+    /// The users that prevent the deletion of this manifest or blob from `repository`.
     async fn refusal_to_delete(
         &mut self,
         repository: &RepositoryName,
@@ -199,8 +201,8 @@ impl Write {
         Ok(None)
     }
 
-    /// Who keeps a tag from being deleted, or pointed to another manifest than `to`: robots that
-    /// should have the package it points to, and are outside of the person's scope.
+    /// The users that prevent deleting a tag, or pointing it to another manifest than `to`: robots
+    /// that should have the tagged package, and are outside the person's scope.
     pub(in crate::store) async fn refusal_to_move(
         &mut self,
         repository: &RepositoryName,

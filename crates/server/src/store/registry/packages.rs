@@ -1,5 +1,5 @@
-//! Repositories, manifests, tags and task packages: what the registry knows of the bytes in the
-//! blob store. It never touches those bytes, and never decides what is a valid manifest.
+//! Repositories, manifests, tags and task packages: the registry's records of the bytes in the blob
+//! store. This module never touches those bytes, and never decides whether a manifest is valid.
 
 use std::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -13,69 +13,70 @@ use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
 use crate::store::{Deed, NewOutput, PackageUsers, SignedDocument, Store, StoreError, Write, rows};
 
-/// A manifest's name inside its repository.
+/// A manifest's reference inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Reference {
-    /// By a tag, which may move.
+    /// A tag, which may move.
     Tag(Tag),
-    /// By what it hashes to.
+    /// The digest of the manifest.
     Digest(Digest),
 }
 
-/// A manifest that is in a repository.
+/// A manifest in a repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredManifest {
-    /// What it hashes to.
+    /// The manifest's digest.
     pub digest: Digest,
     /// Its size in bytes.
     pub size: u64,
-    /// The content type it was pushed with.
+    /// The content type given by the push.
     pub media_type: String,
 }
 
-/// A manifest to be stored.
+/// A manifest to be stored, with its parsed facts.
 #[derive(Debug, Clone)]
 pub struct NewManifest {
     /// The manifest itself.
     pub manifest: StoredManifest,
-    /// What a list of referrers says it is.
+    /// The artifact type, as shown in a list of referrers.
     pub artifact_type: Option<String>,
-    /// What a list of referrers says of it.
+    /// The annotations, as shown in a list of referrers.
     pub annotations: BTreeMap<String, String>,
-    /// The manifest it refers to: any digest, which need not be here.
+    /// The manifest that this one refers to: any digest, stored here or not.
     pub subject: Option<String>,
-    /// The blobs and manifests it is made of.
+    /// The blobs and manifests that this manifest consists of.
     pub parts: Vec<Digest>,
-    /// The tags that shall point to it.
+    /// The tags to point to the manifest.
     pub tags: Vec<Tag>,
-    /// Whether a package may take its version from another, which is outdated by that.
+    /// Whether the package may take its version from another one, which is outdated by that.
     pub takes_version: bool,
-    /// What it says if it is a task package.
+    /// The package and its task manifest, if this is a task package.
     pub package: Option<(PackageRef, TaskManifest)>,
-    /// What it says if it is the output of a run.
+    /// The output, if this is the output of a run.
     pub output: Option<NewOutput>,
-    /// What it brings if it is something that publishers have signed.
+    /// The signed document, if publishers have signed this.
     pub document: Option<SignedDocument>,
 }
 
-/// How storing a manifest ended.
+/// The outcome of storing a manifest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PutManifest {
-    /// It is stored.
+    /// The manifest is stored.
     Stored,
-    /// Nothing is stored: it is a package, and this other one has its version.
+    /// Not stored: this is a package, and this other one has its version.
     VersionTaken(Digest),
-    /// Nothing is stored: these parts are not in the repository.
+    /// Not stored: these parts are not in the repository.
     PartsMissing(Vec<Digest>),
-    /// Nothing is stored: it is a list of publishers, and another has its version or a later one.
+    /// Not stored: this is a list of publishers, and a stored one has the same version or a later
+    /// one.
     Outdated,
-    /// Nothing is stored: this tag points to a package of robots that are none of the person's.
+    /// Not stored: this tag points to a package in use by robots outside the person's scope.
     TagInUse(Tag, PackageUsers),
 }
 
 impl Store {
-    /// Stores a manifest and points its tags to it, if all its parts are in the repository. With a
-    /// `deed` that is written down, as below.
+    /// Stores a manifest and points its tags to it, if all its parts are in the repository. A
+    /// `deed` is recorded in the audit log in the same write.
     pub async fn put_manifest(
         &self,
         repository: &RepositoryName,
@@ -98,7 +99,7 @@ impl Store {
         {
             return Ok(PutManifest::Outdated);
         }
-        // What is stored for one order alone goes by its digest, and takes no version.
+        // A package stored for a single order is addressed by its digest, and takes no version.
         if let Some((package, _)) = new.package.as_ref().filter(|_| !new.tags.is_empty())
             && let Some(other) = write.other_of_version(package).await?
         {
@@ -132,7 +133,7 @@ impl Store {
         Ok(PutManifest::Stored)
     }
 
-    /// The manifest of that name.
+    /// Reads a manifest by tag or digest.
     pub async fn manifest(
         &self,
         repository: &RepositoryName,
@@ -163,7 +164,7 @@ impl Store {
         .transpose()
     }
 
-    /// A repository's tags in the order of their bytes; `None` if there is no such repository.
+    /// A repository's tags in byte order; `None` if there is no such repository.
     pub async fn tags(&self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
         let known: Option<i64> = sqlx::query_scalar(
             "SELECT CAST(1 AS BIGINT) WHERE EXISTS (SELECT 1 FROM manifests WHERE repository = $1)
@@ -181,12 +182,12 @@ impl Store {
             .await?;
         let mut tags =
             names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
-        // Sorted here: a database sorts by its locale.
+        // Sorted here, because a database sorts by its locale.
         tags.sort();
         Ok(Some(tags))
     }
 
-    /// Makes a blob part of a repository.
+    /// Adds a blob to a repository.
     pub async fn link_blob(
         &self,
         repository: &RepositoryName,
@@ -206,7 +207,7 @@ impl Store {
         write.commit().await
     }
 
-    /// Whether a blob is in `repository`, or in any if that is `None`.
+    /// Whether `repository` has the blob; with `None`, whether any repository has it.
     pub async fn has_blob(
         &self,
         repository: Option<&RepositoryName>,
@@ -224,11 +225,12 @@ impl Store {
         Ok(query.fetch_optional(&self.reads).await?.is_some())
     }
 
-    /// Every package, sorted by name; of one name those with a tag first, each the newest first.
+    /// All packages, sorted by name. Within a name, tagged packages come first, and each group is
+    /// sorted newest first.
     pub async fn packages(&self) -> Result<Vec<PackageView>, StoreError> {
         let rows = sqlx::query(PACKAGE_ROWS).fetch_all(&self.reads).await?;
         let mut packages = ranked(&rows)?;
-        // Stable: within a name the rank stays.
+        // The sort is stable and keeps the rank within a name.
         packages.sort_by(|one, other| one.package.name.cmp(&other.package.name));
         Ok(packages)
     }
@@ -250,7 +252,7 @@ impl Store {
 }
 
 impl Write {
-    /// Removes a tag; false if it was not there.
+    /// Removes a tag; false if there is none.
     pub(in crate::store) async fn delete_tag(
         &mut self,
         repository: &RepositoryName,
@@ -261,7 +263,7 @@ impl Write {
         Ok(query.execute(self.connection()).await?.rows_affected() > 0)
     }
 
-    /// Takes a blob out of a repository; false if it was not in it.
+    /// Removes a blob from a repository; false if the repository does not have the blob.
     pub(in crate::store) async fn unlink_blob(
         &mut self,
         repository: &RepositoryName,
@@ -273,8 +275,8 @@ impl Write {
         Ok(query.execute(self.connection()).await?.rows_affected() > 0)
     }
 
-    /// Removes a manifest with all its tags and says what it was made of; `None` if it was not
-    /// there.
+    /// Removes a manifest with all its tags, and returns its parts; `None` if there is no such
+    /// manifest.
     pub(in crate::store) async fn delete_manifest(
         &mut self,
         repository: &RepositoryName,
@@ -378,7 +380,7 @@ impl Write {
         Ok(())
     }
 
-    /// Another package that the version of this one means.
+    /// The digest of another package that has the version of this one.
     async fn other_of_version(
         &mut self,
         package: &PackageRef,
@@ -395,8 +397,7 @@ impl Write {
         other.map(|digest| rows::id("tags.manifest", &digest)).transpose()
     }
 
-    /// Marks the package `outdated` as one whose version means `package` from now on, and that one
-    /// as none.
+    /// Marks the package `outdated` as replaced by `package`, and `package` as not replaced.
     async fn replace_package(
         &mut self,
         package: &PackageRef,
@@ -437,13 +438,13 @@ impl Write {
     }
 }
 
-/// Packages, and whether a tag points to each: what is stored for one order alone, as by
-/// `taskd run`, has none.
+/// Packages, and whether a tag points to each. A package stored for a single order has no tag, as
+/// with `taskd run`.
 pub(in crate::store) const PACKAGE_ROWS: &str = "SELECT p.package, p.task_manifest, p.pushed_at_ms,
     (SELECT COUNT(*) FROM tags t WHERE t.repository = p.name AND t.manifest = p.manifest) AS tags FROM packages p";
 
-/// Those with a tag before the others, each the newest first: so that a name or a version means
-/// what was pushed under it.
+/// Tagged packages before the others, each group newest first. A name or a version thus means the
+/// package that was pushed under it.
 pub(in crate::store) fn ranked(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
     let views =
         rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));

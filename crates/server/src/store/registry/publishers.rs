@@ -1,5 +1,5 @@
-//! What publishers have signed: envelopes about packages, and their lists. The registry holds the
-//! bytes; here is which robots are told of which. Nothing is verified here.
+//! Signed documents of publishers: envelopes about packages, and lists of publishers. The registry
+//! holds the bytes; this module selects the robots that are told of each. Nothing is verified here.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -11,23 +11,23 @@ use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 
 use crate::store::{DesiredTasks, Store, StoreError, Write, rows};
 
-/// A signed document that a manifest brings, besides what any manifest has.
+/// The signed document of a manifest, in addition to the manifest itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SignedDocument {
     /// An envelope about the package with this manifest.
     Signature {
         /// The package.
         package: Digest,
-        /// The envelope.
+        /// The signed envelope.
         envelope: BlobRef,
     },
     /// A list of publishers.
     List {
-        /// Its version.
+        /// The version of the list.
         version: u64,
-        /// The envelope.
+        /// The signed envelope.
         envelope: BlobRef,
-        /// Whether its keepers are others than those of the one before.
+        /// Whether the keepers differ from those of the previous list.
         changes_keepers: bool,
     },
 }
@@ -46,8 +46,8 @@ impl Store {
         row.as_ref().map(|row| envelope("publisher_lists.envelope", row)).transpose()
     }
 
-    /// Whether the blob is something signed that `robot` may have to look at: a list of publishers,
-    /// or a signature of a package it should have.
+    /// Whether `robot` may have to verify the blob: a list of publishers, or a signature of a
+    /// package that the robot should have.
     pub async fn is_evidence_for(
         &self,
         robot: &RobotId,
@@ -89,8 +89,8 @@ impl Store {
         rows.iter().map(|row| rows::id("assignments.robot_id", row)).collect()
     }
 
-    /// Adds to what robots should have who has signed it, and lets that ride along where anything
-    /// does.
+    /// Adds the signatures to the desired state of robots. The documents are sent along if any
+    /// blobs are.
     pub(in crate::store) async fn add_evidence(
         &self,
         found: &mut [DesiredTasks],
@@ -112,7 +112,7 @@ impl Store {
                 );
             }
             if !wanted.along.is_empty() {
-                // First: without them all else is of no use.
+                // The evidence goes first: without it the other blobs are of no use.
                 wanted.along.splice(0..0, evidence.blobs());
             }
             wanted.evidence = evidence;
@@ -120,7 +120,7 @@ impl Store {
         Ok(())
     }
 
-    /// The lists that a robot may need to get to the newest, from whichever it has.
+    /// The lists that a robot may need to reach the newest, from any older one.
     async fn lists_to_follow(&self) -> Result<Vec<BlobRef>, StoreError> {
         if let Some(lists) = self.access.lists() {
             return Ok(lists);
@@ -183,7 +183,7 @@ impl Store {
 }
 
 impl Write {
-    /// Notes a signed document. False if it is a list that is not newer than all there are.
+    /// Records a signed document. Returns false for a list that is not newer than all stored ones.
     pub(in crate::store) async fn insert_document(
         &mut self,
         repository: &RepositoryName,
@@ -233,7 +233,7 @@ impl Write {
         }
     }
 
-    /// Forgets the signed document that a manifest brought.
+    /// Deletes the record of a manifest's signed document.
     pub(in crate::store) async fn delete_document(
         &mut self,
         repository: &RepositoryName,

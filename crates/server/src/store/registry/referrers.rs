@@ -1,5 +1,5 @@
-//! Which manifests refer to one, a page at a time: anything may have any number of them, and each
-//! says of itself what it likes.
+//! The manifests that refer to a manifest, one page at a time: their number is unlimited, and each
+//! brings texts of its own.
 
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
@@ -9,23 +9,23 @@ use task_proto::{Digest, RepositoryName};
 
 use crate::store::{Store, StoreError, rows};
 
-/// About the most bytes of a page as JSON, unless its first entry alone has more.
+/// Approximate limit of a page in bytes of JSON. A larger first entry is returned alone.
 const MAX_PAGE_BYTES: u64 = 4 * 1024 * 1024;
-/// What an entry has at most besides its texts, in bytes.
+/// The most bytes of an entry besides its texts.
 const ENTRY_BYTES: u64 = 256;
 
-/// Some of the manifests that refer to one.
+/// A page of referrers.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct ReferrersPage {
-    /// Sorted by digest.
+    /// The referrers, sorted by digest.
     pub manifests: Vec<Descriptor>,
-    /// The last of them, if there are more.
+    /// The last referrer of the page, if there are more.
     pub next: Option<Digest>,
 }
 
 impl Store {
-    /// The manifests whose subject is `subject`, of one type or of all: those after a digest, or
-    /// the first.
+    /// The manifests whose subject is `subject`, of one type or of all. The page begins after a
+    /// digest, or with the first manifest.
     pub async fn referrers(
         &self,
         repository: &RepositoryName,
@@ -35,7 +35,7 @@ impl Store {
     ) -> Result<ReferrersPage, StoreError> {
         let artifact_type = artifact_type.unwrap_or_default();
         let after = after.map_or_else(String::new, Digest::to_string);
-        // First how much each has to say, for all of it may be more than fits into memory.
+        // The sizes are read first, because all texts together may not fit into memory.
         let sizes: Vec<(String, i64)> = sqlx::query_as(
             "SELECT digest, CAST(octet_length(annotations) + octet_length(media_type)
                  + octet_length(COALESCE(artifact_type, '')) AS BIGINT) FROM manifests
@@ -70,8 +70,8 @@ impl Store {
     }
 }
 
-/// The last entry of a page that begins with the first of these, and whether there are more; `None`
-/// if there is nothing.
+/// The last entry of a page that begins with the first of these, and whether more follow; `None` if
+/// there are no entries.
 fn page_end(sizes: &[(String, i64)]) -> Option<(&str, bool)> {
     let mut bytes = 0;
     let fitting = sizes.iter().take_while(|(_, size)| {

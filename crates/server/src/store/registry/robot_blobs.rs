@@ -1,5 +1,5 @@
-//! How many bytes each robot keeps on the server's disk: of blobs and manifests in its
-//! repositories, from when they are there until they are collected. It knows no limit.
+//! The disk usage of each robot: the bytes of blobs and manifests in its repositories, from their
+//! arrival until they are collected. This module knows no limit.
 
 use std::collections::BTreeMap;
 
@@ -9,11 +9,11 @@ use task_proto::{Digest, RepositoryName, RobotId};
 
 use crate::store::{Store, StoreError, Write, rows};
 
-/// What the smallest file counts: there is more to keeping it than its bytes.
+/// The size that the smallest file counts: storing a file costs more than its bytes.
 const LEAST_BYTES: u64 = 64 * 1024;
 
-/// What one takes on the disk with its manifest and config, small files counted as [`LEAST_BYTES`]
-/// each, in bytes.
+/// The disk usage of one output with its manifest and config, in bytes. Small files count as
+/// [`LEAST_BYTES`] each.
 pub fn bytes_taken(output: &OutputSet) -> u64 {
     let blobs: BTreeMap<Digest, u64> =
         output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
@@ -21,7 +21,7 @@ pub fn bytes_taken(output: &OutputSet) -> u64 {
 }
 
 impl Store {
-    /// Counts a manifest or a blob among what its robot takes, if the repository is a robot's.
+    /// Adds a manifest or a blob to its robot's disk usage, if the repository is a robot's.
     pub async fn count_blob(
         &self,
         repository: &RepositoryName,
@@ -35,8 +35,7 @@ impl Store {
         write.commit().await
     }
 
-    /// Bytes that are kept of what a robot has brought, small files counted as [`LEAST_BYTES`]
-    /// each.
+    /// The disk usage of a robot's uploads, in bytes. Small files count as [`LEAST_BYTES`] each.
     pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
         let bytes: Option<i64> =
             sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
@@ -46,8 +45,8 @@ impl Store {
         Ok(rows::number(bytes.unwrap_or(0)))
     }
 
-    /// Blobs of manifests that robots had and have no more, and that nobody is known to be about to
-    /// list. Others' manifests may need them.
+    /// Blobs of deleted manifests of robots, except those that a known push may be about to list.
+    /// Manifests of others may still need them.
     pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
         let texts: Vec<String> = sqlx::query_scalar(
             "SELECT DISTINCT d.digest FROM robot_blobs d WHERE d.dropped = 1
@@ -62,7 +61,7 @@ impl Store {
 }
 
 impl Write {
-    /// Notes that a manifest is about to be no more, if the repository is a robot's.
+    /// Records that a manifest is about to be deleted, if the repository is a robot's.
     pub(in crate::store) async fn drop_of_robot(
         &mut self,
         repository: &RepositoryName,
@@ -81,8 +80,8 @@ impl Write {
         Ok(())
     }
 
-    /// As [`Store::count_blob`]. What is counted once stays so until the blob is collected: whether
-    /// it was already.
+    /// Does the same as [`Store::count_blob`]. A blob stays counted until it is collected. Returns
+    /// whether the blob was counted already.
     pub(in crate::store) async fn count_blob(
         &mut self,
         repository: &RepositoryName,
@@ -109,7 +108,7 @@ impl Write {
         Ok(false)
     }
 
-    /// Counts that a repository of a robot's got a blob that another of its has.
+    /// Counts that one repository of a robot got a blob which another of its repositories has.
     pub(in crate::store) async fn count_link(
         &mut self,
         repository: &RepositoryName,
@@ -128,7 +127,7 @@ impl Write {
         self.add_to_robot(robot.as_str(), bytes).await
     }
 
-    /// Counts a blob no more, for it is collected.
+    /// Removes a collected blob from the disk usage.
     pub(in crate::store) async fn uncount_blob(
         &mut self,
         digest: &Digest,

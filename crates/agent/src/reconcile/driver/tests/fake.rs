@@ -1,4 +1,4 @@
-//! A robot that only takes notes of what the driver makes it do, and does what the test says.
+//! A fake robot that records the driver's calls and behaves as the test says.
 
 use std::collections::BTreeSet;
 use std::sync::Mutex;
@@ -24,11 +24,11 @@ pub(super) struct Fake {
     pub(super) slow: std::sync::atomic::AtomicBool,
     /// Changes when a process has ended.
     exited: watch::Sender<()>,
-    /// Pulls of content that were told to come back later.
+    /// The number of content pulls that were told to come back later.
     pub(super) pulls: watch::Sender<u32>,
-    /// Looks at processes of which nothing can be told.
+    /// The number of observations of processes with an undeterminable state.
     pub(super) looks: watch::Sender<u64>,
-    /// What who gathers parts says of those that are lacking.
+    /// The missing parts, as announced by the gathering step.
     pub(super) asks: watch::Sender<Asks>,
 }
 
@@ -39,46 +39,47 @@ pub(super) struct State {
     pub(super) alive: BTreeSet<String>,
     pub(super) started: Vec<(DeploymentId, u64)>,
     cancelled: u32,
-    /// How long the next pulls of content are told to wait, the last one first.
+    /// The waits, in milliseconds, that the next content pulls are told; the last one comes first.
     pub(super) told_to_wait: Vec<u64>,
-    /// What came with the newest order.
+    /// The blobs that came with the newest order.
     pub(super) offered: Vec<(BlobRef, Bytes)>,
-    /// The tasks whose contents were pulled, in this order.
+    /// The tasks of the pulled contents, in order.
     pub(super) pulled: Vec<TaskName>,
     pub(super) kept_parts: Vec<Vec<Digest>>,
     pub(super) ledgers: Vec<Ledger>,
     pub(super) held: bool,
-    /// What the robot's clock shows, if it is wrong.
+    /// The reading of the robot's clock, if it is wrong.
     pub(super) wall_ms: Option<u64>,
     pub(super) disk_full: bool,
-    /// What comes of a stop and of a removal, if they fail.
+    /// The failures of stops and removals, if any.
     pub(super) stop: Option<StepFailure>,
     pub(super) removal: Option<StepFailure>,
-    /// What packages say they need, what the robot has, and what of it was seen.
+    /// The dependencies that packages declare, those that the robot has, and those that the last
+    /// inspection saw.
     pub(super) exec_depends: Vec<String>,
     pub(super) ros_packages: BTreeSet<String>,
     seen_packages: BTreeSet<String>,
-    /// What the robot's gate says, if it has one, and what it was asked.
+    /// The answer of the robot's gate, if there is one, and the questions it was asked.
     pub(super) gate: Option<Result<(), String>>,
     pub(super) asked: Vec<GateStep>,
-    /// What comes of an upload, unless it takes its time, and the runs whose files were sent.
+    /// The outcome of an upload, unless it hangs, and the runs of the uploaded files.
     pub(super) upload: Option<Result<(), StepFailure>>,
     pub(super) collected: Vec<u64>,
-    /// The processes are jobs with files.
+    /// Whether the processes are jobs with output files.
     pub(super) jobs: bool,
-    /// How processes ended.
+    /// The exit code of each ended process.
     exits: Vec<(String, i32)>,
-    /// Of processes that have ended nothing can be told.
+    /// Whether the state of ended processes cannot be determined.
     pub(super) hangs: bool,
-    /// Versions that nobody trusted has signed, and what is gone by.
+    /// Versions without a trusted signature, and the trust facts.
     pub(super) untrusted: BTreeSet<Digest>,
     pub(super) trust: TrustFacts,
-    /// The states whose evidence was noted, and the versions whose signers were looked for.
+    /// The states with recorded evidence, and the versions with checked signers.
     pub(super) heeded: Vec<Generation>,
     pub(super) checked: Vec<Digest>,
-    /// Versions that never get ready.
+    /// Versions that never become ready.
     pub(super) bad: BTreeSet<Digest>,
-    /// What ROS says of every process that lives.
+    /// The health of every live process.
     health: watch::Sender<Health>,
 }
 
@@ -87,7 +88,7 @@ impl Fake {
         look(&mut self.state.lock().expect("no test panicked"))
     }
 
-    /// Ends the process that lives.
+    /// Ends the live process.
     pub(super) fn exit(&self, code: i32) {
         self.state(|state| {
             let ended = std::mem::take(&mut state.alive);

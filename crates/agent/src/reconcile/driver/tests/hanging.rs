@@ -1,4 +1,4 @@
-//! A task of whose process nothing can be told: it is left alone, and the others go on.
+//! A task with a process of undeterminable state is left alone, and the other tasks continue.
 
 use super::*;
 

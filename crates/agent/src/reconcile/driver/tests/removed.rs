@@ -1,4 +1,4 @@
-//! A robot that its server does not know any more, and what makes it known again.
+//! A robot that its server no longer knows, and the messages that make the robot known again.
 
 use super::*;
 
@@ -53,7 +53,8 @@ async fn nobody_but_the_server_makes_a_removed_robot_known_again() {
     };
     bench.say(again(false)).await;
     bench.phase(Phase::Running).await;
-    // Whatever is on the broker: what others have signed, and what the server has said before.
+    // Other messages on the broker do not count: those signed by others, and old ones from the
+    // server.
     for message in [bench.sealed(2, tasks.clone(), &SigningKey::random()), again(false)] {
         bench.say(Heard::TokenRefused("revoked".to_owned())).await;
         bench.report(|report| has(report, "removed")).await;
@@ -63,7 +64,7 @@ async fn nobody_but_the_server_makes_a_removed_robot_known_again() {
         bench.say(Heard::Unchanged).await;
         bench.report(|report| !has(report, "after_it") && !has(report, "removed")).await;
     }
-    // The server's answer, and what it has signed since.
+    // The server's answer, and a newly signed state.
     for message in [again(true), bench.sealed(2, tasks, &bench.key)] {
         bench.say(Heard::TokenRefused("revoked".to_owned())).await;
         bench.report(|report| has(report, "removed")).await;

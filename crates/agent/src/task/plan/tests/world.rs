@@ -1,5 +1,5 @@
-//! The simulated world: one robot with one task, on which things happen in any order. Acts for the
-//! agent exactly as the plan decides, and checks on the way that no job is started twice.
+//! The simulated world: one robot with one task, and events in any order. The world acts for the
+//! agent exactly as the plan decides, and checks on the way that no job starts twice.
 
 use proptest::prelude::*;
 use task_proto::desired::{BlobRef, Delivery};
@@ -18,15 +18,15 @@ use crate::task::plan::*;
 pub(super) struct World {
     pub(super) desired: Option<DesiredTask>,
     pub(super) record: Option<TaskRecord>,
-    /// The processes that live, by their directory.
+    /// The live processes, by their directory.
     pub(super) alive: Vec<String>,
-    /// How those ended that do not.
+    /// The exit status of each ended process.
     ended: Vec<(String, Option<ExitStatus>)>,
-    /// Versions whose manifest, content and build are there.
+    /// Versions on the disk, with the number of completed steps: manifest, content, build.
     pub(super) disk: Vec<(PackageRef, u8)>,
-    /// The steps under way, with whether their effect has happened.
+    /// The steps under way, and whether their effect has happened.
     pub(super) steps: Vec<(Step, bool)>,
-    /// (deployment, run) of every process of a job that was ever started.
+    /// The (deployment, run) pair of every job process ever started.
     job_starts: Vec<(DeploymentId, u64)>,
     boot: u32,
     pub(super) start: u64,
@@ -35,20 +35,20 @@ pub(super) struct World {
     may_begin: bool,
     pub(super) manifest: Run,
     ros_seen: bool,
-    /// What ROS says of the process that lives, unless its version is bad.
+    /// The health of the live process, unless its version is bad.
     pub(super) health: Health,
-    /// The number of the package that never gets ready.
+    /// The number of the package that never becomes ready.
     pub(super) bad: Option<u8>,
     pub(super) gated: bool,
     pub(super) outputs: Outputs,
-    /// Whether the robot asks who has signed a version, those whose signatures are on its disk, and
-    /// whether these are enough.
+    /// Whether the robot checks signatures, the versions with signatures on its disk, and whether
+    /// these signatures suffice.
     pub(super) asks: bool,
     vouched: Vec<PackageRef>,
     signed: bool,
 }
 
-/// What can happen.
+/// An event in the world.
 #[derive(Debug, Clone)]
 pub(super) enum Happening {
     Order {
@@ -57,15 +57,15 @@ pub(super) enum Happening {
         stop: bool,
     },
     Withdraw,
-    /// The effect of a step happens, well or badly; the agent does not know it yet.
+    /// The effect of a step happens, well or badly; the agent does not know yet.
     Effect {
         well: bool,
     },
-    /// The server has no room for a pull and says when to come back.
+    /// The server has no capacity for a pull and says when to come back.
     ToldToWait {
         ms: u64,
     },
-    /// A start finds that what is on the disk was changed, and deletes it.
+    /// A start finds changed files on the disk and deletes them.
     FindsChange,
     /// The agent learns of the ends of steps.
     Learn,
@@ -77,7 +77,7 @@ pub(super) enum Happening {
     Reboot,
     Hold(bool),
     MayBegin(bool),
-    /// Signatures are enough, or not any more.
+    /// Whether the signatures suffice from now on.
     Signed(bool),
     Gate(bool),
     Sees(Sight),
@@ -86,7 +86,7 @@ pub(super) enum Happening {
     },
 }
 
-/// What ROS can be seen to say.
+/// An observation of the ROS graph.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Sight {
     Nothing,
@@ -241,10 +241,10 @@ impl World {
         }
     }
 
-    /// The driver's loop: plans both lanes until they rest.
+    /// The driver's loop: plans all lanes until they rest.
     pub(super) fn plan(&mut self) {
         let desired = self.desired.clone();
-        // An interrupted step has no further effect; the driver waits for that before it begins
+        // An interrupted step has no further effect; the driver waits for its end before beginning
         // another.
         self.steps.retain(|(step, _)| step.is_wanted(desired.as_ref(), self.record.as_ref()));
         if self.record.is_none() {
@@ -292,7 +292,7 @@ impl World {
         let vouched = new.map_or(Vouched::Yes, |package| self.vouched_for(package));
         assert_eq!(vouched, Vouched::Yes, "nobody trusted has signed what is begun: {step:?}");
         self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
-        // What a start will do is fixed by the record written before it.
+        // The record written before a start fixes the content of the start.
         let step = match step {
             Step::Start(_) => Step::Start(Box::new(
                 self.record.clone().and_then(|record| record.active).expect("begun"),
@@ -470,8 +470,8 @@ impl World {
             Step::Remove => {
                 assert!(self.alive.is_empty(), "removes a task that runs");
                 self.disk.clear();
-                // With the task its history and directories go: the same order afterwards is a new
-                // one.
+                // Removing the task removes its history and directories: the same order afterwards
+                // is a new one.
                 self.job_starts.clear();
                 self.ended.clear();
             }
@@ -502,7 +502,7 @@ impl World {
         }
     }
 
-    /// Lets everything go well until nothing is left to do.
+    /// Lets every step succeed until no work is left.
     pub(super) fn settle(&mut self) {
         self.happen(Happening::Hold(false));
         self.happen(Happening::MayBegin(true));

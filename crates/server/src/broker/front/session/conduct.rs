@@ -1,4 +1,5 @@
-//! How a robot's session notices that it misbehaves: each packet is weighed, each end judged.
+//! Detects violations in a robot's session: each packet counts against the limits, and each end of
+//! a session is classified.
 
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::time::{Instant, sleep_until};
@@ -7,15 +8,15 @@ use super::{End, Session};
 use crate::broker::front::codec::{DecodeError, Received};
 use crate::limits::conduct::{Offence, Verdict};
 
-/// Subscriptions to what is not for it that a robot may try in one session.
+/// Maximum refused subscriptions that a robot may attempt in one session.
 const MAX_REFUSED_FILTERS: u32 = 16;
-/// How much more of an unfinished packet has to come for the client to count as heard: who trickles
-/// is silent.
+/// Progress of an unfinished packet that counts as activity: a client that sends more slowly counts
+/// as silent.
 const HEARD_BYTES: usize = 1024;
 
 impl End {
-    /// What a robot did that ended like this, if none of ours would do that. (A flood has been
-    /// noticed before.)
+    /// The violation behind this end, if a correct robot would never cause it. (Floods have been
+    /// detected before.)
     pub(super) fn offence(self) -> Option<Offence> {
         match self {
             Self::Malformed(DecodeError::TooLarge(bytes)) => Some(Offence::TooLarge(bytes)),
@@ -30,8 +31,8 @@ impl End {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
-    /// Counts a packet of the robot's. If it is more than may come now, it is the last one for a
-    /// while; if that goes on, the last one of the session.
+    /// Counts a packet of the robot. A packet beyond the limits is the last one for a while; if the
+    /// excess continues, the last one of the session.
     pub(super) fn weigh(&mut self, received: &Received, bytes: usize) -> Result<(), End> {
         let Some(watched) = self.watched else { return Ok(()) };
         let messages = u64::from(!received.is_answer());
@@ -43,14 +44,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         Ok(())
     }
 
-    /// Whoever sends a large packet over a slow way is not silent meanwhile.
+    /// A client that sends a large packet over a slow network is not silent meanwhile.
     pub(super) fn hear_progress(&mut self) {
         if self.input.len() >= self.heard_bytes + HEARD_BYTES {
             (self.heard_at, self.heard_bytes) = (Instant::now(), self.input.len());
         }
     }
 
-    /// A robot's subscription to what is not for it is refused.
+    /// Counts a refused subscription of a robot.
     pub(super) fn refuse_filter(&mut self) -> Result<(), End> {
         self.refused_filters += 1;
         if self.watched.is_some() && self.refused_filters > MAX_REFUSED_FILTERS {
@@ -60,7 +61,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 }
 
-/// Comes then; never if it is `None`.
+/// Resolves at this time; never if `None`.
 pub(super) async fn until(at: Option<Instant>) {
     match at {
         Some(at) => sleep_until(at).await,

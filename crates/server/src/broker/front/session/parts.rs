@@ -1,4 +1,4 @@
-//! A session's part in fan-outs: the packages it hears, and which of their parts its robot has not
+//! A session's state in fan-outs: its package subscriptions, and the parts that its robot has not
 //! acknowledged yet.
 
 use std::collections::HashMap;
@@ -17,21 +17,21 @@ use crate::broker::front::access::Hearing;
 use crate::broker::front::codec::encode_publish_head;
 use crate::broker::front::parts::{Due, Member};
 
-/// What may be left to write of a part that the robot may no longer have; more would keep the
+/// Maximum unwritten bytes of a part after the robot's permission is withdrawn; more would keep the
 /// connection busy in vain.
 const MAX_VAIN_BYTES: usize = 256 * 1024;
 
-/// The packages a session hears.
+/// The package subscriptions of a session.
 #[derive(Default)]
 pub(super) struct Parts {
     members: HashMap<Digest, Member>,
-    /// Says that one of them has news.
+    /// Wakes the session when a package has news.
     news: Arc<Notify>,
     /// By packet id: parts that are sent and not acknowledged.
     in_flight: HashMap<u16, (Digest, u64)>,
     /// The part that needs no acknowledgement and is being written.
     writing: Option<(Digest, u64)>,
-    /// The package whose part was sent last: it is another one's turn.
+    /// The package whose part was sent last: the next turn belongs to another one.
     last: Option<Digest>,
 }
 
@@ -44,7 +44,7 @@ impl Parts {
         self.members.insert(digest, member);
     }
 
-    /// Hears the package no longer; acknowledgements that are still to come mean nothing.
+    /// Ends the subscription to the package; later acknowledgements are ignored.
     pub(super) fn leave(&mut self, digest: &Digest) {
         self.members.remove(digest);
         self.in_flight.retain(|_, (of, _)| of != digest);
@@ -58,7 +58,7 @@ impl Parts {
         }
     }
 
-    /// All that was sent is with the system.
+    /// All sent bytes are with the operating system.
     pub(super) fn written(&mut self) {
         if let Some((digest, number)) = self.writing.take() {
             self.done(&digest, number);
@@ -71,7 +71,7 @@ impl Parts {
         }
     }
 
-    /// The first thing that is due, of all packages by turns.
+    /// The first due action, with packages taking turns.
     fn first_due(&self, may_send: bool) -> Option<(Digest, Due)> {
         let by_turns = |is_last: bool| {
             self.members.iter().filter(move |(digest, _)| (Some(**digest) == self.last) == is_last)
@@ -84,7 +84,7 @@ impl Parts {
     }
 }
 
-/// Waits until there is something to do: a part, if one may be sent, or a package that has ended.
+/// Waits until there is an action: a part, if one may be sent, or a package that has ended.
 /// Cancel-safe, since nothing is taken yet.
 pub(super) async fn due(parts: &Parts, may_send: bool) -> (Digest, Due) {
     loop {

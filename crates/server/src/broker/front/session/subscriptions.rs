@@ -1,4 +1,4 @@
-//! What a session hears: its subscriptions, and what of the router's messages they let through.
+//! A session's subscriptions, and the delivery of matching router messages.
 
 use rumqttd::protocol::{Packet, QoS, SubAck, SubscribeReasonCode, UnsubAck};
 use task_proto::Digest;
@@ -10,12 +10,12 @@ use crate::broker::front::access::{Hearing, Visitor, matches, may_subscribe};
 use crate::broker::front::parts::Member;
 use crate::broker::router::Heard;
 
-/// The longest filter: far longer than any topic, and a session may keep as many as there may be.
+/// Maximum length of a filter: far longer than any topic, and a session may keep many filters.
 const MAX_FILTER_BYTES: usize = 1024;
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     pub(super) fn subscribe(&mut self, pkid: u16, filters: Vec<(String, QoS)>) -> Result<(), End> {
-        // No client can know the bound, so what is beyond it is refused and no offence.
+        // No client can know the limit, so filters beyond it are refused and are no violation.
         let (count, max_filters) = (filters.len(), self.context.limits.max_filters);
         let mut return_codes = Vec::with_capacity(count);
         for (filter, qos) in filters.into_iter().take(max_filters) {
@@ -37,7 +37,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                     SubscribeReasonCode::Success(qos)
                 }
                 _ => {
-                    // What it was granted before it asked again, if that has ended meanwhile.
+                    // The earlier subscription to this filter, if it has ended meanwhile.
                     self.hearing.remove(&filter);
                     SubscribeReasonCode::Failure
                 }
@@ -67,8 +67,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         self.send(Packet::UnsubAck(UnsubAck { pkid, reasons: Vec::new() }, None));
     }
 
-    /// Sends what came out of the router if a subscription matches, once, as the best of them has
-    /// it.
+    /// Sends a router message if a subscription matches: once, with the highest matching QoS.
     pub(super) fn pass_on(&mut self, heard: Heard) {
         let matching = self.hearing.iter().filter(|(filter, _)| matches(filter, &heard.topic));
         let best = matching.map(|(_, (_, qos))| *qos).max_by_key(|qos| *qos as u8);
@@ -77,10 +76,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
     }
 
-    /// Counts this session among those who hear the package; false if it may not.
+    /// Counts this session among the package's subscribers; false if it has no permission.
     fn join(&mut self, digest: Digest) -> bool {
         let Visitor::Robot { robot, .. } = &self.visitor else { return false };
-        // One of an earlier fan-out of the same package counts no longer.
+        // A subscription from an earlier fan-out of the same package no longer counts.
         self.parts.leave(&digest);
         let Some(grant) = self.context.grants.of(&digest, robot) else { return false };
         let member = Member::join(grant, robot, self.parts.news());

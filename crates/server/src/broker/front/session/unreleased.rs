@@ -1,5 +1,6 @@
-//! The QoS 2 messages that a client has sent and not released. MQTT 3.1.1 lets it have as many as
-//! there are packet ids, so they are bits: 8 KiB for all of them, and nothing for who has none.
+//! The QoS 2 messages that a client has sent and not released. MQTT 3.1.1 permits one for each
+//! packet id, so they are stored as bits: 8 KiB for all of them, and no memory for a client without
+//! any.
 
 /// Their packet ids.
 #[derive(Debug, Default)]
@@ -29,7 +30,7 @@ impl Unreleased {
     }
 }
 
-/// In which word, and which bit of it.
+/// The index of the word, and the bit within the word.
 fn place(id: u16) -> (usize, u64) {
     (usize::from(id / 64), 1 << (id % 64))
 }

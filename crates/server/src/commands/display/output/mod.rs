@@ -1,5 +1,5 @@
-//! What people and programs read: results on stdout as table or JSON, everything else on stderr. A
-//! reader that goes away (a closed pipe) is no error: what it no longer wants is dropped.
+//! Output for people and programs: results on stdout as table or JSON, everything else on stderr. A
+//! closed pipe is no error: the remaining output is dropped.
 
 pub(in crate::commands) mod table;
 
@@ -39,32 +39,32 @@ impl Output {
         Self { format, look: Look { wide, width, colours } }
     }
 
-    /// How results are printed.
+    /// The output format.
     pub(crate) fn format(&self) -> Format {
         self.format
     }
 
-    /// Whether colours may repeat what words say.
+    /// Whether colours may be used in addition to words.
     pub(crate) fn has_colours(&self) -> bool {
         self.look.colours
     }
 
-    /// A table that looks as it should here.
+    /// A table in the layout of this output.
     pub(crate) fn table(&self, columns: &Columns, rows: &[Vec<String>]) -> String {
         table(columns, rows, self.look)
     }
 
-    /// Prints `value` as JSON, whatever the format.
+    /// Prints `value` as JSON, in every format.
     pub(crate) fn json<T: Serialize>(&self, value: &T) -> Result<(), CommandError> {
         print(&json(value)?).map(drop)
     }
 
-    /// Prints a text whose parts hold nothing that a terminal would obey.
+    /// Prints a text whose parts contain no terminal control characters.
     pub(crate) fn text(&self, text: &str) -> Result<(), CommandError> {
         print(text).map(drop)
     }
 
-    /// Prints names, one a line.
+    /// Prints names, one per line.
     pub(crate) fn lines(
         &self,
         lines: impl Iterator<Item = impl AsRef<str>>,
@@ -72,7 +72,7 @@ impl Output {
         print(&lines.map(|line| printable(line.as_ref())).collect::<Vec<_>>().join("\n")).map(drop)
     }
 
-    /// Prints the list `value`: as JSON, or as the rows that `rows` makes of it.
+    /// Prints the list `value`: as JSON, or as the rows that `rows` makes of the list.
     pub(crate) fn result<T: Serialize>(
         &self,
         value: &T,
@@ -82,7 +82,7 @@ impl Output {
         self.listed(value, columns, rows).map(drop)
     }
 
-    /// The same, for one of many times; false when nobody reads any more.
+    /// Prints one of many successive lists; false once the reader has closed the pipe.
     pub(crate) fn listed<T: Serialize>(
         &self,
         value: &T,
@@ -97,8 +97,8 @@ impl Output {
         print(&text)
     }
 
-    /// Prints the one thing `value`: as JSON, as the name it goes by, or as the text that
-    /// `describe` makes of it, whose parts hold nothing that a terminal would obey.
+    /// Prints the single `value`: as JSON, as its name, or as the text that `describe` makes of the
+    /// value. The parts of that text contain no terminal control characters.
     pub(crate) fn described<T: Serialize>(
         &self,
         value: &T,
@@ -132,13 +132,13 @@ fn unprintable(error: serde_json::Error) -> CommandError {
     CommandError::Io { what: "can't print the result".to_owned(), source: error.into() }
 }
 
-/// One of many values, on one line.
+/// Prints one of many values, on one line.
 pub(crate) fn json_line<T: Serialize>(value: &T) -> Result<String, CommandError> {
     serde_json::to_string(value).map(escaped).map_err(unprintable)
 }
 
-/// JSON as a terminal may see it: the control characters that JSON itself allows, which lie in
-/// texts only, are escaped.
+/// JSON that is safe on a terminal: control characters that JSON allows, which occur only in
+/// strings, are escaped.
 fn escaped(json: String) -> String {
     if !json.contains(is_c1) {
         return json;
@@ -159,7 +159,7 @@ fn print(text: &str) -> Result<bool, CommandError> {
     }
 }
 
-/// Prints a part of what goes on; false when nobody reads it any more.
+/// Prints a part of a stream; false once the reader has closed the pipe.
 pub(crate) fn stream_text(text: &str) -> Result<bool, CommandError> {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
@@ -171,25 +171,25 @@ pub(crate) fn stream_text(text: &str) -> Result<bool, CommandError> {
     }
 }
 
-/// `text` on one line and without control characters, nor those that turn a line's direction: a
-/// robot or a package may have put them there.
+/// `text` on one line, without control characters and bidirectional controls, which a robot or a
+/// package may have inserted.
 pub(crate) fn printable(text: &str) -> String {
     let turns = |c: char| matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     text.chars().map(|c| if c.is_control() || turns(c) { ' ' } else { c }).collect()
 }
 
-/// The same for a text of several lines, which stay.
+/// The printable form of a text of several lines; line breaks stay.
 fn shown(text: &str) -> String {
     text.split('\n').map(printable).collect::<Vec<_>>().join("\n")
 }
 
-/// Says `text` on stderr: a server's or a robot's words may be in it. Nobody may be listening,
-/// which is no reason to fail.
+/// Prints `text` on stderr; the text may contain words of a server or a robot. A closed stderr is
+/// no reason to fail.
 pub(crate) fn say(text: &str) {
     let _ = writeln!(io::stderr().lock(), "{}", shown(text));
 }
 
-/// Says what went wrong and why, the whole chain.
+/// Prints an error with its whole chain of causes.
 pub(crate) fn complain(error: &CommandError) {
     let mut text = format!("taskd: {error}");
     let mut source = std::error::Error::source(error);
@@ -200,7 +200,7 @@ pub(crate) fn complain(error: &CommandError) {
     say(&text);
 }
 
-/// Whether a person sees stderr, so that progress may move.
+/// Whether stderr is a terminal, so that progress bars may be drawn.
 pub(crate) fn stderr_is_terminal() -> bool {
     io::stderr().is_terminal()
 }
@@ -211,7 +211,7 @@ pub(crate) fn time(ms: u64) -> String {
     format!("{} {}Z", &text[..10], &text[11..19])
 }
 
-/// So many robots, as people say it.
+/// A number of robots in words.
 pub(crate) fn robots(count: u64) -> String {
     if count == 1 { "1 robot".to_owned() } else { format!("{count} robots") }
 }

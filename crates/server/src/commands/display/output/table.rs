@@ -1,33 +1,32 @@
-//! A table without lines, its columns two spaces apart: as wide as what is in it, or as the
-//! terminal that shows it. Text only; what a state means is said by its word, and colour only
-//! repeats it.
+//! A table without lines, its columns two spaces apart: as wide as its contents, or as the
+//! terminal. Text only; the words carry the meaning of a state, and colour only repeats them.
 
 use unicode_width::{UnicodeWidthChar as _, UnicodeWidthStr as _};
 
 use super::printable;
 
-/// What stands between two columns.
+/// The gap between two columns, in spaces.
 const GAP: usize = 2;
-/// A column is not cut below this, however narrow the terminal.
+/// A column is never cut below this width, however narrow the terminal.
 const MIN_CUT: usize = 8;
 /// Columns that are typed or copied from the screen, and so are never cut.
 const WHOLE: [&str; 6] = ["id", "name", "robot", "deployment", "task", "version"];
 /// Columns whose first word has a colour.
 const COLOURED: [&str; 2] = ["state", "phase"];
 
-/// What a list shows of each of its things.
+/// The columns of a list.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Columns {
-    /// The title of the column that says what a thing goes by: all that `-o name` prints.
+    /// The title of the column with the object's name: the only output of `-o name`.
     pub(crate) name: &'static str,
-    /// What every table shows.
+    /// Columns of every table.
     pub(crate) narrow: &'static [&'static str],
-    /// What a wide one shows as well.
+    /// Additional columns of a wide table.
     pub(crate) wide: &'static [&'static str],
 }
 
 impl Columns {
-    /// Those that every table shows, by the first of which a thing goes.
+    /// The columns of every table; the first one is the object's name.
     pub(crate) const fn of(narrow: &'static [&'static str]) -> Self {
         Self { name: narrow[0], narrow, wide: &[] }
     }
@@ -45,12 +44,12 @@ impl Columns {
     }
 }
 
-/// How a table is to look.
+/// Layout of a table.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Look {
-    /// Whether it has the further columns.
+    /// Whether the wide columns are shown.
     pub(crate) wide: bool,
-    /// How many characters a line may have; absent: any number.
+    /// Maximum characters per line; absent: unlimited.
     pub(crate) width: Option<usize>,
     /// Whether states have colours.
     pub(crate) colours: bool,
@@ -95,7 +94,8 @@ fn widths(lines: &[Vec<String>], count: usize) -> Vec<usize> {
         .collect()
 }
 
-/// Widths that fit a line of `limit` characters as far as columns may be cut, the widest cut first.
+/// Column widths that fit a line of `limit` characters as far as columns may be cut, the widest cut
+/// first.
 fn fitted(titles: &[&str], mut widths: Vec<usize>, limit: Option<usize>) -> Vec<usize> {
     let Some(limit) = limit else { return widths };
     let room = limit.saturating_sub(GAP * widths.len().saturating_sub(1));
@@ -113,7 +113,7 @@ fn fitted(titles: &[&str], mut widths: Vec<usize>, limit: Option<usize>) -> Vec<
     widths
 }
 
-/// `cell` in at most `width` characters; an ellipsis stands for what is missing.
+/// `cell` in at most `width` characters; an ellipsis replaces the rest.
 fn cut(cell: &str, width: usize) -> String {
     if cell.width() <= width {
         return cell.to_owned();
@@ -179,7 +179,7 @@ mod tests {
             );
         }
         assert!(!fit(80).contains('…'));
-        // Narrower than what must not be cut.
+        // Narrower than the columns that must not be cut.
         assert!(fit(5).contains("a [31mb c"));
     }
 

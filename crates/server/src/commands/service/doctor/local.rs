@@ -1,6 +1,6 @@
-//! What `taskd doctor` looks at on the machine that the server is on, or is to be on: its
-//! directory, the disk, how many files may be open, its settings and its ports. It opens no secret,
-//! and the database only where no server runs, to check it.
+//! The checks of `taskd doctor` on the machine of the server: its directory, the disk, the limit of
+//! open files, its settings and its ports. No secret is opened. The database is opened only if no
+//! server runs, for a check.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
@@ -19,12 +19,12 @@ use crate::net::open_files;
 use crate::store::check_at_rest;
 use crate::system::data_directory::is_locked;
 
-/// With less free the database may be refused its next page.
+/// Below this free space the database may be unable to grow.
 const LOW_BYTES: u64 = 256 << 20;
-/// With less than this share free it is time to look.
+/// Below this share of free space the operator should act.
 const LOW_PERCENT: u64 = 10;
 
-/// Looks at `data`, and at what a server there would need if none answers.
+/// Checks `data`, and the preconditions of a server there if none answers.
 pub(in crate::commands) async fn check(checkup: &mut Checkup, data: &Path, is_up: bool) {
     if let Some(owner) = anothers(data) {
         return checkup.notice(
@@ -48,7 +48,8 @@ pub(in crate::commands) async fn check(checkup: &mut Checkup, data: &Path, is_up
     }
 }
 
-/// Whose the directory is, if it is closed to this account because it is another's.
+/// The owner of the directory, if the directory belongs to another account and is closed to this
+/// one.
 fn anothers(data: &Path) -> Option<u32> {
     let owner = std::fs::metadata(data).ok()?.uid();
     let is_closed = access(data, AccessFlags::R_OK | AccessFlags::X_OK).is_err();
@@ -77,7 +78,7 @@ fn directory(checkup: &mut Checkup, data: &Path) {
     }
 }
 
-/// Whether the structure of a SQLite file that nobody serves is sound.
+/// Whether the structure of a SQLite file without a running server is sound.
 async fn database(checkup: &mut Checkup, data: &Path, config: &Config) {
     let path = data.join("taskd.sqlite");
     if config.database.is_some() || !path.exists() || is_locked(data).is_ok_and(|is_up| is_up) {
@@ -140,7 +141,7 @@ fn files(checkup: &mut Checkup, config: &Config) {
     }
 }
 
-/// Whether a server could begin to listen.
+/// Whether a server could bind its ports.
 fn ports(checkup: &mut Checkup, data: &Path, config: &Config) {
     if is_locked(data).is_ok_and(|is_up| is_up) {
         return checkup.bad(

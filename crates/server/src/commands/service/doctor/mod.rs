@@ -1,5 +1,5 @@
-//! `taskd doctor`: looks for what commonly goes wrong between here and the server, and on this
-//! machine if the server is on it, and says how to mend it. It changes nothing.
+//! `taskd doctor`: checks for common problems between this machine and the server, and on this
+//! machine if the server runs here, and says how to fix them. The command changes nothing.
 
 mod local;
 
@@ -24,24 +24,24 @@ use crate::commands::display::output::{Format, Output, time};
 use crate::commands::{CommandError, Connection, Outcome};
 use crate::system::clock::Clock;
 
-/// What mends a corrupt database.
+/// How to repair a corrupt database.
 const INTEGRITY_MEND: &str = "stop the server and put back a copy of its data directory, or save what can be read: docs/server.md says how";
-/// How long each answer may take.
+/// Time limit of each answer.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// A clock that is wrong by more confuses whoever reads times.
+/// A larger clock skew confuses readers of timestamps.
 const SKEW_NOTICE_MS: u64 = 5_000;
 /// By more than this, certificates and tokens end at wrong times.
 const SKEW_BAD_MS: u64 = 60 * 60 * 1000;
-/// What ends sooner should be renewed.
+/// Certificates and tokens that end sooner should be renewed.
 const SOON_MS: u64 = 14 * DAY_MS;
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
 
-/// Looks at everything. Something bad is an outcome, not an error.
+/// Runs all checks. A failed check is an outcome, not an error.
 pub(in crate::commands) async fn run(connection: &Connection) -> Result<Outcome, CommandError> {
     let mut checkup = Checkup::default();
     let is_up = match Client::anonymous(connection) {
         Ok(client) => server(&mut checkup, &client, connection).await,
-        // The directory, which is looked at below, is to say why.
+        // The check of the directory, below, explains the cause.
         Err(CommandError::Client(
             ClientError::NotServing { .. } | ClientError::DataDirectory { .. },
         )) => false,
@@ -82,7 +82,7 @@ fn print(output: &Output, checkup: &Checkup) -> Result<(), CommandError> {
     }
 }
 
-/// What can be seen from outside. Whether it answers at all.
+/// Checks from outside, beginning with whether the server answers at all.
 async fn server(checkup: &mut Checkup, client: &Client, connection: &Connection) -> bool {
     let is_up = reach(checkup, client).await;
     if is_up {
@@ -235,7 +235,7 @@ async fn certificate(checkup: &mut Checkup, client: &Client) {
     }
 }
 
-/// What takes a token to ask.
+/// Checks that need a token.
 async fn known_to(checkup: &mut Checkup, connection: &Connection) {
     let client = match Client::connect(connection) {
         Ok(client) => client,
@@ -273,7 +273,7 @@ async fn known_to(checkup: &mut Checkup, connection: &Connection) {
     versions(checkup, &client, &info).await;
 }
 
-/// What the server answers in time, or why it does not.
+/// The server's answer if it arrives in time, or why there is none.
 async fn asked<T: DeserializeOwned>(client: &Client, path: &str) -> Result<T, String> {
     match timeout(PATIENCE, client.get(path, &[])).await {
         Ok(answer) => answer.map_err(|error| error.to_string()),
@@ -281,7 +281,7 @@ async fn asked<T: DeserializeOwned>(client: &Client, path: &str) -> Result<T, St
     }
 }
 
-/// What the server's clock shows, held against ours at the middle of the question.
+/// Compares the server's clock with ours at the middle of the request.
 fn clocks(checkup: &mut Checkup, info: &ServerInfo, asked_ms: u64, answered_ms: u64) {
     let here_ms = asked_ms + answered_ms.saturating_sub(asked_ms) / 2;
     let skew = Duration::from_millis(info.now_ms.abs_diff(here_ms));
@@ -354,8 +354,8 @@ async fn integrity(checkup: &mut Checkup, client: &Client) {
     }
 }
 
-/// The broker's own port, as robots reach it, seen from here. Of an external one the server knows
-/// how it does.
+/// Probes the broker's own port, as robots reach the broker, from this machine. The server reports
+/// the health of an external broker.
 async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     let ServerStatus { broker, .. } = match asked(client, "/server/status").await {
         Ok(status) => status,
@@ -381,7 +381,7 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
             "look at --mqtt of the server",
         );
     };
-    // A server that listens everywhere is where it is asked.
+    // A server that listens on all addresses is reached at the address of its URL.
     let is_everywhere = matches!(bound, "0.0.0.0" | "[::]");
     let host = if is_everywhere { client.place().0 } else { bound.to_owned() };
     let tls = info
@@ -416,13 +416,13 @@ async fn mqtt(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     }
 }
 
-/// Whether one account at an external broker can end the session of another. The server tests that:
-/// it has the accounts.
+/// Whether one account at an external broker can end the session of another. The server runs this
+/// test: it has the accounts.
 async fn external_brokers(checkup: &mut Checkup, client: &Client) {
     let answer = timeout(3 * PATIENCE, client.get::<BrokerChecks>("/broker/check", &[])).await;
     let checks = match answer {
         Ok(Ok(checks)) => checks,
-        // That takes an administrator, and a server that knows the test.
+        // The test needs an administrator, and a server that supports the test.
         Ok(Err(ClientError::Refused {
             status: StatusCode::FORBIDDEN | StatusCode::NOT_FOUND,
             ..
@@ -458,7 +458,7 @@ async fn external_brokers(checkup: &mut Checkup, client: &Client) {
     }
 }
 
-/// Those of this program, the server and the agents.
+/// Versions of this program, the server and the agents.
 async fn versions(checkup: &mut Checkup, client: &Client, info: &ServerInfo) {
     let own = env!("CARGO_PKG_VERSION");
     match info.version == own {

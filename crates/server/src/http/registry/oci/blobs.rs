@@ -1,4 +1,5 @@
-//! Reading and deleting blobs: whole, in ranges, or not at all if the client has them already.
+//! Reading and deleting blobs. Reads return the whole blob, a range, or "not modified" if the
+//! client has the content already.
 
 use std::ops::Range;
 
@@ -22,10 +23,10 @@ use crate::http::registry::packages::in_use;
 use crate::link::transfers::Claim;
 use crate::store::{Act, Deed, Deletion};
 
-/// It may be kept, but not be used before the server was asked.
+/// Cached copies must be revalidated with the server before each use.
 pub(super) const REVALIDATED: &str = "private, no-cache";
 
-/// `GET /v2/<name>/blobs/<digest>` by a person, and `HEAD` by one who only reads.
+/// `GET /v2/<name>/blobs/<digest>` by a person, and `HEAD` by a person without push access.
 pub(super) async fn get(
     registry: &Registry,
     repository: &RepositoryName,
@@ -38,8 +39,8 @@ pub(super) async fn get(
     read(registry, digest, request).await
 }
 
-/// `HEAD` of the same by who may push there: asked before a push, so from now on the answer must
-/// hold for a while.
+/// `HEAD` of the same path by a caller with push access. Clients ask this before a push, so a
+/// positive answer must stay true for a while: the blob is touched.
 pub(super) async fn head_before_push(
     registry: &Registry,
     repository: &RepositoryName,
@@ -54,8 +55,9 @@ pub(super) async fn head_before_push(
     read(registry, digest, request).await
 }
 
-/// `GET` or `HEAD` by a robot. Its packages count, whatever repository they came from and whether
-/// it still has them. It may have to wait for its turn to get bytes, not to ask for their size.
+/// `GET` or `HEAD` by a robot. Access depends on the robot's packages, regardless of their
+/// repository and of whether the repository still has them. Reading bytes may have to wait for a
+/// transfer slot; asking for their size does not.
 pub(super) async fn get_for_robot(
     registry: &Registry,
     robot: &RobotId,
@@ -63,7 +65,7 @@ pub(super) async fn get_for_robot(
     request: &Parts,
 ) -> Answer {
     let Some(order) = registry.store.fetched_by(robot, &digest).await? else {
-        // These are small, and all else waits for them.
+        // Evidence blobs are small, and everything else waits for them.
         if registry.store.is_evidence_for(robot, &digest).await? {
             return read(registry, digest, request).await;
         }
@@ -79,8 +81,8 @@ pub(super) async fn get_for_robot(
     Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
 }
 
-/// `DELETE /v2/<name>/blobs/<digest>`: out of this repository; the bytes go when nothing needs
-/// them.
+/// `DELETE /v2/<name>/blobs/<digest>`: removes the blob from this repository. The bytes are deleted
+/// once nothing references them.
 pub(super) async fn delete(
     registry: &Registry,
     by: &Person,
@@ -99,8 +101,8 @@ async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
     serve(&blob, request, content_type, caching(request))
 }
 
-/// How long what never changes may be kept. Whoever came by a cookie shares the browser with
-/// whoever signs in next, so it asks each time, and is told that nothing has changed.
+/// Cache policy for immutable content. A caller with a cookie shares the browser with the next
+/// person to sign in, so the browser has to revalidate on each use, and gets 304.
 pub(super) fn caching(request: &Parts) -> HeaderValue {
     let is_by_cookie = !request.headers.contains_key(AUTHORIZATION);
     HeaderValue::from_static(if is_by_cookie {
@@ -161,7 +163,7 @@ pub(super) fn serve(
     Ok(response)
 }
 
-/// An answer with room for all the headers it will get, those for browsers included.
+/// An answer with capacity for all its headers, including those for browsers.
 fn with_room(body: Body) -> Response {
     const HEADERS: usize = 24;
     let mut response = Response::new(body);
@@ -181,7 +183,7 @@ fn unsatisfiable(blob: &Blob) -> Answer {
     Ok(response)
 }
 
-/// Whether `If-None-Match` names the content.
+/// True if `If-None-Match` names the content.
 fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
     let tags = headers
         .get_all(IF_NONE_MATCH)
@@ -191,7 +193,7 @@ fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
         .any(|tag| tag == b"*" || tag.strip_prefix(b"W/").unwrap_or(tag) == etag.as_bytes())
 }
 
-/// What a request's `Range` comes to.
+/// The result of evaluating a request's `Range`.
 #[derive(Debug, PartialEq, Eq)]
 enum Wanted {
     All,
@@ -199,8 +201,9 @@ enum Wanted {
     Nothing,
 }
 
-/// RFC 9110, section 14. Several ranges, another unit and what can't be read are answered with
-/// everything, as it allows; one that ends before it begins has no bytes, as registries say.
+/// Evaluates `Range` by RFC 9110, section 14. Multiple ranges, other units and malformed values are
+/// answered with the whole content, as the RFC allows. A range that ends before it begins is
+/// unsatisfiable, as is usual for registries.
 fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
     if headers.get(IF_RANGE).is_some_and(|tag| tag != etag) {
         return Wanted::All;
@@ -220,12 +223,12 @@ fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
     if range.is_empty() { Wanted::Nothing } else { Wanted::Part(range) }
 }
 
-/// A number of digits only: `parse` alone would take a plus sign.
+/// Parses a number of digits only: `parse` alone would accept a plus sign.
 pub(super) fn decimal(text: &str) -> Option<u64> {
     text.bytes().all(|b| b.is_ascii_digit()).then(|| text.parse().ok())?
 }
 
-/// The answer to a deletion of what is `named` so.
+/// The answer to a deletion of the resource `named`.
 pub(super) fn deleted(
     by: &Person,
     deletion: Deletion,
@@ -239,7 +242,7 @@ pub(super) fn deleted(
     }
 }
 
-/// Whether a blob is in the repository and as large as it is said to be.
+/// Checks that the repository has the blob, with the stated size.
 pub(super) async fn check_blob(
     registry: &Registry,
     repository: &RepositoryName,

@@ -1,5 +1,5 @@
 //! The distribution specification's error bodies: `{"errors":[{"code","message","detail"}]}`, with
-//! its codes. What went wrong inside the server is logged, never told.
+//! its codes. Internal causes are logged and never sent.
 
 use crate::http::openapi::{self, Draft};
 use axum::Json;
@@ -14,13 +14,13 @@ use crate::http::error::{ApiError, DATABASE_CORRUPT};
 use crate::link::transfers::NotYet;
 use crate::store::{Fault, StoreError};
 
-/// When it is of use to ask again where something has to be collected first, in seconds.
+/// Seconds until a retry is useful when something has to be collected first.
 const COLLECTION_S: u64 = 300;
 
-/// What the specification has no code for: the database is corrupt.
+/// Our own code for a corrupt database, for which the specification has none.
 const CORRUPT: &str = "DATABASE_CORRUPT";
 
-/// An answer that is not the one hoped for.
+/// An error answer of the registry.
 #[derive(Debug)]
 pub struct OciError {
     status: StatusCode,
@@ -41,18 +41,19 @@ impl OciError {
         }
     }
 
-    /// 401: nobody known is asking.
+    /// 401: the caller is not authenticated.
     pub fn unauthorized() -> Self {
         let message = "log in with any user name and a token as the password";
         Self::new(StatusCode::UNAUTHORIZED, "UNAUTHORIZED", message)
     }
 
-    /// 403: whoever asks may not.
+    /// 403: the caller lacks the permission.
     pub fn denied(message: impl Into<String>) -> Self {
         Self::new(StatusCode::FORBIDDEN, "DENIED", message)
     }
 
-    /// 409: it stays as it is, because robots should have it, or because of its tag.
+    /// 409: the content can't be changed or deleted, because robots should have it, or because of
+    /// its tag.
     pub fn conflict(message: impl Into<String>) -> Self {
         Self::new(StatusCode::CONFLICT, "DENIED", message)
     }
@@ -66,7 +67,7 @@ impl OciError {
         )
     }
 
-    /// 405: the endpoint has other methods.
+    /// 405: the endpoint does not support this method.
     pub fn method(allow: &'static str) -> Self {
         let error = Self::new(
             StatusCode::METHOD_NOT_ALLOWED,
@@ -76,12 +77,12 @@ impl OciError {
         Self { allow: Some(allow), ..error }
     }
 
-    /// 400: not a repository's name.
+    /// 400: not a valid repository name.
     pub fn name_invalid(error: &task_proto::id::InvalidId) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", error.to_string())
     }
 
-    /// 400: a path that is no text, so nothing in it is a name.
+    /// 400: the path is not text, so it contains no valid name.
     pub fn path_invalid() -> Self {
         Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", "the path is not UTF-8")
     }
@@ -91,12 +92,12 @@ impl OciError {
         Self::new(StatusCode::NOT_FOUND, "NAME_UNKNOWN", "there is no such repository")
     }
 
-    /// 400: not a tag.
+    /// 400: not a valid tag.
     pub fn tag_invalid(error: &task_proto::id::InvalidId) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "TAG_INVALID", error.to_string())
     }
 
-    /// 400: not a digest, or not that of the content.
+    /// 400: not a digest, or not the digest of the content.
     pub fn digest_invalid(message: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "DIGEST_INVALID", message)
     }
@@ -106,7 +107,7 @@ impl OciError {
         Self::new(StatusCode::NOT_FOUND, "BLOB_UNKNOWN", "the repository has no such blob")
     }
 
-    /// 400: a chunk's description makes no sense.
+    /// 400: the description of a chunk is invalid.
     pub fn upload_invalid(message: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "BLOB_UPLOAD_INVALID", message)
     }
@@ -130,7 +131,7 @@ impl OciError {
         Self::new(StatusCode::PAYLOAD_TOO_LARGE, "SIZE_INVALID", message)
     }
 
-    /// 416: the content has no such bytes.
+    /// 416: the range is outside the content.
     pub fn range_invalid(message: impl Into<String>) -> Self {
         Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "RANGE_INVALID", message)
     }
@@ -140,12 +141,12 @@ impl OciError {
         Self::new(StatusCode::NOT_FOUND, "MANIFEST_UNKNOWN", "the repository has no such manifest")
     }
 
-    /// 400: a manifest that is not accepted, and why.
+    /// 400: an invalid manifest, with the reason.
     pub fn manifest_invalid(message: impl Into<String>) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "MANIFEST_INVALID", message)
     }
 
-    /// 400: a manifest whose parts are not in the repository.
+    /// 400: a manifest with parts that are not in the repository.
     pub fn parts_unknown(parts: &[Digest]) -> Self {
         let message = "the manifest needs a blob that is not in the repository";
         let messages =
@@ -159,7 +160,7 @@ impl OciError {
         }
     }
 
-    /// 400: a query that makes no sense. The specification has no code for that.
+    /// 400: an invalid query. The specification has no code for this.
     pub fn query_invalid(message: &'static str) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "UNSUPPORTED", message)
     }
@@ -236,7 +237,7 @@ impl From<BlobError> for OciError {
     }
 }
 
-/// Where the registry did something for the rest of the API.
+/// For registry operations that the rest of the API calls.
 impl From<OciError> for ApiError {
     fn from(error: OciError) -> Self {
         let code = match error.status {

@@ -1,4 +1,4 @@
-//! Finding out what a repository holds: its tags, and the manifests that refer to one.
+//! Lists a repository's contents: its tags, and the manifests that refer to another.
 
 use axum::Json;
 use axum::response::IntoResponse as _;
@@ -51,7 +51,7 @@ pub(super) async fn tags(
     Ok(response)
 }
 
-/// `GET /v2/<name>/referrers/<digest>`: an image index, empty if there is nothing.
+/// `GET /v2/<name>/referrers/<digest>`: an image index, empty without referrers.
 pub(super) async fn referrers(
     registry: &Registry,
     repository: &RepositoryName,
@@ -76,7 +76,7 @@ pub(super) async fn referrers(
         headers.insert("oci-filters-applied", HeaderValue::from_static("artifactType"));
     }
     if let Some(last) = page.next {
-        // The same question, asked from there on.
+        // The link to the next page: the same query, continued after the last entry.
         let asked = request.uri.query().unwrap_or_default();
         let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("last="));
         let kept: String = kept.map(|pair| format!("{pair}&")).collect();
@@ -89,7 +89,7 @@ pub(super) async fn referrers(
     Ok(response)
 }
 
-/// Any digest, of an algorithm known here or not: a subject need not be here.
+/// True for any digest, of a known algorithm or not: a subject need not be in this registry.
 pub(super) fn is_digest(text: &str) -> bool {
     text.split_once(':').is_some_and(|(algorithm, encoded)| {
         let is_word = |b: u8| {

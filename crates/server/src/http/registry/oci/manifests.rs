@@ -1,5 +1,5 @@
-//! Reading, pushing and deleting manifests. One that calls itself a task package must be one: that
-//! is checked here, so that whatever can be ordered can be run.
+//! Reading, pushing and deleting manifests. A manifest with the type of a task package is validated
+//! here, so that every package that can be ordered can also run.
 
 use std::time::Duration;
 
@@ -29,16 +29,16 @@ use crate::store::{
     bytes_taken,
 };
 
-/// The largest manifest; the specification asks for at least this.
+/// The largest manifest, in bytes; the specification asks for at least this.
 const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
-/// The largest task manifest.
+/// The largest task manifest, in bytes.
 const MAX_CONFIG_BYTES: u64 = 1024 * 1024;
-/// How long a manifest may take to arrive.
+/// Time limit for a manifest's body.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// The most tags one request sets.
+/// The most tags that one request sets.
 const MAX_TAGS: usize = 64;
 
-/// `GET` and `HEAD /v2/<name>/manifests/<reference>`. What can't be a reference names nothing.
+/// `GET` and `HEAD /v2/<name>/manifests/<reference>`. An invalid reference is answered as unknown.
 pub(super) async fn get(
     registry: &Registry,
     repository: &RepositoryName,
@@ -56,7 +56,7 @@ pub(super) async fn get(
         true => {
             HeaderValue::try_from(stored.media_type).map_err(|_| OciError::manifest_unknown())?
         }
-        // Once any type was taken, also one that makes it a page.
+        // Earlier versions accepted any type, including types that a browser shows as a page.
         false => HeaderValue::from_static("application/octet-stream"),
     };
     let cache = match reference {
@@ -66,20 +66,20 @@ pub(super) async fn get(
     serve(&blob, request, content_type, cache)
 }
 
-/// What is pushed where, and by whom.
+/// The target and the author of a push.
 pub(super) struct Push<'a> {
     pub(super) repository: &'a RepositoryName,
     pub(super) reference: Reference,
-    /// `None`: by a robot.
+    /// `None` for a robot.
     pub(super) by: Option<&'a Person>,
-    /// The only type of artifact that is taken.
+    /// The only artifact type that is accepted.
     pub(super) only: Option<&'static str>,
-    /// Whether a package may take its version from another.
+    /// True if a package may take its version from another package.
     pub(super) takes_version: bool,
 }
 
 impl<'a> Push<'a> {
-    /// What a request pushes. `?force=true` says that a package may take its version from another.
+    /// The push of a request. `?force=true` lets a package take its version from another.
     pub(super) fn of(
         parts: &Parts,
         repository: &'a RepositoryName,
@@ -93,7 +93,7 @@ impl<'a> Push<'a> {
     }
 }
 
-/// `PUT`: stores the exact bytes, if all they refer to is in the repository.
+/// `PUT`: stores the exact bytes, if all referenced parts are in the repository.
 pub(super) async fn put(
     registry: &Registry,
     as_said: Push<'_>,
@@ -107,7 +107,7 @@ pub(super) async fn put(
     created(repository, &stored.manifest.digest, stored.subject, parts, &stored.tags)
 }
 
-/// Stores a manifest's bytes, and says what was stored.
+/// Stores a manifest's bytes, and returns the stored manifest.
 pub(super) async fn push(
     registry: &Registry,
     push: Push<'_>,
@@ -125,13 +125,13 @@ pub(super) async fn push(
     }
 
     let manifest = BlobRef { digest, size: bytes.len() as u64 };
-    // Before the hold: an archive may take minutes to read. What is gone afterwards is missed when
-    // the manifest is stored.
+    // Before the hold, because reading an archive may take minutes. Parts that disappear in between
+    // are noticed when the manifest is stored.
     let package = match &parsed.package {
         Some(image) => check_package(registry, repository, manifest, image).await?,
         None => None,
     };
-    // From here until the manifest is stored, nothing it is made of may be collected.
+    // From here until the manifest is stored, its parts must not be collected.
     let _hold = registry.blobs.hold_collection().await;
     let output = match &parsed.output {
         Some(image) => {
@@ -155,10 +155,11 @@ pub(super) async fn push(
         return Err(OciError::denied("a robot may only tag an output with its own run"));
     }
     let now_ms = registry.clock.now_ms();
-    // A robot's manifest is counted with what it lists.
+    // A robot's manifest is counted together with the parts that it lists.
     let more = if by.is_some() { manifest.size } else { 0 };
     registry.blobs.check_room(repository, more, kept_bytes(registry, repository).await?)?;
-    // First, for whoever hangs up in the middle has it counted as well.
+    // Counted before the bytes are stored, so that a client that disconnects in between is counted
+    // as well.
     registry.store.count_blob(repository, &manifest).await?;
     registry.blobs.put(digest.algorithm(), bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
@@ -196,7 +197,7 @@ pub(super) async fn push(
     }
 }
 
-/// Why a version does not move to another package without being told to.
+/// The refusal to move a version to another package without `force`.
 fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
     let (name, version) = match &new.package {
         Some((package, _)) => (package.name.as_str(), package.version.as_str()),
@@ -208,7 +209,7 @@ fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
     ))
 }
 
-/// What a manifest hashes to, which must be what it is pushed as.
+/// The digest of a manifest, which must match a digest in the reference.
 fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
     let Reference::Digest(expected) = reference else { return Ok(Digest::of(bytes)) };
     let digest = expected.algorithm().digest(bytes);
@@ -220,7 +221,7 @@ fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
     Ok(digest)
 }
 
-/// The push of a manifest, as the audit tells of it.
+/// The audit entry for the push of a manifest.
 fn pushed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> Deed {
     let tags: Vec<&str> = new.tags.iter().map(Tag::as_str).collect();
     let deed = Deed::by(by, Act::ManifestPush, repository).with("manifest", new.manifest.digest);
@@ -250,8 +251,8 @@ pub(super) async fn delete(
                 if let Ok(name) = repository.as_str().parse() {
                     registry.changes.announce(Change::Package(name));
                 }
-                // An order that looked the package up a moment ago still finds its bytes: they stay
-                // for a while.
+                // An order that looked the package up a moment ago still finds its bytes, because
+                // the bytes are kept for a while.
                 for &blob in parts.iter().chain([&digest]) {
                     registry.blobs.touch(blob, now_ms).await?;
                 }
@@ -280,7 +281,7 @@ async fn read_body(body: Body) -> Result<Bytes, OciError> {
     }
 }
 
-/// The tag of the path, or those in the query of a push by digest.
+/// The tag in the path, or the tags in the query of a push by digest.
 fn tags_to_set(parts: &Parts, reference: &Reference) -> Result<Vec<Tag>, OciError> {
     if let Reference::Tag(tag) = reference {
         return Ok(vec![tag.clone()]);
@@ -290,7 +291,7 @@ fn tags_to_set(parts: &Parts, reference: &Reference) -> Result<Vec<Tag>, OciErro
     tags.map(|(_, tag)| tag.parse().map_err(|error| OciError::tag_invalid(&error))).collect()
 }
 
-/// Reads what an output's config blob says of it, which must be true.
+/// Reads an output's config blob and checks its statements.
 async fn check_output(
     registry: &Registry,
     repository: &RepositoryName,
@@ -344,9 +345,9 @@ async fn read_config(
     Ok(blob.read().await?)
 }
 
-/// Reads the task manifest out of a package's config blob and holds it and the archive to their
-/// rules. A package can be ordered from the repository of its own name; one in another repository
-/// is a copy, checked likewise: `None`.
+/// Reads the task manifest in a package's config blob, and validates the manifest and the archive.
+/// A package can be ordered from the repository of its own name. A package in another repository is
+/// a copy: validated in the same way, but returned as `None`.
 async fn check_package(
     registry: &Registry,
     repository: &RepositoryName,
@@ -377,7 +378,7 @@ async fn check_package(
         );
         return Err(OciError::manifest_invalid(message));
     }
-    // What is stored was checked when it was pushed first.
+    // A stored package was checked at its first push.
     if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
         check_archive(registry, &archive, content.size, task.content).await?;
     }
@@ -391,7 +392,7 @@ async fn check_package(
     Ok((RepositoryName::of_package(&task.name) == *repository).then_some((package, task)))
 }
 
-/// Reads the package's archive by the rules that a robot unpacks it by.
+/// Reads the package's archive by the same rules that a robot uses to unpack.
 async fn check_archive(
     registry: &Registry,
     blob: &Blob,

@@ -1,7 +1,6 @@
 //! The registry: the OCI distribution API v1.1, pull and push, under `/v2/`. People pull and push
-//! as their roles allow, a robot reads the blobs of the packages it should have and pushes outputs
-//! into its own repositories. What a repository holds is the store's, the bytes are the blob
-//! store's.
+//! as their roles allow. A robot reads the blobs of its packages and pushes outputs into its own
+//! repositories. The store holds the repositories' contents, the blob store holds the bytes.
 
 mod blobs;
 mod error;
@@ -35,30 +34,30 @@ use crate::orders::changes::Changes;
 use crate::store::{Reference, Store};
 use crate::system::clock::Clock;
 
-/// What is said of digests by another algorithm.
+/// Error message for digests by an unsupported algorithm.
 const ALGORITHMS: &str = "only sha256 and sha512 are supported";
 
-/// What the registry works on.
+/// State of the registry's handlers.
 #[derive(Clone)]
 pub struct Registry {
-    /// What repositories hold.
+    /// Contents of repositories.
     pub store: Store,
-    /// The bytes.
+    /// The blob store.
     pub blobs: Blobs,
-    /// When things were pushed.
+    /// The clock for push times.
     pub clock: Clock,
-    /// Whose turn it is to pull.
+    /// Scheduler of pulls by robots.
     pub transfers: Transfers,
-    /// Who hears of what was signed.
+    /// Announces newly signed documents.
     pub changes: Changes,
-    /// Those who read whole archives.
+    /// Readers of whole archives.
     pub readers: ArchiveReaders,
 }
 
-/// How every handler here ends.
+/// The result of every registry handler.
 pub type Answer = Result<Response, OciError>;
 
-/// What a path below `/v2/` names.
+/// The resource that a path below `/v2/` names.
 #[derive(Debug, PartialEq, Eq)]
 enum Endpoint<'a> {
     Blob(&'a str),
@@ -69,7 +68,7 @@ enum Endpoint<'a> {
     Referrers(&'a str),
 }
 
-/// Splits a path into the repository's name, which may hold slashes, and the endpoint after it.
+/// Splits a path into the repository's name, which may contain slashes, and the endpoint after it.
 fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
     let segments: Vec<&str> = path.split('/').collect();
     let (name_len, endpoint) = match segments[..] {
@@ -87,7 +86,7 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
     Some((path[..bytes].strip_suffix('/')?, endpoint))
 }
 
-/// Tells that this is a registry, and whether the caller's token is good.
+/// Confirms that this is an OCI registry and that the caller's token is valid.
 #[utoipa::path(get, path = "/v2/", tag = "registry",
     responses((status = 200, description = "It is.", body = serde_json::Value, example = json!({}))))]
 pub async fn version(request: Request) -> Answer {
@@ -108,8 +107,8 @@ pub async fn version(request: Request) -> Answer {
 /// Manifests, blobs, uploads, tags and referrers of packages, of lists of publishers and of what
 /// tasks brought back, as the specification of that API says. People pull and push as their roles
 /// allow; a robot reads the blobs of the packages it should have and pushes its own outputs.
-// The caller is taken from the request's extensions, where the guard put it; without one, nobody is
-// let in.
+// The caller is taken from the request's extensions, where the guard put it. Without a caller, the
+// request is refused.
 #[utoipa::path(get, path = "/v2/{path}", tag = "registry",
     params(("path" = String, Path, description = "A repository and what of it, which has slashes.")),
     responses((status = 200, description = "As the OCI distribution specification says.", body = String,
@@ -163,8 +162,8 @@ pub async fn dispatch(
             }
         }
         Endpoint::Uploads if method == Method::POST => {
-            // A blob can be mounted from any repository, also from one that is none of the caller's
-            // business.
+            // A mount may name any repository as its source, including one outside the caller's
+            // scope.
             let may_mount = person.is_some_and(|person| person.scope.is_everything());
             uploads::begin(&registry, &repository, &parts, body, may_mount).await
         }
@@ -210,7 +209,8 @@ pub async fn dispatch(
     }
 }
 
-/// Refuses what the person has no permission to, and other people's robots' outputs.
+/// Refuses requests without the needed permission, and access to outputs of robots outside the
+/// person's scope.
 async fn check_person(
     registry: &Registry,
     person: &Person,
@@ -237,9 +237,9 @@ async fn check_person(
     Err(OciError::denied(format!("{repository} is outside of {name}'s scope {scope:?}")))
 }
 
-/// What a person needs for this. Outputs are the robots': one may be ended like the task it came
-/// from, and only who may do everything pushes in a robot's name. The list of publishers concerns
-/// all robots.
+/// The permission that a person needs for this request. Outputs belong to robots: deleting an
+/// output takes the same permission as stopping the task it came from, and pushing in a robot's
+/// name takes full rights. The list of publishers concerns all robots.
 fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
     let is_output = is_of_outputs(repository);
     match (method, endpoint) {
@@ -254,12 +254,12 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
     }
 }
 
-/// Only people delete.
+/// The person that deletes; robots delete nothing.
 fn deleter(person: Option<&Person>) -> Result<&Person, OciError> {
     person.ok_or_else(|| OciError::denied("a robot deletes nothing"))
 }
 
-/// Whether the repository is for outputs, or for lists of publishers.
+/// True for repositories reserved for outputs or for lists of publishers.
 fn is_reserved(repository: &RepositoryName) -> bool {
     is_of_outputs(repository) || repository.as_str() == LIST_REPOSITORY
 }
@@ -268,14 +268,14 @@ fn is_of_outputs(repository: &RepositoryName) -> bool {
     repository.as_str().starts_with("outputs/")
 }
 
-/// Whether who was let in to this repository may push there: a robot comes this far only to its own
+/// True if an admitted caller may push to this repository. A robot gets this far only for its own
 /// outputs.
 fn may_begin(person: Option<&Person>, repository: &RepositoryName) -> bool {
     person.is_none_or(|person| person.may(needed(repository, &Method::POST, &Endpoint::Uploads)))
 }
 
-/// Whether this is part of pushing one of the robot's own outputs. It deletes nothing and reads
-/// nothing back.
+/// True if the request is part of pushing one of the robot's own outputs. Such a request deletes
+/// nothing and reads nothing back.
 fn may_push(
     robot: &RobotId,
     repository: &RepositoryName,
@@ -301,12 +301,12 @@ fn parse_digest(text: &str) -> Result<Digest, OciError> {
     })
 }
 
-/// The digest of a blob to find: there is none under one of another algorithm.
+/// The digest of a blob to look up. No blob exists under an unsupported algorithm.
 fn digest_of_blob(text: &str) -> Result<Digest, OciError> {
     if is_of_another_algorithm(text) { Err(OciError::blob_unknown()) } else { parse_digest(text) }
 }
 
-/// Whether this is a digest, but not one of those that things have here.
+/// True for a well-formed digest by an unsupported algorithm.
 fn is_of_another_algorithm(text: &str) -> bool {
     let is_known = |algorithm: &str| Algorithm::ALL.iter().any(|known| known.as_str() == algorithm);
     lists::is_digest(text)
@@ -320,7 +320,7 @@ fn parse_reference(text: &str) -> Result<Reference, OciError> {
     text.parse().map(Reference::Tag).map_err(|error| OciError::tag_invalid(&error))
 }
 
-/// The request's query, of which unknown parts are ignored.
+/// Parses the request's query and ignores unknown parameters.
 fn query<T: DeserializeOwned>(uri: &Uri) -> Result<T, OciError> {
     axum::extract::Query::try_from_uri(uri)
         .map(|axum::extract::Query(query)| query)
@@ -331,7 +331,7 @@ fn query<T: DeserializeOwned>(uri: &Uri) -> Result<T, OciError> {
 fn empty<const N: usize>(status: StatusCode, headers: [(&'static str, String); N]) -> Answer {
     let mut response = status.into_response();
     for (name, value) in headers {
-        // All values are made of digests, ids, numbers and names, which a header can hold.
+        // All values consist of digests, ids, numbers and names, which are valid in headers.
         let value = HeaderValue::try_from(value)
             .map_err(|_| OciError::query_invalid("a name no header can hold"))?;
         response.headers_mut().insert(name, value);

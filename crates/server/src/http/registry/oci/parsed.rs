@@ -1,5 +1,6 @@
-//! What the registry has to understand of a manifest: its parts, what it refers to, and whether it
-//! is a task package. Whatever else it says is kept and not looked at.
+//! Parses the parts of a manifest that the registry has to understand: its blobs and manifests, its
+//! subject, and whether the manifest is a task package. All other fields are kept as they are and
+//! not interpreted.
 
 use std::collections::BTreeMap;
 
@@ -14,32 +15,32 @@ use super::OciError;
 
 const DOCKER_MANIFEST_TYPE: &str = "application/vnd.docker.distribution.manifest.v2+json";
 const DOCKER_LIST_TYPE: &str = "application/vnd.docker.distribution.manifest.list.v2+json";
-/// The most blobs and manifests one manifest is made of: each is looked up.
+/// The most blobs and manifests of one manifest: each one costs a lookup.
 const MAX_PARTS: usize = 4096;
 /// The most bytes of annotations, names included, of a manifest that refers to another: lists of
-/// referrers repeat them.
+/// referrers repeat the annotations.
 const MAX_ANNOTATION_BYTES: usize = 64 * 1024;
 
-/// A manifest of any kind, as far as it is understood.
+/// The parsed fields of a manifest of any kind.
 #[derive(Debug)]
 pub struct Parsed {
-    /// The content type it is served with: one of JSON.
+    /// The content type under which the manifest is served; always a type of JSON.
     pub media_type: String,
-    /// What a list of referrers says it is.
+    /// The artifact type in lists of referrers.
     pub artifact_type: Option<String>,
-    /// What a list of referrers says of it.
+    /// The annotations in lists of referrers.
     pub annotations: BTreeMap<String, String>,
-    /// The manifest it refers to.
+    /// The manifest that this one refers to.
     pub subject: Option<String>,
     /// The blobs and manifests that must be in the repository.
     pub parts: Vec<Digest>,
-    /// The manifest in full, if it is meant to be a task package.
+    /// The full manifest, if its type is that of a task package.
     pub package: Option<ImageManifest>,
-    /// The same, if it is meant to be the output of a run.
+    /// The full manifest, if its type is that of a run's output.
     pub output: Option<ImageManifest>,
-    /// The same, if it is meant to be what publishers have signed about a package.
+    /// The full manifest, if its type is that of a package signature by publishers.
     pub signature: Option<ImageManifest>,
-    /// The same, if it is meant to be a list of publishers.
+    /// The full manifest, if its type is that of a list of publishers.
     pub publishers: Option<ImageManifest>,
 }
 
@@ -55,7 +56,7 @@ struct Document {
     annotations: Option<BTreeMap<String, String>>,
 }
 
-/// A descriptor. Its digest may be of any algorithm; only what has one of two can be here.
+/// A descriptor. Its digest may use any algorithm; stored blobs use sha256 or sha512.
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
 struct Part {
@@ -64,7 +65,7 @@ struct Part {
 }
 
 impl Part {
-    /// Layers that, by their type, stay where they were published.
+    /// True for layers that, by their type, are not distributed with the image.
     fn is_elsewhere(&self) -> bool {
         self.media_type.starts_with("application/vnd.oci.image.layer.nondistributable.")
             || self.media_type == "application/vnd.docker.image.rootfs.foreign.diff.tar.gzip"
@@ -72,7 +73,7 @@ impl Part {
 }
 
 impl Parsed {
-    /// Reads a manifest that came with `content_type`.
+    /// Parses a manifest that came with `content_type`.
     pub fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
         let invalid = |error: serde_json::Error| {
             OciError::manifest_invalid(format!("not a manifest: {error}"))
@@ -103,7 +104,8 @@ impl Parsed {
         Ok(parsed)
     }
 
-    /// What robots get or bring has the digests that robots of every version know.
+    /// Documents for or from robots must use sha256, the algorithm that robots of every version
+    /// know.
     pub(super) fn check_for_robots(&self, manifest: Digest) -> Result<(), OciError> {
         let documents = [&self.package, &self.output, &self.signature, &self.publishers];
         if documents.into_iter().all(Option::is_none) {
@@ -119,7 +121,7 @@ impl Parsed {
         }
     }
 
-    /// These go into headers and columns, which not every character can.
+    /// These texts go into headers and columns, which can't hold control characters.
     fn check_texts(&self) -> Result<(), OciError> {
         let texts =
             [("artifactType", self.artifact_type.as_ref()), ("subject", self.subject.as_ref())];
@@ -148,7 +150,7 @@ impl Parsed {
 }
 
 impl Document {
-    /// A kind that is known has its parts; others are taken as they come.
+    /// Known types must have their required parts; other types are accepted as they are.
     fn check_kind(&self, media_type: &str) -> Result<(), OciError> {
         let missing = match media_type {
             MANIFEST_TYPE | DOCKER_MANIFEST_TYPE if self.config.is_none() => "config",
@@ -185,7 +187,7 @@ impl Document {
     }
 }
 
-/// The manifest's type: what the header and the document say, which must be the same.
+/// The manifest's type. If both the header and the document name a type, the two must agree.
 fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, OciError> {
     let header = header
         .and_then(|text| text.split(';').next())
@@ -209,8 +211,8 @@ fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, Oc
     Ok(media_type.to_owned())
 }
 
-/// Whether this is a media type of JSON, which no browser shows as a page: with the characters of
-/// RFC 6838, section 4.2.
+/// True for a JSON media type, which no browser shows as a page. The allowed characters are those
+/// of RFC 6838, section 4.2.
 pub(super) fn is_json(media_type: &str) -> bool {
     let is_character = |b: u8| b.is_ascii_alphanumeric() || b"!#$&-^_.+".contains(&b);
     media_type.strip_prefix("application/").is_some_and(|subtype| {

@@ -1,4 +1,4 @@
-//! A package that the server packed itself, put into the registry by the way that a pusher's takes.
+//! Publishes a package that the server packed itself, through the same steps as a push.
 
 use std::io;
 
@@ -17,10 +17,10 @@ use crate::domain::person::Person;
 use crate::package::Packed;
 use crate::store::Reference;
 
-/// How much of the content is read at once.
+/// Bytes of content read at once.
 const CHUNK_BYTES: usize = 256 * 1024;
 
-/// Stores a package, whose tag is its version, as `by` would have pushed it.
+/// Stores a package under its version as the tag, as if `by` had pushed it.
 pub async fn publish(
     registry: &Registry,
     by: &Person,
@@ -53,7 +53,7 @@ pub async fn publish(
     view.ok_or_else(OciError::manifest_unknown)
 }
 
-/// Makes these bytes a blob of the repository, unless it has it.
+/// Makes these bytes a blob of the repository, unless the repository has the blob.
 async fn store<S>(
     registry: &Registry,
     repository: &RepositoryName,
@@ -70,7 +70,8 @@ where
     }
     let upload = begun(registry, repository).await?;
     if let Err(error) = registry.blobs.append(repository, &upload.id, Some(0), bytes, 0).await {
-        // Best effort, for the collector would find it; what the caller has to know is the error.
+        // Best effort: the collector would remove the upload anyway, and the caller needs the
+        // original error.
         let _ = upload.cancel().await;
         return Err(error.into());
     }

@@ -1,6 +1,6 @@
-//! What publishers have signed, as it is pushed: an envelope about a package, or a list of
-//! publishers. Whether a signature counts is for robots to say; what could never count, or says
-//! something else than its manifest, is turned away here.
+//! Checks signed documents at their push: an envelope about a package, or a list of publishers.
+//! Robots decide whether a signature counts. The server refuses documents that could never count,
+//! or that contradict their manifest.
 
 use task_proto::desired::BlobRef;
 use task_proto::envelope::Envelope;
@@ -15,7 +15,7 @@ use super::parsed::Parsed;
 use super::{OciError, Registry};
 use crate::store::{Reference, SignedDocument};
 
-/// The signed document that a manifest brings, if it is meant to bring one.
+/// The signed document in a manifest, if its type is that of one.
 pub(super) async fn check(
     registry: &Registry,
     repository: &RepositoryName,
@@ -31,7 +31,8 @@ pub(super) async fn check(
     }
 }
 
-/// Tells the robots whom a document concerns. Should that fail they hear of it when they ask.
+/// Notifies the robots that a document concerns. If this fails, the robots learn of the document at
+/// their next request.
 pub(super) async fn tell(
     registry: &Registry,
     repository: &RepositoryName,
@@ -53,8 +54,8 @@ pub(super) async fn tell(
     }
 }
 
-/// The signature of a package in the package's own repository. Beside a copy in another repository
-/// it is a copy itself, and counts for nobody: `None`.
+/// The signature of a package in the package's own repository. A signature beside a copy in another
+/// repository is itself a copy and has no effect: `None`.
 async fn check_signature(
     registry: &Registry,
     repository: &RepositoryName,
@@ -126,7 +127,7 @@ async fn newest_list(registry: &Registry, newest: BlobRef) -> Result<PublisherLi
         .map_err(|error| OciError::manifest_invalid(error.to_string()))
 }
 
-/// The one layer of a signed document.
+/// The single layer of a signed document.
 async fn envelope(
     registry: &Registry,
     repository: &RepositoryName,

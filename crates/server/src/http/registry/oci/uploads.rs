@@ -1,5 +1,5 @@
-//! Pushing blobs: in one request, in a POST and a PUT, in chunks, or by mounting what another
-//! repository has.
+//! Pushing blobs: in one request, in a POST and a PUT, in chunks, or by a mount from another
+//! repository.
 
 use axum::body::Body;
 use axum::response::Response;
@@ -30,9 +30,9 @@ struct FinishQuery {
     digest: Option<String>,
 }
 
-/// `POST /v2/<name>/blobs/uploads/`: begins an upload, or does all of it if `digest` or `mount` is
-/// given. A mount that may not be, because it would show what another repository holds, begins an
-/// upload instead.
+/// `POST /v2/<name>/blobs/uploads/`: begins an upload, or completes the push at once if `digest` or
+/// `mount` is given. A mount that is not allowed, because it would reveal another repository's
+/// contents, begins an upload instead.
 pub(super) async fn begin(
     registry: &Registry,
     repository: &RepositoryName,
@@ -61,8 +61,8 @@ pub(super) async fn begin(
             .append(repository, &upload.id, Some(0), body.into_data_stream(), kept)
             .await;
         if let Err(error) = appended {
-            // Best effort, for the collector would find it; what the caller has to know is the
-            // error.
+            // Best effort: the collector would remove the upload anyway, and the caller needs the
+            // original error.
             let _ = upload.cancel().await;
             return Err(error.into());
         }
@@ -87,19 +87,20 @@ pub(super) struct Upload<'a> {
 }
 
 impl Upload<'_> {
-    /// `GET`: where it stands.
+    /// `GET`: the current offset.
     pub(super) async fn status(&self) -> Answer {
         let offset = self.registry.blobs.upload_offset(self.repository, &self.id).await?;
         self.accepted(StatusCode::NO_CONTENT, offset)
     }
 
-    /// `PATCH`: one more chunk; without a `Content-Range` it begins where the upload stands.
+    /// `PATCH`: appends one chunk. Without a `Content-Range`, the chunk begins at the current
+    /// offset.
     pub(super) async fn append(&self, parts: &Parts, body: Body) -> Answer {
         let offset = self.take_chunk(parts, body).await?;
         self.accepted(StatusCode::ACCEPTED, offset)
     }
 
-    /// `PUT`: perhaps a last chunk, then the digest that everything must have.
+    /// `PUT`: an optional last chunk, then the digest that the whole content must match.
     pub(super) async fn finish(&self, parts: &Parts, body: Body) -> Answer {
         let FinishQuery { digest } = query(&parts.uri)?;
         let digest =
@@ -109,7 +110,7 @@ impl Upload<'_> {
         self.complete(digest).await
     }
 
-    /// `DELETE`: gives the upload up.
+    /// `DELETE`: cancels the upload.
     pub(super) async fn cancel(&self) -> Answer {
         self.registry.blobs.cancel_upload(self.repository, &self.id).await?;
         empty(StatusCode::NO_CONTENT, [])
@@ -132,14 +133,14 @@ impl Upload<'_> {
         }
     }
 
-    /// Makes the upload a blob of the repository, in one go as the collector sees it, also if
-    /// whoever asked has hung up.
+    /// Makes the upload a blob of the repository, in one step from the collector's view, even if
+    /// the caller has disconnected.
     pub(super) async fn complete(&self, digest: Digest) -> Answer {
         let (registry, repository, id) =
             (self.registry.clone(), self.repository.clone(), self.id.clone());
         let completed = tokio::spawn(async move {
             let _hold = registry.blobs.hold_collection().await;
-            // Others of the robot's may have been finished meanwhile.
+            // Other uploads of the robot may have finished in the meantime.
             if let Err(full) =
                 registry.blobs.check_room(&repository, 0, kept_bytes(&registry, &repository).await?)
             {
@@ -159,8 +160,8 @@ impl Upload<'_> {
         let (repository, id) = (self.repository, self.id.as_str());
         let headers: [(&str, String); 3] = [
             ("location", format!("/v2/{repository}/blobs/uploads/{id}")),
-            // An upload without a byte can't be told from one with a single byte: the specification
-            // has no word for it.
+            // An empty upload can't be told from one with a single byte: the specification has no
+            // notation for an empty range.
             ("range", format!("0-{}", offset.saturating_sub(1))),
             ("docker-upload-uuid", id.to_owned()),
         ];
@@ -168,8 +169,8 @@ impl Upload<'_> {
     }
 }
 
-/// Makes a blob of `from` (of any repository, if absent) one of this repository; false if it is not
-/// there.
+/// Adds a blob of `from` (of any repository, if absent) to this repository. False if `from` does
+/// not have the blob.
 async fn mount(
     registry: &Registry,
     repository: &RepositoryName,
@@ -191,7 +192,7 @@ async fn mount(
     Ok(true)
 }
 
-/// How many bytes are kept of the robot whose repository this is, if it is one's.
+/// Bytes stored for the robot that owns this repository; 0 if no robot owns the repository.
 pub(super) async fn kept_bytes(
     registry: &Registry,
     repository: &RepositoryName,
@@ -200,7 +201,7 @@ pub(super) async fn kept_bytes(
     Ok(registry.store.bytes_of_robot(&robot).await?)
 }
 
-/// Refuses what is announced as too large before any of it is read.
+/// Refuses a body with a too large announced length, before reading it.
 fn check_length(
     registry: &Registry,
     repository: &RepositoryName,
@@ -214,7 +215,7 @@ fn announced_length(headers: &HeaderMap) -> Option<u64> {
     headers.get(CONTENT_LENGTH).and_then(|value| value.to_str().ok()).and_then(decimal)
 }
 
-/// `Content-Range` as the specification has it: `first-last`, both inclusive.
+/// `Content-Range` in the specification's form: `first-last`, both inclusive.
 fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError> {
     let Some(value) = parts.headers.get(CONTENT_RANGE) else { return Ok(None) };
     let range =

@@ -30,7 +30,6 @@ use crate::logs::forwarder::ForwardSettings;
 use crate::process::call_filter::Seccomp;
 use crate::system::durable;
 
-/// The file's name.
 pub const FILE_NAME: &str = "agent.toml";
 /// The longest time the gate may be given to answer, in seconds.
 pub const MAX_GATE_TIMEOUT_S: u64 = 300;
@@ -50,7 +49,6 @@ const OTHER_VARIABLES: [&str; 3] = ["TASK_AGENT_DATA", "TASK_AGENT_LOG", "TASK_A
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
-    /// The server's URL.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub server: Option<String>,
     /// Whether MQTT is used. With `false` the robot only polls.
@@ -118,7 +116,6 @@ pub struct Settings {
     pub trusted_publishers: Option<PublisherSettings>,
 }
 
-/// The `[trusted_publishers]` table.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PublisherSettings {
@@ -141,7 +138,6 @@ pub struct PublisherSettings {
     pub require_list: Option<bool>,
 }
 
-/// The `[gate]` table.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GateSettings {
@@ -180,7 +176,6 @@ pub enum GateDefault {
     Deny,
 }
 
-/// The `[logs]` table.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LogSettings {
@@ -283,16 +278,10 @@ pub struct Config {
 pub enum ConfigError {
     /// The file can't be read or written.
     #[error("cannot use {path}")]
-    Io {
-        /// The file's path.
-        path: PathBuf,
-        /// The system's error.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// The file or the variables do not parse; the parser's text names the key.
     #[error("{origin}: {reason}")]
     Invalid {
-        /// File or variable.
         origin: String,
         /// Description of the error.
         reason: String,

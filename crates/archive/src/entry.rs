@@ -30,19 +30,14 @@ pub struct Entry {
     pub kind: Kind,
 }
 
-/// Kinds of entries.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
-    /// A directory.
     Directory,
-    /// A file.
     File {
-        /// Its bytes.
         size: u64,
         /// Whether the file is executable.
         executable: bool,
     },
-    /// A symbolic link.
     Symlink {
         /// As written: relative to the link's own directory.
         target: String,

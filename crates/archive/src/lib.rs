@@ -33,7 +33,6 @@ const COPY_BUFFER_BYTES: usize = 128 * 1024;
 /// Size limits of a package. The default is the packer's own limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Uncompressed bytes.
     pub bytes: u64,
     /// Files, directories and links, including directories implied by paths.
     pub entries: u64,
@@ -55,7 +54,6 @@ impl Default for Limits {
     }
 }
 
-/// Why unpacking failed.
 #[derive(Debug, thiserror::Error)]
 pub enum UnpackError {
     /// The archive violates the rules for packages.
@@ -69,7 +67,6 @@ pub enum UnpackError {
     Disk {
         /// The path being written.
         path: PathBuf,
-        /// The system's error.
         source: io::Error,
     },
 }
@@ -83,9 +80,7 @@ pub enum Refusal {
     Limit {
         /// The quantity that was counted.
         what: &'static str,
-        /// Number found.
         found: u64,
-        /// Maximum number.
         limit: u64,
     },
     /// The archive differs from the description in its manifest.
@@ -93,28 +88,20 @@ pub enum Refusal {
     NotAsAnnounced {
         /// The quantity that was counted.
         what: &'static str,
-        /// Number found.
         found: u64,
-        /// Number announced.
         announced: u64,
     },
     /// The uncompressed archive differs from the description in its manifest.
     #[error(
         "the uncompressed archive hashes to {found}, where the task manifest says {announced} (content.tar_digest)"
     )]
-    OtherDigest {
-        /// Its digest.
-        found: Box<Digest>,
-        /// The announced one.
-        announced: Box<Digest>,
-    },
+    OtherDigest { found: Box<Digest>, announced: Box<Digest> },
     /// The manifest describes the uncompressed archive by a digest algorithm that is not supported.
     #[error("content.tar_digest: {0} is no SHA-256 digest")]
     DigestAlgorithm(Box<Digest>),
     /// An entry is not allowed in a package.
     #[error("entry {name}: {reason}")]
     Entry {
-        /// Its path.
         name: String,
         /// Why the entry is refused.
         reason: String,
@@ -139,7 +126,6 @@ impl Refusal {
 /// Compression of an archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Compression {
-    /// Uncompressed.
     None,
     /// zstd frames: one or more, with skippable frames between them.
     Zstd,

@@ -32,7 +32,6 @@ const CONNECTS_AT_ONCE: usize = 64;
 /// A request: server, path, token and the expected size.
 #[derive(Clone)]
 pub struct Target {
-    /// The server's address.
     pub address: SocketAddr,
     /// TLS configuration; `None`: plain text.
     pub tls: Option<Arc<ClientConfig>>,
@@ -57,9 +56,7 @@ impl Target {
 /// The end of each connection's loop.
 #[derive(Debug, Clone, Copy)]
 pub enum Until {
-    /// This many fetches.
     Fetches(u64),
-    /// After this time.
     Elapsed(Duration),
 }
 

@@ -33,9 +33,7 @@ pub fn another(tls: &ClientConfig) -> ClientConfig {
 pub struct Certificate {
     /// The certificate and the authority's, PEM.
     pub chain: String,
-    /// Its key, PEM.
     pub key: String,
-    /// The authority's pin.
     pub pin: CaPin,
 }
 

@@ -47,7 +47,6 @@ pub struct Fleet {
     /// `None`: a process has ended.
     words: mpsc::Receiver<Option<Word>>,
     dir: TempDir,
-    /// Number of robots.
     pub robots: usize,
     /// Duration of each robot's registration.
     pub enrolments: Vec<Duration>,
@@ -223,7 +222,6 @@ impl Fleet {
         each.fold(Usage::default(), Usage::plus)
     }
 
-    /// Ends the robots.
     pub async fn end(self) -> anyhow::Result<()> {
         for (process, input) in self.processes {
             // Its end is the sign to end.
@@ -311,7 +309,6 @@ async fn enrol(
     Ok((members, took, key))
 }
 
-/// A robot's name.
 pub fn name(number: usize) -> String {
     format!("r{number:05}")
 }

@@ -25,7 +25,6 @@ const MAX_WAIT: &str = "200ms";
 pub struct LinkQuality {
     /// Bits per second, each way.
     pub bits_per_s: u64,
-    /// Milliseconds, each way.
     pub delay_ms: Option<u32>,
 }
 

@@ -20,11 +20,8 @@ pub enum Format {
 /// Facts needed to compare one run with another.
 #[derive(Serialize)]
 pub struct Facts {
-    /// This program's version.
     pub taskbench: &'static str,
-    /// The server's version.
     pub taskd: String,
-    /// The server's URL.
     pub server: String,
     /// Number of requested robots.
     pub robots: usize,
@@ -44,7 +41,6 @@ pub struct LoadReport {
 }
 
 impl LoadReport {
-    /// Prints the facts.
     pub fn begin(facts: Facts, format: Format) -> Self {
         let Facts { taskbench, taskd, server, robots, seconds, reports_per_s, cores } = &facts;
         if format == Format::Table {

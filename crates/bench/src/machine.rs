@@ -15,20 +15,16 @@ const UNKNOWN: &str = "unknown";
 /// The machine of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Machine {
-    /// The processor's model.
     pub cpu: String,
     /// Cores available to this program.
     pub cores: usize,
-    /// Memory in bytes.
     pub memory_bytes: u64,
     /// The kernel's name and release.
     pub kernel: String,
-    /// The system's name.
     pub system: String,
 }
 
 impl Machine {
-    /// This machine.
     pub fn here() -> Self {
         let read = |path: &str| std::fs::read_to_string(Path::new(path)).unwrap_or_default();
         let kilobytes: Option<u64> = field(&read("/proc/meminfo"), "MemTotal", ':')

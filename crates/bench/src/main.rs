@@ -197,7 +197,6 @@ async fn load(flags: LoadFlags) -> anyhow::Result<ExitCode> {
     Ok(code)
 }
 
-/// Prints a result.
 fn print(text: &str) -> anyhow::Result<()> {
     use std::io::Write as _;
     std::io::stdout().write_all(text.as_bytes()).context("stdout")

@@ -30,7 +30,6 @@ pub async fn every<T>(
 
 /// Measurements of a phase.
 pub struct Phase {
-    /// Its name.
     pub name: &'static str,
     /// From its start to the end of its last step.
     pub wall: Duration,

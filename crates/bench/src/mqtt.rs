@@ -20,7 +20,6 @@ const CLIENTS_PER_ADDRESS: usize = 20_000;
 
 /// Credentials of a client.
 pub struct Login<'a> {
-    /// The client id.
     pub client_id: &'a str,
     /// User name and password, if the broker requires them.
     pub credentials: Option<(&'a str, &'a str)>,
@@ -47,10 +46,11 @@ pub enum Heard<'a> {
     /// SUBACK with the first filter's code.
     Subscribed(u8),
     /// A message. The packet id is 0 for QoS 0.
-    Message { packet_id: u16, payload: &'a [u8] },
-    /// PUBACK.
+    Message {
+        packet_id: u16,
+        payload: &'a [u8],
+    },
     Acknowledged(u16),
-    /// Anything else.
     Other,
 }
 

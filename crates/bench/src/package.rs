@@ -12,15 +12,11 @@ pub const PAYLOAD_FILE: &str = "payload.bin";
 
 /// A package that is ready to be pushed.
 pub struct Package {
-    /// Its name.
     pub name: TaskName,
-    /// Its version.
     pub version: Version,
     /// The task manifest, JSON.
     pub config: Vec<u8>,
-    /// tar+zstd.
     pub content: Vec<u8>,
-    /// The payload's digest.
     pub payload: Digest,
 }
 

@@ -27,7 +27,6 @@ pub struct Peer {
     pub address: SocketAddr,
     /// Pin of the certificate's authority; `None` without encryption.
     pub pin: Option<CaPin>,
-    /// The program's version.
     pub version: String,
 }
 
@@ -121,7 +120,6 @@ impl Peer {
         self.process.family_usage()
     }
 
-    /// Ends the program.
     pub async fn end(self) {
         self.process.end().await;
     }

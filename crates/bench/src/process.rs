@@ -28,36 +28,21 @@ const END_TIMEOUT: Duration = Duration::from_secs(15);
 pub enum ProcessError {
     /// The program did not start.
     #[error("{program} can't be started")]
-    Start {
-        /// The program.
-        program: String,
-        /// The cause.
-        source: io::Error,
-    },
+    Start { program: String, source: io::Error },
     /// The program is not at its expected path.
     #[error("{name} is not beside {}: build it (cargo build --release --bins) or give --{name} PATH", dir.display())]
-    Missing {
-        /// The program.
-        name: &'static str,
-        /// The directory searched.
-        dir: PathBuf,
-    },
+    Missing { name: &'static str, dir: PathBuf },
     /// The program ended with a failure.
     #[error("{program} ended with {status}: {said}")]
     Failed {
-        /// The program.
         program: String,
-        /// Its exit status.
         status: std::process::ExitStatus,
         /// The end of its stderr.
         said: String,
     },
     /// The program ran longer than its time limit.
     #[error("{program} did not end within {ANSWER_TIMEOUT:?}")]
-    Late {
-        /// The program.
-        program: String,
-    },
+    Late { program: String },
 }
 
 /// A program and its arguments, not started yet.
@@ -88,14 +73,12 @@ impl Program {
         path.map(Self::named).ok_or(ProcessError::Missing { name, dir })
     }
 
-    /// With further arguments.
     #[must_use]
     pub fn args(mut self, arguments: impl IntoIterator<Item = impl AsRef<OsStr>>) -> Self {
         self.arguments.extend(arguments.into_iter().map(|argument| argument.as_ref().to_owned()));
         self
     }
 
-    /// With a variable.
     #[must_use]
     pub fn variable(mut self, name: &str, value: &str) -> Self {
         self.environment.push((name.to_owned(), value.to_owned()));
@@ -279,7 +262,6 @@ pub struct Usage {
 }
 
 impl Usage {
-    /// Of both together.
     #[must_use]
     pub fn plus(self, other: Self) -> Self {
         Self {

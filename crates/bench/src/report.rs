@@ -10,7 +10,6 @@ use crate::run::{Point, Run};
 
 const STYLE: &str = include_str!("report.css");
 
-/// The whole page.
 pub fn page(run: &Run) -> String {
     let mut names: Vec<&str> = Vec::new();
     for point in &run.points {

@@ -23,7 +23,6 @@ use crate::simulated::{Machine, VITALS_INTERVAL};
 
 /// Time limit for any single answer of the server.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// As the agent's.
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
 /// Requests between a robot and its session: a subscription, a status and a report.
 const QUEUED_REQUESTS: usize = 8;
@@ -48,7 +47,6 @@ pub struct Identity {
     pub enrolled: EnrollResponse,
     /// The MQTT broker's host.
     pub host: String,
-    /// Its port.
     pub port: u16,
     /// The key pinned by the enrollment token.
     pub key: PublicKey,
@@ -127,7 +125,6 @@ impl Robot {
         Ok(self.hear("SUBACK", |heard| heard.subscribed).await? - begun)
     }
 
-    /// Loses its connection.
     pub fn cut(&mut self) {
         self.session = None;
     }

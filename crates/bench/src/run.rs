@@ -43,13 +43,10 @@ impl RunFlags {
 pub struct Run {
     /// The scenario: the subcommand.
     pub scenario: String,
-    /// Start time, UTC.
     pub began: String,
-    /// Duration in seconds.
     pub wall_s: f64,
     /// The commit of the repository in the working directory.
     pub commit: String,
-    /// The machine.
     pub machine: Machine,
     /// Programs by name, with their versions.
     pub versions: BTreeMap<String, String>,
@@ -63,7 +60,6 @@ pub struct Run {
     /// Plots of the points.
     #[serde(default)]
     pub plots: Vec<Plot>,
-    /// The measured points.
     pub points: Vec<Point>,
 }
 
@@ -81,19 +77,14 @@ pub struct Point {
     pub failures: BTreeMap<String, u64>,
 }
 
-/// A quantity's unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Unit {
-    /// Milliseconds.
     #[serde(rename = "ms")]
     Milliseconds,
-    /// Seconds.
     #[serde(rename = "s")]
     Seconds,
-    /// Bytes.
     #[serde(rename = "B")]
     Bytes,
-    /// Bytes per second.
     #[serde(rename = "B/s")]
     BytesPerSecond,
     /// A rate per second.
@@ -102,7 +93,6 @@ pub enum Unit {
     /// Seconds for each gigabyte (10⁹ bytes).
     #[serde(rename = "s/GB")]
     SecondsPerGigabyte,
-    /// Of a hundred.
     #[serde(rename = "%")]
     Percent,
     /// A count or a ratio.
@@ -131,9 +121,7 @@ impl Unit {
 pub struct Quantity {
     /// The unit of all samples.
     pub unit: Unit,
-    /// Number of values.
     pub count: usize,
-    /// The smallest.
     pub min: f64,
     /// Half of the values were no larger.
     pub median: f64,
@@ -141,7 +129,6 @@ pub struct Quantity {
     pub p95: f64,
     /// Of a hundred values ninety-nine were no larger.
     pub p99: f64,
-    /// The largest.
     pub max: f64,
     /// The values as they came, unless they are too many.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -152,19 +139,15 @@ pub struct Quantity {
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Figure {
-    /// [`Quantity::median`].
     #[default]
     Median,
-    /// [`Quantity::p99`].
     P99,
-    /// [`Quantity::max`].
     Max,
 }
 
 /// A plot of some points: one line for each series.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Plot {
-    /// Its heading.
     pub title: String,
     /// The setting along the horizontal axis.
     pub x: String,
@@ -249,12 +232,10 @@ impl Point {
         }
     }
 
-    /// Adds a failure.
     pub fn fail(&mut self, text: impl Into<String>) {
         *self.failures.entry(text.into()).or_default() += 1;
     }
 
-    /// Number of failures.
     pub fn failed(&self) -> u64 {
         self.failures.values().sum()
     }

@@ -99,12 +99,10 @@ impl Server {
         read("the list of robots", get.query(&[("selector", selector.to_string())])).await
     }
 
-    /// One robot.
     pub async fn robot(&self, robot: &RobotId) -> Result<RobotView, ServerError> {
         read("a robot", self.request(Method::GET, &format!("/api/v1/robots/{robot}"))).await
     }
 
-    /// Removes a robot.
     pub async fn remove_robot(&self, robot: &RobotId) -> Result<(), ServerError> {
         send("a robot's removal", self.request(Method::DELETE, &format!("/api/v1/robots/{robot}")))
             .await

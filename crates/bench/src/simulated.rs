@@ -11,7 +11,6 @@ pub const VITALS_INTERVAL: Duration = Duration::from_secs(60);
 
 const GIB: f64 = (1u64 << 30) as f64;
 
-/// A simulated machine.
 #[derive(Debug, Clone)]
 pub struct Machine {
     cpu: f64,

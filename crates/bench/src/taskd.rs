@@ -44,7 +44,6 @@ pub struct TaskdOrder {
     pub listen: IpAddr,
     /// The configuration file's text.
     pub configuration: String,
-    /// Further `TASKD_*` settings.
     pub settings: Vec<(String, String)>,
 }
 
@@ -75,11 +74,9 @@ pub struct Taskd {
     pub mqtt: SocketAddr,
     /// Pin of the server's certificate authority; `None` without encryption.
     pub pin: Option<CaPin>,
-    /// The operator's token.
     pub token: Token,
     /// Its API, as the operator.
     pub server: Server,
-    /// Its version.
     pub version: String,
 }
 
@@ -139,7 +136,6 @@ impl Taskd {
         Ok(Self { process, program, dir, http, mqtt, pin, token, server, version })
     }
 
-    /// Its URL.
     pub fn url(&self) -> String {
         url(self.http, self.pin)
     }

@@ -35,7 +35,6 @@ pub struct Target {
     pub tries: u32,
 }
 
-/// All targets.
 pub const TARGETS: [Target; 17] = [
     Target { name: "archive", run: archive, tries: 500 },
     Target { name: "desired", run: desired, tries: 1_000 },

@@ -2,6 +2,8 @@
 //! sides read. It never does I/O and never reads a clock; randomness and time are arguments or
 //! explicit constructors.
 
+#![warn(missing_docs)]
+
 pub mod api;
 pub mod audit;
 pub mod checkup;

@@ -24,14 +24,7 @@ pub enum LineError {
     Dial(#[from] DialError),
     /// The connection was not established in time.
     #[error("{host}:{port} does not answer within {time:?}")]
-    Late {
-        /// The host.
-        host: String,
-        /// The port.
-        port: u16,
-        /// The time limit.
-        time: Duration,
-    },
+    Late { host: String, port: u16, time: Duration },
     /// The system refused the local socket.
     #[error("no local socket")]
     Local(#[source] io::Error),

@@ -17,7 +17,6 @@ use crate::trust::{Clock, Trust};
 const GREETING: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 0x7f, 0x02, 0, 10, 0, 0];
 /// The first byte of a CONNACK.
 const CONNACK: u8 = 0x20;
-/// PINGREQ and PINGRESP.
 const PING: [u8; 2] = [0xc0, 0];
 const PONG: [u8; 2] = [0xd0, 0];
 /// CONNECT's flags for a clean session, a user name and a password.
@@ -32,7 +31,6 @@ const FAR_FUTURE_MS: u64 = 7_258_118_400_000;
 /// The result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probed {
-    /// MQTT.
     Mqtt,
     /// Another protocol, or the connection was closed.
     SomethingElse,
@@ -54,30 +52,21 @@ pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
 /// An account at an MQTT broker.
 #[derive(Clone, Copy)]
 pub struct MqttLogin<'a> {
-    /// The user name.
     pub user_name: &'a str,
-    /// The password.
     pub password: &'a str,
 }
 
 /// Why the displacement test gave no result.
 #[derive(Debug, thiserror::Error)]
 pub enum DisplaceError {
-    /// The connection failed.
     #[error(transparent)]
     Dial(#[from] DialError),
     /// The broker does not let the account in.
     #[error("the broker refuses the user {user_name} (CONNACK {code})")]
-    Refused {
-        /// The account.
-        user_name: String,
-        /// The return code.
-        code: u8,
-    },
+    Refused { user_name: String, code: u8 },
     /// The connection ended before the broker had let the account in.
     #[error("the broker closes the connection of the user {user_name}")]
     Closed {
-        /// The account.
         user_name: String,
         /// The error of the connection.
         source: io::Error,

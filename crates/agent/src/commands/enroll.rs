@@ -52,14 +52,12 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Parses `key=value`.
 pub(super) fn parse_label(text: &str) -> Result<(LabelKey, LabelValue), String> {
     let (key, value) = text.split_once('=').ok_or("expected key=value")?;
     let key = key.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?;
     Ok((key, value.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?))
 }
 
-/// Registers the robot.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(enroll(arguments))

@@ -21,7 +21,6 @@ pub struct Arguments {
     data: DataDir,
 }
 
-/// Prints the status.
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
     let data = Layout::new(&arguments.data.data)?;
     let identity = Identity::read(&data.identity())?;

@@ -14,7 +14,6 @@ use task_proto::settings::{EffectiveSettings, RobotSettings};
 
 use crate::config::{Config, count};
 
-/// The effective settings.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settled {
     /// The robot's settings with the values taken from the server.

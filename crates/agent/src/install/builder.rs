@@ -38,7 +38,6 @@ const MAX_PACKAGE_XML_BYTES: u64 = 1024 * 1024;
 /// A build: tool, place, environment and limits.
 #[derive(Debug, Clone)]
 pub struct BuildOrder {
-    /// The build tool.
     pub tool: BuildTool,
     /// The version's directory, with `src`; `build` and `install` are created there.
     pub version: VersionDir,
@@ -59,7 +58,6 @@ pub struct BuildOrder {
 /// Limits of a build.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BuildLimits {
-    /// Longest duration.
     pub timeout: Duration,
     /// Memory limit of the whole build; without a control group, the limit on the data of each
     /// process. `None` is unlimited.
@@ -75,7 +73,6 @@ pub struct BuildLimits {
 /// Output of a build: the log file, and the tail in memory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Output {
-    /// The log file.
     pub log: PathBuf,
     /// The last bytes of the output.
     pub tail: String,
@@ -90,7 +87,6 @@ pub enum BuildError {
     /// The build exceeded its time limit.
     #[error("the build did not end within {} s; {output}", timeout.as_secs())]
     TimedOut {
-        /// The time limit.
         timeout: Duration,
         /// Output of the build.
         output: Output,
@@ -98,7 +94,6 @@ pub enum BuildError {
     /// The build tool failed or is missing.
     #[error("the build {status}; {output}")]
     Failed {
-        /// Exit status.
         status: ExitStatus,
         /// Output of the build.
         output: Output,
@@ -114,7 +109,6 @@ pub enum BuildError {
     /// The build tool succeeded, but the package is not installed.
     #[error("the build tool succeeded without installing {missing}; {output}")]
     NotInstalled {
-        /// The missing path.
         missing: String,
         /// Output of the build.
         output: Output,

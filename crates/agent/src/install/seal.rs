@@ -37,9 +37,7 @@ pub struct Seal {
 /// The tree that does not match its seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Broken {
-    /// The unpacked package.
     Source,
-    /// The built tree.
     Install,
 }
 

@@ -73,7 +73,6 @@ const AROUND_MESSAGE_BYTES: usize = 4096;
 pub struct MqttAccess {
     /// Host name or address, also for an endpoint without one.
     pub host: String,
-    /// TCP port.
     pub port: u16,
     /// Prefix of all topics.
     pub prefix: TopicPrefix,
@@ -100,7 +99,6 @@ enum Ended {
     Moved,
     /// The connection to the broker can't be opened.
     Unreachable(LineError),
-    /// Any other error.
     Lost(ConnectionError),
     /// The agent is shutting down.
     Closed,

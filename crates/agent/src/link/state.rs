@@ -35,7 +35,6 @@ pub(crate) const REFUSED_POLL: Duration = Duration::from_secs(300);
 pub enum Heard {
     /// A desired state with an unverified signature.
     Desired {
-        /// The signed envelope.
         envelope: Box<Envelope>,
         /// Blobs delivered with the state. They are accessible only by the digests that the state
         /// names.
@@ -68,7 +67,6 @@ pub enum Heard {
 /// writes the rest.
 #[derive(Clone)]
 pub struct Shared {
-    /// The newest report.
     pub reports: watch::Sender<Option<Arc<Report>>>,
     /// Sequence number of the newest stored report.
     pub confirmed: watch::Sender<u64>,
@@ -108,7 +106,6 @@ pub struct Shared {
 pub struct Talk {
     /// Incoming requests, each with its time of arrival.
     pub requests: mpsc::Sender<(Request, Instant)>,
-    /// Messages to publish.
     pub messages: mpsc::Receiver<Message>,
     /// Batches of log lines to publish. The next batch is taken after the acknowledgement of the
     /// last.
@@ -124,7 +121,6 @@ pub struct Message {
     pub payload: Vec<u8>,
 }
 
-/// Intervals between polls.
 #[derive(Debug, Clone, Copy)]
 pub struct Intervals {
     /// Interval while MQTT is up.

@@ -31,7 +31,6 @@ pub struct LogFile {
 /// A line as shown to users, with the key that its duplicate would have.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
-    /// The line.
     pub line: LogLine,
     mark: Option<Mark>,
 }

@@ -26,7 +26,6 @@ const START: &[u8] = b"started";
 /// The same mark as written by earlier versions.
 const OLD_START: &[u8] = b"[taskd: started]";
 
-/// One stored line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Record<'a> {
     /// Time of writing, by the robot's clock.

@@ -14,7 +14,6 @@ use nix::errno::Errno;
 use nix::sys::prctl;
 use serde::{Deserialize, Serialize};
 
-/// The setting `seccomp`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Seccomp {

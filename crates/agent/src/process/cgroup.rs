@@ -133,7 +133,6 @@ impl Cgroup {
         Self(path)
     }
 
-    /// Its directory.
     pub fn path(&self) -> &Path {
         &self.0
     }

@@ -43,10 +43,7 @@ pub enum ContainmentError {
     Io(#[from] io::Error),
     /// Processes that SIGKILL did not end in time: they hang in the kernel.
     #[error("processes {pids:?} do not end, not even by SIGKILL")]
-    Survivors {
-        /// Their pids.
-        pids: Vec<u32>,
-    },
+    Survivors { pids: Vec<u32> },
 }
 
 /// Kills all members when it is dropped. Use it for processes that must not outlive the code that

@@ -53,7 +53,6 @@ const PASSED_ON: [Signal; 6] = [
 /// A process, distinguishable from every other process, also from a later one with the same pid.
 #[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ProcessIdentity {
-    /// The pid.
     pub pid: u32,
     /// Start time of the process: clock ticks since boot.
     pub start_ticks: u64,
@@ -64,11 +63,8 @@ pub struct ProcessIdentity {
 /// One line of the process table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ProcessEntry {
-    /// The pid.
     pub pid: u32,
-    /// Its parent.
     pub parent: u32,
-    /// Its process group.
     pub group: u32,
     /// Start time of the process: clock ticks since boot.
     pub start_ticks: u64,

@@ -61,7 +61,6 @@ pub struct RunSpec {
 /// The processes of a run that has begun.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Started {
-    /// The shim.
     pub shim: ProcessIdentity,
     /// The task's first process, which leads its own process group.
     pub task: ProcessIdentity,
@@ -87,20 +86,10 @@ pub struct Ended {
 pub enum RunDirError {
     /// Reading or writing it failed.
     #[error("cannot use {}", path.display())]
-    Io {
-        /// The file's path.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// The file is not in the format that this version writes.
     #[error("{} is not readable as what it should be", path.display())]
-    Malformed {
-        /// The file's path.
-        path: PathBuf,
-        /// The parser's error.
-        source: serde_json::Error,
-    },
+    Malformed { path: PathBuf, source: serde_json::Error },
 }
 
 impl RunDirError {
@@ -125,7 +114,6 @@ impl RunDir {
         Self(path.to_owned())
     }
 
-    /// The directory.
     pub fn path(&self) -> &Path {
         &self.0
     }
@@ -135,7 +123,6 @@ impl RunDir {
         self.read("spec.json")
     }
 
-    /// The run's processes.
     pub fn started(&self) -> Result<Option<Started>, RunDirError> {
         self.read("pid.json")
     }

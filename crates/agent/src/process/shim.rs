@@ -58,7 +58,6 @@ pub enum ShimError {
         script: String,
         /// Intended working directory of the script.
         directory: String,
-        /// The system's error.
         source: io::Error,
     },
     /// The system refused an operation that every process may do.

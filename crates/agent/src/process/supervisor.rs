@@ -59,10 +59,7 @@ pub enum Observed {
     /// The task ended and the shim recorded the exit status.
     Exited(ExitStatus),
     /// The kernel killed the task because it used more memory than its limit.
-    OutOfMemory {
-        /// The limit.
-        limit_bytes: u64,
-    },
+    OutOfMemory { limit_bytes: u64 },
     /// The run was started, but its exit status is unknown: its shim was killed, or the machine
     /// went down. None of its processes is left.
     Gone,
@@ -102,7 +99,6 @@ pub enum SupervisorError {
     Io {
         /// The operation that failed.
         what: &'static str,
-        /// The system's error.
         source: io::Error,
     },
 }

@@ -29,7 +29,6 @@ pub enum Refused {
     /// The state is older than the robot's current one.
     #[error("its generation {offered} is older than {accepted}, which this robot has")]
     Stale {
-        /// The generation offered.
         offered: Generation,
         /// The generation accepted before.
         accepted: Generation,

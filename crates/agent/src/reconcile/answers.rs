@@ -29,7 +29,6 @@ const AT_A_TIME: usize = 8;
 
 /// Answers the server's questions.
 pub struct Answers {
-    /// The robot's id.
     pub robot_id: RobotId,
     /// Verifies the requests that change something.
     pub orders: Orders,

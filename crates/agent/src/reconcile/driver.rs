@@ -57,7 +57,6 @@ static NOTHING_PREPARED: Prepared = Prepared {
 /// The robot and the agent that the driver reports for.
 #[derive(Debug, Clone)]
 pub struct Speaker {
-    /// The robot's id.
     pub robot_id: RobotId,
     /// The server's public key, which verifies the desired states.
     pub server_key: PublicKey,

@@ -40,23 +40,16 @@ pub enum GateError {
     /// The gate could not be run.
     #[error("cannot run the gate {}", .program.display())]
     Run {
-        /// The program.
         program: PathBuf,
         /// The operating system's error.
         source: io::Error,
     },
     /// The gate did not answer in time.
     #[error("the gate {} did not answer within {} s", .program.display(), .timeout.as_secs())]
-    Hung {
-        /// The program.
-        program: PathBuf,
-        /// The time limit.
-        timeout: Duration,
-    },
+    Hung { program: PathBuf, timeout: Duration },
     /// A signal ended the gate.
     #[error("the gate {} crashed: {status}", .program.display())]
     Crashed {
-        /// The program.
         program: PathBuf,
         /// The signal that ended the program.
         status: ExitStatus,

@@ -26,7 +26,6 @@ const MAX_STATES: usize = 64;
 /// Answers questions about the ROS graph.
 #[derive(Clone)]
 pub struct GraphAnswers {
-    /// The robot.
     pub robot: Arc<Robot>,
 }
 

@@ -79,7 +79,6 @@ const RUN_RECORD: &str = "run.json";
 /// How much of the end of a log goes into a failure's text, without its times.
 const TAIL_BYTES: u64 = 3072;
 
-/// This robot.
 pub struct Robot {
     data: DataDir,
     fetcher: Arc<Fetcher>,

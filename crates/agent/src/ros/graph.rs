@@ -82,14 +82,10 @@ pub enum GraphError {
     DomainId(u16),
     /// The program that takes part could not be started.
     #[error("cannot start the program that takes part in the ROS graph: {reason}")]
-    Start {
-        /// The system's error.
-        reason: String,
-    },
+    Start { reason: String },
     /// The agent could not take part in the domain.
     #[error("cannot take part in ROS domain {domain_id}: {reason}")]
     Join {
-        /// The domain.
         domain_id: u16,
         /// The DDS library's error.
         reason: String,
@@ -97,7 +93,6 @@ pub enum GraphError {
     /// A reader or writer could not be created.
     #[error("cannot make a reader or writer for {topic}: {reason}")]
     Endpoint {
-        /// The DDS topic.
         topic: String,
         /// The DDS library's error.
         reason: String,
@@ -107,18 +102,10 @@ pub enum GraphError {
     Kind(String),
     /// The service's full name would exceed the limit for ROS names.
     #[error("{node}/{service} is longer than a ROS name may be")]
-    Name {
-        /// The node.
-        node: GraphName,
-        /// The service.
-        service: String,
-    },
+    Name { node: GraphName, service: String },
     /// A message could not be serialized.
     #[error("cannot encode the request: {reason}")]
-    Encode {
-        /// The serializer's error.
-        reason: String,
-    },
+    Encode { reason: String },
     /// A message could not be sent.
     #[error("cannot send the request: {reason}")]
     Write {
@@ -128,35 +115,26 @@ pub enum GraphError {
     /// No node offers the service.
     #[error("{service}: no server within {within:?}")]
     NoServer {
-        /// The service.
         service: GraphName,
-        /// Time spent waiting.
         #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
     /// There is a server, but no answer arrived.
     #[error("{service}: no answer within {within:?}")]
     NoAnswer {
-        /// The service.
         service: GraphName,
-        /// Time spent waiting.
         #[serde(rename = "within_ms", with = "milliseconds")]
         within: Duration,
     },
     /// The answer does not decode as the service's type.
     #[error("{service}: the answer is not of the service's type")]
-    Malformed {
-        /// The service.
-        service: GraphName,
-    },
+    Malformed { service: GraphName },
     /// The node exceeds a limit.
     #[error("{node}: {found} {what} are too many")]
     TooMany {
         /// The kind of the counted objects.
         what: String,
-        /// The node.
         node: GraphName,
-        /// The number found.
         found: usize,
     },
     /// The limit of concurrent calls is reached.

@@ -44,7 +44,6 @@ const EVERYWHERE: &str = "use_sim_time";
 /// A run to be watched.
 #[derive(Debug, Clone, Default)]
 pub struct Watched {
-    /// Its run directory.
     pub dir: PathBuf,
     /// Start time of the run's process, in milliseconds since boot.
     pub started_ms: u64,

@@ -23,7 +23,6 @@ const NO_ROOM_BYTES: u64 = 16 * 1024 * 1024;
 pub struct Need {
     /// The missing part of the compressed content.
     pub blob: u64,
-    /// The unpacked tree.
     pub tree: u64,
     /// Build and install trees.
     pub build: u64,
@@ -51,7 +50,6 @@ pub struct DiskFull {
 pub struct Room {
     /// Bytes that an ordinary user may still write.
     pub free: u64,
-    /// Bytes in all.
     pub total: u64,
 }
 

@@ -19,7 +19,6 @@ const INTERFACES: &str = "/sys/class/net";
 /// Value of `addr_assign_type` for the hardware's own address.
 const PERMANENT: &str = "0";
 
-/// A registered robot.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Identity {
     /// The robot's permanent id at the server.
@@ -60,20 +59,10 @@ pub enum IdentityError {
     Missing(PathBuf),
     /// Reading or writing the file failed.
     #[error("cannot use {path}")]
-    Io {
-        /// The file's path.
-        path: PathBuf,
-        /// The system's error.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// The file is not an identity.
     #[error("{path} is not an identity")]
-    Malformed {
-        /// The file's path.
-        path: PathBuf,
-        /// The parser's error.
-        source: serde_json::Error,
-    },
+    Malformed { path: PathBuf, source: serde_json::Error },
 }
 
 /// Reasons why no MAC address was chosen.
@@ -93,7 +82,6 @@ pub enum MacError {
 }
 
 impl Identity {
-    /// Reads the identity.
     pub fn read(path: &Path) -> Result<Self, IdentityError> {
         match std::fs::read(path) {
             Ok(bytes) => serde_json::from_slice(&bytes)

@@ -73,7 +73,6 @@ impl DataDir {
         Ok(Self { root: std::path::absolute(root)? })
     }
 
-    /// The directory itself.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -123,7 +122,6 @@ impl DataDir {
         self.root.join("logs").join("ros.log")
     }
 
-    /// One task's directory.
     pub fn task(&self, name: &TaskName) -> TaskDir {
         TaskDir { root: self.tasks().join(name.as_str()) }
     }
@@ -177,12 +175,10 @@ impl DataDir {
 }
 
 impl TaskDir {
-    /// The directory itself.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// The shim's files.
     pub fn run(&self) -> PathBuf {
         self.root.join("run")
     }
@@ -288,7 +284,6 @@ impl TaskDir {
 }
 
 impl VersionDir {
-    /// The directory itself.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -309,7 +304,6 @@ impl VersionDir {
         self.root.join("build")
     }
 
-    /// The built files.
     pub fn install(&self) -> PathBuf {
         self.root.join("install")
     }

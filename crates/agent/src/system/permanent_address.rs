@@ -16,7 +16,6 @@ const MAX_ADDRESS: usize = 32;
 /// Length of an Ethernet address.
 const MAC: usize = 6;
 
-/// `struct ethtool_perm_addr`.
 #[repr(C)]
 struct Answer {
     command: u32,

@@ -26,14 +26,11 @@ const SETGROUPS: libc::c_long = libc::SYS_setgroups;
 #[cfg(target_pointer_width = "32")]
 const SETGROUPS: libc::c_long = libc::SYS_setgroups32;
 
-/// A user account.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct TaskUser {
     /// The account's name, or its number where it has no name.
     pub name: String,
-    /// Its user id.
     pub uid: u32,
-    /// Its group.
     pub gid: u32,
     /// The supplementary groups: `dialout`, `video`, …
     pub groups: Vec<u32>,
@@ -48,17 +45,13 @@ pub enum TaskUserError {
          {DEFAULT_NAME}`), or name another by `task_user` in agent.toml (\"root\" if tasks are to have the whole \
          machine), and restart the agent"
     )]
-    Missing {
-        /// The name.
-        name: String,
-    },
+    Missing { name: String },
     /// The account can't enter a directory above the agent's data directory.
     #[error(
         "tasks run as {user:?}, which may not enter {}, where the data directory {} lies: let it pass \
          (`chmod o+x {}`) or move the data directory, and restart the agent", dir.display(), data.display(), dir.display()
     )]
     ShutOut {
-        /// The account's name.
         user: String,
         /// The first directory that the account can't enter.
         dir: PathBuf,
@@ -69,10 +62,7 @@ pub enum TaskUserError {
     #[error(
         "task_user is {name:?}, but the agent does not run as root and can't start anything as another user"
     )]
-    NotRoot {
-        /// The name.
-        name: String,
-    },
+    NotRoot { name: String },
 }
 
 impl TaskUser {

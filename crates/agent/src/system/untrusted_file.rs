@@ -21,7 +21,6 @@ pub struct Directory(OwnedFd);
 /// The type of a directory entry; links are not followed.
 #[derive(Debug)]
 pub enum Entry {
-    /// A directory.
     Directory(Directory),
     /// A regular file, with its size in bytes.
     File(u64),

@@ -21,7 +21,6 @@ use crate::transfer::parts::Asks;
 /// Readings of the agent's two clocks, in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Now {
-    /// Since boot.
     pub boot_ms: u64,
     /// Since the Unix epoch, by the robot's clock, which may be wrong.
     pub wall_ms: u64,
@@ -130,7 +129,6 @@ pub trait Effects: Send + Sync + 'static {
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
-    /// Builds the package.
     fn build(
         &self,
         package: &PackageRef,

@@ -37,7 +37,6 @@ const MAX_FINISHED: usize = 32;
 /// The agent's persistent state.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Ledger {
-    /// See [`FORMAT`].
     pub format: u32,
     /// How many times the agent has been started.
     pub start: u64,
@@ -60,7 +59,6 @@ pub struct Ledger {
 pub struct Accepted {
     /// The generation of the state.
     pub generation: Generation,
-    /// The signed bytes.
     pub envelope: Envelope,
 }
 
@@ -190,7 +188,6 @@ pub struct FinishedRun {
 /// The outcome of a run.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct End {
-    /// A final phase.
     pub phase: Phase,
     /// The reason, if the run did not succeed.
     pub failure: Option<Failure>,
@@ -205,7 +202,6 @@ pub struct Collection {
     pub run: u64,
     /// The package that ran.
     pub package: PackageRef,
-    /// Service or job.
     pub kind: TaskKind,
     /// When the run ended, or when this boot began.
     pub since_ms: u64,
@@ -239,7 +235,6 @@ pub struct LedgerError {
 /// The result of reading the ledger file.
 #[derive(Debug)]
 pub enum Found {
-    /// A valid ledger.
     Ledger(Box<Ledger>),
     /// No file: a first start.
     Nothing,

@@ -56,16 +56,13 @@ pub struct TrustFacts {
 pub enum ProcessState {
     /// The ledger has no process.
     None,
-    /// The process lives.
     Alive {
-        /// The process id.
         pid: u32,
     },
     /// The state cannot be determined now.
     Unknown,
     /// The process was about to be started and was not.
     NeverStarted,
-    /// The process ended.
     Ended(Exit),
 }
 
@@ -84,10 +81,8 @@ pub struct Exit {
 /// of its package.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub enum Health {
-    /// No observation yet.
     #[default]
     Unknown,
-    /// All promises hold.
     Holds {
         /// The time since which all promises have held without a break.
         since_ms: u64,
@@ -119,7 +114,6 @@ pub struct Missing {
 /// Facts about the robot that a package may require.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct RobotFacts {
-    /// The processor architecture.
     pub arch: String,
     /// The labels that the server holds; `None` until the server has sent them.
     pub labels: Option<Labels>,

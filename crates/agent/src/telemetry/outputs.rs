@@ -23,9 +23,7 @@ pub use push::Registry;
 /// The files to upload, and the run that they belong to.
 #[derive(Debug, Clone)]
 pub struct OutputOrder {
-    /// The robot.
     pub robot_id: RobotId,
-    /// The task.
     pub task: TaskName,
     /// Version of the task.
     pub version: Version,
@@ -51,12 +49,7 @@ pub struct OutputOrder {
 pub enum OutputError {
     /// A pattern is invalid.
     #[error("outputs.paths: {pattern:?} is not a pattern: {reason}")]
-    Pattern {
-        /// The pattern.
-        pattern: String,
-        /// Reason.
-        reason: &'static str,
-    },
+    Pattern { pattern: String, reason: &'static str },
     /// The files exceed a limit.
     #[error("outputs.paths: {0}")]
     TooMuch(String),
@@ -66,7 +59,6 @@ pub enum OutputError {
     /// A file can't be read.
     #[error("cannot read {path}")]
     Read {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
@@ -74,7 +66,6 @@ pub enum OutputError {
     /// The record of uploads in progress can't be written.
     #[error("cannot write {path}")]
     Note {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
@@ -85,7 +76,6 @@ pub enum OutputError {
     /// The answer does not come from a registry, but from a captive portal or a proxy.
     #[error("something else answers in the server's place: {status} {text}")]
     NotTheServer {
-        /// The HTTP status.
         status: u16,
         /// Text of the answer.
         text: String,
@@ -93,7 +83,6 @@ pub enum OutputError {
     /// The server is overloaded, restarting or broken.
     #[error("the server answers {status} {text}")]
     Busy {
-        /// The HTTP status.
         status: u16,
         /// Text of the answer.
         text: String,
@@ -105,7 +94,6 @@ pub enum OutputError {
     Refused {
         /// Subject of the request.
         what: String,
-        /// The HTTP status.
         status: u16,
         /// The registry's error code, if the answer has one.
         code: String,

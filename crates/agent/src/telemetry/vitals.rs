@@ -33,9 +33,7 @@ const UNKNOWN_PAUSE: Duration = Duration::from_secs(3600);
 /// Paths that vitals are read from.
 #[derive(Debug, Clone)]
 pub struct Places {
-    /// `/proc`.
     pub proc: PathBuf,
-    /// `/sys`.
     pub sys: PathBuf,
     /// A path on the reported file system.
     pub data: PathBuf,
@@ -183,7 +181,6 @@ fn tenths(value: f64) -> f32 {
 
 /// A source of vitals: the machine, or a simulation of one.
 pub trait Source: Send + 'static {
-    /// The current vitals.
     fn look(&mut self) -> Vitals;
 }
 
@@ -222,7 +219,6 @@ impl Asked {
 
 /// Sends the robot's vitals periodically.
 pub struct Sender<S> {
-    /// The robot.
     pub robot_id: RobotId,
     /// Interval between messages; zero disables them.
     pub interval: Duration,

@@ -8,7 +8,6 @@ use std::sync::{Arc, PoisonError, RwLock};
 pub struct Credential(Arc<RwLock<String>>);
 
 impl Credential {
-    /// The current token.
     pub fn current(&self) -> String {
         self.0.read().unwrap_or_else(PoisonError::into_inner).clone()
     }

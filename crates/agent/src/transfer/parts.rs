@@ -39,7 +39,6 @@ pub struct Wishes {
 /// A request to collect a content's parts. Each new request has a new number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wish {
-    /// The content.
     pub digest: Digest,
     number: u64,
 }
@@ -72,7 +71,6 @@ pub enum Hearing {
 pub struct Ear {
     wish: Wish,
     listening: Listening,
-    /// Received parts.
     pub parts: mpsc::Receiver<Arrived>,
     /// State of the subscription.
     pub hearing: watch::Receiver<Hearing>,

@@ -13,7 +13,6 @@ pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-co
 /// Most bytes of an error's body that are read.
 const MAX_BYTES: usize = 4096;
 
-/// A registry's error.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct RegistryWords {
     /// Error code of the specification; empty if the body is not a registry's error.

@@ -46,19 +46,13 @@ pub enum ServerError {
     /// The server is overloaded, restarting or broken.
     #[error("the server answers {status}")]
     Busy {
-        /// The HTTP status.
         status: u16,
         /// Wait that the server requests.
         retry_after: Option<Duration>,
     },
     /// The server refused the request.
     #[error("the server refuses: {message} ({code})")]
-    Refused {
-        /// Stable error code.
-        code: String,
-        /// Text for people.
-        message: String,
-    },
+    Refused { code: String, message: String },
 }
 
 /// Client of the server for one registered robot.
@@ -75,7 +69,6 @@ pub struct Server {
 /// A desired state as the server sent it.
 #[derive(Debug)]
 pub struct Sent {
-    /// The signed state.
     pub envelope: Envelope,
     /// The server's entity tag for exactly these bytes, opaque to the agent.
     pub tag: Option<HeaderValue>,
@@ -93,7 +86,6 @@ pub fn client(tls: ClientConfig) -> Result<reqwest::Client, reqwest::Error> {
         .build()
 }
 
-/// Registers a robot.
 pub async fn enroll(
     client: &reqwest::Client,
     base: &Url,

@@ -12,7 +12,6 @@ use task_proto::{CaPin, DeploymentId, MacAddress};
 /// The first line to the process: the list of its robots. Every further line is an [`Order`].
 #[derive(Serialize, Deserialize)]
 pub struct Crew {
-    /// The server's URL.
     pub server: String,
     /// Pin of the certificate authority; absent without encryption.
     pub pin: Option<CaPin>,
@@ -28,11 +27,9 @@ pub struct Crew {
     pub own_addresses: bool,
     /// The number of the first robot; the others count on from there.
     pub first: usize,
-    /// The robots.
     pub members: Vec<Member>,
 }
 
-/// A registered robot.
 #[derive(Clone, Serialize, Deserialize)]
 pub struct Member {
     /// The MAC used for registration.
@@ -68,7 +65,6 @@ pub enum Word {
     Verified {
         /// Number of the robot.
         robot: usize,
-        /// The deployment.
         deployment: DeploymentId,
         /// When the acknowledgement came.
         at_ns: u64,
@@ -77,9 +73,7 @@ pub enum Word {
     Failed {
         /// Number of the robot.
         robot: usize,
-        /// The deployment.
         deployment: DeploymentId,
-        /// Code and text.
         why: String,
     },
 }

@@ -69,7 +69,6 @@ struct Case<'a> {
     robots: &'a [EnrollResponse],
 }
 
-/// Runs the scenario.
 pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     let (began, seed) = (Instant::now(), flags.run.seed());
     let mut run = Run::begin("blob", seed).await;

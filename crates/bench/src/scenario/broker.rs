@@ -69,7 +69,6 @@ struct Figures {
     anonymous_bytes: Vec<f64>,
 }
 
-/// Runs the scenario.
 pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("broker", flags.run.seed()).await;

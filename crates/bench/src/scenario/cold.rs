@@ -23,7 +23,6 @@ const PROBE_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Parameters of the measurement.
 pub struct Plan {
-    /// Number of runs.
     pub runs: u32,
     /// Number of blobs, and of robots that pull one each.
     pub pulls: usize,

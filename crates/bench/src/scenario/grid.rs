@@ -80,14 +80,12 @@ impl fmt::Display for Mechanism {
     }
 }
 
-/// One run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Cell {
     /// The mechanism of delivery.
     pub mechanism: Mechanism,
     /// Size of the payload, in bytes.
     pub payload_bytes: u64,
-    /// Number of robots.
     pub robots: usize,
 }
 

@@ -48,7 +48,6 @@ pub struct PageFlags {
 /// Measurements from the browser.
 #[derive(Debug, Deserialize)]
 struct Seen {
-    /// Its version.
     browser: String,
     /// From asking for the page, with a session, until rows were drawn.
     first_rows_ms: Vec<f64>,
@@ -68,7 +67,6 @@ struct Seen {
     events_s: f64,
 }
 
-/// Runs the scenario.
 pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("page", flags.run.seed()).await;

@@ -187,7 +187,6 @@ impl Stand {
     }
 }
 
-/// The requested runs.
 fn chosen(flags: &PaperFlags, seed: u64) -> anyhow::Result<Vec<Cell>> {
     anyhow::ensure!((0.1..=3600.0).contains(&flags.poll_s), "--poll-s: expected 0.1 to 3600");
     let (extent, usual) = match (flags.quick, flags.full) {

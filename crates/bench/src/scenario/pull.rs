@@ -56,7 +56,6 @@ pub struct PullFlags {
     run: RunFlags,
 }
 
-/// Runs the scenario.
 pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
     let (begun, seed) = (Instant::now(), flags.run.seed());
     let mut run = Run::begin("pull", seed).await;

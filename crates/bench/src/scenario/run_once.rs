@@ -34,7 +34,6 @@ pub struct OneOrder {
     pub robots: usize,
     /// Seed of the payload's bytes; unique for each order of a run.
     pub seed: u64,
-    /// Time limit.
     pub limit: Duration,
 }
 

@@ -41,7 +41,6 @@ pub struct StatusFlags {
     run: RunFlags,
 }
 
-/// Runs the scenario.
 pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("status", flags.run.seed()).await;

@@ -26,7 +26,6 @@ const DECOY: &str = "$argon2id$v=19$m=19456,t=2,p=1$oiWDNzbpRSZLLWAsLdq6YA$fFQXZ
 pub struct PasswordHash(String);
 
 impl PasswordHash {
-    /// The stored text.
     pub fn as_str(&self) -> &str {
         &self.0
     }

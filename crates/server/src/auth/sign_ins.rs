@@ -24,7 +24,6 @@ const MOST_COUNTS: usize = 8_192;
 /// Maximum familiar pairs of account and address.
 const MOST_FAMILIAR: usize = 8_192;
 
-/// The counts.
 #[derive(Debug, Default)]
 pub struct SignIns(Mutex<Counts>);
 

@@ -70,7 +70,6 @@ impl Blob {
         Ok(Self { digest, size, quoted_digest, file: Arc::new(file), mapped, disk, store })
     }
 
-    /// The blob's digest.
     pub fn digest(&self) -> Digest {
         self.digest
     }

@@ -14,7 +14,6 @@ use http_body::{Body, Frame, SizeHint};
 
 use super::{Blob, BytesFor};
 
-/// The largest slice.
 const SLICE_BYTES: u64 = 128 * 1024;
 /// The most bytes that one system call checks for presence in memory, and that are read ahead if
 /// they are absent. The kernel may evict them again before they are sent. A page is then read on

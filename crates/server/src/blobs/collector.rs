@@ -24,9 +24,7 @@ const DROPPED_GRACE: Duration = Duration::from_secs(3600);
 /// The number of items that one collection removed.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Collected {
-    /// Unfinished uploads.
     pub uploads: usize,
-    /// Blobs.
     pub blobs: usize,
 }
 
@@ -36,7 +34,6 @@ pub enum CollectError {
     /// The blob store failed.
     #[error("unneeded blobs can't be deleted")]
     Blobs(#[from] BlobError),
-    /// The database failed.
     #[error("the database can't tell which blobs are needed")]
     Store(#[from] StoreError),
 }

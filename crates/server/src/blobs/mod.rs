@@ -79,30 +79,22 @@ pub enum BlobError {
     /// [`BlobSettings::max_uploads`] is reached and no upload can be evicted; or a robot has
     /// reached its share.
     #[error("{max} uploads are unfinished already; finish or cancel one")]
-    TooManyUploads {
-        /// The limit.
-        max: usize,
-    },
+    TooManyUploads { max: usize },
     /// A chunk does not begin at the upload's offset.
     #[error("the chunk begins at byte {given}, the upload stands at {offset}")]
     OutOfOrder {
         /// Where the chunk begins.
         given: u64,
-        /// The upload's offset.
         offset: u64,
     },
     /// The blob exceeds the size limit.
     #[error("the blob is larger than this server's limit of {max} bytes")]
-    TooLarge {
-        /// The limit.
-        max: u64,
-    },
+    TooLarge { max: u64 },
     /// The robot exceeds its share of the disk.
     #[error(
         "{kept} bytes of what this robot brought back are on the disk, {max} may be: older ones leave it within hours (robots.output_bytes)"
     )]
     TooMuchOfRobot {
-        /// The limit.
         max: u64,
         /// Bytes stored for the robot, including unfinished uploads.
         kept: u64,
@@ -110,7 +102,6 @@ pub enum BlobError {
     /// The bytes do not hash to the announced digest.
     #[error("the bytes hash to {actual}, not to {expected}")]
     WrongDigest {
-        /// The announced digest.
         expected: Box<Digest>,
         /// The digest of the received bytes.
         actual: Box<Digest>,
@@ -132,14 +123,7 @@ pub enum BlobError {
     },
     /// A file operation failed.
     #[error("the blob store can't {action} {path}")]
-    Disk {
-        /// The operation.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
+    Disk { action: &'static str, path: PathBuf, source: io::Error },
 }
 
 impl BlobError {

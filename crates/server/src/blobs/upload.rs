@@ -66,7 +66,6 @@ impl FromStr for UploadId {
     }
 }
 
-/// All unfinished uploads.
 pub(super) struct Uploads {
     directory: PathBuf,
     settings: BlobSettings,
@@ -452,7 +451,6 @@ impl Blobs {
         finished
     }
 
-    /// Cancels an upload.
     pub async fn cancel_upload(
         &self,
         repository: &RepositoryName,

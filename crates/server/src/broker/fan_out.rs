@@ -55,7 +55,6 @@ pub struct FanOutSettings {
 pub enum PartQos {
     /// Sent without acknowledgement: robots request lost parts again.
     AtMostOnce,
-    /// Acknowledged.
     #[default]
     AtLeastOnce,
     /// Acknowledged, released and completed.

@@ -61,7 +61,6 @@ pub enum Principal {
     /// A robot: publishes and subscribes on its own topics only. Its client id must be its robot
     /// id.
     Robot {
-        /// The robot's id.
         robot: RobotId,
         /// The number of the token that was presented; it is attached to the robot's messages.
         token_number: u64,
@@ -100,7 +99,6 @@ pub struct RobotMessage {
     /// The sender. The embedded broker proves the sender by the connection; an external broker only
     /// as far as its access control list does.
     pub robot: RobotId,
-    /// The topic.
     pub topic: RobotTopic,
     /// The bytes, not decoded.
     pub payload: Bytes,
@@ -150,9 +148,7 @@ pub struct BrokerConfig {
     pub tls: Option<Tls>,
     /// The prefix of all topics.
     pub prefix: TopicPrefix,
-    /// The bounds.
     pub limits: Limits,
-    /// How robots behave.
     pub conduct: Arc<Conduct>,
 }
 
@@ -212,7 +208,6 @@ impl Default for Limits {
 /// The broker's health. On [`Health::Failed`] the server should report the failure and end.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Health {
-    /// The canary arrived.
     Serving,
     /// The canary did not arrive, and a remedy is under way; contains the observation.
     Recovering(String),
@@ -226,17 +221,13 @@ pub enum BrokerError {
     /// The address is in use, or does not belong to this machine.
     #[error("cannot listen for MQTT on {address}")]
     Listen {
-        /// The configured address.
         address: SocketAddr,
         /// The operating system's error.
         source: std::io::Error,
     },
     /// The router thread did not come up.
     #[error("the message router did not start: {reason}")]
-    Router {
-        /// The observed failure.
-        reason: String,
-    },
+    Router { reason: String },
 }
 
 /// The robot has no live session here.

@@ -60,7 +60,6 @@ type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 pub(super) enum Listening {
     /// Everything below the prefix.
     Everything,
-    /// Canaries.
     Canary,
 }
 
@@ -273,7 +272,6 @@ impl Drop for Place {
     }
 }
 
-/// Receives published messages.
 pub(super) struct Listener {
     link: Link,
     replaced: CancellationToken,

@@ -9,7 +9,6 @@ use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 use crate::commands;
 use crate::config::ServeFlags;
 
-/// See [`commands::Outcome`].
 const EXIT_CODES: &str = "Exit codes: 0 done, 1 failed, 2 the command line, a setting or the package is wrong or no robot \
                           is meant, 3 some robots failed, 4 not allowed, 5 not done in time";
 

@@ -238,12 +238,7 @@ pub enum CommandError {
     Broken(String),
     /// A local file or stream.
     #[error("{what}")]
-    Io {
-        /// The failed operation.
-        what: String,
-        /// The cause.
-        source: std::io::Error,
-    },
+    Io { what: String, source: std::io::Error },
 }
 
 impl CommandError {

@@ -152,13 +152,10 @@ pub enum BlobRead {
 pub enum Origin {
     /// A command line flag.
     Flag(String),
-    /// An environment variable.
     Variable(String),
     /// A key in a file.
     File {
-        /// The key.
         key: String,
-        /// The file.
         path: PathBuf,
     },
 }
@@ -195,7 +192,6 @@ pub enum ConfigError {
     /// The file can't be read.
     #[error("can't read the configuration file {}", path.display())]
     Unreadable {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         source: std::io::Error,
@@ -203,7 +199,6 @@ pub enum ConfigError {
     /// The file is not TOML.
     #[error("{} is not valid TOML: {reason}", path.display())]
     Syntax {
-        /// The file.
         path: PathBuf,
         /// The position and the error.
         reason: String,
@@ -218,10 +213,7 @@ pub enum ConfigError {
         "--{name}: everybody on this machine can read a command line, so a URL with a password belongs in the \
          configuration file ({name} = \"…\") or in TASKD_{upper}", upper = name.to_uppercase()
     )]
-    PasswordInSight {
-        /// The setting.
-        name: &'static str,
-    },
+    PasswordInSight { name: &'static str },
     /// One public address is set, but robots use several brokers.
     #[error(
         "public_mqtt_host and public_mqtt_port name one place, and broker names several; robots are told the hosts and \
@@ -233,10 +225,7 @@ pub enum ConfigError {
         "broker = {address}: an unencrypted connection to another machine is refused; use mqtts://, a broker on this machine or \
          give --allow-plaintext"
     )]
-    PlaintextBroker {
-        /// The broker's address.
-        address: String,
-    },
+    PlaintextBroker { address: String },
     /// A certificate without its key, or the other way round.
     #[error("{given}: {missing} is missing")]
     HalfACertificate {
@@ -261,12 +250,7 @@ pub enum ConfigError {
         "{key} = {address}: unencrypted connections from other machines are refused; leave out --tls-private-ca=false, \
          bind a loopback address or give --allow-plaintext"
     )]
-    Plaintext {
-        /// The listener's setting.
-        key: &'static str,
-        /// Its address.
-        address: SocketAddr,
-    },
+    Plaintext { key: &'static str, address: SocketAddr },
 }
 
 /// Variables that other commands and tasks use; `serve` ignores them.
@@ -502,7 +486,6 @@ pub fn default_data_directory(variable: impl Fn(&str) -> Option<OsString>) -> Op
 /// The flags of `taskd serve`: `--config FILE` and one per setting.
 #[derive(Debug, Clone, Default)]
 pub struct ServeFlags {
-    /// The TOML file.
     pub config: Option<PathBuf>,
     /// Settings by flag name.
     pub settings: Vec<(&'static str, String)>,

@@ -25,7 +25,6 @@ pub struct OidcSettings {
     pub client_secret_file: Option<PathBuf>,
     /// The URL at which browsers reach this server, without a path.
     pub public_url: String,
-    /// The requested scopes.
     pub scopes: String,
     /// The claim that becomes a new user's name.
     pub name_claim: String,

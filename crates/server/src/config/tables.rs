@@ -47,9 +47,7 @@ impl Default for PersonRates {
 /// Limits of a group of robots together; `None`: unlimited.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct SiteLimits {
-    /// Concurrent transfers.
     pub max: Option<u64>,
-    /// Bytes per second.
     pub bytes_per_s: Option<u64>,
 }
 

@@ -59,18 +59,15 @@ impl FromStr for BrokerUrls {
     }
 }
 
-/// `mqtt://user:password@host:port`, or `mqtts://…`.
 #[derive(Clone, PartialEq, Eq)]
 pub struct BrokerUrl {
     /// Host name or address; an IPv6 address in brackets.
     pub host: String,
-    /// TCP port.
     pub port: u16,
     /// Whether the broker expects TLS.
     pub tls: bool,
     /// The server's own user at the broker.
     pub user_name: String,
-    /// The user's password.
     pub password: String,
 }
 

@@ -58,29 +58,17 @@ pub struct Inputs {
 /// A number that rules can compare.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Quantity {
-    /// [`Inputs::size`].
     Size,
-    /// [`Inputs::lacking`].
     Lacking,
-    /// [`Inputs::robots`].
     Robots,
-    /// [`Inputs::batch`].
     Batch,
-    /// [`Inputs::same_site`].
     SameSite,
-    /// [`Inputs::throughput_bytes_per_s`].
     Throughput,
-    /// [`Inputs::rtt_ms`].
     Rtt,
-    /// [`Inputs::losses`].
     Losses,
-    /// [`Inputs::reconnects`].
     Reconnects,
-    /// [`Inputs::battery_percent`].
     Battery,
-    /// [`Inputs::transfers`].
     Transfers,
-    /// [`Inputs::backlog`].
     Backlog,
 }
 
@@ -91,33 +79,24 @@ pub enum Unit {
     Bytes,
     /// `256 KB/s`, in the units of [`Unit::Bytes`].
     BytesPerSecond,
-    /// `100 ms`.
     Milliseconds,
-    /// 0 to 100.
     Percent,
-    /// A plain number.
     Count,
 }
 
 /// The comparison of a quantity with a rule's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Comparison {
-    /// `>`
     Above,
-    /// `≤`
     AtMost,
-    /// `≥`
     AtLeast,
-    /// `<`
     Below,
 }
 
 /// A fact that is true or false.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Flag {
-    /// [`Inputs::metered`].
     Metered,
-    /// [`Inputs::connected`].
     Connected,
 }
 
@@ -321,7 +300,6 @@ pub enum ConditionKey {
 }
 
 impl Quantity {
-    /// All quantities.
     pub const ALL: [Self; 12] = [
         Self::Size,
         Self::Lacking,
@@ -421,7 +399,6 @@ pub fn shown_bytes(bytes: u64) -> String {
 }
 
 impl Comparison {
-    /// All comparisons.
     pub const ALL: [Self; 4] = [Self::Above, Self::AtMost, Self::AtLeast, Self::Below];
 
     /// The suffix of a key in the configuration.
@@ -468,7 +445,6 @@ impl Comparison {
 }
 
 impl Flag {
-    /// All flags.
     pub const ALL: [Self; 2] = [Self::Metered, Self::Connected];
 
     /// The flag's key in the configuration.

@@ -21,13 +21,9 @@ pub enum Happening {
 /// The phase of a robot's part of a deployment.
 #[derive(Debug)]
 pub struct TaskNews {
-    /// The robot.
     pub robot: RobotId,
-    /// The robot's name.
     pub name: RobotName,
-    /// The deployment.
     pub deployment: DeploymentId,
-    /// The phase.
     pub phase: Phase,
     /// The cause of a failure.
     pub failure: Option<Failure>,

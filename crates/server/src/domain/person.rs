@@ -17,13 +17,11 @@ const FIRST: &str = "operator.token";
 /// The person behind a request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Person {
-    /// The user's name.
     pub name: UserName,
     /// The roles that the presented token allows.
     pub roles: Roles,
     /// The robots within the person's rights.
     pub scope: Scope,
-    /// The presented token.
     pub token: TokenId,
     /// The origin of that token.
     pub origin: TokenOrigin,
@@ -69,7 +67,6 @@ pub fn first_name() -> UserName {
 pub struct Scope(Vec<Selector>);
 
 impl Scope {
-    /// Every robot.
     pub fn everything() -> Self {
         Self::default()
     }

@@ -78,7 +78,6 @@ pub struct Tally {
     pub busy: u64,
     /// Lost while they worked on the package.
     pub lost: u64,
-    /// Settled by failing.
     pub failed: u64,
 }
 

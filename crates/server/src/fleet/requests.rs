@@ -28,10 +28,7 @@ pub enum RequestError {
     Busy,
     /// The robot did not answer in time.
     #[error("the robot did not answer within {} s", .patience.as_secs_f64())]
-    TimedOut {
-        /// The time limit.
-        patience: Duration,
-    },
+    TimedOut { patience: Duration },
     /// The robot refused, with a reason.
     #[error("{}", .0.text)]
     Refused(Refusal),

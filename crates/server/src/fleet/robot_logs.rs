@@ -53,7 +53,6 @@ struct Kept {
 /// The robot's lines that the server holds in memory.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Remembered {
-    /// The oldest first.
     pub lines: Vec<LogLine>,
     /// The robot's clock when the lines arrived.
     pub robot_ms: u64,
@@ -73,7 +72,6 @@ pub enum Told {
     },
     /// The robot can't be reached.
     Away(Arc<str>),
-    /// Lines arrived.
     Lines(Arc<LogBatch>),
 }
 
@@ -92,7 +90,6 @@ pub struct Follower {
 
 /// A new follower's place, and the follow-up work.
 pub struct Joined {
-    /// The place.
     pub follower: Follower,
     /// The events for the follower.
     pub told: broadcast::Receiver<Told>,

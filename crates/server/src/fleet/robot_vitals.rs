@@ -42,7 +42,6 @@ struct Sample {
     disk: u16,
     network_in: Rate,
     network_out: Rate,
-    /// In hundredths.
     load: u16,
     battery: u8,
     /// In degrees Celsius above -50.
@@ -86,7 +85,6 @@ impl RobotVitals {
         kept.newest
     }
 
-    /// The newest vitals.
     pub fn newest(&self, robot: &RobotId) -> Option<Vitals> {
         self.robots().get(robot).map(|kept| kept.newest)
     }

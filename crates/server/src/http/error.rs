@@ -24,9 +24,7 @@ pub(super) const DATABASE_CORRUPT: &str = "database_corrupt";
 /// An error answer of the API.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ApiError {
-    /// The HTTP status.
     pub status: StatusCode,
-    /// The stable code.
     pub code: &'static str,
     /// The error message, which names the caller's own key.
     pub message: String,

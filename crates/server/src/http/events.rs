@@ -133,7 +133,6 @@ impl Audience {
     }
 }
 
-/// A connected listener.
 #[derive(Clone, PartialEq, Eq)]
 struct Listener {
     name: UserName,
@@ -186,7 +185,6 @@ pub struct EventFeed {
 
 /// The sources that the feed reads from.
 pub struct EventSource {
-    /// The database.
     pub store: Store,
     /// Presence of the robots.
     pub presence: Arc<Presence>,
@@ -196,7 +194,6 @@ pub struct EventSource {
     pub vitals: RobotVitals,
     /// The feed of recent events.
     pub feed: Feed,
-    /// The time source.
     pub clock: Clock,
 }
 

@@ -68,19 +68,14 @@ pub struct App(Arc<AppParts>);
 
 /// The parts of an [`App`].
 pub struct AppParts {
-    /// The time source.
     pub clock: Clock,
-    /// The database.
     pub store: Store,
-    /// The order operations.
     pub actions: Actions,
-    /// Notices of changes.
     pub changes: Changes,
     /// The writer that stores reports.
     pub reports: ReportWriter,
     /// Presence of the robots.
     pub presence: Arc<Presence>,
-    /// The MQTT broker.
     pub broker: Broker,
     /// Requests to robots that are under way.
     pub requests: Requests,
@@ -124,9 +119,7 @@ pub struct AppParts {
     pub mqtt: Arc<MqttAccess>,
     /// The addresses of reverse proxies with a trusted `X-Forwarded-For`.
     pub trusted_proxies: Arc<[IpAddr]>,
-    /// HTTP traffic totals.
     pub http_traffic: Arc<connection::traffic::HttpTotals>,
-    /// The data directory.
     pub data: PathBuf,
     /// Health of the server's components.
     pub readiness: Readiness,

@@ -55,7 +55,6 @@ impl Default for ConductLimits {
     }
 }
 
-/// A robot's violation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Offence {
     /// The robot exceeds its MQTT limits.
@@ -73,9 +72,7 @@ pub enum Offence {
 /// because the robot must be able to receive the instruction to stop.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Way {
-    /// An MQTT session.
     Mqtt,
-    /// HTTP requests.
     Http,
     /// HTTP requests that upload the outputs of the robot's runs.
     Outputs,
@@ -84,7 +81,6 @@ pub enum Way {
 /// The decision about a robot that has just sent data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// Continue.
     Fine,
     /// Read nothing more from the robot before this time.
     Slow(Instant),
@@ -139,7 +135,6 @@ struct Allowance {
 #[derive(Debug)]
 struct Trouble {
     offence: Offence,
-    /// Number of cuts.
     cuts: u32,
     /// The last backoff; zero: the robot was only slowed.
     away: Duration,
@@ -225,7 +220,6 @@ impl Record {
 }
 
 impl Conduct {
-    /// Starts without records.
     pub fn new(limits: ConductLimits) -> Arc<Self> {
         Arc::new(Self {
             limits,

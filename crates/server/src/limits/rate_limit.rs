@@ -28,7 +28,6 @@ pub struct TokenBucket {
 }
 
 impl TokenBucket {
-    /// A rested bucket.
     pub fn new(per_s: u64, now: Instant) -> Self {
         Self { each_ns: 1e9 / per_s.max(1) as f64, next_at: now.checked_sub(BURST).unwrap_or(now) }
     }

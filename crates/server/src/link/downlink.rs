@@ -32,11 +32,9 @@ pub struct Downlink {
     pub actions: Actions,
     /// The source of inline blobs.
     pub blobs: Blobs,
-    /// Delivers the messages.
     pub broker: Broker,
     /// The presence of robots.
     pub presence: Arc<Presence>,
-    /// The server's clock.
     pub clock: Clock,
 }
 

@@ -16,9 +16,7 @@ pub const LEAST_FILES: usize = 1024;
      ulimit -n {needed} in the shell)"
 )]
 pub struct TooFewFiles {
-    /// The granted limit.
     pub allowed: usize,
-    /// The minimum limit.
     pub needed: usize,
 }
 

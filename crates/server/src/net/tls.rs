@@ -52,29 +52,16 @@ pub enum TlsError {
     /// One of the operator's files can't be read.
     #[error("can't read {}", path.display())]
     Unreadable {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
     },
     /// The file has unexpected content.
     #[error("{} does not hold {expected} in PEM", path.display())]
-    Content {
-        /// The file.
-        path: PathBuf,
-        /// The expected content.
-        expected: &'static str,
-    },
+    Content { path: PathBuf, expected: &'static str },
     /// The certificate and the key do not belong together, or are of an unknown kind.
     #[error("the certificate in {} can't be used with the key in {}", certificate.display(), key.display())]
-    Unfit {
-        /// The certificate's file.
-        certificate: PathBuf,
-        /// The key's file.
-        key: PathBuf,
-        /// The cause.
-        source: rustls::Error,
-    },
+    Unfit { certificate: PathBuf, key: PathBuf, source: rustls::Error },
 }
 
 /// The TLS configuration of the server. Clones share the same state.
@@ -90,7 +77,6 @@ struct Parts {
     clock: Clock,
 }
 
-/// The current certificates.
 #[derive(Debug)]
 struct Shown(RwLock<Certificates>);
 

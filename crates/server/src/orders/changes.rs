@@ -66,12 +66,10 @@ struct Bells {
 pub struct Rings {
     /// Whether all robots are to be notified.
     pub everyone: bool,
-    /// Robots to notify.
     pub robots: BTreeSet<RobotId>,
 }
 
 impl Changes {
-    /// Nothing announced yet.
     pub fn new() -> Self {
         Self {
             notices: broadcast::Sender::new(NOTICES),

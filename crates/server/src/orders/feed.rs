@@ -34,7 +34,6 @@ const LEAST_FREE_PERCENT: u64 = 5;
 /// The users who may see an entry.
 #[derive(Debug, Clone)]
 pub enum FeedAudience {
-    /// All users.
     Everybody,
     /// Users who may see every robot: the entry counts robots.
     Unlimited,
@@ -57,7 +56,6 @@ pub struct FeedSource {
     pub store: Store,
     /// The broker, for its health.
     pub broker: Broker,
-    /// The time.
     pub clock: Clock,
     /// On the disk that is looked at.
     pub data: PathBuf,

@@ -31,7 +31,6 @@ struct Slot {
 }
 
 impl ReportMeter {
-    /// Nothing stored yet.
     pub fn new(now: Instant) -> Self {
         let slots = std::array::from_fn(|_| Slot { number: 0, bins: [0; BINS] });
         Self { began: now, slots: Arc::new(Mutex::new(slots)) }

@@ -11,9 +11,7 @@ pub struct Launch {
     /// The ROS package of the file; absent: that of the manifest's own launch file, otherwise the
     /// package named like the manifest.
     pub ros_package: Option<String>,
-    /// The file's name.
     pub file: String,
-    /// `name:=value`.
     pub arguments: BTreeMap<String, String>,
 }
 

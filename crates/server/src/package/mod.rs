@@ -33,7 +33,6 @@ pub struct Packed {
     pub manifest: TaskManifest,
     /// The manifest as the OCI config blob.
     pub config_bytes: Vec<u8>,
-    /// The OCI manifest.
     pub manifest_bytes: Vec<u8>,
     /// The content blob, deleted when this is dropped.
     pub content: NamedTempFile,
@@ -55,18 +54,12 @@ pub struct Problem {
 pub enum PackageError {
     /// The directory is not a package that could run; lists all problems.
     #[error("{} can't be packed:\n{}", dir.display(), list(problems))]
-    Invalid {
-        /// The directory.
-        dir: PathBuf,
-        /// At least one.
-        problems: Vec<Problem>,
-    },
+    Invalid { dir: PathBuf, problems: Vec<Problem> },
     /// A file could not be read or written.
     #[error("{what}")]
     Io {
         /// The failed operation, with the path.
         what: String,
-        /// The cause.
         source: std::io::Error,
     },
 }

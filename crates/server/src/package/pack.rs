@@ -22,7 +22,6 @@ pub struct Described {
     pub package: PackageRef,
     /// The manifest as the OCI config blob.
     pub config_bytes: Vec<u8>,
-    /// The OCI manifest.
     pub manifest_bytes: Vec<u8>,
 }
 

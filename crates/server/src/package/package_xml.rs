@@ -4,7 +4,6 @@
 
 use roxmltree::{Document, Node};
 
-/// The file's name.
 pub const FILE: &str = "package.xml";
 
 /// Contents of the file.
@@ -14,7 +13,6 @@ pub struct PackageXml {
     pub name: String,
     /// `<version>`; empty if absent.
     pub version: String,
-    /// The build type.
     pub build_type: BuildType,
     /// Names from exec_depend, depend and run_depend, sorted, without duplicates. Conditional
     /// dependencies are left out: only a robot can evaluate them.
@@ -28,10 +26,8 @@ pub struct PackageXml {
 /// The build type in the file.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub enum BuildType {
-    /// Nothing.
     #[default]
     Absent,
-    /// One type.
     One(String),
     /// Several, told apart by conditions.
     Several(Vec<String>),
@@ -171,7 +167,6 @@ fn is_version(version: &str) -> bool {
         && numbers.iter().all(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit()))
 }
 
-/// catkin_pkg's pattern: `local(.local)*@domain(.domain)*.xx`.
 fn is_email(email: &str) -> bool {
     let words = |text: &str, extra: &[u8]| {
         text.split('.').all(|word| {

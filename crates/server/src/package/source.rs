@@ -20,7 +20,6 @@ use super::{Launch, PackageError, Problem, rules};
 pub(super) struct Source {
     /// The manifest; its content facts are zeros until the content is packed.
     pub(super) manifest: TaskManifest,
-    /// The files.
     pub(super) tree: Tree,
 }
 

@@ -11,29 +11,20 @@ use task_proto::{TaskName, Version};
 
 use super::Problem;
 
-/// The file's name.
 pub const FILE: &str = "task.toml";
 
 /// Contents of the file; absent keys have their default or are `None`.
 #[derive(Debug, Default, PartialEq)]
 pub struct TaskToml {
-    /// The package's name.
     pub name: Option<TaskName>,
-    /// Its version.
     pub version: Option<Version>,
-    /// `build.tool`.
     pub build_tool: Option<BuildTool>,
-    /// `[run]`.
     pub run: Run,
-    /// `[ready]`.
     pub ready: Ready,
     /// `[parameters]`, by node and name.
     pub parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
-    /// `[outputs]`.
     pub outputs: Outputs,
-    /// `[requires]`.
     pub requires: Requires,
-    /// `[limits]`.
     pub limits: Limits,
 }
 

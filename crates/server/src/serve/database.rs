@@ -18,7 +18,6 @@ const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5
 
 /// The first operator, whose token exists on every server.
 pub struct FirstOperator {
-    /// The token.
     pub token: Token,
     /// The file with the token.
     pub path: PathBuf,
@@ -63,7 +62,6 @@ impl Database {
         Ok(database)
     }
 
-    /// The database.
     pub fn store(&self) -> &Store {
         &self.store
     }

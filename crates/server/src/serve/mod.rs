@@ -97,7 +97,6 @@ pub enum ServeError {
     /// HTTP can't be served.
     #[error("cannot listen for HTTP on {address}")]
     Listen {
-        /// The configured address.
         address: SocketAddr,
         /// The operating system's error.
         source: std::io::Error,
@@ -257,7 +256,6 @@ impl Server {
         &self.addresses
     }
 
-    /// The data directory.
     pub fn data(&self) -> &DataDirectory {
         &self.data
     }

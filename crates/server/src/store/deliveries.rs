@@ -25,9 +25,7 @@ pub struct DeliveryOrder {
 /// The known facts about a robot that is to get a package.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RobotFacts {
-    /// The robot's id.
     pub robot: RobotId,
-    /// The robot's labels.
     pub labels: Labels,
     /// The robot's link to the server, as far as it was measured.
     pub link: Option<LinkFacts>,
@@ -40,7 +38,6 @@ pub struct RobotFacts {
 /// The delivery decision for a robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Decided {
-    /// The robot.
     pub robot: RobotId,
     /// The mechanism, and the reason for it.
     pub decision: DeliveryDecision,

@@ -105,7 +105,6 @@ impl fmt::Debug for Store {
 /// The kind of the database, and its size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DatabaseSize {
-    /// `sqlite` or `postgres`.
     pub kind: &'static str,
     /// The size, if the database reports one.
     pub bytes: Option<u64>,
@@ -119,7 +118,6 @@ pub enum StoreError {
     Open {
         /// The database, without its password.
         url: String,
-        /// The cause.
         source: sqlx::Error,
     },
     /// The tables can't be brought up to date.
@@ -127,7 +125,6 @@ pub enum StoreError {
     Migrate {
         /// The database, without its password.
         url: String,
-        /// The cause.
         source: sqlx::migrate::MigrateError,
     },
     /// A later version of this program has migrated the tables further.
@@ -148,7 +145,6 @@ pub enum StoreError {
     Damaged {
         /// The database, without its password.
         url: String,
-        /// The first finding.
         finding: String,
     },
     /// Opening the database takes a write, and the disk is full.
@@ -162,7 +158,6 @@ pub enum StoreError {
     /// The database was found corrupt while it was in use.
     #[error("the database is corrupt, so nothing is changed until it is mended")]
     Corrupt,
-    /// A statement failed.
     #[error("the database refused a statement")]
     Statement(#[from] sqlx::Error),
     /// A write that serves several robots failed.
@@ -176,17 +171,13 @@ pub enum StoreError {
         "{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s"
     )]
     TooManyActs {
-        /// The person's name.
         who: String,
         /// Seconds until the next act is allowed.
         seconds: u64,
     },
     /// A row holds a value that this version can't read.
     #[error("column {column} of the database holds what this version of taskd can't read")]
-    Unreadable {
-        /// Table and column.
-        column: &'static str,
-    },
+    Unreadable { column: &'static str },
 }
 
 impl StoreError {

@@ -29,7 +29,6 @@ pub struct HistoryPage {
     pub next: Option<DeploymentId>,
 }
 
-/// Selects the page.
 #[derive(Debug, Clone, Copy)]
 pub struct HistoryQuery<'a> {
     /// Only assignments of this task.

@@ -54,7 +54,6 @@ pub struct Addresses {
 }
 
 impl Addresses {
-    /// The server's URL.
     pub fn url(&self) -> String {
         let scheme = if self.ca_pin.is_some() { "https" } else { "http" };
         format!("{scheme}://{}", self.http)
@@ -85,14 +84,10 @@ pub fn is_locked(path: &Path) -> io::Result<bool> {
 pub enum DataError {
     /// Another server runs from the directory.
     #[error("{} is in use: another taskd serves from it", path.display())]
-    InUse {
-        /// The directory.
-        path: PathBuf,
-    },
+    InUse { path: PathBuf },
     /// A file or the directory itself can't be created or read.
     #[error("{} can't be used", path.display())]
     Io {
-        /// The path.
         path: PathBuf,
         /// The operating system's error.
         source: io::Error,
@@ -102,24 +97,13 @@ pub enum DataError {
         "{0} can be written by everybody on this machine, and belongs to somebody else: take that away (chmod o-w {0}), \
          or name another directory", path.display()
     )]
-    OpenToAll {
-        /// The directory.
-        path: PathBuf,
-    },
+    OpenToAll { path: PathBuf },
     /// There is no disk space for a file.
     #[error("{} can't be written on a full disk: make at least 16 MB free on its file system", path.display())]
-    Full {
-        /// The path.
-        path: PathBuf,
-    },
+    Full { path: PathBuf },
     /// A file has unexpected content.
     #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
-    Content {
-        /// The path.
-        path: PathBuf,
-        /// The expected content.
-        expected: &'static str,
-    },
+    Content { path: PathBuf, expected: &'static str },
 }
 
 impl DataError {
@@ -210,7 +194,6 @@ impl DataDirectory {
         Ok(())
     }
 
-    /// The directory's path.
     pub fn path(&self) -> &Path {
         &self.path
     }

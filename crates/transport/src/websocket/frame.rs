@@ -29,13 +29,9 @@ pub enum Role {
 pub enum Opcode {
     /// Further bytes of the current message.
     Continuation,
-    /// Bytes.
     Binary,
-    /// The end.
     Close,
-    /// To be answered.
     Ping,
-    /// The answer.
     Pong,
 }
 
@@ -46,7 +42,6 @@ pub enum Piece {
     Data(BytesMut),
     /// To be answered with the same bytes.
     Ping(BytesMut),
-    /// An unsolicited pong.
     Pong,
     /// A close frame, with its code if the other end sent one (RFC 6455, section 7.4).
     Close(Option<u16>),
@@ -71,10 +66,8 @@ impl Violation {
     }
 }
 
-/// Decodes frames incrementally.
 #[derive(Debug)]
 pub struct Decoder {
-    /// Of this end.
     role: Role,
     frame: Option<Frame>,
     /// Whether a message has begun and not ended.

@@ -27,7 +27,6 @@ pub enum FetchError {
     Interrupted {
         /// Bytes present so far.
         received: u64,
-        /// The blob's size.
         size: u64,
     },
     /// Too few bytes arrived within the stall timeout.
@@ -40,7 +39,6 @@ pub enum FetchError {
     /// The server is overloaded, restarting or broken.
     #[error("the server answers {status}")]
     Busy {
-        /// The HTTP status.
         status: u16,
         /// Wait that the server requests.
         retry_after: Option<Duration>,
@@ -51,31 +49,17 @@ pub enum FetchError {
     /// The server does not provide this blob to this robot.
     #[error("the server answers {status} for blob {digest} of {repository}")]
     Unavailable {
-        /// The HTTP status.
         status: u16,
-        /// The requested blob.
         digest: Digest,
         /// Repository of the blob's package.
         repository: RepositoryName,
     },
     /// The announced size exceeds the limit for such a blob.
     #[error("blob {digest} is said to have {size} bytes, {most} are possible")]
-    TooLarge {
-        /// The requested blob.
-        digest: Digest,
-        /// The announced size.
-        size: u64,
-        /// The limit.
-        most: u64,
-    },
+    TooLarge { digest: Digest, size: u64, most: u64 },
     /// The bytes do not match the ordered digest, even when fetched again.
     #[error("the server's bytes for {digest} are others: {reason}")]
-    DigestMismatch {
-        /// The ordered digest.
-        digest: Digest,
-        /// The observed difference.
-        reason: String,
-    },
+    DigestMismatch { digest: Digest, reason: String },
     /// The bytes match the digest, but are not a task manifest for this package.
     #[error("the package's task manifest can't be used: {0}")]
     ManifestInvalid(String),

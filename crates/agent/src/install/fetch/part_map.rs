@@ -71,7 +71,6 @@ impl PartMap {
         !lacking.is_empty()
     }
 
-    /// Cancels all requests.
     pub(super) fn ask_nothing(&mut self) {
         self.asked = Bits::new(self.cut.count());
     }

@@ -25,7 +25,6 @@ const OUTPUT_BYTES: u64 = 4 << 30;
 pub(super) struct Held {
     /// The settings made at the server.
     pub(super) set: RobotSettings,
-    /// The combined settings.
     pub(super) config: Config,
     /// The settings as reported.
     pub(super) effective: Option<EffectiveSettings>,

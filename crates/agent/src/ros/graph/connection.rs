@@ -194,7 +194,6 @@ impl Connection {
         *self.routes() = Routes { closed: true, ..Routes::default() };
     }
 
-    /// The program's process.
     pub fn pid(&self) -> u32 {
         self.pid
     }

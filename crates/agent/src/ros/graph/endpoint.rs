@@ -48,16 +48,13 @@ pub enum Delivery {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Cdr {
     encoding: RepresentationIdentifier,
-    /// The body.
     pub body: Bytes,
 }
 
 /// A message with its origin.
 #[derive(Debug)]
 pub struct Sample<M> {
-    /// The message.
     pub message: M,
-    /// The message's writer.
     pub writer: EndpointId,
     /// Sequence number of the message at its writer.
     pub number: i64,
@@ -136,7 +133,6 @@ impl Cdr {
 }
 
 impl Endpoints {
-    /// For this participant.
     pub fn of(participant: &DomainParticipant) -> Result<Self, GraphError> {
         let failed = |source| GraphError::endpoint("the participant's groups", source);
         Ok(Self {
@@ -183,7 +179,6 @@ impl Endpoints {
 }
 
 impl<M: Received> Reader<M> {
-    /// The reader's id.
     pub fn id(&self) -> EndpointId {
         EndpointId::of(self.reader.guid())
     }
@@ -207,7 +202,6 @@ impl<M> Sample<M> {
 }
 
 impl Writer {
-    /// The writer's id.
     pub fn id(&self) -> EndpointId {
         EndpointId::of(self.writer.guid())
     }
@@ -243,7 +237,6 @@ pub trait Received: Send + Sized + 'static {
     /// The accepted encodings; messages in other encodings are left out.
     const ENCODINGS: &'static [RepresentationIdentifier];
 
-    /// The message.
     fn from_body(encoding: RepresentationIdentifier, body: &[u8]) -> Self;
 }
 
@@ -291,7 +284,6 @@ impl Received for Counted {
 /// Passes bytes through where the library expects a codec.
 pub struct Adapter;
 
-/// See [`Adapter`].
 #[derive(Clone)]
 pub struct PassThrough;
 

@@ -22,16 +22,13 @@ const MAX_NAME_BYTES: usize = 256;
 pub enum GidForm {
     /// Up to Humble: the 16 bytes of a DDS GUID and 8 zeros.
     Bytes24,
-    /// From Iron on.
     Bytes16,
 }
 
 /// A participant's message about itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ParticipantEntities {
-    /// The sending participant.
     pub participant: ParticipantId,
-    /// Its nodes.
     pub nodes: Vec<NodeEntities>,
     /// Number of nodes that were left out because ROS does not allow their names.
     pub misnamed: usize,
@@ -42,9 +39,7 @@ pub struct ParticipantEntities {
 pub struct NodeEntities {
     /// The node's full name.
     pub name: GraphName,
-    /// The node's readers.
     pub readers: Vec<EndpointId>,
-    /// The node's writers.
     pub writers: Vec<EndpointId>,
 }
 

@@ -88,7 +88,6 @@ pub struct DiagnosticStatus {
     pub participant: ParticipantId,
 }
 
-/// `diagnostic_msgs/msg/DiagnosticArray`.
 #[derive(Deserialize)]
 struct DiagnosticArray {
     stamp: Time,

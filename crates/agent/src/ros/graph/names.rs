@@ -7,7 +7,6 @@ use task_proto::ros::GraphName;
 /// Role of a DDS topic in ROS.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
-    /// A topic.
     Topic,
     /// The request topic of a service.
     Request,

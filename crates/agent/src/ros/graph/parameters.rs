@@ -30,30 +30,20 @@ const SET: (&str, &str) = ("set_parameters", "rcl_interfaces/srv/SetParameters")
 pub enum ParameterValue {
     /// A parameter declared without a value, or not declared.
     NotSet,
-    /// A truth value.
     Bool(bool),
-    /// A whole number.
     Integer(i64),
-    /// A number.
     Double(#[serde(with = "double")] f64),
-    /// A text.
     String(String),
-    /// Bytes.
     Bytes(Vec<u8>),
-    /// Truth values.
     Bools(Vec<bool>),
-    /// Whole numbers.
     Integers(Vec<i64>),
-    /// Numbers.
     Doubles(#[serde(with = "doubles")] Vec<f64>),
-    /// Texts.
     Strings(Vec<String>),
 }
 
 /// Result of setting one parameter.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SetResult {
-    /// The parameter.
     pub name: String,
     /// Whether the parameter has the new value.
     pub successful: bool,

@@ -57,29 +57,17 @@ pub enum Request {
     Join(GraphSettings),
     /// Call a node and return the result.
     Call {
-        /// Identifies the answer.
         id: u64,
         /// Time limit of the call.
         within_ms: u64,
-        /// The call.
         call: Call,
     },
     /// Forward messages of a feed from now on.
     Listen(Feed),
     /// Count the messages of a topic.
-    Count {
-        /// Identifies the rate.
-        meter: u64,
-        /// The topic.
-        topic: GraphName,
-        /// Its type, `package/msg/Type`.
-        kind: String,
-    },
+    Count { meter: u64, topic: GraphName, kind: String },
     /// Stop counting the messages of a topic.
-    StopCounting {
-        /// The meter.
-        meter: u64,
-    },
+    StopCounting { meter: u64 },
 }
 
 /// A call to a node.
@@ -87,57 +75,31 @@ pub enum Request {
 #[serde(rename_all = "snake_case")]
 pub enum Call {
     /// Create the endpoints that calls to this node need, before the node exists.
-    Prepare {
-        /// The node.
-        node: GraphName,
-    },
+    Prepare { node: GraphName },
     /// Wait until a server of the service would receive a request.
     Servers {
-        /// The service.
         service: GraphName,
         /// The service's type; absent: the type that the graph shows.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         kind: Option<String>,
     },
     /// Ask a lifecycle node for its state.
-    LifecycleState {
-        /// The node.
-        node: GraphName,
-    },
+    LifecycleState { node: GraphName },
     /// Request a transition of a lifecycle node, once.
-    ChangeState {
-        /// The node.
-        node: GraphName,
-        /// The transition.
-        transition: Transition,
-    },
+    ChangeState { node: GraphName, transition: Transition },
     /// Ask a node for all its parameters. The time limit applies to each of the calls that this
     /// takes.
-    Parameters {
-        /// The node.
-        node: GraphName,
-    },
+    Parameters { node: GraphName },
     /// Ask a node for one parameter.
-    Parameter {
-        /// The node.
-        node: GraphName,
-        /// Its name.
-        name: String,
-    },
+    Parameter { node: GraphName, name: String },
     /// Set parameters of a node, each independently.
-    SetParameters {
-        /// The node.
-        node: GraphName,
-        /// Names and values.
-        parameters: Vec<(String, ParameterValue)>,
-    },
+    SetParameters { node: GraphName, parameters: Vec<(String, ParameterValue)> },
 }
 
 /// Feeds of messages from all nodes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Feed {
-    /// Log lines.
     Rosout,
     /// Diagnostic statuses of the robot's parts.
     Diagnostics,
@@ -150,10 +112,7 @@ pub enum Event {
     /// The program takes part in the graph.
     Joined,
     /// The program could not join, and ends.
-    Failed {
-        /// The cause.
-        error: GraphError,
-    },
+    Failed { error: GraphError },
     /// The new state of the graph.
     Snapshot(Shown),
     /// The graph has not changed.
@@ -168,11 +127,9 @@ pub enum Event {
         /// The result of the call.
         answer: Answer,
     },
-    /// A call failed.
     Refused {
         /// Id of the call.
         id: u64,
-        /// The cause.
         error: GraphError,
     },
     /// A node logged something.
@@ -186,9 +143,7 @@ pub enum Event {
     },
     /// Message rate of a topic.
     Rate {
-        /// The meter.
         meter: u64,
-        /// Messages a second.
         hz: f64,
         /// Age of the last message; absent: no message has come.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -198,7 +153,6 @@ pub enum Event {
     },
 }
 
-/// Results of calls.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Answer {
@@ -206,13 +160,11 @@ pub enum Answer {
     Done,
     /// The participants with such a server.
     Servers(BTreeSet<ParticipantId>),
-    /// The node's state.
     State(LifecycleState),
     /// Whether the node made the transition.
     Changed(bool),
     /// Parameters with their values.
     Parameters(Vec<(String, ParameterValue)>),
-    /// One parameter's value.
     Parameter(ParameterValue),
     /// The result for each parameter that was set.
     Set(Vec<SetResult>),

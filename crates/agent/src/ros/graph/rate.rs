@@ -64,7 +64,6 @@ impl Counter {
         (meter, count(reader, arrivals, ending))
     }
 
-    /// The rate now.
     pub fn rate(&self) -> Rate {
         self.arrivals.lock().unwrap_or_else(PoisonError::into_inner).rate(Instant::now())
     }
@@ -77,7 +76,6 @@ impl RateMeter {
         Self { last, _ends_with_this: ending.drop_guard() }
     }
 
-    /// The rate now.
     pub fn rate(&self) -> Rate {
         let (rate, at) = *self.last.borrow();
         Rate { since_last: rate.since_last.map(|since| since + at.elapsed()), ..rate }

@@ -74,7 +74,6 @@ pub struct Participant {
 /// A reader or writer in discovery's data.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Discovered {
-    /// The endpoint's id.
     pub id: EndpointId,
     /// The endpoint's DDS topic.
     pub topic: String,
@@ -92,7 +91,6 @@ enum Direction {
 }
 
 impl Snapshot {
-    /// An empty snapshot.
     pub fn empty(at: Instant) -> Self {
         Self { at, nodes: Vec::new(), participants: BTreeMap::new(), omitted: 0 }
     }

@@ -27,15 +27,12 @@ const UNDECLARED_PATIENCE_MS: u64 = 3000;
 /// A question for a node.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Question {
-    /// The node.
     pub node: GraphName,
     /// The participant of the node; answers of a later participant do not count.
     pub instance: ParticipantId,
-    /// The question.
     pub ask: Ask,
 }
 
-/// Questions for nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Ask {
     /// Any answer at all: a query for no parameter.
@@ -44,14 +41,11 @@ pub enum Ask {
     State,
     /// Make a lifecycle transition.
     Transition(Transition),
-    /// Set these parameters.
     Set(Vec<(String, Value)>),
 }
 
-/// Answers of nodes.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    /// The node answered.
     Something,
     /// The node's lifecycle state.
     State(LifecycleState),
@@ -192,7 +186,6 @@ impl BringUp {
         }
     }
 
-    /// Records an answer.
     pub(super) fn answered(&mut self, question: &Question, answer: Answer, now_ms: u64) {
         if question.instance != self.instance {
             return;

@@ -276,7 +276,6 @@ fn a_parameter_that_nobody_declares_is_rejected_in_the_end() {
     assert!(refused(&stage.after(0)).starts_with("parameter_rejected"));
 }
 
-/// As in `bring_up`.
 const ASK_AGAIN_MS: u64 = 500;
 
 #[test]

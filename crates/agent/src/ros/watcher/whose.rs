@@ -13,7 +13,6 @@ use crate::ros::readiness::Promise;
 /// been seen in between.
 const START_SLACK: Duration = Duration::from_secs(1);
 
-/// Participants by owner.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Whose {
     /// Participants of the run's processes.

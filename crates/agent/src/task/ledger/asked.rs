@@ -8,7 +8,6 @@ use task_proto::{DeploymentId, Version};
 /// A question to the robot's gate, with its answer.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GateRecord {
-    /// The question.
     pub question: GateQuestion,
     /// The last answer to the question.
     pub answer: Option<GateAnswer>,

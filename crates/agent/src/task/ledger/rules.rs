@@ -6,7 +6,6 @@ use task_proto::manifest::{OnBoot, Restart, TaskKind, TaskManifest};
 /// The parts of a task manifest that matter while the task runs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunRules {
-    /// Service or job.
     pub kind: TaskKind,
     /// The effect of a reboot.
     pub on_boot: OnBoot,

@@ -30,7 +30,6 @@ pub enum Done {
 /// A step that did not succeed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StepFailure {
-    /// The cause.
     pub failure: Failure,
     /// The shortest wait in milliseconds before a retry; `None`: a retry can never succeed.
     pub retry_after_ms: Option<u64>,

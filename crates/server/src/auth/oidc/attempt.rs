@@ -10,7 +10,6 @@ use subtle::ConstantTimeEq as _;
 /// The secret's length in bytes.
 const SECRET_BYTES: usize = 32;
 
-/// One attempt.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Attempt([u8; SECRET_BYTES]);
 

@@ -30,12 +30,7 @@ pub enum IdTokenError {
     Signature,
     /// A claim has an unexpected value.
     #[error("{claim}: {reason}")]
-    Claim {
-        /// The claim.
-        claim: &'static str,
-        /// The error.
-        reason: &'static str,
-    },
+    Claim { claim: &'static str, reason: &'static str },
 }
 
 /// The claims that a token must contain.

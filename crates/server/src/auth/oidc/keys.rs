@@ -13,12 +13,9 @@ const MOST_KEYS: usize = 64;
 /// Length of a coordinate of a point on P-256, in bytes.
 const COORDINATE_BYTES: usize = 32;
 
-/// A signature algorithm.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Algorithm {
-    /// RSASSA-PKCS1-v1_5.
     Rs256,
-    /// ECDSA on P-256.
     Es256,
 }
 
@@ -34,7 +31,6 @@ impl Algorithm {
     }
 }
 
-/// The usable keys.
 #[derive(Clone)]
 pub(super) struct KeySet(Vec<Key>);
 

@@ -42,16 +42,10 @@ const MOST_SECRET_BYTES: u64 = 4096;
 pub enum OidcError {
     /// The provider did not answer.
     #[error("the provider's {what} can't be reached")]
-    Unreachable {
-        /// The requested object.
-        what: &'static str,
-        /// The cause.
-        source: reqwest::Error,
-    },
+    Unreachable { what: &'static str, source: reqwest::Error },
     /// The provider's answer is unusable.
     #[error("the provider's {what} can't be used: {reason}")]
     Unusable {
-        /// The requested object.
         what: &'static str,
         /// The error in the answer.
         reason: String,
@@ -73,23 +67,18 @@ pub enum OidcSetUpError {
     /// The file with the secret can't be read.
     #[error("oidc.client_secret_file: {} can't be read", path.display())]
     SecretFile {
-        /// The file.
         path: PathBuf,
         /// The operating system's error.
         source: std::io::Error,
     },
     /// The file contains no secret.
     #[error("oidc.client_secret_file: {} holds no secret: expected one line", path.display())]
-    NoSecret {
-        /// The file.
-        path: PathBuf,
-    },
+    NoSecret { path: PathBuf },
     /// The HTTP client can't be created.
     #[error("oidc: the provider can't be asked")]
     Client(#[source] reqwest::Error),
 }
 
-/// The provider.
 pub struct Provider {
     settings: OidcSettings,
     secret: Option<String>,
@@ -98,7 +87,6 @@ pub struct Provider {
     exchanges: Semaphore,
 }
 
-/// The provider's documents.
 #[derive(Default)]
 struct Known {
     document: Option<(Document, u64)>,
@@ -148,7 +136,6 @@ impl Provider {
         })
     }
 
-    /// The provider's settings.
     pub fn settings(&self) -> &OidcSettings {
         &self.settings
     }

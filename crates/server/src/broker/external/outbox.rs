@@ -16,7 +16,6 @@ const MAX_QUESTIONS: usize = 1024;
 /// Bytes of pending desired states above which callers should wait.
 const MANY_STATE_BYTES: usize = 32 * 1024 * 1024;
 
-/// The pending messages.
 #[derive(Default)]
 pub(super) struct Outbox {
     is_open: bool,

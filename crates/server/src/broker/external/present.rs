@@ -11,7 +11,6 @@ use task_proto::report::Status;
 /// questions.
 const MAX_ROBOTS: usize = 100_000;
 
-/// The present robots.
 #[derive(Default)]
 pub(super) struct Present {
     robots: HashMap<RobotId, Seat>,

@@ -57,7 +57,6 @@ pub(super) enum Ended {
     Unreachable(LineError),
     /// The server's own message did not come back.
     Deaf,
-    /// Any other error.
     Lost(ConnectionError),
 }
 

@@ -9,12 +9,8 @@ use crate::broker::router::CANARY_TOPIC;
 /// The owner of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Visitor {
-    Robot {
-        robot: RobotId,
-        token_number: u64,
-    },
+    Robot { robot: RobotId, token_number: u64 },
     Operator(UserName),
-    /// Our own watchdog.
     Canary,
 }
 

@@ -9,9 +9,7 @@ use rumqttd::protocol::{Packet, Protocol, QoS};
 /// A packet from a client. All checks that need no session state are done.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Received {
-    /// CONNECT.
     Connect(Connect),
-    /// PUBLISH.
     Publish(Publish),
     /// PUBACK, of the packet with this id.
     PubAck(u16),
@@ -21,23 +19,19 @@ pub enum Received {
     PubRel(u16),
     /// PUBCOMP, of the packet with this id.
     PubComp(u16),
-    /// SUBSCRIBE.
     Subscribe {
         /// The packet id that the SUBACK repeats.
         packet_id: u16,
         /// The filters and the requested QoS, at least one.
         filters: Vec<(String, QoS)>,
     },
-    /// UNSUBSCRIBE.
     Unsubscribe {
         /// The packet id that the UNSUBACK repeats.
         packet_id: u16,
         /// The filters, at least one.
         filters: Vec<String>,
     },
-    /// PINGREQ.
     PingReq,
-    /// DISCONNECT.
     Disconnect,
 }
 
@@ -68,9 +62,7 @@ pub struct Connect {
 /// A message to publish after an end without DISCONNECT.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Will {
-    /// The topic.
     pub topic: String,
-    /// The bytes.
     pub payload: Bytes,
     /// The quality of service.
     pub qos: QoS,
@@ -85,7 +77,6 @@ pub struct Publish {
     pub qos: QoS,
     /// The packet id that the acknowledgement repeats.
     pub packet_id: u16,
-    /// The bytes.
     pub payload: Bytes,
 }
 

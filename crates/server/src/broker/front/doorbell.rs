@@ -10,7 +10,6 @@ use tokio::sync::Notify;
 /// Maximum pending questions for one robot.
 const MAX_QUESTIONS: usize = 32;
 
-/// One session's doorbell.
 #[derive(Default)]
 pub(super) struct Doorbell {
     waiting: Mutex<Waiting>,

@@ -32,7 +32,6 @@ const MAX_CLIENT_ID_BYTES: usize = 256;
 /// The watchdog's client id.
 pub(in crate::broker) const CANARY_ID: &str = "router canary";
 
-/// An admitted client.
 pub(super) struct Guest {
     pub(super) visitor: Visitor,
     pub(super) seat_name: SeatName,
@@ -232,7 +231,6 @@ fn watch(context: &Context, robot: &RobotId) -> Result<Watched, Rejection> {
     ))
 }
 
-/// Encodes a CONNACK.
 pub(super) fn connack(code: ConnectReturnCode, output: &mut BytesMut) {
     // Sessions are always clean, so there is never one to resume.
     encode(Packet::ConnAck(ConnAck { session_present: false, code }, None), output);

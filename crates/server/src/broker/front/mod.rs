@@ -48,7 +48,6 @@ use places::{Claim, Places};
 use takeover::Seats;
 use traffic::Totals;
 
-/// The running front.
 pub(super) struct Front {
     local_addr: SocketAddr,
     context: Arc<Context>,

@@ -41,7 +41,6 @@ struct Progress {
     sent: u64,
     /// The last parts, up to a window.
     parts: VecDeque<Part>,
-    /// The permitted robots.
     robots: HashMap<RobotId, Permit>,
     listeners: usize,
     /// Subscribers that are a whole window behind.
@@ -325,9 +324,7 @@ pub(super) struct Member {
 pub(super) enum Due {
     /// Send this part, and call `Member::take`.
     Part(u64, Part),
-    /// Drop the package.
     End,
-    /// Wait.
     Nothing,
 }
 

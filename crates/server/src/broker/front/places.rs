@@ -22,7 +22,6 @@ pub(super) struct Places {
 
 /// The claim of a new connection.
 pub(super) enum Claim {
-    /// A place.
     Place(OwnedSemaphorePermit),
     /// A turn to wait for the place of a connection that is being closed.
     Turn(Arc<Semaphore>, OwnedSemaphorePermit),

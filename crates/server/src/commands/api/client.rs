@@ -39,14 +39,7 @@ const MAX_ANSWER_BYTES: usize = 256 * 1024 * 1024;
 pub enum ClientError {
     /// The server answered with an error.
     #[error("{message} ({code})")]
-    Refused {
-        /// The HTTP status.
-        status: StatusCode,
-        /// The stable code.
-        code: String,
-        /// The server's words.
-        message: String,
-    },
+    Refused { status: StatusCode, code: String, message: String },
     /// The server could not be reached, or the connection was lost.
     #[error("can't reach the server at {url}{hint}")]
     Unreachable {
@@ -54,54 +47,31 @@ pub enum ClientError {
         url: String,
         /// A suggestion for the user, in brackets; empty if there is none.
         hint: &'static str,
-        /// The cause.
         source: reqwest::Error,
     },
     /// The answer did not come from taskd.
     #[error("what answers at {url} is not taskd (status {status})")]
-    NotTheServer {
-        /// The URL.
-        url: String,
-        /// The HTTP status.
-        status: StatusCode,
-    },
+    NotTheServer { url: String, status: StatusCode },
     /// No server runs on the directory that would contain its address.
     #[error("no server is up that serves from {}: start it with taskd serve, or name another with --server", data.display())]
-    NotServing {
-        /// The directory.
-        data: PathBuf,
-    },
+    NotServing { data: PathBuf },
     /// Whether a server runs on the directory can't be determined.
     #[error("can't tell whether a server serves from {}", data.display())]
-    DataDirectory {
-        /// The directory.
-        data: PathBuf,
-        /// The cause.
-        source: std::io::Error,
-    },
+    DataDirectory { data: PathBuf, source: std::io::Error },
     /// No token was given.
     #[error(
         "no token for {url}: sign in with taskd login NAME, give --token or --token-file, set TASKD_TOKEN, or, where the \
          server runs, point --data at its data directory"
     )]
-    NoToken {
-        /// The server's URL.
-        url: String,
-    },
+    NoToken { url: String },
     /// The token file can't be read.
     #[error("can't read the token file {}", path.display())]
-    TokenFile {
-        /// The file's path.
-        path: PathBuf,
-        /// The cause.
-        source: std::io::Error,
-    },
+    TokenFile { path: PathBuf, source: std::io::Error },
     /// The token is malformed.
     #[error("{origin}")]
     Token {
         /// Where the URL came from: a flag, the environment or a file.
         origin: String,
-        /// The parse error.
         source: InvalidToken,
     },
     /// The URL is malformed.
@@ -206,7 +176,6 @@ impl Client {
         Ok(Self { http, base, token: None, trust })
     }
 
-    /// The server's URL.
     pub(crate) fn base(&self) -> &str {
         &self.base
     }

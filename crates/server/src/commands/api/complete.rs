@@ -34,7 +34,6 @@ pub fn complete(command_line: fn() -> clap::Command) {
 /// Names with their descriptions.
 type Candidates = BTreeMap<String, String>;
 
-/// Robots' names.
 pub(in crate::commands) fn robots() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| candidates(current, |_| named_robots()))
 }
@@ -75,7 +74,6 @@ pub(in crate::commands) fn packages() -> ArgValueCompleter {
     })
 }
 
-/// Ids of deployments.
 pub(in crate::commands) fn deployments() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {
@@ -95,7 +93,6 @@ pub(in crate::commands) fn deployments() -> ArgValueCompleter {
     })
 }
 
-/// Names of users.
 pub(in crate::commands) fn users() -> ArgValueCompleter {
     ArgValueCompleter::new(|current: &OsStr| {
         candidates(current, |_| {

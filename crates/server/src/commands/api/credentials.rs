@@ -35,7 +35,6 @@ pub(in crate::commands) struct Kept {
     /// The pins that were given with them.
     #[serde(default)]
     pub(in crate::commands) pins: BTreeMap<String, CaPin>,
-    /// The default server.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(in crate::commands) last: Option<String>,
 }

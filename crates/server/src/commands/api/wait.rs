@@ -17,7 +17,6 @@ use crate::commands::{CommandError, Outcome, Session};
 
 /// The first pause between two polls; the pause doubles while nothing changes.
 const MIN_PAUSE: Duration = Duration::from_millis(100);
-/// The longest pause.
 pub(in crate::commands) const MAX_PAUSE: Duration = Duration::from_secs(1);
 /// Robots named in one line of the verdict.
 const MAX_NAMES: usize = 20;

@@ -21,7 +21,6 @@ pub(in crate::commands) struct Course {
     seen: VecDeque<(Duration, u64)>,
 }
 
-/// Progress and forecast.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::commands) struct Estimate {
     /// Bytes that robots have.

@@ -25,7 +25,6 @@ pub struct PasswordFrom {
 pub(in crate::commands) struct Secret(String);
 
 impl Secret {
-    /// The password itself.
     pub(in crate::commands) fn reveal(self) -> String {
         self.0
     }

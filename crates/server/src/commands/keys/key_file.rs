@@ -19,26 +19,13 @@ const MAX_BYTES: u64 = 4096;
 pub enum KeyError {
     /// The file can't be created or read.
     #[error("{} can't be used", path.display())]
-    Io {
-        /// The file's path.
-        path: PathBuf,
-        /// The cause.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// Accounts other than its owner can read or write a private key.
     #[error("{} has mode {mode:03o}: a private key is for its owner alone (chmod 600)", path.display())]
-    Exposed {
-        /// The file.
-        path: PathBuf,
-        /// The file's permissions.
-        mode: u32,
-    },
+    Exposed { path: PathBuf, mode: u32 },
     /// The file is not a private key.
     #[error("{} holds no private key; taskd key new makes one", path.display())]
-    NotPrivate {
-        /// The file.
-        path: PathBuf,
-    },
+    NotPrivate { path: PathBuf },
     /// Neither a public key nor a file with a public key.
     #[error("{0:?} is neither a public key nor a file with one")]
     NotPublic(String),

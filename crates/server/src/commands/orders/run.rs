@@ -63,7 +63,6 @@ pub struct RunOrder {
     keys: Vec<PathBuf>,
 }
 
-/// A launch argument.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Argument {
     name: String,

@@ -71,7 +71,6 @@ pub enum Action {
 /// A package reference from the command line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PackageName {
-    /// Its name.
     pub(in crate::commands) name: TaskName,
     /// A version or a manifest's digest.
     pub(in crate::commands) version: Option<String>,

@@ -21,7 +21,6 @@ use crate::config::{at_least_one, lifetime};
 pub enum Uses {
     /// A number of uses.
     Number(u64),
-    /// Unlimited.
     Unlimited,
 }
 

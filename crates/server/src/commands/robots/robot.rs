@@ -116,7 +116,6 @@ pub enum Action {
 pub enum LabelChange {
     /// Sets the label to this value.
     Set(LabelKey, LabelValue),
-    /// Removes the label.
     Remove(LabelKey),
 }
 

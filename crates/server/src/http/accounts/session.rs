@@ -54,12 +54,10 @@ struct Entry {
     _end: DropGuard,
 }
 
-/// One signed-in page.
 #[derive(Debug, Clone)]
 pub struct Session {
     /// The token that began the session: a session ends with its token.
     pub token: Token,
-    /// The signed-in user.
     pub user: UserName,
     /// Expiry time, in milliseconds.
     pub expires_at_ms: u64,

@@ -66,9 +66,7 @@ pub struct TokenNumber(pub u64);
 pub enum Caller {
     /// An unauthenticated caller: only on routes for anyone.
     Anyone,
-    /// An authenticated person.
     Person(Person),
-    /// An authenticated robot.
     Robot(RobotId),
     /// The holder of an enrollment token.
     Enrolment(Box<Token>),

@@ -35,7 +35,6 @@ const SWEEP_ABOVE: usize = 1_024;
 pub(in crate::http) enum RequestKind {
     /// Changes the work or the settings of robots.
     Order,
-    /// Changes other state.
     Change,
     /// Answered from the database.
     Read,

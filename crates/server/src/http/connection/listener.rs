@@ -55,7 +55,6 @@ const LOOK_AGAIN: Duration = Duration::from_millis(250);
 /// Pause after an accept that failed for a local reason, for example a lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
-/// Limits on connections.
 #[derive(Debug, Clone)]
 pub struct Limits {
     /// Concurrent connections. When nearly all are taken, the holder with the most loses its
@@ -75,7 +74,6 @@ pub struct Limits {
 
 /// The router to serve, and the records of its connections and traffic.
 pub struct Service {
-    /// Answers requests.
     pub router: Router,
     /// TLS settings; `None` serves plain HTTP.
     pub tls: Option<Tls>,

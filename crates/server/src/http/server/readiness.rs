@@ -71,11 +71,8 @@ impl Readiness {
 
 /// The job that checks database, broker and disk.
 pub struct ReadinessCheck {
-    /// Receives the verdicts.
     pub readiness: Readiness,
-    /// The database.
     pub store: Store,
-    /// The MQTT broker.
     pub broker: Broker,
     /// The probe of the data directory.
     pub disk: DiskProbe,

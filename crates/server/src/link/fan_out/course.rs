@@ -64,7 +64,6 @@ struct Standing {
     useless: u32,
 }
 
-/// The next action.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Step {
     /// Publish these parts, then call `sent`.

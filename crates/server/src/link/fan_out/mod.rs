@@ -43,7 +43,6 @@ pub struct FanOutWorker {
     pub actions: Actions,
     /// The bytes of packages.
     pub blobs: Blobs,
-    /// Delivers the parts.
     pub broker: Broker,
     /// Changes of orders, and robots' missing parts.
     pub changes: Changes,

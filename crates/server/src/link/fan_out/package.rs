@@ -35,7 +35,6 @@ const SETTLE: Duration = Duration::from_secs(10);
 /// Pause before an interrupted fan-out is retried.
 const PAUSE: Duration = Duration::from_secs(2);
 
-/// A running fan-out.
 struct Package<'a> {
     worker: &'a FanOutWorker,
     content: BlobRef,

@@ -15,7 +15,6 @@ use crate::broker::CANARY_LEVEL;
 const DERIVED_COST: u32 = 4;
 /// A higher cost, because a person chose the server's own password.
 const SERVER_COST: u32 = 11;
-/// The whole block.
 pub(super) fn authorization(
     external: &External,
     accounts: &[Account],

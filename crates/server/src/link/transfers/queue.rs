@@ -56,7 +56,6 @@ pub struct Claim {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Asking(u64);
 
-/// A running transfer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Turn {
     pub(super) robot: RobotId,
@@ -150,7 +149,6 @@ impl<'a> Free<'a> {
 #[derive(Debug)]
 pub(super) struct Queue {
     all: Load,
-    /// Sites with limits.
     sites: HashMap<LabelValue, Load>,
     /// Number of running transfers of each robot.
     turns: HashMap<RobotId, u64>,

@@ -167,7 +167,6 @@ impl Actions {
         Ok(rollback)
     }
 
-    /// Previews [`Actions::roll_back`].
     pub async fn rollback(
         &self,
         by: &Person,

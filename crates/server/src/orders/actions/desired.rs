@@ -17,9 +17,7 @@ const MAX_KEPT: usize = 16 * 1024;
 /// A robot's signed desired state.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Desired {
-    /// Its generation.
     pub generation: Generation,
-    /// The signed document.
     pub envelope: Envelope,
     /// Blobs that are sent along with a pushed state.
     pub along: Vec<BlobRef>,

@@ -283,7 +283,6 @@ pub enum ActionError {
         what: String,
         /// The user with the limited scope.
         person: UserName,
-        /// The scope.
         scope: String,
     },
     /// The person lacks the named permission.
@@ -321,7 +320,6 @@ pub enum ActionError {
     /// The name is taken.
     #[error("there is a user {0} already, or the name stands for something else")]
     UserExists(UserName),
-    /// No such user.
     #[error("there is no user {0}")]
     UserNotFound(UserName),
     /// No such token, or the token belongs to another user.
@@ -333,7 +331,6 @@ pub enum ActionError {
     /// A request that makes no sense.
     #[error("{key}: {reason}")]
     Invalid {
-        /// The request's key.
         key: &'static str,
         /// Why the value is invalid.
         reason: String,
@@ -341,9 +338,7 @@ pub enum ActionError {
     /// The inline package exceeds the size limit of an announcement.
     #[error("delivery: {package} has {size}, inline carries at most {most}")]
     TooLargeForInline {
-        /// Name and version.
         package: String,
-        /// Its size.
         size: String,
         /// The largest size possible.
         most: String,
@@ -353,7 +348,6 @@ pub enum ActionError {
         "a robot with MAC {mac} is registered as {name}; to register it again, make a token for that robot"
     )]
     MacKnown {
-        /// The MAC.
         mac: MacAddress,
         /// Name of the registered robot.
         name: RobotName,
@@ -421,7 +415,6 @@ pub enum ActionError {
     /// The deployment does not wait for the operator.
     #[error("deployment {id} is not paused: {why}")]
     NotPaused {
-        /// The deployment.
         id: DeploymentId,
         /// The condition the deployment waits for.
         why: String,
@@ -432,7 +425,6 @@ pub enum ActionError {
         "robot {0} reports a later state than the server knows; it is left alone until its next order"
     )]
     Diverged(RobotId),
-    /// The database failed.
     #[error("the database failed")]
     Store(#[from] StoreError),
 }

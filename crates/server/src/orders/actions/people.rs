@@ -18,7 +18,6 @@ use crate::auth::passwords::PasswordError;
 use crate::domain::person::{Person, first_name};
 use crate::store::{Act, Deed, NewToken, User, Write};
 
-/// The most users.
 const MOST_USERS: usize = 10_000;
 /// Maximum number of access tokens of one user; a new sign-in replaces the oldest sign-in token.
 pub(super) const MOST_TOKENS: usize = 100;
@@ -33,7 +32,6 @@ const MOST_SCOPE_BYTES: usize = 1_024;
 const RESERVED: [&str; 3] = ["operator.token", "enrolment", "server"];
 
 impl Actions {
-    /// Adds a user.
     pub async fn add_user(&self, by: &Person, order: &AddUser) -> Result<UserView, ActionError> {
         let name = &order.name;
         let password = match &order.password {

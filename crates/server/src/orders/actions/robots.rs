@@ -30,9 +30,7 @@ const MOST_PENDING: u64 = 1_000;
 /// A robot that has just registered.
 #[derive(Debug)]
 pub struct Enrolled {
-    /// Its identity.
     pub robot_id: RobotId,
-    /// The assigned name.
     pub name: RobotName,
     /// Its token, shown this once.
     pub token: Token,

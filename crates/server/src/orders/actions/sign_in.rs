@@ -21,9 +21,7 @@ pub const PAGE_LIFETIME_MS: u64 = DAY_MS / 2;
 
 /// A user who has just signed in.
 pub struct SignedIn {
-    /// As this user,
     pub user: UserName,
-    /// by this token,
     pub token: Token,
     /// Expiry of the token.
     pub expires_at_ms: u64,

@@ -25,7 +25,6 @@ const MOST_REMEMBERED: usize = 10_000;
 /// A deployment older than this when first seen is not new.
 const NEW_MS: u64 = 60_000;
 
-/// Pending entries.
 #[derive(Default)]
 pub(super) struct Pending {
     /// The first and the last state of each robot: a robot that is back in its first state is no

@@ -21,11 +21,9 @@ use super::state::DatabaseState;
 
 /// The settings shared by one set of connections.
 pub(in crate::store) struct Terms {
-    /// The database's URL.
     pub(in crate::store) url: String,
     /// Statements that prepare a new connection.
     pub(in crate::store) session: String,
-    /// The most connections.
     pub(in crate::store) count: u32,
     /// The most connections that [`with_shared_reads`] may use at once.
     pub(in crate::store) shared: u32,

@@ -64,7 +64,6 @@ impl Fault {
         }
     }
 
-    /// Classifies an SQLSTATE.
     fn of_postgres(code: &str) -> Option<Self> {
         match code {
             "XX001" | "XX002" => Some(Self::Corrupt),

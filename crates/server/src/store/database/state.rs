@@ -17,7 +17,6 @@ pub struct DatabaseState(Arc<Inner>);
 
 #[derive(Debug)]
 struct Inner {
-    /// The first finding.
     corruption: OnceLock<String>,
     is_there: watch::Sender<bool>,
     /// Whether a caller was told that the database does not answer.

@@ -25,7 +25,6 @@ const MAX_GENERATION: Generation = Generation(1 << 53);
 /// The stored state of a robot that has reported.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ReportedRobot {
-    /// The robot's id.
     pub id: RobotId,
     /// The robot's name on the server.
     pub name: RobotName,
@@ -42,9 +41,7 @@ pub struct ReportedRobot {
 /// A released assignment that has not ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OpenAssignment {
-    /// The deployment.
     pub deployment: DeploymentId,
-    /// The robot.
     pub robot: RobotId,
     /// Whether the task is a service or a job.
     pub kind: TaskKind,

@@ -18,23 +18,18 @@ use crate::store::rows::{
 };
 use crate::store::{Store, StoreError, Write};
 
-/// A robot's identity.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct KnownRobot {
-    /// The robot's id.
     pub id: RobotId,
-    /// The robot's name.
     pub name: RobotName,
     /// The MAC address of its registration.
     pub mac: MacAddress,
-    /// The robot's labels.
     pub labels: Labels,
 }
 
 /// The version of a robot's password at an external broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct BrokerCredential {
-    /// The robot.
     pub robot: RobotId,
     /// The password's number; each further enrollment raises it.
     pub number: u64,
@@ -43,7 +38,6 @@ pub struct BrokerCredential {
 /// A robot's desired state, read at one moment.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DesiredTasks {
-    /// The robot.
     pub robot: RobotId,
     /// The number of this state.
     pub generation: Generation,
@@ -55,18 +49,15 @@ pub struct DesiredTasks {
     pub along: Vec<BlobRef>,
     /// The publishers' signed documents on these tasks' packages.
     pub evidence: Evidence,
-    /// The robot's settings.
     pub settings: RobotSettings,
 }
 
 /// The order for which a robot fetches a blob.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FetchedBy {
-    /// The deployment's priority.
     pub priority: i32,
     /// The deployment's number: a later deployment has a higher one.
     pub number: u64,
-    /// The robot's labels.
     pub labels: Labels,
 }
 
@@ -147,7 +138,6 @@ impl Store {
         Ok(robots)
     }
 
-    /// Every robot.
     pub async fn robot_ids(&self) -> Result<Vec<RobotId>, StoreError> {
         let known = "SELECT id FROM robots WHERE removed_at_ms IS NULL";
         let rows: Vec<String> = sqlx::query_scalar(known).fetch_all(&self.reads).await?;
@@ -325,7 +315,6 @@ impl Write {
         rows.iter().map(known_robot).collect()
     }
 
-    /// Registers a robot.
     pub async fn insert_robot(
         &mut self,
         robot: &KnownRobot,

@@ -22,13 +22,11 @@ use crate::store::{deliveries, timelines};
 /// A deployment to be stored.
 #[derive(Debug)]
 pub struct NewDeployment<'a> {
-    /// The deployment's id.
     pub id: &'a DeploymentId,
     /// The package to deploy.
     pub package: &'a PackageRef,
     /// Whether the task is a service or a job.
     pub kind: TaskKind,
-    /// The operator's request.
     pub order: &'a CreateDeployment,
     /// The time at which unfinished assignments expire.
     pub expires_at_ms: u64,
@@ -37,7 +35,6 @@ pub struct NewDeployment<'a> {
 /// A deployment with robots that wait for their batch.
 #[derive(Debug)]
 pub struct OpenRollout {
-    /// The deployment's pace.
     pub rollout: Rollout,
     /// The number of robots on which the deployment has failed.
     pub failed: u64,
@@ -48,7 +45,6 @@ pub struct OpenRollout {
 /// A robot with an unsettled assignment of a deployment.
 #[derive(Debug)]
 pub struct OpenRobot {
-    /// The robot's id.
     pub robot: RobotId,
     /// The progress of the assignment.
     pub standing: Standing,
@@ -275,7 +271,6 @@ impl Store {
 }
 
 impl Write {
-    /// Stores an order.
     pub async fn insert_deployment(
         &mut self,
         new: &NewDeployment<'_>,

@@ -15,7 +15,6 @@ use crate::store::{KnownRobot, StoreError, Write};
 /// example.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Unsuccessful {
-    /// The robot.
     pub robot: KnownRobot,
     /// The cause, if the deployment failed there.
     pub failure: Option<Failure>,
@@ -24,7 +23,6 @@ pub struct Unsuccessful {
 /// A robot's earlier package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EarlierPackage {
-    /// The robot's id.
     pub robot: RobotId,
     /// The package, which is still stored.
     pub package: PackageRef,

@@ -6,9 +6,7 @@ use crate::store::{StoreError, Write};
 /// An order that was carried out before.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PastOrder {
-    /// The request.
     pub request: String,
-    /// The answer.
     pub answer: String,
 }
 

@@ -14,7 +14,6 @@ use crate::store::{StoreError, Write};
 /// A robot that still runs an ordered package.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StillRunning {
-    /// The robot's id.
     pub robot: RobotId,
     /// The deployment that has failed, and was desired until now.
     pub failed: DeploymentId,

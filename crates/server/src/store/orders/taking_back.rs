@@ -18,9 +18,7 @@ use crate::store::{StoreError, Write};
 /// An assignment that is to be revoked.
 #[derive(Debug, Clone)]
 pub struct Revocable {
-    /// The deployment.
     pub deployment: DeploymentId,
-    /// The robot.
     pub robot: RobotId,
     /// The deployment that this one replaced, which becomes desired again.
     pub previous: Option<DeploymentId>,
@@ -87,7 +85,6 @@ impl Write {
         Ok(count > 0)
     }
 
-    /// The expired assignments.
     pub async fn overdue(&mut self, now_ms: u64) -> Result<Vec<Revocable>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT {COLUMNS} FROM assignments a JOIN robots r ON r.id = a.robot_id

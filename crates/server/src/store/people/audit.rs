@@ -190,7 +190,6 @@ impl Deed {
         }
     }
 
-    /// Adds a detail.
     pub fn with(mut self, key: &str, value: impl ToString) -> Self {
         self.detail.insert(key.to_owned(), shortened(&value.to_string()));
         self

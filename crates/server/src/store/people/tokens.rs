@@ -23,13 +23,10 @@ use crate::store::{Store, StoreError, Write};
 /// The holder of a valid token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TokenHolder {
-    /// A user.
     Person(Person),
     /// The holder of an enrollment token.
     Enrolment,
-    /// A robot.
     Robot {
-        /// The robot's id.
         robot: RobotId,
         /// The number of the token: a later one has a higher number.
         token_number: u64,
@@ -38,7 +35,6 @@ pub enum TokenHolder {
     },
     /// A robot that waits for approval and has no permissions yet.
     Pending {
-        /// The robot's id.
         robot: RobotId,
         /// The public key that the robot registered with the token.
         key: Option<PublicKey>,

@@ -22,7 +22,6 @@ const MOST_LISTED: i64 = 10_000;
 pub struct User {
     /// The name for signing in.
     pub name: UserName,
-    /// The user's roles.
     pub roles: Roles,
     /// The robots that the user is limited to; `None`: no limit.
     pub scope: Option<Selector>,
@@ -51,7 +50,6 @@ impl User {
 /// A user's token to be stored.
 #[derive(Debug)]
 pub struct NewToken<'a> {
-    /// The token.
     pub token: &'a Token,
     /// The user that the token belongs to.
     pub user: &'a UserName,
@@ -124,7 +122,6 @@ impl Write {
         row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
     }
 
-    /// All users.
     pub async fn users(&mut self) -> Result<Vec<User>, StoreError> {
         sqlx::query(USERS).fetch_all(self.connection()).await?.iter().map(user).collect()
     }

@@ -25,7 +25,6 @@ pub enum Reference {
 /// A manifest in a repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredManifest {
-    /// The manifest's digest.
     pub digest: Digest,
     /// Its size in bytes.
     pub size: u64,
@@ -36,7 +35,6 @@ pub struct StoredManifest {
 /// A manifest to be stored, with its parsed facts.
 #[derive(Debug, Clone)]
 pub struct NewManifest {
-    /// The manifest itself.
     pub manifest: StoredManifest,
     /// The artifact type, as shown in a list of referrers.
     pub artifact_type: Option<String>,
@@ -235,7 +233,6 @@ impl Store {
         Ok(packages)
     }
 
-    /// One package.
     pub async fn package(
         &self,
         name: &TaskName,

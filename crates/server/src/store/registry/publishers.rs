@@ -15,17 +15,11 @@ use crate::store::{DesiredTasks, Store, StoreError, Write, rows};
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SignedDocument {
     /// An envelope about the package with this manifest.
-    Signature {
-        /// The package.
-        package: Digest,
-        /// The signed envelope.
-        envelope: BlobRef,
-    },
+    Signature { package: Digest, envelope: BlobRef },
     /// A list of publishers.
     List {
         /// The version of the list.
         version: u64,
-        /// The signed envelope.
         envelope: BlobRef,
         /// Whether the keepers differ from those of the previous list.
         changes_keepers: bool,

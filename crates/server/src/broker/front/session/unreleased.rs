@@ -2,7 +2,6 @@
 //! packet id, so they are stored as bits: 8 KiB for all of them, and no memory for a client without
 //! any.
 
-/// Their packet ids.
 #[derive(Debug, Default)]
 pub(super) struct Unreleased {
     bits: Vec<u64>,

@@ -39,7 +39,6 @@ impl Output {
         Self { format, look: Look { wide, width, colours } }
     }
 
-    /// The output format.
     pub(crate) fn format(&self) -> Format {
         self.format
     }

@@ -28,7 +28,6 @@ struct ReferrersQuery {
     last: Option<String>,
 }
 
-/// `GET /v2/<name>/tags/list`.
 pub(super) async fn tags(
     registry: &Registry,
     repository: &RepositoryName,

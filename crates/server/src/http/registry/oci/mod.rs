@@ -40,9 +40,7 @@ const ALGORITHMS: &str = "only sha256 and sha512 are supported";
 /// State of the registry's handlers.
 #[derive(Clone)]
 pub struct Registry {
-    /// Contents of repositories.
     pub store: Store,
-    /// The blob store.
     pub blobs: Blobs,
     /// The clock for push times.
     pub clock: Clock,

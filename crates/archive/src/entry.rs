@@ -30,14 +30,19 @@ pub struct Entry {
     pub kind: Kind,
 }
 
+/// The kind of an entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
+    /// A directory, with no bytes.
     Directory,
+    /// A regular file with its bytes.
     File {
+        /// The size of the file in bytes.
         size: u64,
         /// Whether the file is executable.
         executable: bool,
     },
+    /// A symbolic link with its target.
     Symlink {
         /// As written: relative to the link's own directory.
         target: String,

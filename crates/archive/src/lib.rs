@@ -8,6 +8,8 @@
 //! and a robot that unpacks the package come to the same verdict. Neither hashes the compressed
 //! bytes, and neither renames files.
 
+#![warn(missing_docs)]
+
 mod entry;
 mod names;
 mod stream;
@@ -33,6 +35,7 @@ const COPY_BUFFER_BYTES: usize = 128 * 1024;
 /// Size limits of a package. The default is the packer's own limit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
+    /// Maximum uncompressed size in bytes.
     pub bytes: u64,
     /// Files, directories and links, including directories implied by paths.
     pub entries: u64,
@@ -54,6 +57,7 @@ impl Default for Limits {
     }
 }
 
+/// The reason why unpacking failed.
 #[derive(Debug, thiserror::Error)]
 pub enum UnpackError {
     /// The archive violates the rules for packages.
@@ -67,6 +71,7 @@ pub enum UnpackError {
     Disk {
         /// The path being written.
         path: PathBuf,
+        /// The error of the operating system.
         source: io::Error,
     },
 }
@@ -80,7 +85,9 @@ pub enum Refusal {
     Limit {
         /// The quantity that was counted.
         what: &'static str,
+        /// The number found in the archive.
         found: u64,
+        /// The maximum number that is allowed.
         limit: u64,
     },
     /// The archive differs from the description in its manifest.
@@ -88,20 +95,28 @@ pub enum Refusal {
     NotAsAnnounced {
         /// The quantity that was counted.
         what: &'static str,
+        /// The number found in the archive.
         found: u64,
+        /// The number announced by the manifest.
         announced: u64,
     },
     /// The uncompressed archive differs from the description in its manifest.
     #[error(
         "the uncompressed archive hashes to {found}, where the task manifest says {announced} (content.tar_digest)"
     )]
-    OtherDigest { found: Box<Digest>, announced: Box<Digest> },
+    OtherDigest {
+        /// The digest of the bytes read.
+        found: Box<Digest>,
+        /// The digest announced by the manifest.
+        announced: Box<Digest>,
+    },
     /// The manifest describes the uncompressed archive by a digest algorithm that is not supported.
     #[error("content.tar_digest: {0} is no SHA-256 digest")]
     DigestAlgorithm(Box<Digest>),
     /// An entry is not allowed in a package.
     #[error("entry {name}: {reason}")]
     Entry {
+        /// The path of the entry.
         name: String,
         /// Why the entry is refused.
         reason: String,
@@ -126,6 +141,7 @@ impl Refusal {
 /// Compression of an archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Compression {
+    /// A plain tar archive.
     None,
     /// zstd frames: one or more, with skippable frames between them.
     Zstd,

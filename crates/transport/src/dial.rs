@@ -26,6 +26,7 @@ impl<S: AsyncRead + AsyncWrite + Send + Unpin> Duplex for S {}
 pub struct Route {
     /// Host name or address; an IPv6 address may stand in brackets, as in a URL.
     pub host: String,
+    /// TCP port of the listener.
     pub port: u16,
     /// TLS configuration; `None`: plain text.
     pub tls: Option<Arc<ClientConfig>>,
@@ -38,14 +39,23 @@ pub struct Route {
 pub enum DialError {
     /// The TCP connection failed.
     #[error("cannot connect to {host}:{port}")]
-    Connect { host: String, port: u16, source: io::Error },
+    Connect {
+        /// The host name or address.
+        host: String,
+        /// The TCP port that was tried.
+        port: u16,
+        /// The error of the operating system.
+        source: io::Error,
+    },
     /// The name is not a valid name in a certificate.
     #[error("{0:?} is neither a host name nor an address")]
     Name(String),
     /// The TLS handshake failed: the certificate is not trusted, or the server does not speak TLS.
     #[error("no TLS with {host}:{port}")]
     Tls {
+        /// The host name or address.
         host: String,
+        /// The TCP port that was tried.
         port: u16,
         /// The TLS library's error.
         source: io::Error,
@@ -95,6 +105,7 @@ async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     }
 }
 
+/// Opens a connection along the route.
 pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     let (host, port) = (route.host.clone(), route.port);
     let bare =

@@ -2,6 +2,8 @@
 //! how the client authenticates itself, and MQTT over WebSocket. The crate knows no message, keeps
 //! no file and reads no clock: the time is a parameter.
 
+#![warn(missing_docs)]
+
 mod client_key;
 mod dial;
 mod line;

@@ -24,7 +24,14 @@ pub enum LineError {
     Dial(#[from] DialError),
     /// The connection was not established in time.
     #[error("{host}:{port} does not answer within {time:?}")]
-    Late { host: String, port: u16, time: Duration },
+    Late {
+        /// The host name or address.
+        host: String,
+        /// The TCP port that was tried.
+        port: u16,
+        /// The time limit that was exceeded.
+        time: Duration,
+    },
     /// The system refused the local socket.
     #[error("no local socket")]
     Local(#[source] io::Error),

@@ -17,6 +17,7 @@ use crate::trust::{Clock, Trust};
 const GREETING: [u8; 14] = [0x10, 12, 0, 4, b'M', b'Q', b'T', b'T', 0x7f, 0x02, 0, 10, 0, 0];
 /// The first byte of a CONNACK.
 const CONNACK: u8 = 0x20;
+/// Fixed packets: PINGREQ and PINGRESP.
 const PING: [u8; 2] = [0xc0, 0];
 const PONG: [u8; 2] = [0xd0, 0];
 /// CONNECT's flags for a clean session, a user name and a password.
@@ -31,6 +32,7 @@ const FAR_FUTURE_MS: u64 = 7_258_118_400_000;
 /// The result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Probed {
+    /// The port answered in MQTT.
     Mqtt,
     /// Another protocol, or the connection was closed.
     SomethingElse,
@@ -52,21 +54,30 @@ pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
 /// An account at an MQTT broker.
 #[derive(Clone, Copy)]
 pub struct MqttLogin<'a> {
+    /// User name of the MQTT account.
     pub user_name: &'a str,
+    /// Password of the MQTT account.
     pub password: &'a str,
 }
 
 /// Why the displacement test gave no result.
 #[derive(Debug, thiserror::Error)]
 pub enum DisplaceError {
+    /// The connection failed or was lost.
     #[error(transparent)]
     Dial(#[from] DialError),
     /// The broker does not let the account in.
     #[error("the broker refuses the user {user_name} (CONNACK {code})")]
-    Refused { user_name: String, code: u8 },
+    Refused {
+        /// The user name that was refused.
+        user_name: String,
+        /// The return code of the CONNACK.
+        code: u8,
+    },
     /// The connection ended before the broker had let the account in.
     #[error("the broker closes the connection of the user {user_name}")]
     Closed {
+        /// The user name that was refused.
         user_name: String,
         /// The error of the connection.
         source: io::Error,

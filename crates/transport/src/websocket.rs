@@ -16,6 +16,7 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _, Re
 
 use self::frame::{Decoder, NORMAL, Opcode, Piece, Role, Violation, encode};
 
+/// Name of the WebSocket subprotocol (MQTT 3.1.1, section 6).
 pub const MQTT: &str = "mqtt";
 /// The GUID that both ends hash behind the client's key (RFC 6455, section 1.3).
 const KEY_SUFFIX: &str = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11";
@@ -30,11 +31,13 @@ const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
 /// Limit on consecutive frames that carry no byte of MQTT: pings, pongs, empty frames. They cost
 /// time, and no other limit counts them.
 const MAX_VAIN_FRAMES: usize = 64;
+/// Maximum number of bytes per read.
 const READ_BYTES: usize = 8 * 1024;
 
 /// Why the WebSocket was not established.
 #[derive(Debug, thiserror::Error)]
 pub enum WebSocketError {
+    /// The connection failed or was lost.
     #[error("the connection failed before the WebSocket was there")]
     Io(#[from] io::Error),
     /// An HTTP status other than 101.
@@ -162,6 +165,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         io::Error::new(io::ErrorKind::InvalidData, violation)
     }
 
+    /// Writes pending bytes to the connection.
     fn poll_drain(&mut self, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         while !self.output.is_empty() {
             let written = ready!(Pin::new(&mut self.stream).poll_write(context, &self.output))?;

@@ -29,9 +29,13 @@ pub enum Role {
 pub enum Opcode {
     /// Further bytes of the current message.
     Continuation,
+    /// A message of bytes.
     Binary,
+    /// The end of the connection.
     Close,
+    /// A request for a pong.
     Ping,
+    /// The answer to a ping.
     Pong,
 }
 
@@ -42,6 +46,7 @@ pub enum Piece {
     Data(BytesMut),
     /// To be answered with the same bytes.
     Ping(BytesMut),
+    /// A pong, which needs no answer.
     Pong,
     /// A close frame, with its code if the other end sent one (RFC 6455, section 7.4).
     Close(Option<u16>),
@@ -66,8 +71,10 @@ impl Violation {
     }
 }
 
+/// A decoder of frames that takes input in any pieces.
 #[derive(Debug)]
 pub struct Decoder {
+    /// The role of this end of the connection.
     role: Role,
     frame: Option<Frame>,
     /// Whether a message has begun and not ended.

@@ -4,7 +4,7 @@
 
 use std::io::Read;
 
-use task_proto::manifest::MAX_CONTENT_PATH_BYTES;
+use task_proto::packages::manifest::MAX_CONTENT_PATH_BYTES;
 
 use super::stream::{BLOCK_BYTES, Blocks};
 use super::{Refusal, UnpackError};
@@ -71,7 +71,7 @@ pub(super) fn next<R: Read>(
         let block = archive.block()?;
         if block == [0; BLOCK_BYTES] {
             if extended.path.is_some() || extended.link.is_some() {
-                return Err(archive.damaged("a long name belongs to no entry"));
+                return Err(archive.damaged("a long name without an entry"));
             }
             return Ok(None);
         }
@@ -83,7 +83,7 @@ pub(super) fn next<R: Read>(
             return Err(archive.damaged("a header is neither ustar nor GNU"));
         }
         let size =
-            header.entry_size().map_err(|_| archive.damaged("an entry's size is no number"))?;
+            header.entry_size().map_err(|_| archive.damaged("an entry's size is not a number"))?;
         archive.check_entry(size)?;
         match header.entry_type().as_byte() {
             b'L' => extended.path(long_name(archive, size)?, archive)?,
@@ -162,7 +162,7 @@ fn parse(
         return Err(refuse(reason));
     }
     let path = normal_path(&name, depth_limit).map_err(refuse)?;
-    let mode = header.mode().map_err(|_| refuse("its mode is no number".to_owned()))?;
+    let mode = header.mode().map_err(|_| refuse("its mode is not a number".to_owned()))?;
     if mode & SPECIAL_MODE_BITS != 0 {
         return Err(refuse(format!("mode {mode:o} has set-id or sticky bits")));
     }

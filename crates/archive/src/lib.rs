@@ -19,8 +19,8 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
 use task_proto::Digest;
-use task_proto::digest::Algorithm;
-use task_proto::manifest::{
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::manifest::{
     CONTENT_RATIO_FREE_BYTES, ContentFacts, MAX_CONTENT_DEPTH, MAX_CONTENT_ENTRIES,
     MAX_CONTENT_RATIO, MAX_CONTENT_TAR_BYTES,
 };
@@ -63,8 +63,8 @@ pub enum UnpackError {
     /// The archive violates the rules for packages.
     #[error(transparent)]
     Refused(#[from] Refusal),
-    /// The compressed bytes stopped coming.
-    #[error("the package's bytes stopped coming")]
+    /// The compressed bytes could not be read to their end.
+    #[error("the package could not be read to its end")]
     Source(#[source] io::Error),
     /// A write to the disk failed.
     #[error("cannot write {}", path.display())]
@@ -102,7 +102,8 @@ pub enum Refusal {
     },
     /// The uncompressed archive differs from the description in its manifest.
     #[error(
-        "the uncompressed archive hashes to {found}, where the task manifest says {announced} (content.tar_digest)"
+        "the uncompressed archive hashes to {found}, \
+         where the task manifest says {announced} (content.tar_digest)"
     )]
     OtherDigest {
         /// The digest of the bytes read.
@@ -111,7 +112,7 @@ pub enum Refusal {
         announced: Box<Digest>,
     },
     /// The manifest describes the uncompressed archive by a digest algorithm that is not supported.
-    #[error("content.tar_digest: {0} is no SHA-256 digest")]
+    #[error("content.tar_digest: {0} is not a SHA-256 digest")]
     DigestAlgorithm(Box<Digest>),
     /// An entry is not allowed in a package.
     #[error("entry {name}: {reason}")]
@@ -287,7 +288,7 @@ fn admit(content_size: u64, facts: &ContentFacts, limits: &Limits) -> Result<(),
     let unpacked_limit = content_size.saturating_mul(limits.ratio).max(CONTENT_RATIO_FREE_BYTES);
     for (what, found, limit) in [
         ("uncompressed bytes", facts.tar_size, limits.bytes),
-        ("uncompressed bytes for so few compressed ones", facts.tar_size, unpacked_limit),
+        ("uncompressed bytes for this compressed size", facts.tar_size, unpacked_limit),
         ("entries in the archive", facts.entries, limits.entries),
     ] {
         if found > limit {

@@ -41,7 +41,7 @@ impl Names {
         match kind {
             Kind::Directory => self.directory(path),
             Kind::File { .. } => self.claim(path, Node::File),
-            Kind::Symlink { target } if target.starts_with('/') => Err(leaves(path, target)),
+            Kind::Symlink { target } if target.starts_with('/') => Err(escape_error(path, target)),
             Kind::Symlink { target } => {
                 self.bytes += target.len();
                 self.claim(path, Node::Symlink { target: target.clone() })
@@ -99,7 +99,7 @@ impl Names {
             return Err(Refusal::entry(path.as_bytes(), format!("{above:?} above it {reason}")));
         }
         if self.nodes.contains_key(path) {
-            return Err(Refusal::entry(path.as_bytes(), "the name is there twice"));
+            return Err(Refusal::entry(path.as_bytes(), "duplicate name"));
         }
         self.insert(path, node)?;
         Ok(implied)
@@ -135,7 +135,7 @@ impl Names {
             }
             match part {
                 "" | "." => continue,
-                ".." if at.pop().is_none() => return Err(leaves(path, target)),
+                ".." if at.pop().is_none() => return Err(escape_error(path, target)),
                 ".." => continue,
                 name => at.push(name),
             }
@@ -148,7 +148,7 @@ impl Names {
     }
 }
 
-fn leaves(path: &str, target: &str) -> Refusal {
+fn escape_error(path: &str, target: &str) -> Refusal {
     Refusal::entry(path.as_bytes(), format!("the symbolic link to {target:?} leaves the package"))
 }
 

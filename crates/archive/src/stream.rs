@@ -4,7 +4,7 @@ use std::io::{self, BufRead as _, BufReader, Read};
 
 use sha2::{Digest as _, Sha256};
 use task_proto::Digest;
-use task_proto::manifest::CONTENT_RATIO_FREE_BYTES;
+use task_proto::packages::manifest::CONTENT_RATIO_FREE_BYTES;
 use zstd::stream::read::Decoder;
 
 use super::{COPY_BUFFER_BYTES, Compression, Refusal, UnpackError};
@@ -101,7 +101,7 @@ impl<R: Read> Bytes<R> {
     }
 
     /// Whether bytes follow the last byte read.
-    fn goes_on(&mut self) -> io::Result<bool> {
+    fn has_more(&mut self) -> io::Result<bool> {
         match self {
             Self::Plain(reader) => reader.fill_buf().map(|rest| !rest.is_empty()),
             Self::Zstd(decoder) => decoder.get_mut().fill_buf().map(|rest| !rest.is_empty()),
@@ -140,9 +140,9 @@ impl<R: Read> Blocks<R> {
     pub(super) fn check_entry(&self, size: u64) -> Result<(), UnpackError> {
         let left = self.size.most() - self.position;
         match self.size {
-            Bound::Exactly(_) if size > left => {
-                Err(self.damaged(format!("an entry of {size} bytes is longer than what is left")))
-            }
+            Bound::Exactly(_) if size > left => Err(self.damaged(format!(
+                "an entry of {size} bytes is longer than the rest of the archive"
+            ))),
             Bound::AtMost(_) => {
                 Ok(self.size.check("uncompressed bytes", self.position.saturating_add(size))?)
             }
@@ -168,7 +168,7 @@ impl<R: Read> Blocks<R> {
         self.size.check("uncompressed bytes, so far", found)?;
         let limit =
             self.bytes.source().taken.saturating_mul(self.ratio).max(CONTENT_RATIO_FREE_BYTES);
-        Bound::AtMost(limit).check("uncompressed bytes for so few compressed ones", found)?;
+        Bound::AtMost(limit).check("uncompressed bytes for this compressed size", found)?;
         self.position = found;
         if let Some((hasher, _)) = &mut self.digest {
             hasher.update(&buffer[..count]);
@@ -179,7 +179,7 @@ impl<R: Read> Blocks<R> {
     fn read_exact(&mut self, mut buffer: &mut [u8]) -> Result<(), UnpackError> {
         while !buffer.is_empty() {
             match self.read(buffer)? {
-                0 => return Err(self.damaged("it ends too early")),
+                0 => return Err(self.damaged("the archive ends too early")),
                 count => buffer = &mut buffer[count..],
             }
         }
@@ -228,12 +228,12 @@ impl<R: Read> Blocks<R> {
             match self.read(buffer)? {
                 0 => break,
                 count if buffer[..count].iter().all(|&byte| byte == 0) => {}
-                _ => return Err(self.damaged("there are bytes after its end marker")),
+                _ => return Err(self.damaged("bytes follow the end marker")),
             }
         }
         self.size.check_end("uncompressed bytes", self.position)?;
-        if self.bytes.goes_on().map_err(UnpackError::Source)? {
-            return Err(self.damaged("there are bytes after its end"));
+        if self.bytes.has_more().map_err(UnpackError::Source)? {
+            return Err(self.damaged("bytes follow the end of the archive"));
         }
         if let Some((hasher, announced)) = self.digest.take() {
             let found = Digest::from_sha256(hasher.finalize().into());

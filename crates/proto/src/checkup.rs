@@ -1,5 +1,5 @@
-//! What `taskd doctor` and `task-agent doctor` have found: each check with its verdict in words,
-//! and how to mend what is wrong. Data and text; who checks reads it elsewhere.
+//! Owns the results of `taskd doctor` and `task-agent doctor`, each check with its verdict, finding
+//! and remedy; it never checks anything.
 
 use serde::{Deserialize, Serialize};
 
@@ -86,8 +86,8 @@ impl Checkup {
         let count = |verdict| self.checks.iter().filter(|check| check.verdict == verdict).count();
         let (bad, notices) = (count(Verdict::Bad), count(Verdict::Notice));
         text.push_str(&match (bad, notices) {
-            (0, 0) => "all is well\n".to_owned(),
-            _ => format!("{bad} bad, {notices} to look at, {} good\n", count(Verdict::Good)),
+            (0, 0) => "no problems found\n".to_owned(),
+            _ => format!("{bad} failed, {notices} to review, {} passed\n", count(Verdict::Good)),
         });
         text
     }
@@ -98,10 +98,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn each_check_has_a_line_and_what_to_do_below_it() {
+    fn each_check_has_a_line_and_its_remedy_below() {
         let mut checkup = Checkup::default();
         checkup.good("http", "answers");
-        assert_eq!(checkup.text(|v| v.sign().to_string()), "✓ http         answers\nall is well\n");
+        assert_eq!(
+            checkup.text(|v| v.sign().to_string()),
+            "✓ http         answers\nno problems found\n"
+        );
         checkup.notice("clock", "6 s\u{1b}[31m ahead", "set it");
         assert!(checkup.is_healthy());
         checkup.bad("disk", "full", "make room");
@@ -109,7 +112,7 @@ mod tests {
         assert_eq!(
             checkup.text(|v| v.sign().to_string()),
             "✓ http         answers\n! clock        6 s [31m ahead\n               → set it\n\
-             ✗ disk         full\n               → make room\n1 bad, 1 to look at, 1 good\n"
+             ✗ disk         full\n               → make room\n1 failed, 1 to review, 1 passed\n"
         );
     }
 }

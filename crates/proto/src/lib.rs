@@ -5,35 +5,21 @@
 #![warn(missing_docs)]
 
 pub mod api;
-pub mod audit;
 pub mod checkup;
+pub mod data_directory;
 pub mod desired;
-pub mod digest;
-pub mod envelope;
-pub mod expected;
-pub mod id;
-pub mod line;
-pub mod log;
-pub mod manifest;
-pub mod oci;
-pub mod output;
-pub mod part;
-pub mod person;
-pub mod pin;
-pub mod publisher;
-pub mod report;
-pub mod request;
-pub mod ros;
-pub mod selector;
-pub mod settings;
-pub mod time;
-pub mod token;
-pub mod topic;
-pub mod vitals;
+pub mod ids;
+pub mod messages;
+pub mod packages;
+pub mod people;
+pub mod telemetry;
+mod text;
+pub mod trust;
 
-pub use digest::Digest;
-pub use id::{
+pub use ids::digest::Digest;
+pub use ids::{
     AbsolutePath, DeploymentId, Generation, InstanceId, MacAddress, RepositoryName, RobotId,
     RobotName, Tag, TaskName, TokenId, UserName, Version,
 };
-pub use pin::CaPin;
+pub use text::{error_chain, expected, line, size, time};
+pub use trust::pin::CaPin;

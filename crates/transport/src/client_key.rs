@@ -14,7 +14,7 @@ use rustls::pki_types::{CertificateDer, PrivatePkcs8KeyDer};
 use rustls::server::ParsedCertificate;
 use rustls::sign::{CertifiedKey, SingleCertAndKey};
 use serde::{Deserialize, Serialize};
-use task_proto::envelope::{PublicKey, SigningKey};
+use task_proto::trust::envelope::{PublicKey, SigningKey};
 
 /// DER prefix before the seed in an ed25519 key as PKCS #8 (RFC 8410, section 7).
 const PKCS8_PREFIX: [u8; 16] = [
@@ -36,7 +36,7 @@ pub struct InvalidKey;
 
 /// The certificate can't be created.
 #[derive(Debug, thiserror::Error)]
-#[error("no certificate can be made with this key")]
+#[error("could not create a certificate with this key")]
 pub struct CertificateError(#[source] Box<dyn std::error::Error + Send + Sync>);
 
 impl ClientKey {
@@ -106,7 +106,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_certificate_shows_the_key_it_was_made_with() {
+    fn certificate_contains_its_key() {
         let key = ClientKey::random();
         let certified = key.certificate().expect("a certificate");
         assert_eq!(key_in(&certified.cert[0]), Some(key.public_key()));

@@ -51,7 +51,7 @@ pub enum DialError {
     #[error("{0:?} is neither a host name nor an address")]
     Name(String),
     /// The TLS handshake failed: the certificate is not trusted, or the server does not speak TLS.
-    #[error("no TLS with {host}:{port}")]
+    #[error("the TLS handshake with {host}:{port} failed")]
     Tls {
         /// The host name or address.
         host: String,
@@ -71,7 +71,7 @@ const HEAD_START: Duration = Duration::from_millis(250);
 const MAX_ADDRESSES: usize = 16;
 
 /// The addresses of both families alternating, beginning with the family that the system prefers.
-fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
+fn alternate_families(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
     let addresses: Vec<_> = addresses.collect();
     let is_first = addresses.first().map(SocketAddr::is_ipv6);
     let (first, second): (Vec<_>, Vec<_>) =
@@ -85,7 +85,7 @@ fn in_turns(addresses: impl Iterator<Item = SocketAddr>) -> Vec<SocketAddr> {
 
 /// Connects to the first of these addresses that answers. A silent address, such as one of a family
 /// that is not routed, does not delay the others.
-async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
+async fn connect_to(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
     let mut addresses = addresses.into_iter();
     let mut tries = JoinSet::new();
     let mut failed = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
@@ -107,21 +107,26 @@ async fn connect(addresses: Vec<SocketAddr>) -> io::Result<TcpStream> {
 
 /// Opens a connection along the route.
 pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
-    let (host, port) = (route.host.clone(), route.port);
-    let bare =
-        host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(&host).to_owned();
-    let addresses = match tokio::net::lookup_host((bare.as_str(), port)).await {
-        Ok(addresses) => in_turns(addresses),
-        Err(source) => return Err(DialError::Connect { host, port, source }),
-    };
-    let stream = match connect(addresses).await {
-        Ok(stream) => stream,
-        Err(source) => return Err(DialError::Connect { host, port, source }),
-    };
+    secure(connect(route).await?, route).await
+}
+
+/// Opens the route's TCP connection, the first step of [`dial`].
+pub async fn connect(route: &Route) -> Result<TcpStream, DialError> {
+    let failed = |source| DialError::Connect { host: route.host.clone(), port: route.port, source };
+    let addresses =
+        tokio::net::lookup_host((route.bare_host(), route.port)).await.map_err(failed)?;
+    let stream = connect_to(alternate_families(addresses)).await.map_err(failed)?;
     // Packets are small and latency matters. If the option can't be set, packets arrive a little
     // later.
     let _ = stream.set_nodelay(true);
+    Ok(stream)
+}
+
+/// Adds the route's TLS and WebSocket, the second step of [`dial`].
+pub async fn secure(stream: TcpStream, route: &Route) -> Result<Box<dyn Duplex>, DialError> {
+    let (host, port) = (route.host.clone(), route.port);
     let stream: Box<dyn Duplex> = if let Some(tls) = &route.tls {
+        let bare = route.bare_host().to_owned();
         let name = ServerName::try_from(bare.clone()).map_err(|_| DialError::Name(bare))?;
         match TlsConnector::from(tls.clone()).connect(name, stream).await {
             Ok(stream) => Box::new(stream),
@@ -138,6 +143,14 @@ pub async fn dial(route: &Route) -> Result<Box<dyn Duplex>, DialError> {
     }
 }
 
+impl Route {
+    /// The host without the brackets of an IPv6 address.
+    fn bare_host(&self) -> &str {
+        let inner = self.host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+        inner.unwrap_or(&self.host)
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -147,16 +160,17 @@ mod tests {
     }
 
     #[test]
-    fn both_families_have_their_turn() {
-        let given = ["[::1]:1", "[::2]:1", "[::3]:1", "10.0.0.1:1", "10.0.0.2:1"].map(address);
-        let turns = ["[::1]:1", "10.0.0.1:1", "[::2]:1", "10.0.0.2:1", "[::3]:1"].map(address);
-        assert_eq!(in_turns(given.into_iter()), turns);
-        assert_eq!(in_turns(given[3..].iter().copied()), given[3..]);
-        assert_eq!(in_turns(std::iter::empty()), []);
+    fn address_families_alternate() {
+        let addresses = ["[::1]:1", "[::2]:1", "[::3]:1", "10.0.0.1:1", "10.0.0.2:1"].map(address);
+        let alternating =
+            ["[::1]:1", "10.0.0.1:1", "[::2]:1", "10.0.0.2:1", "[::3]:1"].map(address);
+        assert_eq!(alternate_families(addresses.into_iter()), alternating);
+        assert_eq!(alternate_families(addresses[3..].iter().copied()), addresses[3..]);
+        assert_eq!(alternate_families(std::iter::empty()), []);
     }
 
     #[tokio::test]
-    async fn an_address_that_is_silent_or_refuses_holds_nobody_up() {
+    async fn silent_or_refusing_address_does_not_delay_the_others() {
         let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
         let open = listener.local_addr().expect("its address");
         // A listener with a full queue: further connections get no answer.
@@ -169,12 +183,12 @@ mod tests {
             waiting.push(stream);
         }
         let refuses = address("127.0.0.1:1");
-        let stream = connect(vec![full, refuses, open]).await.expect("connected");
+        let stream = connect_to(vec![full, refuses, open]).await.expect("connected");
         assert_eq!(stream.peer_addr().expect("its address"), open);
         assert_eq!(
-            connect(vec![refuses]).await.expect_err("refused").kind(),
+            connect_to(vec![refuses]).await.expect_err("refused").kind(),
             io::ErrorKind::ConnectionRefused
         );
-        assert_eq!(connect(Vec::new()).await.expect_err("none").kind(), io::ErrorKind::NotFound);
+        assert_eq!(connect_to(Vec::new()).await.expect_err("none").kind(), io::ErrorKind::NotFound);
     }
 }

@@ -6,13 +6,13 @@
 
 mod client_key;
 mod dial;
-mod line;
 mod probe;
+mod relay;
 mod trust;
 pub mod websocket;
 
 pub use client_key::{CertificateError, ClientKey, InvalidKey, key_in};
-pub use dial::{DialError, Duplex, Route, dial};
-pub use line::{Line, LineError};
-pub use probe::{DisplaceError, MqttLogin, Probed, certificate_end_ms, displaces, greet_mqtt};
+pub use dial::{DialError, Duplex, Route, connect, dial, secure};
+pub use probe::{DisplaceError, MqttLogin, ProbeResult, certificate_end_ms, displaces, probe_mqtt};
+pub use relay::{Relay, RelayError};
 pub use trust::{BUILT_MS, Clock, Trust, WrongServer, pin_of};

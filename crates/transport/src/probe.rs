@@ -31,15 +31,15 @@ const FAR_FUTURE_MS: u64 = 7_258_118_400_000;
 
 /// The result of a probe.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Probed {
+pub enum ProbeResult {
     /// The port answered in MQTT.
     Mqtt,
     /// Another protocol, or the connection was closed.
-    SomethingElse,
+    Other,
 }
 
 /// Whether the port speaks MQTT. There is no timeout.
-pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
+pub async fn probe_mqtt(route: &Route) -> Result<ProbeResult, DialError> {
     let mut stream = dial(route).await?;
     let mut answer = [0];
     let greeted: io::Result<()> = async {
@@ -48,7 +48,7 @@ pub async fn greet_mqtt(route: &Route) -> Result<Probed, DialError> {
         stream.read_exact(&mut answer).await.map(drop)
     }
     .await;
-    Ok(if greeted.is_ok() && answer[0] == CONNACK { Probed::Mqtt } else { Probed::SomethingElse })
+    Ok(if greeted.is_ok() && answer[0] == CONNACK { ProbeResult::Mqtt } else { ProbeResult::Other })
 }
 
 /// An account at an MQTT broker.

@@ -19,7 +19,7 @@ use rustls::{
     SignatureScheme,
 };
 use task_proto::CaPin;
-use task_proto::pin::PINNED_PROTOCOL;
+use task_proto::trust::pin::PINNED_PROTOCOL;
 
 /// Certificates whose start of validity a wrong clock may be moved to: more than any chain has.
 const MAX_CHAIN: usize = 8;
@@ -159,7 +159,7 @@ impl Verifier {
     ) -> Result<(), Error> {
         let server = ParsedCertificate::try_from(certificate)?;
         let by = |roots: &RootCertStore| {
-            self.at_a_possible_time(now, |time| {
+            self.check_at_plausible_time(now, |time| {
                 verify_server_cert_signed_by_trust_anchor(
                     &server,
                     roots,
@@ -188,7 +188,7 @@ impl Verifier {
     /// Verifies at time `now`. If the clock can't be right, a certificate's start of validity is
     /// not held against the server: we use the earliest moment at which all certificates had begun,
     /// and certificates that ended before that stay invalid.
-    fn at_a_possible_time(
+    fn check_at_plausible_time(
         &self,
         now: UnixTime,
         check: impl Fn(UnixTime) -> Result<(), Error>,
@@ -311,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pinned_authority_is_believed_under_any_name_and_no_other_is() {
+    fn only_the_pinned_authority_is_trusted_under_any_name() {
         let (own, other) = (Authority::new("own"), Authority::new("other"));
         let pinned = verifier(Anchor::Pin(own.pin()));
         let good = own.server(2025, 2100, ExtendedKeyUsagePurpose::ServerAuth);
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn roots_vouch_for_a_name() {
+    fn system_roots_verify_the_server_name() {
         let own = Authority::new("own");
         let mut roots = RootCertStore::empty();
         roots.add(own.certificate.clone()).expect("an authority");
@@ -356,7 +356,7 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_before_the_programs_own_time_is_not_held_against_a_beginning() {
+    fn impossible_clock_ignores_the_start_of_validity() {
         let own = Authority::new("own");
         let pinned = verifier(Anchor::Pin(own.pin()));
         let chain = [own.certificate.clone()];
@@ -378,7 +378,7 @@ mod tests {
     }
 
     #[test]
-    fn the_time_of_the_build_is_what_it_says() {
+    fn build_time_is_read_from_source_date_epoch() {
         assert_eq!(built_ms(None), BEGINNING_MS);
         assert_eq!(built_ms(Some("1800000000")), 1_800_000_000_000);
         for nothing in ["", "0", "-5", "1800000000x", "99999999999999999999"] {
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn only_who_trusts_a_pin_asks_for_its_certificate() {
+    fn only_pinned_clients_request_the_pinned_certificate() {
         let clock = Clock { now_ms: || BUILT_MS, earliest_ms: BUILT_MS };
         let pinned = Trust::Pinned(Authority::new("own").pin()).client_config(clock);
         assert!(pinned.alpn_protocols.iter().any(|protocol| protocol == PINNED_PROTOCOL));

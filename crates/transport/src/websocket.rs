@@ -30,7 +30,7 @@ const FRAME_BYTES: usize = 16 * 1024;
 const MAX_UNWRITTEN_BYTES: usize = 32 * 1024;
 /// Limit on consecutive frames that carry no byte of MQTT: pings, pongs, empty frames. They cost
 /// time, and no other limit counts them.
-const MAX_VAIN_FRAMES: usize = 64;
+const MAX_EMPTY_FRAMES: usize = 64;
 /// Maximum number of bytes per read.
 const READ_BYTES: usize = 8 * 1024;
 
@@ -38,13 +38,13 @@ const READ_BYTES: usize = 8 * 1024;
 #[derive(Debug, thiserror::Error)]
 pub enum WebSocketError {
     /// The connection failed or was lost.
-    #[error("the connection failed before the WebSocket was there")]
+    #[error("the connection failed before the WebSocket was established")]
     Io(#[from] io::Error),
     /// An HTTP status other than 101.
-    #[error("the server answers {0} where MQTT over WebSocket should be")]
+    #[error("the server answered {0} instead of upgrading to MQTT over WebSocket")]
     Refused(StatusCode),
     /// The request or the answer is not one for MQTT over WebSocket.
-    #[error("no MQTT over WebSocket: {0}")]
+    #[error("invalid MQTT over WebSocket handshake: {0}")]
     Malformed(&'static str),
 }
 
@@ -101,7 +101,7 @@ pub struct WebSocket<S> {
     /// Whether the other end has sent a close frame, or has violated the protocol.
     is_over: bool,
     /// Frames without a byte since the last byte.
-    vain_frames: usize,
+    empty_frames: usize,
     output: BytesMut,
     /// The close code of this end; `None` answers a close frame without a code.
     closing: Option<u16>,
@@ -120,7 +120,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
         let key = STANDARD.encode(rand::random::<[u8; 16]>());
         let request = format!(
             "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {MQTT}\r\nSec-WebSocket-Key: {key}\r\n\r\n"
+             Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: {MQTT}\r\n\
+             Sec-WebSocket-Key: {key}\r\n\r\n"
         );
         stream.write_all(request.as_bytes()).await?;
         stream.flush().await?;
@@ -129,7 +130,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             if stream.read_buf(&mut input).await? == 0 {
                 return Err(io::Error::from(io::ErrorKind::UnexpectedEof).into());
             }
-            if let Some(length) = judge(&input, &key)? {
+            if let Some(length) = parse_response(&input, &key)? {
                 input.advance(length);
                 return Ok(Self::new(stream, Role::Client, input));
             }
@@ -147,7 +148,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
             input,
             unread: BytesMut::new(),
             is_over: false,
-            vain_frames: 0,
+            empty_frames: 0,
             output: BytesMut::new(),
             closing: Some(NORMAL),
             is_closed: false,
@@ -180,15 +181,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
     }
 
     /// Handles the received frames; payload bytes go to `unread`.
-    fn act_on_input(&mut self) -> io::Result<()> {
+    fn handle_input(&mut self) -> io::Result<()> {
         while self.unread.is_empty() && !self.is_over {
             let piece =
                 self.decoder.decode(&mut self.input).map_err(|violation| self.refuse(violation))?;
             let has_data = matches!(&piece, Some(Piece::Data(bytes)) if !bytes.is_empty());
-            self.vain_frames =
-                if has_data { 0 } else { self.vain_frames + usize::from(piece.is_some()) };
-            if self.vain_frames > MAX_VAIN_FRAMES {
-                return Err(self.refuse(Violation::new("another one that carries nothing")));
+            self.empty_frames =
+                if has_data { 0 } else { self.empty_frames + usize::from(piece.is_some()) };
+            if self.empty_frames > MAX_EMPTY_FRAMES {
+                return Err(self.refuse(Violation::new("too many empty frames")));
             }
             match piece {
                 Some(Piece::Data(bytes)) => self.unread = bytes,
@@ -214,7 +215,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> WebSocket<S> {
 
 /// The length of the answer's head if the head grants the WebSocket; `None` until the head is
 /// complete.
-fn judge(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
+fn parse_response(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
     let mut fields = [httparse::EMPTY_HEADER; MAX_HEADERS];
     let mut answer = httparse::Response::new(&mut fields);
     let malformed = WebSocketError::Malformed;
@@ -230,7 +231,7 @@ fn judge(input: &[u8], key: &str) -> Result<Option<usize>, WebSocketError> {
         field.map(|field| field.value)
     };
     if field("sec-websocket-accept") != Some(accept_of(key.as_bytes()).as_bytes()) {
-        return Err(malformed("the answer is one to another request"));
+        return Err(malformed("the answer belongs to another request"));
     }
     if field("sec-websocket-protocol") != Some(MQTT.as_bytes()) {
         return Err(malformed("the server does not agree on mqtt"));
@@ -246,7 +247,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncRead for WebSocket<S> {
     ) -> Poll<io::Result<()>> {
         let this = self.get_mut();
         loop {
-            this.act_on_input()?;
+            this.handle_input()?;
             if !this.output.is_empty() {
                 // A pong. Bytes that cannot be written now are written later; the next write
                 // reports the error as well.
@@ -347,32 +348,32 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn bytes_go_both_ways_and_end() {
+    async fn bytes_are_carried_both_ways_until_the_close() {
         for room in [97, 1 << 20] {
             let (mut client, mut server) = pair(room).await;
             let sent: Vec<u8> = (0..300_000u32).map(|n| (n * 7 % 251) as u8).collect();
-            let mut came = vec![0; sent.len()];
+            let mut received = vec![0; sent.len()];
             let writing = async {
                 client.write_all(&sent).await.expect("written");
                 client.flush().await.expect("flushed");
             };
-            let ((), read) = tokio::join!(writing, server.read_exact(&mut came));
+            let ((), read) = tokio::join!(writing, server.read_exact(&mut received));
             read.expect("read");
-            assert!(came == sent);
+            assert!(received == sent);
             let writing = async {
                 server.write_all(&sent).await.expect("written");
                 server.shutdown().await.expect("closed");
             };
-            let mut came = Vec::new();
-            let ((), read) = tokio::join!(writing, client.read_to_end(&mut came));
+            let mut received = Vec::new();
+            let ((), read) = tokio::join!(writing, client.read_to_end(&mut received));
             read.expect("read");
-            assert!(came == sent);
+            assert!(received == sent);
             assert!(server.write_all(b"more").await.is_err());
         }
     }
 
     #[tokio::test]
-    async fn a_ping_is_answered_while_nothing_is_said() {
+    async fn ping_is_answered_while_idle() {
         let (client, mut server) = pair(1024).await;
         let WebSocket { mut stream, .. } = client;
         let mut ping = BytesMut::new();
@@ -394,7 +395,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn whoever_is_closed_is_told_why() {
+    async fn close_frame_has_the_reason() {
         for (frame, answer) in [
             (masked(Opcode::Continuation, b"x"), &b"\x88\x02\x03\xea"[..]),
             (BytesMut::from(&b"\x81\x80\0\0\0\0"[..]), b"\x88\x02\x03\xeb"),
@@ -408,9 +409,9 @@ mod tests {
             // The result may be data, the end or an error.
             let _ = server.read(&mut [0; 8]).await;
             server.shutdown().await.expect("closed");
-            let mut came = Vec::new();
-            stream.read_to_end(&mut came).await.expect("read");
-            assert_eq!(came, answer, "{frame:x?}");
+            let mut received = Vec::new();
+            stream.read_to_end(&mut received).await.expect("read");
+            assert_eq!(received, answer, "{frame:x?}");
         }
     }
 
@@ -421,14 +422,14 @@ mod tests {
             let WebSocket { mut stream, .. } = client;
             for _ in 0..3 {
                 stream
-                    .write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES))
+                    .write_all(&masked(opcode, b"").repeat(MAX_EMPTY_FRAMES))
                     .await
                     .expect("written");
                 stream.write_all(&masked(Opcode::Binary, b"x")).await.expect("written");
                 assert_eq!(server.read_u8().await.expect("a byte"), b'x');
             }
             stream
-                .write_all(&masked(opcode, b"").repeat(MAX_VAIN_FRAMES + 1))
+                .write_all(&masked(opcode, b"").repeat(MAX_EMPTY_FRAMES + 1))
                 .await
                 .expect("written");
             let ended =
@@ -442,7 +443,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn whoever_does_not_grant_it_is_named() {
+    async fn refused_handshake_names_the_reason() {
         for (answer, expected) in [
             (&b"HTTP/1.1 404 Not Found\r\n\r\n"[..], "404"),
             (b"HTTP/1.1 101 Fine\r\nSec-WebSocket-Accept: x\r\n\r\n", "another request"),
@@ -468,7 +469,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_head_without_an_end_is_not_gathered() {
+    async fn endless_response_head_is_refused() {
         let (client, mut server) = duplex(4096);
         let endless = async move {
             let _ = server.write_all(b"HTTP/1.1 101 Fine\r\nx: ").await;

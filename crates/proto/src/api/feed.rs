@@ -1,12 +1,12 @@
-//! Bodies of the feed: recent notable events in the fleet. The feed is in memory and starts empty
-//! with the server; records that must not be lost are in the audit.
+//! Bodies of the feed: recent notable events in the fleet. An event that the server can't store in
+//! time is left out; records that must not be lost are in the audit.
 
 use serde::{Deserialize, Serialize};
 
-use crate::log::LogLevel;
+use crate::telemetry::log::LogLevel;
 use crate::{DeploymentId, RobotId, RobotName};
 
-/// The most entries that the server keeps, and the most in one answer.
+/// The highest `limit` of a request. The server may keep fewer entries.
 pub const MAX_FEED_ENTRIES: usize = 2000;
 
 /// `GET /feed` (read), optionally `?after=<number>` and `?limit=` (absent: 100): the newest entries

@@ -1,10 +1,11 @@
-//! Bodies about packages: their versions, their files, and differences between versions.
+//! Bodies about packages, their versions and files, and about the outputs of runs.
 
 use serde::{Deserialize, Serialize};
 
 use crate::desired::PackageRef;
-use crate::manifest::TaskManifest;
-use crate::{Digest, TaskName};
+use crate::packages::manifest::TaskManifest;
+use crate::packages::output::OutputSet;
+use crate::{Digest, RobotName, TaskName};
 
 /// `GET /packages` (read).
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
@@ -116,4 +117,28 @@ pub struct ChangedFile {
     pub from: PackageFile,
     /// The entry in the second version.
     pub to: PackageFile,
+}
+
+/// `GET /outputs` (read), optionally `?robot=` (id or name) and `?task=`. The files are read from
+/// `/v2/outputs/<robot id>/<task>/blobs/<digest>`.
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct OutputList {
+    /// The newest first, at most 1,000.
+    pub outputs: Vec<OutputView>,
+}
+
+/// Files that one run uploaded.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct OutputView {
+    /// The robot's name.
+    pub robot_name: RobotName,
+    /// Digest of the artifact's manifest.
+    pub manifest: Digest,
+    /// When the output was pushed.
+    pub pushed_at_ms: u64,
+    /// The run and its files.
+    #[serde(flatten)]
+    pub output: OutputSet,
 }

@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::audit::AuditRecord;
-use crate::person::{Permission, Roles};
-use crate::selector::Selector;
+use crate::ids::selector::Selector;
+use crate::people::audit::AuditRecord;
+use crate::people::roles::{Permission, Roles};
 use crate::{TokenId, UserName};
 
 /// `GET /users` (administer).
@@ -120,9 +120,6 @@ pub struct SessionView {
     /// The provider for sign-in without a password; absent: none configured.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provider: Option<ProviderView>,
-    /// Whether the caller was signed in until the server restarted, which ends all sessions.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub ended_by_restart: bool,
 }
 
 /// A provider that users may sign in with.
@@ -249,16 +246,16 @@ pub struct AuditQuery {
     /// Only entries with a lower number.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub before: Option<u64>,
-    /// At most so many; absent: 1,000, which is also the most.
+    /// Maximum number of entries, up to 1,000; absent: 1,000.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub limit: Option<u64>,
-    /// Only what this one did.
+    /// Only actions by this actor.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub who: Option<String>,
-    /// Only what was done to this.
+    /// Only actions on this target.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub target: Option<String>,
-    /// Only acts that begin so, like `robot.`.
+    /// Only actions with this prefix, such as `robot.`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub act: Option<String>,
 }

@@ -8,12 +8,12 @@ use task_proto::api::{
     SessionList, SiteStatus, Subscription, TaskHistory, TimelineEntry, Traffic, TransferStatus,
     VitalsView,
 };
+use task_proto::desired::settings::{EffectiveSettings, RobotLimits, RobotSettings};
 use task_proto::desired::{Delivery, DesiredState, Wanted};
-use task_proto::log::LogLevel;
-use task_proto::manifest::TaskKind;
-use task_proto::report::{Failure, FailureCode, Phase, Report};
-use task_proto::settings::{EffectiveSettings, RobotLimits, RobotSettings};
-use task_proto::vitals::{Telemetry, Vitals};
+use task_proto::messages::report::{Failure, FailureCode, Phase, Report};
+use task_proto::packages::manifest::TaskKind;
+use task_proto::telemetry::log::LogLevel;
+use task_proto::telemetry::vitals::{Telemetry, Vitals};
 
 use crate::golden::{check, check_tolerance, golden, package, parsed, robot};
 
@@ -50,7 +50,7 @@ pub fn vitals() -> Vitals {
 }
 
 #[test]
-fn how_a_robot_does() {
+fn vitals_documents() {
     check("telemetry.json", &Telemetry { robot_id: robot(), vitals: vitals() });
     check_tolerance::<Telemetry>("telemetry.json");
     let little = Vitals { at_ms: 1_799_999_940_000, ..Vitals::default() };
@@ -59,7 +59,7 @@ fn how_a_robot_does() {
 }
 
 #[test]
-fn what_is_set_for_a_robot() {
+fn robot_settings_documents() {
     check("robot_settings.json", &settings());
     check_tolerance::<RobotSettings>("robot_settings.json");
     check("effective_settings.json", &effective_settings());
@@ -78,7 +78,7 @@ fn parsed_path(text: &str) -> Option<task_proto::AbsolutePath> {
 }
 
 #[test]
-fn settings_that_can_not_be_read_leave_the_rest_readable() {
+fn unreadable_settings_leave_the_others_readable() {
     let mut value: serde_json::Value =
         serde_json::from_str(&golden("desired_state.json")).expect("json");
     value["settings"]["workspace"] = json!("ws");
@@ -99,7 +99,7 @@ fn settings_that_can_not_be_read_leave_the_rest_readable() {
 }
 
 #[test]
-fn what_became_of_tasks() {
+fn task_history_documents() {
     let timeline = vec![
         TimelineEntry { phase: Phase::Fetching, at_ms: 1_800_000_000_100, attempt: 1 },
         TimelineEntry { phase: Phase::Fetching, at_ms: 1_800_000_003_000, attempt: 2 },
@@ -150,7 +150,7 @@ fn what_became_of_tasks() {
 }
 
 #[test]
-fn how_the_server_does() {
+fn server_status_documents() {
     let site = |site: Option<&str>, rtt_ms: Option<u64>| SiteStatus {
         site: site.map(parsed),
         robots: 3,
@@ -223,7 +223,7 @@ fn how_the_server_does() {
 }
 
 #[test]
-fn what_is_worth_a_look() {
+fn feed_documents() {
     let entry = FeedEntry {
         number: 1_800_000_000_007,
         at_ms: 1_800_000_000_000,
@@ -243,7 +243,7 @@ fn what_is_worth_a_look() {
 }
 
 #[test]
-fn a_decision_about_the_delivery() {
+fn delivery_decision_document() {
     let decision = DeliveryDecision {
         mechanism: Delivery::DirectPush,
         rule: "many small".to_owned(),

@@ -10,33 +10,34 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use task_proto::api::{
-    ConductTotals, CreateDeployment, DeliveryChoice, EnrollRequest, EnrollResponse, ErrorBody,
+    BrokerAddress, CreateDeployment, DeliveryChoice, EnrollRequest, EnrollResponse, ErrorBody,
     Event, ExternalBroker, HttpTraffic, LogEvent, LogsFrom, LogsView, MqttConnection, MqttEndpoint,
-    MqttPlace, MqttTraffic, OutputList, OutputView, ReportReply, RobotToken, ServerInfo, Traffic,
+    MqttTraffic, OutputList, OutputView, PenaltyTotals, ReportReply, RobotToken, ServerInfo,
+    Traffic,
 };
 use task_proto::desired::{
-    BlobRef, Delivery, DesiredState, DesiredTask, Doorbell, Evidence, Inline, PackageRef,
+    BlobRef, Delivery, DesiredNotice, DesiredState, DesiredTask, Evidence, Inline, PackageRef,
     SignatureRef, Wanted,
 };
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
-use task_proto::log::{LogBatch, LogLevel, LogLine, LogSource};
-use task_proto::manifest::{
-    Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind,
-    TaskManifest,
-};
-use task_proto::oci::ImageManifest;
-use task_proto::output::{OutputFile, OutputSet};
-use task_proto::part::{Part, PartRange};
-use task_proto::publisher::{PackageStatement, PublisherList, Role, SIGNATURE_ARTIFACT};
-use task_proto::report::{
+use task_proto::messages::part::{Part, PartRange};
+use task_proto::messages::report::{
     ActiveVersion, Condition, Failure, FailureCode, HostFacts, Isolation, LinkFacts, Phase,
     Progress, Report, RosFacts, Status, TaskAccounts, TaskReport,
 };
-use task_proto::request::{Action, Answer, Ask, Outcome, Refusal, Reply, Request};
-use task_proto::ros::{
+use task_proto::messages::request::{Action, Answer, Ask, Outcome, Refusal, Reply, Request};
+use task_proto::messages::topic::TopicPrefix;
+use task_proto::packages::manifest::{
+    Build, BuildTool, ContentFacts, Limits, Outputs, Ready, ReadyTopic, Requires, Run, TaskKind,
+    TaskManifest,
+};
+use task_proto::packages::oci::ImageManifest;
+use task_proto::packages::output::{OutputFile, OutputSet};
+use task_proto::packages::publisher::{PackageStatement, PublisherList, Role, SIGNATURE_ARTIFACT};
+use task_proto::telemetry::log::{LogBatch, LogLevel, LogLine, LogSource};
+use task_proto::telemetry::ros::{
     Endpoint, LifecycleState, NodeDetail, NodeSummary, Parameter, TopicSummary, Transition,
 };
-use task_proto::topic::TopicPrefix;
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{Digest, Generation, RobotId};
 
 pub fn parsed<T: std::str::FromStr<Err: Debug>>(text: &str) -> T {
@@ -267,7 +268,7 @@ pub fn golden(name: &str) -> String {
 }
 
 #[test]
-fn documents_between_server_and_robot() {
+fn robot_protocol_documents() {
     let key = SigningKey::from_bytes([7; 32]);
     let state = desired_state();
     check("desired_state.json", &state);
@@ -275,13 +276,13 @@ fn documents_between_server_and_robot() {
         Envelope::seal(DESIRED_STATE_TYPE, &serde_json::to_vec(&state).expect("json"), &key);
     check(
         "doorbell_state.json",
-        &Doorbell::State { envelope: envelope.clone(), inline: Inline::default() },
+        &DesiredNotice::State { envelope: envelope.clone(), inline: Inline::default() },
     );
     let mut inline = Inline::default();
     inline.insert(blob("config").digest, b"config".to_vec());
     inline.insert(blob("content").digest, b"content".to_vec());
-    check("doorbell_inline.json", &Doorbell::State { envelope: envelope.clone(), inline });
-    check("doorbell_notice.json", &Doorbell::Notice { generation: Generation(8) });
+    check("doorbell_inline.json", &DesiredNotice::State { envelope: envelope.clone(), inline });
+    check("doorbell_notice.json", &DesiredNotice::Notice { generation: Generation(8) });
     check("report.json", &report());
     check(
         "status.json",
@@ -301,9 +302,9 @@ fn documents_between_server_and_robot() {
     check("report_reply.json", &reply);
 
     check_tolerance::<DesiredState>("desired_state.json");
-    check_tolerance::<Doorbell>("doorbell_state.json");
-    check_tolerance::<Doorbell>("doorbell_inline.json");
-    check_tolerance::<Doorbell>("doorbell_notice.json");
+    check_tolerance::<DesiredNotice>("doorbell_state.json");
+    check_tolerance::<DesiredNotice>("doorbell_inline.json");
+    check_tolerance::<DesiredNotice>("doorbell_notice.json");
     check_tolerance::<Report>("report.json");
     check_tolerance::<Status>("status.json");
     let payload = envelope.open(DESIRED_STATE_TYPE, &key.public_key()).expect("signed");
@@ -311,7 +312,7 @@ fn documents_between_server_and_robot() {
 }
 
 #[test]
-fn questions_and_answers() {
+fn request_and_reply_documents() {
     let asks = [
         Ask::Nodes,
         Ask::Node { name: parsed("/talker") },
@@ -409,7 +410,7 @@ fn log_batch() -> LogBatch {
 }
 
 #[test]
-fn documents_of_a_package() {
+fn package_documents() {
     check("task_manifest.json", &manifest());
     assert_eq!(manifest().problems(), []);
     check("oci_manifest.json", &ImageManifest::package(blob("config"), blob("content")));
@@ -417,7 +418,7 @@ fn documents_of_a_package() {
 }
 
 #[test]
-fn documents_that_publishers_sign() {
+fn publisher_documents() {
     let keys = [1, 2, 3].map(|seed| SigningKey::from_bytes([seed; 32]));
     let public = |keys: &[SigningKey]| keys.iter().map(SigningKey::public_key).collect::<Vec<_>>();
     let statement = PackageStatement { package: package() };
@@ -445,7 +446,7 @@ fn documents_that_publishers_sign() {
 }
 
 #[test]
-fn documents_of_the_api() {
+fn api_documents() {
     check(
         "error.json",
         &serde_json::from_value::<ErrorBody>(
@@ -493,7 +494,7 @@ fn documents_of_the_api() {
             prefix: TopicPrefix::default(),
             tls: true,
             external,
-            alternatives: vec![MqttPlace {
+            alternatives: vec![BrokerAddress {
                 host: Some("broker2.lab".to_owned()),
                 port: 8883,
                 tls: true,
@@ -520,7 +521,7 @@ fn documents_of_the_api() {
 
 /// The last part of a blob of 1,030 bytes, in hexadecimal digits.
 #[test]
-fn a_part_of_a_package() {
+fn part_message() {
     let blob: Vec<u8> = (0..1030).map(|at| (at % 256) as u8).collect();
     let part = Part { index: 1, count: 2, part_bytes: 1024, bytes: &blob[1024..] };
     let written = part.encode().iter().map(|byte| format!("{byte:02x}")).collect::<String>() + "\n";
@@ -530,7 +531,7 @@ fn a_part_of_a_package() {
 }
 
 #[test]
-fn documents_about_what_came_back() {
+fn output_documents() {
     let file = |path: &str| OutputFile { path: parsed(path), blob: blob(path) };
     let output = OutputSet {
         robot_id: robot(),
@@ -551,7 +552,7 @@ fn documents_about_what_came_back() {
 }
 
 #[test]
-fn documents_about_what_was_said() {
+fn log_documents() {
     let view = LogsView {
         from: LogsFrom::Server,
         age_ms: 61_000,
@@ -571,7 +572,7 @@ fn documents_about_what_was_said() {
 }
 
 #[test]
-fn documents_about_the_traffic() {
+fn traffic_documents() {
     let traffic = Traffic {
         bytes_in: 1,
         bytes_out: 2,
@@ -598,7 +599,7 @@ fn documents_about_the_traffic() {
             all: traffic,
         },
         http: HttpTraffic { connections: 6, requests: 7, bytes_in: 8, bytes_out: 9 },
-        conduct: ConductTotals { slowed: 3, cut: 2, turned_away: 1 },
+        conduct: PenaltyTotals { slowed: 3, cut: 2, turned_away: 1 },
     };
     check_text("server_info.json", &info);
 }

@@ -6,7 +6,7 @@ use task_proto::api::{
     PackageFileKind, PackageFiles, PackageUse, PackageVersions, PackageView, RetryDeployment,
     RobotList, RolledBack,
 };
-use task_proto::report::FailureCode;
+use task_proto::messages::report::FailureCode;
 
 use crate::golden::{check, check_text, check_tolerance, manifest, package, parsed, robot};
 
@@ -22,7 +22,7 @@ fn file(text: &str, mode: u32) -> PackageFile {
 }
 
 #[test]
-fn what_is_in_packages() {
+fn package_content_documents() {
     let view =
         PackageView { package: package(), pushed_at_ms: 1_800_000_000_000, manifest: manifest() };
     let running = vec![PackageUse { manifest: package().manifest.digest, robots: 12 }];
@@ -64,7 +64,7 @@ fn what_is_in_packages() {
 }
 
 #[test]
-fn what_is_done_to_many_robots() {
+fn bulk_documents() {
     let set = [(parsed("site"), parsed("lab"))].into();
     let selector = parsed("site=field,!arm");
     check(
@@ -81,7 +81,7 @@ fn what_is_done_to_many_robots() {
 }
 
 #[test]
-fn a_page_of_a_list() {
+fn paged_list_document() {
     let next = Some(parsed("atlas"));
     check_text(
         "robot_list.json",

@@ -5,8 +5,8 @@ use std::fmt::Debug;
 use task_proto::api::{
     AccessToken, Me, ProviderView, SessionView, TokenOrigin, TokenView, UserView,
 };
-use task_proto::audit::{AuditEntry, AuditRecord, Link};
-use task_proto::person::Permission;
+use task_proto::people::audit::{AuditEntry, AuditRecord, ChainLink};
+use task_proto::people::roles::Permission;
 
 use crate::golden::{check, check_text, check_tolerance};
 
@@ -15,7 +15,7 @@ fn parsed<T: std::str::FromStr<Err: Debug>>(text: &str) -> T {
 }
 
 #[test]
-fn people_and_their_tokens() {
+fn people_and_token_documents() {
     let user = UserView {
         name: parsed("alice"),
         roles: parsed("operator,publisher"),
@@ -33,11 +33,7 @@ fn people_and_their_tokens() {
     };
     check(
         "session_view.json",
-        &SessionView {
-            expires_at_ms: Some(1_800_000_000_000),
-            provider: Some(provider),
-            ended_by_restart: false,
-        },
+        &SessionView { expires_at_ms: Some(1_800_000_000_000), provider: Some(provider) },
     );
     check_tolerance::<SessionView>("session_view.json");
     let token = TokenView {
@@ -74,7 +70,7 @@ fn people_and_their_tokens() {
 
 /// An entry's bytes and their chaining may never change: written entries must stay valid for ever.
 #[test]
-fn entries_of_the_audit() {
+fn audit_documents() {
     let entry = AuditEntry {
         number: 1,
         at_ms: 1_800_000_000_000,
@@ -87,9 +83,9 @@ fn entries_of_the_audit() {
     };
     check("audit_entry.json", &entry);
     let text = serde_json::to_string(&entry).expect("json");
-    let link = Link::START.next(&text);
+    let link = ChainLink::START.next(&text);
     let entry = serde_json::value::RawValue::from_string(text).expect("json");
     let record = AuditRecord { digest: link.digest, entry };
     check_text("audit_record.json", &record);
-    assert_eq!(Link::START.follow(&record), Ok(link));
+    assert_eq!(ChainLink::START.append(&record), Ok(link));
 }

@@ -54,7 +54,7 @@ pub enum Piece {
 
 /// The other end violated the protocol.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("not a WebSocket frame that may stand there: {reason}")]
+#[error("invalid WebSocket frame: {reason}")]
 pub struct Violation {
     reason: &'static str,
     code: u16,
@@ -145,7 +145,12 @@ fn read_header(
         8 => Opcode::Close,
         9 => Opcode::Ping,
         10 => Opcode::Pong,
-        1 => return Err(Violation { reason: "text, where MQTT is bytes", code: UNSUPPORTED_DATA }),
+        1 => {
+            return Err(Violation {
+                reason: "a text frame; MQTT needs binary frames",
+                code: UNSUPPORTED_DATA,
+            });
+        }
         _ => return Err(Violation::new("an unknown opcode")),
     };
     let is_masked = second & MASKED != 0;
@@ -167,7 +172,7 @@ fn read_header(
             return Err(Violation::new("a new message inside of another"));
         }
         Opcode::Continuation if !*is_in_message => {
-            return Err(Violation::new("the rest of no message"));
+            return Err(Violation::new("a continuation without a message"));
         }
         Opcode::Binary | Opcode::Continuation => *is_in_message = !is_last,
         _ if !is_last || usize::from(short) > MAX_CONTROL_BYTES => {
@@ -194,12 +199,16 @@ fn read_header(
 /// The close code of the other end; absent if its close frame has none.
 fn close_code(payload: &[u8]) -> Result<Option<u16>, Violation> {
     let &[high, low, ..] = payload else {
-        return if payload.is_empty() { Ok(None) } else { Err(Violation::new("half of a code")) };
+        return if payload.is_empty() {
+            Ok(None)
+        } else {
+            Err(Violation::new("a truncated close code"))
+        };
     };
     let code = u16::from_be_bytes([high, low]);
     // The others are reserved, or never sent.
-    let is_one = matches!(code, 1000..=1003 | 1007..=1014 | 3000..=4999);
-    if is_one { Ok(Some(code)) } else { Err(Violation::new("a code that nobody sends")) }
+    let is_valid = matches!(code, 1000..=1003 | 1007..=1014 | 3000..=4999);
+    if is_valid { Ok(Some(code)) } else { Err(Violation::new("an invalid close code")) }
 }
 
 /// Appends a whole frame to `output`. `mask` is random for a client.
@@ -239,9 +248,9 @@ fn apply_mask(bytes: &mut [u8], mask: [u8; 4], passed: u64) {
     if mask == [0; 4] {
         return;
     }
-    let turned: [u8; 4] = std::array::from_fn(|at| mask[(at + (passed % 4) as usize) % 4]);
-    for four in bytes.chunks_mut(4) {
-        four.iter_mut().zip(turned).for_each(|(byte, mask)| *byte ^= mask);
+    let rotated: [u8; 4] = std::array::from_fn(|at| mask[(at + (passed % 4) as usize) % 4]);
+    for chunk in bytes.chunks_mut(4) {
+        chunk.iter_mut().zip(rotated).for_each(|(byte, mask)| *byte ^= mask);
     }
 }
 
@@ -264,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn frames_are_as_the_standard_shows_them() {
+    fn frames_match_the_examples_of_the_rfc() {
         // RFC 6455, section 5.7, in binary: "Hello" masked, and in two fragments.
         let masked = [0x82, 0x85, 0x37, 0xfa, 0x21, 0x3d, 0x7f, 0x9f, 0x4d, 0x51, 0x58];
         assert_eq!(pieces(Role::Server, &masked, 99), Ok(vec![Piece::Data(b"Hello"[..].into())]));
@@ -279,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn what_breaks_the_rules_is_refused() {
+    fn invalid_frames_are_refused() {
         for (bytes, role) in [
             (&[0x82, 0x05][..], Role::Server),
             (&[0x82, 0x85], Role::Client),
@@ -303,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_gathered_of_a_frame_that_never_ends() {
+    fn endless_frame_takes_no_memory() {
         let (mut decoder, mut input) = (Decoder::new(Role::Client), BytesMut::new());
         input.extend_from_slice(&[0x82, 0x7f, 0x7f, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff]);
         for _ in 0..1000 {
@@ -316,7 +325,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_sent_arrives_however_it_is_cut(
+        fn sent_bytes_arrive_however_they_are_split(
             messages in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..300), 1..8),
             mask in any::<[u8; 4]>(),
             step in 1usize..400,
@@ -336,15 +345,19 @@ mod tests {
                     }
                 }
                 prop_assert_eq!(data, messages.concat());
-                let asked: Vec<Vec<u8>> = messages.iter().map(|m| m[..m.len().min(125)].to_vec()).collect();
+                let first = |m: &Vec<u8>| m[..m.len().min(125)].to_vec();
+                let asked: Vec<Vec<u8>> = messages.iter().map(first).collect();
                 prop_assert_eq!(pings, asked);
             }
         }
 
         #[test]
-        fn no_bytes_make_it_panic(bytes in prop::collection::vec(any::<u8>(), 0..600), step in 1usize..64) {
+        fn arbitrary_bytes_do_not_panic(
+            bytes in prop::collection::vec(any::<u8>(), 0..600), step in 1usize..64
+        ) {
             for role in [Role::Client, Role::Server] {
-                let handed_out: usize = pieces(role, &bytes, step).unwrap_or_default().iter().map(|piece| match piece {
+                let pieces = pieces(role, &bytes, step).unwrap_or_default();
+                let handed_out: usize = pieces.iter().map(|piece| match piece {
                     Piece::Data(bytes) | Piece::Ping(bytes) => bytes.len(),
                     Piece::Pong | Piece::Close(_) => 0,
                 }).sum();

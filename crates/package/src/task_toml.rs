@@ -1,0 +1,372 @@
+//! Reads `task.toml`. The parser is strict: an unknown key and a value of the wrong type are
+//! problems, and all problems are found in one pass. Rules that involve several keys are not
+//! checked here.
+
+use std::collections::BTreeMap;
+
+use serde::de::DeserializeOwned;
+use task_proto::expected::in_file_terms;
+use task_proto::packages::manifest::{
+    BuildTool, Limits, Outputs, Ready, ReadyTopic, Requires, Run,
+};
+use task_proto::{TaskName, Version};
+
+use super::Problem;
+
+/// The file's name in a package.
+pub const FILE: &str = "task.toml";
+
+/// Contents of the file; absent keys have their default or are `None`.
+#[derive(Debug, Default, PartialEq)]
+pub struct TaskToml {
+    /// `name`; absent: the name in package.xml.
+    pub name: Option<TaskName>,
+    /// `version`; absent: the version in package.xml.
+    pub version: Option<Version>,
+    /// `build.tool`; absent: the tool implied by package.xml.
+    pub build_tool: Option<BuildTool>,
+    /// `[run]`: the launch file or program, and how to run it.
+    pub run: Run,
+    /// `[ready]`: the conditions for the task to count as running.
+    pub ready: Ready,
+    /// `[parameters]`, by node and name.
+    pub parameters: BTreeMap<String, BTreeMap<String, serde_json::Value>>,
+    /// `[outputs]`: the files to upload when the task ends.
+    pub outputs: Outputs,
+    /// `[requires]`: the requirements on a robot.
+    pub requires: Requires,
+    /// `[limits]`: the resource limits of the task.
+    pub limits: Limits,
+}
+
+/// Parses `text`, adding errors to `problems`.
+pub fn parse(text: &str, problems: &mut Vec<Problem>) -> TaskToml {
+    let mut file = TaskToml::default();
+    match text.parse::<toml::Table>() {
+        Ok(table) => {
+            Section { path: String::new(), table, known: Vec::new(), problems }.read_file(&mut file)
+        }
+        Err(error) => {
+            let line = error
+                .span()
+                .map_or(1, |span| text[..span.start.min(text.len())].matches('\n').count() + 1);
+            problems.push(Problem {
+                file: FILE.to_owned(),
+                reason: format!("line {line}: {}", error.message()),
+            });
+        }
+    }
+    file
+}
+
+/// A table that is read key by key; keys left over at the end are unknown.
+struct Section<'p> {
+    /// The table's own key followed by a dot; empty at the top.
+    path: String,
+    table: toml::Table,
+    known: Vec<&'static str>,
+    problems: &'p mut Vec<Problem>,
+}
+
+impl Section<'_> {
+    fn read_file(mut self, file: &mut TaskToml) {
+        self.take("name", &mut file.name);
+        self.take("version", &mut file.version);
+        self.section("build", |build| build.take("tool", &mut file.build_tool));
+        self.section("run", |section| {
+            let run = &mut file.run;
+            section.take("launch", &mut run.launch);
+            section.take("exec", &mut run.exec);
+            section.take("args", &mut run.args);
+            section.take("kind", &mut run.kind);
+            section.take("on_boot", &mut run.on_boot);
+            section.take("restart", &mut run.restart);
+            section.take("idempotent", &mut run.idempotent);
+            section.take("stop_timeout_s", &mut run.stop_timeout_s);
+            section.take("deadline_s", &mut run.deadline_s);
+        });
+        self.section("ready", |section| {
+            let ready = &mut file.ready;
+            section.take("nodes", &mut ready.nodes);
+            section.take("lifecycle", &mut ready.lifecycle);
+            section.take("services", &mut ready.services);
+            section.topics(&mut ready.topics);
+            section.take("hold_s", &mut ready.hold_s);
+            section.take("timeout_s", &mut ready.timeout_s);
+        });
+        self.section("outputs", |section| section.take("paths", &mut file.outputs.paths));
+        self.section("requires", |section| {
+            let requires = &mut file.requires;
+            section.take("labels", &mut requires.labels);
+            section.take("ros_distro", &mut requires.ros_distro);
+            section.take("arch", &mut requires.arch);
+        });
+        self.section("limits", |section| {
+            let limits = &mut file.limits;
+            section.take("memory_mb", &mut limits.memory_mb);
+            section.take("cpu_weight", &mut limits.cpu_weight);
+            section.take("pids", &mut limits.pids);
+        });
+        self.parameters(&mut file.parameters);
+        self.finish();
+    }
+
+    /// Reads `key` into `slot`, which keeps its default if the key is absent or invalid.
+    fn take<T: DeserializeOwned>(&mut self, key: &'static str, slot: &mut T) {
+        self.known.push(key);
+        let Some(value) = self.table.remove(key) else { return };
+        let written = truncated(&value);
+        match value.try_into() {
+            Ok(value) => *slot = value,
+            Err(error) => {
+                let error: toml::de::Error = error;
+                self.problem(
+                    key,
+                    format!("{} (it is {written})", in_file_terms(error.message().trim_end())),
+                );
+            }
+        }
+    }
+
+    /// Reads the table `key` with `read`; the table may be absent.
+    fn section(&mut self, key: &'static str, read: impl FnOnce(&mut Section<'_>)) {
+        self.known.push(key);
+        match self.table.remove(key) {
+            None => {}
+            Some(toml::Value::Table(table)) => {
+                let path = format!("{}{key}.", self.path);
+                let mut section =
+                    Section { path, table, known: Vec::new(), problems: self.problems };
+                read(&mut section);
+                section.finish();
+            }
+            Some(other) => self.problem(
+                key,
+                format!("expected a table, written [{key}] (it is {})", truncated(&other)),
+            ),
+        }
+    }
+
+    /// Reads `topics`: a table of tables, by the topics' names.
+    fn topics(&mut self, topics: &mut BTreeMap<String, ReadyTopic>) {
+        let mut tables: BTreeMap<String, toml::Table> = BTreeMap::new();
+        self.take("topics", &mut tables);
+        for (topic, table) in tables {
+            let path = format!("{}topics.{topic:?}.", self.path);
+            let mut section = Section { path, table, known: Vec::new(), problems: self.problems };
+            let mut wanted = ReadyTopic::default();
+            section.take("min_hz", &mut wanted.min_hz);
+            section.finish();
+            topics.insert(topic, wanted);
+        }
+    }
+
+    fn parameters(&mut self, nodes: &mut BTreeMap<String, BTreeMap<String, serde_json::Value>>) {
+        self.known.push("parameters");
+        let tables = match self.table.remove("parameters") {
+            None => return,
+            Some(toml::Value::Table(tables)) => tables,
+            Some(other) => {
+                return self.problem(
+                    "parameters",
+                    format!("expected a table (it is {})", truncated(&other)),
+                );
+            }
+        };
+        for (node, value) in tables {
+            let toml::Value::Table(parameters) = value else {
+                self.problem(
+                    "parameters",
+                    format!(
+                        "expected one table per node, like [parameters.\"/mapper\"], not {node:?}"
+                    ),
+                );
+                continue;
+            };
+            let mut accepted = BTreeMap::new();
+            for (name, value) in parameters {
+                match parameter(&value) {
+                    Ok(value) => drop(accepted.insert(name, value)),
+                    Err(reason) => self.problem("parameters", format!("{node:?} {name}: {reason}")),
+                }
+            }
+            nodes.insert(node, accepted);
+        }
+    }
+
+    fn finish(&mut self) {
+        for (key, _) in std::mem::take(&mut self.table) {
+            let hint = match closest_key(&key, &self.known) {
+                Some(known) => format!(" (did you mean {}{known}?)", self.path),
+                None => format!(" (expected one of: {})", self.known.join(", ")),
+            };
+            self.problem(&key, format!("unknown key{hint}"));
+        }
+    }
+
+    fn problem(&mut self, key: &str, reason: String) {
+        self.problems.push(Problem {
+            file: FILE.to_owned(),
+            reason: format!("{}{key}: {reason}", self.path),
+        });
+    }
+}
+
+/// A ROS parameter's value: a boolean, number or string, or a list of one of these types.
+fn parameter(value: &toml::Value) -> Result<serde_json::Value, &'static str> {
+    const EXPECTED: &str = "expected a boolean, a number, a string or a list of one of these";
+    match value {
+        toml::Value::Boolean(truth) => Ok((*truth).into()),
+        toml::Value::Integer(number) => Ok((*number).into()),
+        toml::Value::String(text) => Ok(text.as_str().into()),
+        toml::Value::Float(number) if number.is_finite() => Ok((*number).into()),
+        toml::Value::Float(_) => Err("must be a finite number"),
+        toml::Value::Array(list) if list.iter().any(|item| item.is_array() || item.is_table()) => {
+            Err(EXPECTED)
+        }
+        toml::Value::Array(list) if list.windows(2).any(|pair| !pair[0].same_type(&pair[1])) => {
+            Err("a list's values must be of one type")
+        }
+        toml::Value::Array(list) => list.iter().map(parameter).collect(),
+        toml::Value::Datetime(_) | toml::Value::Table(_) => Err(EXPECTED),
+    }
+}
+
+/// A value roughly as the user wrote it, short enough for a message.
+fn truncated(value: &toml::Value) -> String {
+    const MAX_CHARS: usize = 60;
+    let text = value.to_string().replace('\n', " ");
+    if text.chars().count() <= MAX_CHARS {
+        text
+    } else {
+        text.chars().take(MAX_CHARS).chain(['…']).collect()
+    }
+}
+
+/// The known key closest to `key`: at most two letters away, and not all of them.
+fn closest_key<'k>(key: &str, known: &[&'k str]) -> Option<&'k str> {
+    let (distance, best) =
+        known.iter().map(|candidate| (edit_distance(key, candidate), *candidate)).min()?;
+    (distance <= 2 && distance < best.len()).then_some(best)
+}
+
+/// Number of insertions, deletions and substitutions (Levenshtein distance).
+fn edit_distance(from: &str, to: &str) -> usize {
+    let to: Vec<char> = to.chars().collect();
+    let mut row: Vec<usize> = (0..=to.len()).collect();
+    for (i, a) in from.chars().take(64).enumerate() {
+        let mut diagonal = row[0];
+        row[0] = i + 1;
+        for (j, b) in to.iter().enumerate() {
+            let changed = diagonal + usize::from(a != *b);
+            diagonal = row[j + 1];
+            row[j + 1] = changed.min(row[j] + 1).min(diagonal + 1);
+        }
+    }
+    row[to.len()]
+}
+
+#[cfg(test)]
+mod tests {
+    use task_proto::packages::manifest::{OnBoot, Restart, TaskKind};
+
+    use super::*;
+
+    fn problems(text: &str) -> Vec<String> {
+        let mut problems = Vec::new();
+        parse(text, &mut problems);
+        problems.into_iter().map(|problem| problem.to_string()).collect()
+    }
+
+    #[test]
+    fn every_key_is_read() {
+        let text = r#"
+            name = "corridor_mapping"
+            version = "1.0.0"
+            [build]
+            tool = "colcon"
+            [run]
+            launch = ["corridor_mapping", "mapping.launch.py"]
+            args = { use_sim_time = "false" }
+            kind = "job"
+            on_boot = "hold"
+            restart = "never"
+            idempotent = true
+            stop_timeout_s = 3
+            [ready]
+            nodes = ["/mapper"]
+            lifecycle = ["/mapper"]
+            hold_s = 1
+            timeout_s = 20
+            [parameters."/mapper"]
+            resolution = 0.05
+            frames = ["map", "odom"]
+            "nested.name" = 3
+            [outputs]
+            paths = ["maps/*.pgm"]
+            [requires]
+            labels = { base = "turtlebot" }
+            ros_distro = ["jazzy"]
+            arch = ["x86_64"]
+        "#;
+        let mut problems = Vec::new();
+        let file = parse(text, &mut problems);
+        assert_eq!(problems, []);
+        assert_eq!(file.name.expect("name").as_str(), "corridor_mapping");
+        assert_eq!(file.build_tool, Some(BuildTool::Colcon));
+        assert_eq!(
+            file.run.launch,
+            Some(["corridor_mapping".to_owned(), "mapping.launch.py".to_owned()])
+        );
+        assert_eq!(
+            (file.run.kind, file.run.on_boot, file.run.restart),
+            (TaskKind::Job, OnBoot::Hold, Restart::Never)
+        );
+        assert_eq!((file.run.stop_timeout_s, file.ready.hold_s, file.ready.timeout_s), (3, 1, 20));
+        assert_eq!(file.parameters["/mapper"]["resolution"], serde_json::json!(0.05));
+        assert_eq!(file.parameters["/mapper"]["frames"], serde_json::json!(["map", "odom"]));
+        assert_eq!(file.requires.labels.len(), 1);
+    }
+
+    #[test]
+    fn all_problems_are_found_at_once_and_name_their_key() {
+        let text = "nam = \"x\"\nversion = 1\nzzz = 1\n[run]\nexec = \"true\"\nkindd = \"job\"\nrestart = \"sometimes\"\n\
+                    [ready]\nhold_s = -1\n[outputs]\npaths = [1]\n";
+        let found = problems(text);
+        for expected in [
+            "task.toml: nam: unknown key (did you mean name?)",
+            "task.toml: zzz: unknown key (expected one of: name, version, build, run,",
+            "task.toml: version: invalid type: integer `1`, expected a string (it is 1)",
+            "task.toml: run.kindd: unknown key (did you mean run.kind?)",
+            "task.toml: run.exec: invalid type: string \"true\", expected a list",
+            "task.toml: run.restart: unknown variant `sometimes`, expected one of `on-failure`, `always`, `never`",
+            "task.toml: ready.hold_s: ",
+            "task.toml: outputs.paths: ",
+        ] {
+            assert!(
+                found.iter().any(|problem| problem.starts_with(expected)),
+                "{expected:?} not in {found:#?}"
+            );
+        }
+        assert_eq!(found.len(), 8, "{found:#?}");
+    }
+
+    #[test]
+    fn syntax_errors_name_the_line() {
+        let found = problems("name = \"x\"\nversion = \n");
+        assert!(found[0].starts_with("task.toml: line 2: "), "{found:?}");
+    }
+
+    #[test]
+    fn sections_must_be_tables_and_parameters_must_be_ros_values() {
+        assert_eq!(
+            problems("run = 3"),
+            ["task.toml: run: expected a table, written [run] (it is 3)"]
+        );
+        let found = problems(
+            "[parameters]\nx = 1\n[parameters.\"/n\"]\na = nan\nb = [1, 2.0]\nc = { d = 1 }\ne = 2020-01-01\n",
+        );
+        assert_eq!(found.len(), 5, "{found:#?}");
+        assert!(found[0].contains("\"/n\" a: must be a finite number"), "{found:#?}");
+    }
+}

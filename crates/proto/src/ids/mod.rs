@@ -1,0 +1,12 @@
+//! Owns the names, numbers and digests that identify things, and the selectors of robots by them;
+//! it never looks anything up.
+
+pub mod digest;
+mod id;
+pub mod selector;
+
+pub use id::{
+    AbsolutePath, DeploymentId, Generation, GraphName, InstanceId, InvalidId, LabelKey, LabelValue,
+    Labels, MacAddress, OutputPath, RepositoryName, RequestId, RobotId, RobotName, Tag, TaskName,
+    TokenId, UserName, Version,
+};

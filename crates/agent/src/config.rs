@@ -17,12 +17,12 @@ use std::time::Duration;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 use task_proto::RobotName;
-use task_proto::envelope::PublicKey;
-use task_proto::expected::in_file_words;
-use task_proto::id::Labels;
-use task_proto::log::LogLevel;
-use task_proto::publisher::{InvalidRole, Role};
-use task_proto::settings::{MAX_ROS_DOMAIN_ID, RobotLimits};
+use task_proto::desired::settings::{MAX_ROS_DOMAIN_ID, RobotLimits};
+use task_proto::expected::in_file_terms;
+use task_proto::ids::Labels;
+use task_proto::packages::publisher::{InvalidRole, Role};
+use task_proto::telemetry::log::LogLevel;
+use task_proto::trust::envelope::PublicKey;
 use toml::{Table, Value};
 
 use crate::config::trust::TrustSettings;
@@ -299,7 +299,7 @@ impl Settings {
     pub fn write(&self, data_dir: &Path) -> Result<(), ConfigError> {
         let path = data_dir.join(FILE_NAME);
         let mut text =
-            "# The robot's settings. task-agent configure asks for them; TASK_AGENT_* variables win.\n".to_owned();
+            "# The robot's settings. Edit with task-agent configure; TASK_AGENT_* variables override them.\n".to_owned();
         let body =
             toml::to_string(self).map_err(|error| invalid(&path.display().to_string(), &error))?;
         // Writing to a String can't fail.
@@ -324,7 +324,8 @@ impl Config {
         for (name, value) in variables {
             // Other variables may hold any bytes. In a setting's value a wrong character becomes
             // one that the setting's type refuses.
-            let (name, value) = (name.to_string_lossy(), value.to_string_lossy());
+            let name = name.to_string_lossy();
+            let value = value.to_string_lossy();
             if name == ROS_DOMAIN_ID && !value.is_empty() {
                 ros_domain_id = Some(parse_ros_domain_id(&value)?);
             }
@@ -496,7 +497,7 @@ pub fn parse_server(text: &str) -> Result<reqwest::Url, ConfigError> {
     let is_servers =
         |url: &reqwest::Url| matches!(url.scheme(), "http" | "https") && url.host_str().is_some();
     let url = text.parse().ok().filter(is_servers);
-    url.ok_or_else(|| fault(format!("{text:?} is no URL of a server like https://server:8080")))
+    url.ok_or_else(|| fault(format!("{text:?} is not a server URL such as https://server:8080")))
 }
 
 /// Stores one variable's value under its key: `TASK_AGENT_LIMITS_LOG_BYTES` is `limits.log_bytes`.
@@ -571,7 +572,7 @@ fn deserialize(table: Table, origin: &str) -> Result<Settings, ConfigError> {
 }
 
 fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
-    let lines: Vec<String> = error.to_string().trim_end().lines().map(in_file_words).collect();
+    let lines: Vec<String> = error.to_string().trim_end().lines().map(in_file_terms).collect();
     ConfigError::Invalid { origin: origin.to_owned(), reason: lines.join("\n") }
 }
 
@@ -579,7 +580,7 @@ fn invalid(origin: &str, error: &dyn std::fmt::Display) -> ConfigError {
 mod tests {
     use std::os::unix::ffi::OsStringExt as _;
 
-    use task_proto::envelope::SigningKey;
+    use task_proto::trust::envelope::SigningKey;
 
     use super::*;
 
@@ -614,7 +615,7 @@ mod tests {
     }
 
     #[test]
-    fn the_domain_is_the_setting_or_what_the_agent_was_started_with() {
+    fn ros_domain_id_setting_overrides_the_environment() {
         let domain = |file: &str, variables: &[(&str, &str)]| {
             load(file, variables).expect("valid").ros_domain_id
         };
@@ -628,7 +629,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_named() {
+    fn invalid_settings_are_named() {
         let text = |file: &str, variables: &[(&str, &str)]| {
             load(file, variables).expect_err("refused").to_string()
         };
@@ -655,7 +656,7 @@ mod tests {
         assert!(typed.contains("expected a whole number\nin `poll_interval_s`"), "{typed}");
         assert!(
             text("server = \"foo\"\n", &[])
-                .contains("agent.toml: \"foo\" is no URL of a server like https://")
+                .contains("agent.toml: \"foo\" is not a server URL such as https://")
         );
         assert!(text("[logs]\nforward_level = \"loud\"\n", &[]).contains("forward_level"));
         let variable = "TASK_AGENT_LOGS_FORWARD_LINES_PER_S";
@@ -692,7 +693,7 @@ mod tests {
     }
 
     #[test]
-    fn every_setting_is_in_its_table() {
+    fn every_setting_is_documented() {
         let table = include_str!("../../../docs/agent.md");
         let missing = load("unknown = 1\n", &[]).expect_err("refused").to_string();
         let (_, keys) = missing.split_once("expected one of ").expect("all are named");
@@ -739,7 +740,7 @@ mod tests {
     }
 
     #[test]
-    fn publishers_are_keys_and_how_many_of_them_it_takes() {
+    fn trusted_publishers_have_keys_and_thresholds() {
         assert_eq!(load("", &[]).expect("valid").trust, None);
         let keys: Vec<String> = [1, 2, 3]
             .map(|seed| SigningKey::from_bytes([seed; 32]).public_key().to_string())
@@ -748,7 +749,8 @@ mod tests {
         let trust = load(&table("threshold = 2\n"), &[]).expect("valid").trust.expect("given");
         assert_eq!((trust.publishers.keys().len(), trust.publishers.threshold()), (2, 2));
         assert_eq!((trust.keepers, trust.requires_list), (trust.publishers, false));
-        let (joined, one) = (keys[..2].join(","), keys[2].as_str());
+        let joined = keys[..2].join(",");
+        let one = keys[2].as_str();
         let variables = [
             ("TASK_AGENT_TRUSTED_PUBLISHERS_KEYS", joined.as_str()),
             ("TASK_AGENT_TRUSTED_PUBLISHERS_KEEPER_KEYS", one),

@@ -23,12 +23,12 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use task_proto::TaskName;
-use task_proto::log::{LogLevel, LogLine, LogSource};
+use task_proto::telemetry::log::{LogLevel, LogLine, LogSource};
 use tokio::sync::watch;
 
 use crate::system::clock;
 use crate::system::layout::DataDir;
-use archive::Wanted;
+use archive::LogQuery;
 use line::LogFile;
 use record::Record;
 
@@ -82,14 +82,13 @@ impl Logs {
     }
 
     /// The newest matching lines that fit into an answer, the oldest first.
-    pub async fn kept(&self, wanted: Wanted) -> Result<Vec<LogLine>, NoSuchTask> {
-        if let Some(task) =
-            wanted.task.as_ref().filter(|task| !self.data.task(task).root().exists())
+    pub async fn query(&self, query: LogQuery) -> Result<Vec<LogLine>, NoSuchTask> {
+        if let Some(task) = query.task.as_ref().filter(|task| !self.data.task(task).root().exists())
         {
             return Err(NoSuchTask(task.clone()));
         }
         let data = self.data.clone();
-        let read = move || archive::newest(&files(&data), &wanted, clock::wall_ms());
+        let read = move || archive::newest(&files(&data), &query, clock::wall_ms());
         Ok(tokio::task::spawn_blocking(read).await.unwrap_or_default())
     }
 
@@ -107,8 +106,8 @@ impl Logs {
 
 /// All logs that may exist.
 fn files(data: &DataDir) -> Vec<LogFile> {
-    let none_of_ours = LogFile { path: data.ros_log(), task: None, unmarked: LogSource::Rosout };
-    let mut files = vec![none_of_ours];
+    let ros_log = LogFile { path: data.ros_log(), task: None, unmarked: LogSource::Rosout };
+    let mut files = vec![ros_log];
     for name in data.task_names().unwrap_or_default() {
         let task = data.task(&name);
         let logs = [
@@ -143,8 +142,10 @@ pub fn last_lines(path: &Path, max_bytes: u64) -> String {
         let records: Vec<Record> =
             bytes[cut..].split(|byte| *byte == b'\n').map(Record::parse).collect();
         let begin = records.iter().rposition(Record::is_start).map_or(0, |at| at + 1);
-        let said = records[begin..].iter().filter(|record| record.source != Some(LogSource::Agent));
-        let lines: Vec<String> = said.map(|record| console::printable(record.text)).collect();
+        let task_records =
+            records[begin..].iter().filter(|record| record.source != Some(LogSource::Agent));
+        let lines: Vec<String> =
+            task_records.map(|record| console::printable(record.text)).collect();
         Ok::<_, io::Error>(lines.join("\n").trim_end().to_owned())
     };
     read().unwrap_or_default()
@@ -155,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_lines_are_whole_of_the_last_run_and_without_times() {
+    fn last_lines_are_complete_and_of_the_last_run_only() {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("task.log");
         assert_eq!(last_lines(&path, 10), "");

@@ -17,30 +17,30 @@ struct CommandLine {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Register this robot at a server
+    /// Register this robot with a server
     Enroll(commands::enroll::Arguments),
-    /// Ask for this robot's settings and write them to its property file
+    /// Prompt for this robot's settings and write them to agent.toml
     Configure(commands::configure::Arguments),
-    /// Run this robot's tasks, until a signal; tasks go on running afterwards
+    /// Run the agent until a signal; tasks keep running afterwards
     Run(commands::run::Arguments),
-    /// Say where this robot's tasks stand; works without server and without a running agent
+    /// Show the state of this robot's tasks; works without a server or a running agent
     Status(commands::status::Arguments),
-    /// Let nothing be started or switched on this robot, until `release`; running tasks go on
+    /// Block starts and switches of tasks until `release`; running tasks continue
     Hold(commands::hold::Arguments),
-    /// Take a `hold` back
+    /// Release a `hold`
     Release(commands::hold::Arguments),
-    /// Look for what commonly goes wrong on this robot, and say how to mend it
+    /// Check this robot for common problems and suggest fixes
     Doctor(commands::doctor::Arguments),
     /// Write man pages
     Man(commands::man::Arguments),
-    /// Stand between the agent and one task; only the agent itself calls this
+    /// Supervise one task for the agent; called only by the agent
     #[command(hide = true)]
     Shim {
         /// The run's directory
         #[arg(long)]
         dir: PathBuf,
     },
-    /// Take part in the ROS graph for the agent; only the agent itself calls this
+    /// Join the ROS graph for the agent; called only by the agent
     #[command(hide = true)]
     Graph,
 }

@@ -8,9 +8,9 @@ use std::path::{Component, Path};
 use task_archive::{
     Compression, Entries, Kind, Limits, Refusal, UnpackError, check, unpack, unpack_unannounced,
 };
+use task_package::contents::list;
 use task_proto::Digest;
-use task_proto::manifest::ContentFacts;
-use taskd::package::contents::list;
+use task_proto::packages::manifest::ContentFacts;
 
 const LIMITS: Limits = Limits { bytes: 1 << 20, entries: 200, depth: 8, ratio: 200 };
 const BLOCK_BYTES: usize = 512;

@@ -1,4 +1,4 @@
-//! What clients of the MQTT front send.
+//! Packets and sessions of MQTT clients.
 
 use std::io::{ErrorKind, Read as _, Write as _};
 use std::net::{Shutdown, SocketAddr, TcpStream};
@@ -9,13 +9,14 @@ use bytes::BytesMut;
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use task_proto::RobotId;
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 use taskd::broker::codec::{DecodeError, Received, decode, encode_publish};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
     RobotMessage,
 };
-use taskd::limits::conduct::{Conduct, ConductLimits};
+use taskd::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
+use taskd::net::proxy_protocol::ProxyProtocol;
 use tokio::runtime::Runtime;
 
 /// The largest packet that we try.
@@ -23,13 +24,13 @@ const MAX_PACKET_BYTES: usize = 2048;
 /// Timeout, longer than any step here takes unless it hangs.
 const PATIENCE: Duration = Duration::from_secs(20);
 /// Limits for tests: the same robot breaks the rules again and again.
-const INDULGENT: ConductLimits = ConductLimits {
+const LENIENT: RobotLimits = RobotLimits {
     messages_per_s: 1_000_000,
     bytes_per_s: 1 << 40,
     requests_per_s: 1_000_000,
     patience: Duration::MAX,
     backoff: Duration::ZERO,
-    forgive_after: Duration::ZERO,
+    penalty_lifetime: Duration::ZERO,
 };
 /// The only robot that may connect.
 const ROBOT: &str = "r00000000000000a1";
@@ -83,24 +84,24 @@ fn read(bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<DecodeError>
 /// when the client has sent everything. A refused client receives one packet or none. The inbox
 /// receives messages of this robot only, and the next client is served.
 pub fn mqtt_session(bytes: &[u8]) {
-    let Some((&first, said)) = bytes.split_first() else { return };
+    let Some((&first, rest)) = bytes.split_first() else { return };
     let front = Front::running();
     // Several threads would take over each other's sessions.
-    let _turn = front.turn.lock().unwrap_or_else(PoisonError::into_inner);
-    let heard = front.talk(&[if first % 2 == 0 { &[] } else { CONNECT }, said].concat());
-    match heard.get(..4) {
-        None => assert!(heard.is_empty(), "half an answer: {}", heard.escape_ascii()),
+    let _exclusive = front.exclusive.lock().unwrap_or_else(PoisonError::into_inner);
+    let answer = front.exchange(&[if first % 2 == 0 { &[] } else { CONNECT }, rest].concat());
+    match answer.get(..4) {
+        None => assert!(answer.is_empty(), "half an answer: {}", answer.escape_ascii()),
         Some([0x20, 2, 0, 0]) => {}
         Some([0x20, 2, 0, 1..=5]) => {
-            assert_eq!(heard.len(), 4, "more after a refusal: {}", heard.escape_ascii())
+            assert_eq!(answer.len(), 4, "more after a refusal: {}", answer.escape_ascii())
         }
-        Some(_) => panic!("no CONNACK: {}", heard.escape_ascii()),
+        Some(_) => panic!("no CONNACK: {}", answer.escape_ascii()),
     }
     if first % 2 == 1 {
-        assert_eq!(&heard[..4], [0x20, 2, 0, 0], "a good CONNECT was refused");
+        assert_eq!(&answer[..4], [0x20, 2, 0, 0], "a good CONNECT was refused");
     }
     assert_eq!(
-        front.talk(&[CONNECT, b"\xe0\x00"].concat()),
+        front.exchange(&[CONNECT, b"\xe0\x00"].concat()),
         [0x20, 2, 0, 0],
         "the next client is not served"
     );
@@ -109,7 +110,7 @@ pub fn mqtt_session(bytes: &[u8]) {
 /// A broker that serves until the process ends.
 struct Front {
     address: SocketAddr,
-    turn: Mutex<()>,
+    exclusive: Mutex<()>,
     _broker: (Runtime, Broker),
 }
 
@@ -120,37 +121,47 @@ impl Front {
             let runtime = Runtime::new().expect("a runtime");
             let limits = Limits { max_packet_bytes: MAX_PACKET_BYTES, ..Limits::default() };
             let listen = ([127, 0, 0, 1], 0).into();
-            let conduct = Conduct::new(INDULGENT);
-            let config =
-                BrokerConfig { listen, tls: None, prefix: TopicPrefix::default(), limits, conduct };
+            let robot_limiter = RobotLimiter::new(LENIENT);
+            let config = BrokerConfig {
+                listen,
+                tls: None,
+                proxy_protocol: ProxyProtocol::new(&[]),
+                prefix: TopicPrefix::default(),
+                limits,
+                robot_limiter,
+            };
             let broker = runtime
-                .block_on(Broker::start(config, Arc::new(Door), Arc::new(Letterbox)))
+                .block_on(Broker::start(
+                    config,
+                    Arc::new(OneRobotGatekeeper),
+                    Arc::new(CheckingInbox),
+                ))
                 .expect("a broker");
             let address = broker.local_addr().expect("an address");
-            Self { address, turn: Mutex::default(), _broker: (runtime, broker) }
+            Self { address, exclusive: Mutex::default(), _broker: (runtime, broker) }
         })
     }
 
     /// Sends `bytes` and nothing more; returns the answer received until the connection ended.
-    fn talk(&self, bytes: &[u8]) -> Vec<u8> {
+    fn exchange(&self, bytes: &[u8]) -> Vec<u8> {
         let mut stream = TcpStream::connect(self.address).expect("connected");
         stream.set_read_timeout(Some(PATIENCE)).expect("set");
-        let mut heard = Vec::new();
+        let mut answer = Vec::new();
         // The server may rightly have closed the connection already.
-        let said = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
-        match stream.read_to_end(&mut heard) {
+        let sent = stream.write_all(bytes).and_then(|()| stream.shutdown(Shutdown::Write));
+        match stream.read_to_end(&mut answer) {
             Ok(_) => {}
             Err(error)
                 if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) => {}
-            Err(error) => panic!("the connection does not end: {error} (said: {said:?})"),
+            Err(error) => panic!("the connection does not end: {error} (sent: {sent:?})"),
         }
-        heard
+        answer
     }
 }
 
-struct Door;
+struct OneRobotGatekeeper;
 
-impl Gatekeeper for Door {
+impl Gatekeeper for OneRobotGatekeeper {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
         let robot = ROBOT.parse().expect("valid");
         let known = login.user_name.as_deref() == Some(ROBOT);
@@ -163,9 +174,9 @@ impl Gatekeeper for Door {
     }
 }
 
-struct Letterbox;
+struct CheckingInbox;
 
-impl Inbox for Letterbox {
+impl Inbox for CheckingInbox {
     fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
         assert!(message.robot.as_str() == ROBOT && message.topic.is_from_robot(), "{message:?}");
         async { Ok(()) }.boxed()
@@ -179,5 +190,5 @@ impl Inbox for Letterbox {
         assert_eq!(robot.as_str(), ROBOT);
     }
 
-    fn everyone_may_be_there(&self) {}
+    fn external_broker_connected(&self) {}
 }

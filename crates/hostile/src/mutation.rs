@@ -45,17 +45,17 @@ impl Mutation {
         Self { state: seed }
     }
 
-    /// One of `kept`, or nothing if there are none, changed in one to eight places.
-    pub fn next(&mut self, kept: &[Vec<u8>]) -> Vec<u8> {
-        let mut bytes = self.one_of(kept);
+    /// One of `corpus`, or nothing if there are none, changed in one to eight places.
+    pub fn next(&mut self, corpus: &[Vec<u8>]) -> Vec<u8> {
+        let mut bytes = self.pick(corpus);
         for _ in 0..=self.below(8) {
-            self.change(&mut bytes, kept);
+            self.change(&mut bytes, corpus);
         }
         bytes.truncate(MAX_BYTES);
         bytes
     }
 
-    fn change(&mut self, bytes: &mut Vec<u8>, kept: &[Vec<u8>]) {
+    fn change(&mut self, bytes: &mut Vec<u8>, corpus: &[Vec<u8>]) {
         let at = self.below(bytes.len() + 1);
         let end = (at + 1 + self.below(16)).min(bytes.len());
         match self.below(8) {
@@ -79,7 +79,7 @@ impl Mutation {
                 drop(bytes.splice(at..at, again));
             }
             _ => {
-                let other = self.one_of(kept);
+                let other = self.pick(corpus);
                 let from = self.below(other.len() + 1);
                 bytes.truncate(at);
                 bytes.extend_from_slice(&other[from..]);
@@ -87,8 +87,8 @@ impl Mutation {
         }
     }
 
-    fn one_of(&mut self, kept: &[Vec<u8>]) -> Vec<u8> {
-        if kept.is_empty() { Vec::new() } else { kept[self.below(kept.len())].clone() }
+    fn pick(&mut self, corpus: &[Vec<u8>]) -> Vec<u8> {
+        if corpus.is_empty() { Vec::new() } else { corpus[self.below(corpus.len())].clone() }
     }
 
     fn below(&mut self, limit: usize) -> usize {

@@ -3,10 +3,10 @@
 use std::fmt::{Debug, Display};
 use std::str::FromStr;
 
-use task_proto::id::{GraphName, LabelKey, LabelValue, Labels, OutputPath, RequestId};
-use task_proto::selector::Selector;
-use task_proto::token::Token;
-use task_proto::topic::TopicPrefix;
+use task_proto::ids::selector::Selector;
+use task_proto::ids::{GraphName, LabelKey, LabelValue, Labels, OutputPath, RequestId};
+use task_proto::messages::topic::TopicPrefix;
+use task_proto::trust::token::Token;
 use task_proto::{
     DeploymentId, Digest, InstanceId, MacAddress, RepositoryName, RobotId, RobotName, Tag,
     TaskName, TokenId, UserName, Version,
@@ -58,7 +58,7 @@ fn exact<T: FromStr + Display>(text: &str) -> bool {
 /// A selector: written and read again, it matches the same robots.
 pub fn selector(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
-    let Some(selector) = same_again::<Selector>(text) else { return };
+    let Some(selector) = round_trip::<Selector>(text) else { return };
     let again: Selector = selector.to_string().parse().expect("a selector that was written");
     let id: RobotId = "r00000000000000a1".parse().expect("valid");
     for (name, labels) in
@@ -88,7 +88,7 @@ pub fn token(bytes: &[u8]) {
     }
 }
 
-fn same_again<T: FromStr + Display + PartialEq + Debug>(text: &str) -> Option<T> {
+fn round_trip<T: FromStr + Display + PartialEq + Debug>(text: &str) -> Option<T> {
     let read: T = text.parse().ok()?;
     assert_eq!(read.to_string().parse::<T>().ok().as_ref(), Some(&read));
     Some(read)

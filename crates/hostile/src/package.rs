@@ -6,15 +6,15 @@ use task_agent::setup::launch;
 use task_agent::setup::script::run_script;
 use task_agent::system::layout::DataDir;
 use task_proto::Digest;
-use task_proto::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
+use task_proto::packages::manifest::{Build, BuildTool, ContentFacts, TaskManifest};
 
-use crate::said::same_again;
+use crate::messages::round_trip;
 
 /// `task.toml`: a file without problems makes a manifest that robots read as written.
 pub fn task_toml(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let mut problems = Vec::new();
-    let file = taskd::package::task_toml::parse(text, &mut problems);
+    let file = task_package::task_toml::parse(text, &mut problems);
     let (Some(name), Some(version)) = (file.name, file.version) else { return };
     let manifest = TaskManifest {
         name,
@@ -42,7 +42,7 @@ pub fn task_toml(bytes: &[u8]) {
 /// `package.xml`: each dependency is known once.
 pub fn package_xml(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
-    let Ok(xml) = taskd::package::package_xml::parse(text) else { return };
+    let Ok(xml) = task_package::package_xml::parse(text) else { return };
     for depends in [&xml.exec_depends, &xml.conditional_depends] {
         assert!(
             depends.is_sorted_by(|a, b| a < b) && depends.iter().all(|name| xml.depends_on(name))
@@ -53,7 +53,7 @@ pub fn package_xml(bytes: &[u8]) {
 /// A task manifest that breaks no rule: its paths stay in the task's own directory, and the start
 /// script has each word in quotes, as one word.
 pub fn manifest(bytes: &[u8]) {
-    let Some(manifest) = same_again::<TaskManifest>(bytes) else { return };
+    let Some(manifest) = round_trip::<TaskManifest>(bytes) else { return };
     let problems = manifest.problems();
     assert!(
         problems.iter().all(|problem| !problem.to_string().contains(char::is_control)),

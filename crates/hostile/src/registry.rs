@@ -2,14 +2,14 @@
 
 use std::collections::BTreeSet;
 
-use task_proto::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
-use taskd::http::registry::oci::parsed::Parsed;
+use task_proto::packages::oci::{MANIFEST_TYPE, PACKAGE_TYPE};
+use taskd::http::registry::oci::parsed::ParsedManifest;
 
 /// An OCI manifest: each part is known once, its texts fit a header, and a manifest that claims to
 /// be a package is the same package when written again.
 pub fn oci_manifest(bytes: &[u8]) {
     for content_type in [None, Some(MANIFEST_TYPE)] {
-        let Ok(parsed) = Parsed::new(content_type, bytes) else { continue };
+        let Ok(parsed) = ParsedManifest::new(content_type, bytes) else { continue };
         assert_eq!(parsed.parts.iter().collect::<BTreeSet<_>>().len(), parsed.parts.len());
         let texts =
             [Some(&parsed.media_type), parsed.artifact_type.as_ref(), parsed.subject.as_ref()];
@@ -17,7 +17,8 @@ pub fn oci_manifest(bytes: &[u8]) {
         let Some(package) = parsed.package else { continue };
         assert_eq!(parsed.artifact_type.as_deref(), Some(PACKAGE_TYPE));
         let written = serde_json::to_vec(&package).expect("what was read can be written");
-        let again = Parsed::new(content_type, &written).expect("what was written can be read");
+        let again =
+            ParsedManifest::new(content_type, &written).expect("what was written can be read");
         assert_eq!((again.package.as_ref(), &again.parts), (Some(&package), &parsed.parts));
         if let Some((config, content)) = package.package_blobs() {
             assert!(

@@ -1,11 +1,11 @@
 //! Envelopes and the desired states in them, as a robot receives them from whoever.
 
-use task_agent::reconcile::admission::{Refused, admit};
-use task_proto::desired::{BlobRef, DesiredState, Doorbell, Inline};
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_agent::reconcile::admission::{AdmissionError, admit};
+use task_proto::desired::{BlobRef, DesiredNotice, DesiredState, Inline};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{Digest, Generation, RobotId};
 
-use crate::said::same_again;
+use crate::messages::round_trip;
 
 /// The payloads that the key has signed: the envelopes of the corpus have no others.
 const SIGNED: [&[u8]; 2] = [b"{}", b"{\"generation\":1}"];
@@ -17,8 +17,8 @@ const NOW_MS: u64 = 4_102_444_800_000;
 /// returned, and only blobs that hash to their digest.
 pub fn envelope(bytes: &[u8]) {
     let (mut envelopes, mut inlines) = (Vec::new(), Vec::new());
-    envelopes.extend(same_again::<Envelope>(bytes));
-    if let Some(Doorbell::State { envelope, inline }) = same_again::<Doorbell>(bytes) {
+    envelopes.extend(round_trip::<Envelope>(bytes));
+    if let Some(DesiredNotice::State { envelope, inline }) = round_trip::<DesiredNotice>(bytes) {
         envelopes.push(envelope);
         inlines.push(inline);
     }
@@ -32,7 +32,7 @@ pub fn envelope(bytes: &[u8]) {
             );
         }
     }
-    inlines.extend(same_again::<Inline>(bytes));
+    inlines.extend(round_trip::<Inline>(bytes));
     for inline in inlines {
         for size in 0..8 {
             let blob = BlobRef { digest: Digest::of(b"true"), size };
@@ -53,13 +53,13 @@ pub fn desired(bytes: &[u8]) {
     names.sort();
     names.dedup();
     assert_eq!(names.len(), state.tasks.len());
-    assert_eq!(same_again::<DesiredState>(bytes).as_ref(), Some(&state));
+    assert_eq!(round_trip::<DesiredState>(bytes).as_ref(), Some(&state));
     let again =
         admit(&envelope, &key.public_key(), &robot, Some(&state), NOW_MS).expect("the same state");
     assert_eq!(again, state);
     if let Some(generation) = state.generation.0.checked_add(1) {
         let newer = DesiredState { generation: Generation(generation), ..state.clone() };
         let stale = admit(&envelope, &key.public_key(), &robot, Some(&newer), NOW_MS);
-        assert!(matches!(stale, Err(Refused::Stale { .. })));
+        assert!(matches!(stale, Err(AdmissionError::Stale { .. })));
     }
 }

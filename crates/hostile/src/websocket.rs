@@ -11,22 +11,22 @@ pub fn websocket(bytes: &[u8]) {
         for piece_bytes in [1, 7] {
             assert_eq!(read(role, bytes, piece_bytes), whole, "it depends on the pieces");
         }
-        let data: Vec<u8> = whole.0.iter().filter_map(Came::data).flatten().copied().collect();
+        let data: Vec<u8> = whole.0.iter().filter_map(Received::data).flatten().copied().collect();
         let mut sent = BytesMut::new();
         encode(Opcode::Binary, &data, (role == Role::Server).then_some([1, 2, 3, 4]), &mut sent);
-        let again = if data.is_empty() { vec![] } else { vec![Came::Data(data)] };
+        let again = if data.is_empty() { vec![] } else { vec![Received::Data(data)] };
         assert_eq!(read(role, &sent, sent.len()), (again, None));
     }
 }
 
 /// A received message, with fragmented data joined.
 #[derive(Debug, PartialEq)]
-enum Came {
+enum Received {
     Data(Vec<u8>),
     Other(Piece),
 }
 
-impl Came {
+impl Received {
     fn data(&self) -> Option<&Vec<u8>> {
         match self {
             Self::Data(data) => Some(data),
@@ -35,7 +35,7 @@ impl Came {
     }
 }
 
-fn read(role: Role, bytes: &[u8], piece_bytes: usize) -> (Vec<Came>, Option<Violation>) {
+fn read(role: Role, bytes: &[u8], piece_bytes: usize) -> (Vec<Received>, Option<Violation>) {
     let (mut all, mut decoder, mut input) = (Vec::new(), Decoder::new(role), BytesMut::new());
     for piece in bytes.chunks(piece_bytes.max(1)) {
         input.extend_from_slice(piece);
@@ -43,11 +43,11 @@ fn read(role: Role, bytes: &[u8], piece_bytes: usize) -> (Vec<Came>, Option<Viol
             match (decoder.decode(&mut input), all.last_mut()) {
                 (Ok(None), _) => break,
                 (Ok(Some(Piece::Data(data))), _) if data.is_empty() => {}
-                (Ok(Some(Piece::Data(data))), Some(Came::Data(before))) => {
+                (Ok(Some(Piece::Data(data))), Some(Received::Data(before))) => {
                     before.extend_from_slice(&data)
                 }
-                (Ok(Some(Piece::Data(data))), _) => all.push(Came::Data(data.to_vec())),
-                (Ok(Some(other)), _) => all.push(Came::Other(other)),
+                (Ok(Some(Piece::Data(data))), _) => all.push(Received::Data(data.to_vec())),
+                (Ok(Some(other)), _) => all.push(Received::Other(other)),
                 (Err(violation), _) => return (all, Some(violation)),
             }
         }

@@ -6,15 +6,15 @@ use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use task_proto::api::AWAITS_APPROVAL;
+use task_proto::error_chain::chain;
 
 use super::say;
 use crate::reconcile::admission;
 use crate::system::durable;
-use crate::system::error_chain::chain;
 use crate::system::identity::Identity;
 use crate::system::layout::DataDir as Layout;
-use crate::task::plan::backoff_ms;
-use crate::transfer::server::{Sent, Server, ServerError};
+use crate::task::timing::backoff_ms;
+use crate::transfer::server::{DesiredResponse, Server, ServerError};
 
 /// Maximum pause between two requests; the minimum is a quarter of it.
 const PAUSE: Duration = Duration::from_secs(8);
@@ -23,9 +23,9 @@ const MAX_AWAY_MS: u64 = 60 * 1000;
 
 /// Checks that the server holds the key that the token pins: a desired state signed with that key
 /// proves this.
-pub(super) fn check_key(sent: &Sent, robot: &Identity) -> anyhow::Result<()> {
+pub(super) fn check_key(sent: &DesiredResponse, robot: &Identity) -> anyhow::Result<()> {
     admission::open(&sent.envelope, &robot.server_key, &robot.robot_id)
-        .context("the server does not hold the key that the enrolment token names")?;
+        .context("the server's key is not the one pinned by the enrollment token")?;
     Ok(())
 }
 
@@ -38,7 +38,7 @@ pub(super) async fn wait(
     before: Option<Identity>,
 ) -> anyhow::Result<()> {
     say(format_args!(
-        "{} waits to be approved at {} (taskd robot approve)",
+        "{} is waiting for approval at {} (taskd robot approve)",
         robot.robot_id, robot.server
     ));
     match answer(server).await {
@@ -77,7 +77,7 @@ pub(super) fn forget(data: &Layout, before: Option<Identity>) -> anyhow::Result<
 }
 
 /// The result of the wait: the first state from the server, or the reason for the rejection.
-async fn answer(server: &Server) -> Result<Option<Sent>, String> {
+async fn answer(server: &Server) -> Result<Option<DesiredResponse>, String> {
     let mut failures = 0;
     loop {
         let pause = match server.desired(None).await {
@@ -92,7 +92,7 @@ async fn answer(server: &Server) -> Result<Option<Sent>, String> {
             Err(error) => {
                 failures += 1;
                 if failures == 1 {
-                    say(format_args!("{}: it is asked again", chain(&error)));
+                    say(format_args!("{}: retrying", chain(&error)));
                 }
                 PAUSE / 4 + Duration::from_millis(backoff_ms(failures, MAX_AWAY_MS, rand::random()))
             }

@@ -8,17 +8,16 @@ use std::process::ExitCode;
 
 use anyhow::{Context as _, bail};
 use task_proto::RobotName;
-use task_proto::id::{LabelKey, LabelValue};
+use task_proto::ids::{LabelKey, LabelValue};
 
 use super::enroll::parse_label;
 use super::{DataDir, say};
 use crate::config::{FILE_NAME, Settings, parse_server};
-use crate::setup::underlay::{self, Places};
+use crate::setup::underlay::{self, SearchPaths};
 use crate::system::durable;
 use crate::system::identity;
 use crate::system::layout::DataDir as Layout;
 
-/// Arguments of `configure`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// The server's URL
@@ -27,13 +26,13 @@ pub struct Arguments {
     /// The robot's name
     #[arg(long)]
     name: Option<RobotName>,
-    /// A label; may be given more than once. Those given replace all others
+    /// A label; repeatable. Replaces all existing labels
     #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
     labels: Vec<(LabelKey, LabelValue)>,
-    /// A setup file to source before a task is built or run; may be given more than once
+    /// A setup file to source before a task is built or run; repeatable
     #[arg(long = "underlay", value_name = "FILE")]
     underlays: Vec<PathBuf>,
-    /// Ask nothing: what is not given keeps its value
+    /// Do not prompt; settings that are not given keep their values
     #[arg(long, short)]
     yes: bool,
     #[command(flatten)]
@@ -49,11 +48,11 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
         Err(error) => say(format_args!("MAC address: {error} when you enroll")),
     }
     if !arguments.yes && !std::io::stdin().is_terminal() {
-        bail!("there is no terminal to ask at: give the values as flags, with --yes");
+        bail!("no terminal for prompts: pass the values as flags, with --yes");
     }
     apply_flags(&mut settings, &arguments)?;
     if !arguments.yes {
-        ask_for_the_rest(&mut settings, &arguments)?;
+        prompt_for_missing(&mut settings, &arguments)?;
     }
     durable::create_dir_all(data.root())
         .with_context(|| format!("cannot make {}", data.root().display()))?;
@@ -78,20 +77,20 @@ fn apply_flags(settings: &mut Settings, arguments: &Arguments) -> anyhow::Result
     Ok(())
 }
 
-fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::Result<()> {
+fn prompt_for_missing(settings: &mut Settings, arguments: &Arguments) -> anyhow::Result<()> {
     if arguments.server.is_none() {
         let server = settings.server.clone().unwrap_or_else(|| "http://localhost:8080".to_owned());
-        settings.server = ask("Server", &server, |text| Ok(parse_server(text)?.to_string()))?;
+        settings.server = prompt("Server", &server, |text| Ok(parse_server(text)?.to_string()))?;
     }
     if arguments.name.is_none() {
         let hostname = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
         let name = settings.name.as_ref().map_or(hostname.trim().to_owned(), ToString::to_string);
-        settings.name = ask("Name", &name, |text| Ok(text.parse()?))?;
+        settings.name = prompt("Name", &name, |text| Ok(text.parse()?))?;
     }
     if arguments.labels.is_empty() {
         let pairs = settings.labels.iter().flatten().map(|(key, value)| format!("{key}={value}"));
         settings.labels =
-            ask("Labels (key=value,…)", &pairs.collect::<Vec<_>>().join(","), |text| {
+            prompt("Labels (key=value,…)", &pairs.collect::<Vec<_>>().join(","), |text| {
                 let labels = text.split(',').filter(|pair| !pair.trim().is_empty());
                 labels.map(|pair| parse_label(pair.trim()).map_err(anyhow::Error::msg)).collect()
             })?;
@@ -99,14 +98,14 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
     if arguments.underlays.is_empty() {
         let underlays = match &settings.underlays {
             Some(underlays) => underlays.clone(),
-            None => underlay::find(&[], &Places::of_this_machine())
+            None => underlay::find(&[], &SearchPaths::of_this_machine())
                 .pop()
                 .map(|best| best.setups)
                 .unwrap_or_default(),
         };
         let shown =
             underlays.iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(":");
-        settings.underlays = ask("ROS setup file (a:b for several)", &shown, |text| {
+        settings.underlays = prompt("ROS setup file (a:b for several)", &shown, |text| {
             Ok(text.split(':').filter(|path| !path.is_empty()).map(PathBuf::from).collect())
         })?;
     }
@@ -115,7 +114,7 @@ fn ask_for_the_rest(settings: &mut Settings, arguments: &Arguments) -> anyhow::R
 
 /// Asks until the answer is valid. An empty answer selects the default, or no value where there is
 /// no default.
-fn ask<T>(
+fn prompt<T>(
     question: &str,
     default: &str,
     parse: impl Fn(&str) -> anyhow::Result<T>,
@@ -126,7 +125,7 @@ fn ask<T>(
         out.flush()?;
         let mut answer = String::new();
         if std::io::stdin().read_line(&mut answer)? == 0 {
-            bail!("the form was left: nothing is written");
+            bail!("input ended: nothing was written");
         }
         let answer = if answer.trim().is_empty() { default } else { answer.trim() };
         if answer.is_empty() {
@@ -144,7 +143,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flags_are_written_and_what_is_not_given_stays() {
+    fn configure_flags_keep_other_settings() {
         let dir = tempfile::tempdir().expect("a directory");
         let arguments = |name: Option<&str>, server: Option<&str>| Arguments {
             server: server.map(str::to_owned),

@@ -6,29 +6,31 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::fmt::rfc2822::DateTimeParser;
 use nix::sys::resource::{Resource, getrlimit};
 use nix::unistd::{AccessFlags, access};
 use reqwest::Url;
 use rustls::ClientConfig;
-use task_proto::api::{MqttEndpoint, MqttPlace};
+use task_proto::api::{BrokerAddress, MqttEndpoint};
 use task_proto::checkup::{Checkup, Verdict};
-use task_proto::time::{parse_timestamp, span};
-use task_transport::{Probed, Route, Trust, certificate_end_ms, greet_mqtt};
+use task_proto::error_chain::chain;
+use task_proto::size::format_bytes;
+use task_proto::time::span;
+use task_transport::{ProbeResult, Route, Trust, certificate_end_ms, probe_mqtt};
 use tokio::time::timeout;
 
 use super::status::agent_runs;
 use super::{DataDir, Output, refuse_plain_text, say, tls};
-use crate::config::settings::settle;
+use crate::config::settings::merge_settings;
 use crate::config::{Config, ConfigError, MqttTransport, parse_server};
 use crate::install::fetch::FetchSettings;
 use crate::process::call_filter::{self, CallFilter};
-use crate::process::cgroup::{self, Outlook};
+use crate::process::cgroup::{self, Capability};
 use crate::reconcile::admission;
 use crate::setup::installation::{Installation, all_distros};
 use crate::setup::underlay::{self, UnderlayError};
 use crate::system::clock;
-use crate::system::disk;
-use crate::system::error_chain::chain;
+use crate::system::disk::{self, DiskSpace};
 use crate::system::identity::Identity;
 use crate::system::layout::DataDir as Layout;
 use crate::system::task_user::{TaskUser, TaskUserError};
@@ -37,7 +39,7 @@ use crate::transfer::credential::Credential;
 use crate::transfer::server::{self, Server, ServerError};
 
 /// Maximum time for each answer.
-const PATIENCE: Duration = Duration::from_secs(5);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(5);
 /// A clock error above this limit confuses readers of logs.
 const SKEW_NOTICE_S: u64 = 10;
 /// With a clock error above this limit, signed orders and certificates expire at wrong times.
@@ -47,7 +49,6 @@ const SOON_MS: u64 = 14 * 24 * 60 * 60 * 1000;
 /// Number of open files that a robot with many tasks needs.
 const WANTED_FILES: u64 = 1024;
 
-/// Arguments of `doctor`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// How to print the result
@@ -88,11 +89,11 @@ async fn check(data: &Path) -> anyhow::Result<Checkup> {
         match base {
             Ok(base) => server(&mut checkup, &identity, &base, config.as_ref()).await?,
             Err(error) => {
-                let mend = "mend server in agent.toml, or enrol again (task-agent enroll)";
+                let mend = "fix server in agent.toml, or enroll again (task-agent enroll)";
                 checkup.bad("server", error.to_string(), mend);
             }
         }
-        config = config.map(|own| settled(&own, &layout, &identity));
+        config = config.map(|own| effective_config(&own, &layout, &identity));
     }
     machine(&mut checkup, data, config.as_ref());
     if let Some(config) = &config {
@@ -110,10 +111,8 @@ fn settings(checkup: &mut Checkup, data: &Path) -> Option<Config> {
         }
         Err(error) => {
             let mend = match &error {
-                ConfigError::Io { .. } => "run it as the agent's user",
-                ConfigError::Invalid { .. } => {
-                    "mend the key that it names, in agent.toml or the environment"
-                }
+                ConfigError::Io { .. } => "run as the agent's user",
+                ConfigError::Invalid { .. } => "fix this key in agent.toml or the environment",
             };
             checkup.bad("settings", chain(&error), mend);
             None
@@ -122,13 +121,13 @@ fn settings(checkup: &mut Checkup, data: &Path) -> Option<Config> {
 }
 
 /// The effective settings: the robot's `own`, and the last ones from its server.
-fn settled(own: &Config, layout: &Layout, identity: &Identity) -> Config {
+fn effective_config(own: &Config, layout: &Layout, identity: &Identity) -> Config {
     let accepted = Ledger::peek(&layout.ledger()).ok().flatten().and_then(|ledger| ledger.accepted);
     let state = accepted.and_then(|accepted| {
         // A state that this server did not sign is ignored, as in the agent.
         admission::open(&accepted.envelope, &identity.server_key, &identity.robot_id).ok()
     });
-    state.map_or_else(|| own.clone(), |state| settle(own, &state.settings).config)
+    state.map_or_else(|| own.clone(), |state| merge_settings(own, &state.settings).config)
 }
 
 /// Checks the data directory, the robot's identity, and whether the agent runs.
@@ -137,8 +136,7 @@ fn directory(checkup: &mut Checkup, data: &Path) -> Option<(Layout, Identity)> {
     match access(data, flags) {
         Ok(()) => checkup.good("data", format!("{} can be written", data.display())),
         Err(error) => {
-            let mend =
-                "run it as the agent's user (root, mostly), or say where the directory is (--data)";
+            let mend = "run as the agent's user (usually root), or set the directory (--data)";
             checkup.bad("data", format!("{}: {}", data.display(), error.desc()), mend);
             return None;
         }
@@ -146,14 +144,15 @@ fn directory(checkup: &mut Checkup, data: &Path) -> Option<(Layout, Identity)> {
     let layout = match Layout::new(data) {
         Ok(layout) => layout,
         Err(error) => {
-            checkup.bad("data", error.to_string(), "say where the directory is (--data)");
+            checkup.bad("data", error.to_string(), "set the directory (--data)");
             return None;
         }
     };
     let identity = match Identity::read(&layout.identity()) {
         Ok(identity) => identity,
         Err(error) => {
-            let mend = "enrol: task-agent enroll --server URL --token TOKEN (taskd enroll-token create makes one)";
+            let mend = "enroll: task-agent enroll --server URL --token TOKEN \
+                        (create a token with taskd enroll-token create)";
             checkup.bad("identity", chain(&error), mend);
             return None;
         }
@@ -179,21 +178,21 @@ async fn server(
     let (host, port) =
         (base.host_str().unwrap_or_default(), base.port_or_known_default().unwrap_or_default());
     let bare = host.trim_matches(['[', ']']);
-    match timeout(PATIENCE, tokio::net::lookup_host((bare, port))).await {
-        Ok(Ok(_)) => checkup.good("dns", format!("{bare} is known")),
+    match timeout(ANSWER_TIMEOUT, tokio::net::lookup_host((bare, port))).await {
+        Ok(Ok(_)) => checkup.good("dns", format!("{bare} resolves")),
         Ok(Err(error)) => {
             checkup.bad(
                 "dns",
                 format!("{bare}: {error}"),
-                "look at /etc/resolv.conf and /etc/hosts, and at the network",
+                "check the network, /etc/resolv.conf and /etc/hosts",
             );
             return Ok(());
         }
         Err(_) => {
             checkup.bad(
                 "dns",
-                format!("{bare} is not resolved within 5 s"),
-                "look at the network and at /etc/resolv.conf",
+                format!("{bare} did not resolve within 5 s"),
+                "check the network and /etc/resolv.conf",
             );
             return Ok(());
         }
@@ -211,7 +210,7 @@ async fn server(
         token(checkup, &Server::new(client, base.clone(), identity.robot_id.clone(), credential))
             .await;
     match config {
-        Some(config) if !config.mqtt => checkup.good("mqtt", "is turned off: the robot polls"),
+        Some(config) if !config.mqtt => checkup.good("mqtt", "disabled: the robot polls"),
         config => {
             let transport = config.map(|config| config.mqtt_transport).unwrap_or_default();
             // As in the agent: the address from the enrollment, until the server names another one.
@@ -247,13 +246,13 @@ async fn mqtt(
             Some(Arc::new(Trust::by(broker.ca_pin).client_config(clock::for_certificates())))
         }
     };
-    let by_port = |place: &MqttPlace| Route {
+    let by_port = |place: &BrokerAddress| Route {
         host: place.host.clone().unwrap_or_else(|| base.host_str().unwrap_or_default().to_owned()),
         port: place.port,
         tls: mqtt_tls(place.tls),
         websocket: None,
     };
-    let first = MqttPlace { host: mqtt.host.clone(), port: mqtt.port, tls: mqtt.tls };
+    let first = BrokerAddress { host: mqtt.host.clone(), port: mqtt.port, tls: mqtt.tls };
     let by_http = Route {
         host,
         port: base.port_or_known_default().unwrap_or_default(),
@@ -272,19 +271,17 @@ async fn mqtt(
 /// Checks the server's first answer, and the clock by the answer's date.
 async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> bool {
     let url = format!("{}/healthz", base.as_str().trim_end_matches('/'));
-    let response = match client.get(url).timeout(PATIENCE).send().await {
+    let response = match client.get(url).timeout(ANSWER_TIMEOUT).send().await {
         Ok(response) if response.status().is_success() => response,
         Ok(response) => {
-            let found = format!(
-                "what answers at {base} is not taskd (status {})",
-                response.status().as_u16()
-            );
-            let mend = "look whether a captive portal or a proxy is in between, and at server in agent.toml";
+            let found = format!("{base} is not taskd (status {})", response.status().as_u16());
+            let mend = "check for a captive portal or proxy, and check server in agent.toml";
             checkup.bad("http", found, mend);
             return false;
         }
         Err(error) => {
-            let mend = "look at the network, at server in agent.toml, and whether taskd serve runs and may be reached there";
+            let mend = "check the network, server in agent.toml, \
+                        and that taskd serve is running and reachable";
             checkup.bad("http", chain(&error.without_url()), mend);
             return false;
         }
@@ -304,9 +301,10 @@ async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> b
             span(Duration::from_secs(server_s.abs_diff(here_s)))
         )
     };
-    let mend = "let it follow NTP (timedatectl set-ntp true); without a battery-backed clock install fake-hwclock";
+    let mend = "enable NTP (timedatectl set-ntp true); \
+                without a battery-backed clock, install fake-hwclock";
     match server_s.abs_diff(here_s) {
-        ..SKEW_NOTICE_S => checkup.good("clock", "this robot and the server agree"),
+        ..SKEW_NOTICE_S => checkup.good("clock", "matches the server's"),
         SKEW_NOTICE_S..SKEW_BAD_S => checkup.notice("clock", found(), mend),
         _ => checkup.bad("clock", found(), mend),
     }
@@ -315,48 +313,49 @@ async fn reach(checkup: &mut Checkup, client: &reqwest::Client, base: &Url) -> b
 
 async fn certificate(checkup: &mut Checkup, host: &str, port: u16, identity: &Identity) {
     let trust = Trust::by(identity.ca_pin);
-    let end_ms = timeout(PATIENCE, certificate_end_ms(host, port, trust)).await.ok().flatten();
-    let by =
-        if identity.ca_pin.is_some() { "by the pinned authority" } else { "by the system's roots" };
+    let end_ms =
+        timeout(ANSWER_TIMEOUT, certificate_end_ms(host, port, trust)).await.ok().flatten();
+    let by = if identity.ca_pin.is_some() { "by the pinned CA" } else { "by the system's CAs" };
     match end_ms {
         Some(end_ms) if end_ms < clock::wall_ms() + SOON_MS => checkup.notice(
             "tls",
-            format!("the server's certificate ends {}", task_proto::time::timestamp(end_ms)),
-            "the server's administrator renews it",
+            format!("the server's certificate expires {}", task_proto::time::timestamp(end_ms)),
+            "ask the server's administrator to renew it",
         ),
         Some(end_ms) => {
             checkup.good(
                 "tls",
-                format!("vouched for {by}, until {}", task_proto::time::timestamp(end_ms)),
+                format!("trusted {by}, until {}", task_proto::time::timestamp(end_ms)),
             );
         }
-        None => checkup.good("tls", format!("vouched for {by}")),
+        None => checkup.good("tls", format!("trusted {by}")),
     }
 }
 
 /// Checks whether the server accepts the token, and returns the address of MQTT from the server.
 async fn token(checkup: &mut Checkup, server: &Server) -> Option<MqttEndpoint> {
-    match timeout(PATIENCE, server.mqtt_endpoint()).await {
+    match timeout(ANSWER_TIMEOUT, server.mqtt_endpoint()).await {
         Ok(Ok(endpoint)) => {
-            checkup.good("token", "the server accepts it");
+            checkup.good("token", "accepted by the server");
             return Some(endpoint);
         }
         Ok(Err(error)) => {
             let mend = match &error {
                 ServerError::TokenRefused(_) => {
-                    "enrol again with a token made for this robot (taskd enroll-token create --robot NAME)"
+                    "enroll again with a token for this robot \
+                     (taskd enroll-token create --robot NAME)"
                 }
                 ServerError::Refused { code, .. } if code == task_proto::api::AWAITS_APPROVAL => {
-                    "an administrator lets the robot in (taskd robot approve)"
+                    "ask an administrator to approve the robot (taskd robot approve)"
                 }
-                _ => "look at the server (taskd doctor there)",
+                _ => "check the server (run taskd doctor there)",
             };
             checkup.bad("token", chain(&error), mend);
         }
         Err(_) => checkup.bad(
             "token",
-            "the server does not answer within 5 s",
-            "look at the server (taskd doctor there)",
+            "the server did not answer within 5 s",
+            "check the server (run taskd doctor there)",
         ),
     }
     None
@@ -365,16 +364,17 @@ async fn token(checkup: &mut Checkup, server: &Server) -> Option<MqttEndpoint> {
 /// Checks whether MQTT is spoken at the route's address. One of two routes is enough.
 async fn greet(checkup: &mut Checkup, name: &str, route: &Route, has_other: bool) -> bool {
     let at = format!("{}:{}", route.host, route.port);
-    let found = match timeout(PATIENCE, greet_mqtt(route)).await {
-        Ok(Ok(Probed::Mqtt)) => {
+    let found = match timeout(ANSWER_TIMEOUT, probe_mqtt(route)).await {
+        Ok(Ok(ProbeResult::Mqtt)) => {
             checkup.good(name, format!("{at} answers"));
             return true;
         }
-        Ok(Ok(Probed::SomethingElse)) => format!("what answers at {at} speaks no MQTT"),
+        Ok(Ok(ProbeResult::Other)) => format!("{at} does not speak MQTT"),
         Ok(Err(error)) => chain(&error),
-        Err(_) => format!("{at} does not answer within 5 s"),
+        Err(_) => format!("{at} did not answer within 5 s"),
     };
-    let mend = "look at firewalls and proxies in between; without MQTT the robot polls (mqtt_transport in agent.toml)";
+    let mend =
+        "check firewalls and proxies; without MQTT the robot polls (mqtt_transport in agent.toml)";
     match has_other {
         true => checkup.notice(name, found, mend),
         false => checkup.bad(name, found, mend),
@@ -382,36 +382,40 @@ async fn greet(checkup: &mut Checkup, name: &str, route: &Route, has_other: bool
     false
 }
 
+fn free_space(room: &DiskSpace) -> String {
+    format!("{} of {} free", format_bytes(room.free), format_bytes(room.total))
+}
+
 fn machine(checkup: &mut Checkup, data: &Path, config: Option<&Config>) {
     let reserve = config
         .and_then(|config| config.limits.disk_reserve_bytes)
         .unwrap_or(FetchSettings::default().reserve_bytes);
-    match disk::room(data) {
+    match disk::space(data) {
         Ok(room) if room.free < reserve => {
-            let found = format!("{} MiB of {} MiB free", room.free >> 20, room.total >> 20);
-            let mend = "make room: logs, recordings, packages of other tasks (limits.disk_reserve_bytes is kept free)";
-            if room.is_used_up() {
+            let found = free_space(&room);
+            let mend = "free disk space: logs, recordings, unused packages \
+                        (limits.disk_reserve_bytes stays free)";
+            if room.is_full() {
                 checkup.bad("disk", found, mend)
             } else {
                 checkup.notice("disk", found, mend)
             }
         }
-        Ok(room) => checkup
-            .good("disk", format!("{} MiB of {} MiB free", room.free >> 20, room.total >> 20)),
+        Ok(room) => checkup.good("disk", free_space(&room)),
         Err(error) => {
-            checkup.bad("disk", format!("{}: {error}", data.display()), "look at the file system")
+            checkup.bad("disk", format!("{}: {error}", data.display()), "check the file system")
         }
     }
     match getrlimit(Resource::RLIMIT_NOFILE) {
         Ok((files, _)) if files < WANTED_FILES => checkup.notice(
             "files",
-            format!("an agent started from here may have {files} files open"),
-            "raise the limit (LimitNOFILE= in its unit, ulimit -n here)",
+            format!("an agent started from here may open {files} files"),
+            "raise the limit (LimitNOFILE= in the agent's unit, or ulimit -n)",
         ),
         Ok((files, _)) => {
-            checkup.good("files", format!("an agent started from here may have {files} files open"))
+            checkup.good("files", format!("an agent started from here may open {files} files"))
         }
-        Err(error) => checkup.notice("files", error.desc(), "look at ulimit -n"),
+        Err(error) => checkup.notice("files", error.desc(), "check ulimit -n"),
     }
 }
 
@@ -422,18 +426,21 @@ fn ros(checkup: &mut Checkup, config: &Config) {
         found.iter().flat_map(|f| &f.setups).map(|setup| setup.display().to_string()).collect();
     match (missing, all_distros(&found)) {
         (Some(missing), _) => {
-            let mend = "mend underlays and workspace, in agent.toml or at the server";
+            let mend = "fix underlays and workspace in agent.toml or on the server";
             checkup.bad("ros", UnderlayError::Missing(missing.clone()).to_string(), mend);
         }
         (None, distros) if distros.is_empty() && setups.is_empty() => checkup.notice(
             "ros",
             "none found in /opt/ros",
-            "install ROS, or name its setup file as underlays in agent.toml; tasks without ROS run as well",
+            "install ROS, or set underlays in agent.toml to its setup file; \
+             tasks without ROS do not need it",
         ),
         (None, distros) if setups.is_empty() => {
             checkup.good("ros", format!("{}, without a setup file", distros.join(", ")))
         }
-        (None, distros) => checkup.good("ros", format!("{}: {}", distros.join(", "), setups.join(", "))),
+        (None, distros) => {
+            checkup.good("ros", format!("{}: {}", distros.join(", "), setups.join(", ")))
+        }
     }
     let path = std::env::var_os("PATH").unwrap_or_default();
     let mut places: Vec<PathBuf> = std::env::split_paths(&path).collect();
@@ -445,8 +452,9 @@ fn ros(checkup: &mut Checkup, config: &Config) {
     match tools.is_empty() {
         true => checkup.notice(
             "build",
-            "neither colcon nor catkin_make is found",
-            "install colcon (python3-colcon-common-extensions); packages that are built elsewhere run without",
+            "neither colcon nor catkin_make was found",
+            "install colcon (python3-colcon-common-extensions); \
+             packages built elsewhere do not need it",
         ),
         false => checkup.good("build", tools.join(", ")),
     }
@@ -461,17 +469,17 @@ fn own_programs(installation: &Installation) -> Vec<PathBuf> {
 
 /// Checks the environment and the account of tasks.
 fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
-    let mend = "tasks run all the same, without limits that hold; use a kernel with cgroup v2 and let systemd delegate \
-                (Delegate=yes in the agent's unit)";
-    match cgroup::outlook() {
-        Outlook::Isolates => checkup.good("cgroups", "v2, with memory and pids"),
-        Outlook::Counts => {
+    let mend = "tasks run, but limits are not enforced; use a kernel with cgroup v2 \
+                and let systemd delegate (Delegate=yes in the agent's unit)";
+    match cgroup::capability() {
+        Capability::Isolates => checkup.good("cgroups", "v2, with memory and pids"),
+        Capability::Counts => {
             checkup.notice("cgroups", "v2, without the controllers memory and pids", mend)
         }
-        Outlook::Nothing => checkup.notice("cgroups", "no cgroup v2", mend),
+        Capability::Nothing => checkup.notice("cgroups", "no cgroup v2", mend),
     }
     let found = TaskUser::find(config.task_user.as_deref());
-    let user = found.and_then(|user| user.map(|user| user.admitted_to(data)).transpose());
+    let user = found.and_then(|user| user.map(|user| user.check_access(data)).transpose());
     match &user {
         Ok(Some(user)) => checkup.good(
             "task user",
@@ -479,7 +487,7 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
                 Some(range) => {
                     let (first, last) = (range.start(), range.end());
                     format!(
-                        "each task has an account of its own, from {first} to {last}, with the groups of {}",
+                        "each task has its own account, {first} to {last}, with the groups of {}",
                         user.name
                     )
                 }
@@ -488,37 +496,41 @@ fn tasks(checkup: &mut Checkup, data: &Path, config: &Config) {
         ),
         Ok(None) => checkup.good(
             "task user",
-            "tasks run as whoever the agent is: nothing keeps them from each other's files and processes",
+            "tasks run as the agent's user \
+             and are not isolated from each other's files and processes",
         ),
-        Err(error @ TaskUserError::ShutOut { dir, .. }) => {
+        Err(error @ TaskUserError::NoAccess { dir, .. }) => {
             let mend = format!("chmod o+x {}, or move the data directory", dir.display());
             checkup.bad("task user", error.to_string(), mend);
         }
-        Err(error) => checkup.bad("task user", error.to_string(), "make the user, or set task_user in agent.toml"),
+        Err(error) => {
+            let mend = "create the user, or set task_user in agent.toml";
+            checkup.bad("task user", error.to_string(), mend);
+        }
     }
     let has_account = !matches!(&user, Ok(None));
     match (call_filter::is_wanted(config.seccomp, has_account), CallFilter::of_tasks()) {
-        (true, Some(_)) => checkup.good("seccomp", "tasks are denied system calls that only an administrator needs"),
+        (true, Some(_)) => checkup
+            .good("seccomp", "tasks are denied system calls that only an administrator needs"),
         (true, None) => {
-            let mend = "use a kernel with CONFIG_SECCOMP_FILTER on x86_64, aarch64 or armv7, or set seccomp = \"off\"";
-            checkup.notice("seccomp", "this kernel or architecture has no filter of system calls", mend);
+            let found = "this kernel or architecture does not support system call filters";
+            let mend = "use a kernel with CONFIG_SECCOMP_FILTER on x86_64, aarch64 or armv7, \
+                        or set seccomp = \"off\"";
+            checkup.notice("seccomp", found, mend);
         }
         (false, _) => checkup.notice(
             "seccomp",
             "tasks may make all system calls",
-            "set seccomp = \"default\" in agent.toml, or run the agent as root and tasks under an account of their own",
+            "set seccomp = \"default\" in agent.toml, \
+             or run the agent as root and tasks under their own accounts",
         ),
     }
 }
 
 /// Parses an HTTP date, like `Sun, 06 Nov 1994 08:49:37 GMT`, to seconds since the Unix epoch.
 fn parse_date(text: &str) -> Option<u64> {
-    const MONTHS: [&str; 12] =
-        ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
-    let mut words = text.split_once(", ")?.1.split(' ');
-    let (day, name, year, clock) = (words.next()?, words.next()?, words.next()?, words.next()?);
-    let month = MONTHS.iter().position(|month| *month == name)? + 1;
-    Some(parse_timestamp(&format!("{year}-{month:02}-{day}T{clock}.000Z"))? / 1000)
+    let date = DateTimeParser::new().parse_timestamp(text).ok()?;
+    u64::try_from(date.as_second()).ok()
 }
 
 #[cfg(test)]
@@ -526,7 +538,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn dates_of_http_are_read() {
+    fn http_dates_are_parsed() {
         assert_eq!(parse_date("Thu, 01 Jan 1970 00:00:00 GMT"), Some(0));
         assert_eq!(parse_date("Sun, 06 Nov 1994 08:49:37 GMT"), Some(784_111_777));
         assert_eq!(parse_date("Tue, 29 Feb 2000 00:00:00 GMT"), Some(951_782_400));

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use anyhow::{Context as _, bail};
 use task_proto::api::{EnrollRequest, EnrollResponse};
-use task_proto::id::{LabelKey, LabelValue};
-use task_proto::token::{Token, TokenKind};
+use task_proto::ids::{LabelKey, LabelValue};
+use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{MacAddress, RobotName};
 use task_transport::ClientKey;
 
@@ -18,7 +18,7 @@ use crate::system::clock;
 use crate::system::durable;
 use crate::system::identity::{self, Identity};
 use crate::system::layout::DataDir as Layout;
-use crate::task::plan::backoff_ms;
+use crate::task::timing::backoff_ms;
 use crate::transfer::server::{self, Server, ServerError};
 
 /// Maximum number of requests to the server.
@@ -26,7 +26,6 @@ const TRIES: u32 = 4;
 /// Maximum pause between two attempts.
 const MAX_PAUSE_MS: u64 = 4000;
 
-/// Arguments of `enroll`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// The server's URL [default: the one in the property file]
@@ -39,13 +38,14 @@ pub struct Arguments {
     /// The robot's name
     #[arg(long)]
     name: Option<RobotName>,
-    /// A label; may be given more than once
+    /// A label; repeatable
     #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
     labels: Vec<(LabelKey, LabelValue)>,
-    /// The MAC the robot shall be known by [default: that of its first physical network interface]
+    /// MAC address that identifies the robot [default: that of its first physical network
+    /// interface]
     #[arg(long)]
     mac: Option<MacAddress>,
-    /// Register anew although this robot is registered
+    /// Register again even if this robot is already registered
     #[arg(long)]
     force: bool,
     #[command(flatten)]
@@ -54,8 +54,8 @@ pub struct Arguments {
 
 pub(super) fn parse_label(text: &str) -> Result<(LabelKey, LabelValue), String> {
     let (key, value) = text.split_once('=').ok_or("expected key=value")?;
-    let key = key.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?;
-    Ok((key, value.parse().map_err(|error: task_proto::id::InvalidId| error.to_string())?))
+    let key = key.parse().map_err(|error: task_proto::ids::InvalidId| error.to_string())?;
+    Ok((key, value.parse().map_err(|error: task_proto::ids::InvalidId| error.to_string())?))
 }
 
 pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
@@ -68,26 +68,26 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
     if data.identity().exists() && !arguments.force {
         let known = Identity::read(&data.identity())?;
         if known.awaits_approval {
-            return go_on_waiting(&data, known).await;
+            return resume_waiting(&data, known).await;
         }
         bail!(
-            "this robot is registered as {} at {}: use --force to register it anew",
+            "this robot is registered as {} at {}: use --force to register again",
             known.robot_id,
             known.server
         );
     }
     let Some(shown_token) = &arguments.token else {
-        bail!("--token: no enrolment token is given, here or in TASK_AGENT_ENROLL_TOKEN");
+        bail!("--token: no enrollment token given, here or in TASK_AGENT_ENROLL_TOKEN");
     };
     let token: Token = shown_token.parse().context("--token")?;
-    let (TokenKind::Enrolment, Some(key)) = (token.kind(), token.server_key()) else {
-        bail!("--token: this is no enrolment token; taskd enroll-token create makes one");
+    let (TokenKind::Enrollment, Some(key)) = (token.kind(), token.server_key()) else {
+        bail!("--token: not an enrollment token; create one with taskd enroll-token create");
     };
     let config = Config::load(data.root(), std::env::vars_os())?;
     let server = match (&arguments.server, &config.server) {
         (Some(server), _) => parse_server(server)?,
         (None, Some(server)) => server.clone(),
-        (None, None) => bail!("--server: no server is given, here or in the property file"),
+        (None, None) => bail!("--server: no server given, here or in agent.toml"),
     };
     let mac = match arguments.mac {
         Some(mac) => mac,
@@ -153,8 +153,9 @@ async fn enroll(arguments: Arguments) -> anyhow::Result<ExitCode> {
 }
 
 /// Resumes the wait of an earlier call of the command.
-async fn go_on_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCode> {
-    let (server, id) = (parse_server(&robot.server)?, robot.robot_id.clone());
+async fn resume_waiting(data: &Layout, robot: Identity) -> anyhow::Result<ExitCode> {
+    let server = parse_server(&robot.server)?;
+    let id = robot.robot_id.clone();
     refuse_plain_text(robot.ca_pin, &server, "server")?;
     let client = server::client(tls(robot.ca_pin, robot.client_key.as_ref())?)?;
     let asked = Server::new(client, server.clone(), id.clone(), robot.token.clone());
@@ -194,7 +195,7 @@ fn remember_settings(
     arguments: &Arguments,
     server: &reqwest::Url,
     response: &EnrollResponse,
-    labels: task_proto::id::Labels,
+    labels: task_proto::ids::Labels,
 ) -> anyhow::Result<()> {
     let before = Settings::read(data.root())?;
     let mut settings = before.clone();

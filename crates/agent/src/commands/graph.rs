@@ -5,11 +5,11 @@ use std::os::fd::{AsFd as _, BorrowedFd};
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use task_proto::line::OneLineEach;
+use task_proto::line::SingleLineWriter;
 use tokio::net::unix::pipe;
 
 use crate::process::confinement;
-use crate::ros::graph::serve;
+use crate::ros::graph::process::serve;
 
 /// Maximum number of threads for blocking work: opening the graph and leaving it.
 const MAX_BLOCKING_THREADS: usize = 2;
@@ -23,7 +23,8 @@ pub fn run() -> anyhow::Result<ExitCode> {
         .enable_all()
         .build()?;
     let outcome = runtime.block_on(async {
-        let (input, output) = (std::io::stdin(), std::io::stdout());
+        let input = std::io::stdin();
+        let output = std::io::stdout();
         let input =
             pipe::Receiver::from_owned_fd(owned(input.as_fd())?).context("standard input")?;
         let output =
@@ -44,6 +45,6 @@ fn start_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn,rustdds=off"));
     let colours = std::io::stderr().is_terminal();
-    let writer = move || OneLineEach::new(std::io::stderr(), colours);
+    let writer = move || SingleLineWriter::new(std::io::stderr(), colours);
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }

@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn hold_is_written_as_what_survives_a_power_cut_and_release_takes_it_back() {
+    fn hold_file_is_durable_and_release_removes_it() {
         let dir = tempfile::tempdir().expect("a directory");
         let arguments = || Arguments { data: DataDir { data: dir.path().to_owned() } };
         let path = dir.path().join(HOLD_FILE);

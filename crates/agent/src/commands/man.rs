@@ -5,10 +5,9 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 
-/// Arguments of `man`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// The directory, made if need be
+    /// Output directory; created if missing
     directory: PathBuf,
 }
 

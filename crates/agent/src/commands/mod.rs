@@ -52,7 +52,7 @@ fn refuse_plain_text(
     let is_plain = pin.is_some() && server.scheme() != "https";
     ensure!(
         !is_plain,
-        "{setting}: the token is for a server that encrypts: https:// instead of {}://",
+        "{setting}: the token requires an encrypted server: use https:// instead of {}://",
         server.scheme()
     );
     Ok(())

@@ -9,9 +9,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use task_proto::InstanceId;
-use task_proto::line::OneLineEach;
-use task_proto::report::Status;
+use task_proto::line::SingleLineWriter;
+use task_proto::messages::report::Status;
+use task_proto::{Digest, InstanceId};
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
@@ -19,36 +19,37 @@ use super::{DataDir, refuse_plain_text, tls};
 use crate::config::{Config, parse_server};
 use crate::install::fetch::{FetchSettings, Fetcher};
 use crate::link::endpoint;
-use crate::link::mqtt::{self, MqttAccess, Ways};
+use crate::link::mqtt::{self, MqttAccess, Routes};
 use crate::link::rotation::Rotation;
-use crate::link::state::{self, Heard, Intervals, Message, Shared, Talk};
+use crate::link::state::{
+    self, LinkState, Message, MqttChannels, MqttState, PollIntervals, ServerMessage,
+};
 use crate::logs::Logs;
 use crate::logs::forwarder::Forwarder;
 use crate::process::confinement;
 use crate::process::program;
-use crate::reconcile::answers::Answers;
-use crate::reconcile::driver::{Driver, Speaker};
-use crate::reconcile::graph_answers::GraphAnswers;
-use crate::reconcile::orders::Orders;
+use crate::reconcile::driver::{AgentIdentity, Driver};
+use crate::reconcile::graph_requests::GraphRequests;
+use crate::reconcile::request_verifier::RequestVerifier;
+use crate::reconcile::requests::RequestHandler;
 use crate::reconcile::robot::Robot;
 use crate::system::clock;
 use crate::system::identity::Identity;
 use crate::system::layout::DataDir as Layout;
 use crate::system::place;
-use crate::task::ledger::{Found, Ledger};
+use crate::task::ledger::{Ledger, LedgerFile};
 use crate::telemetry::outputs::Registry;
-use crate::telemetry::vitals::{self, Gauge, Places};
+use crate::telemetry::vitals::{self, VitalsPaths, VitalsReader};
 use crate::transfer::credential::Credential;
 use crate::transfer::server::{self, Server};
 
 /// Maximum number of link messages that the driver has not taken yet.
 const QUEUED_MESSAGES: usize = 16;
 /// Maximum number of unanswered questions.
-const QUEUED_QUESTIONS: usize = 32;
+const QUEUED_REQUESTS: usize = 32;
 /// Maximum time for the remaining work after a signal.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// Arguments of `run`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     #[command(flatten)]
@@ -78,14 +79,14 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let place = Some(place::of(&lock).context("cannot look at the lock file")?);
     let (ledger, lost) = open_ledger(&data)?;
     if let Err(error) = data.clean_leftovers() {
-        tracing::warn!(%error, "cannot remove all that an earlier agent left half done");
+        tracing::warn!(%error, "cannot remove leftovers of an earlier agent");
     }
     let base = server_of(&config, &identity)?;
     let tls = tls(identity.ca_pin, identity.client_key.as_ref())?;
     let client = server::client(tls.clone()).context("cannot make an HTTP client")?;
     let credential = Credential::from(identity.token.clone());
     let shutdown = CancellationToken::new();
-    let shared = Shared::new(shutdown.clone());
+    let link_state = LinkState::new(shutdown.clone());
     let fetcher = Fetcher::new(
         client.clone(),
         base.clone(),
@@ -94,7 +95,8 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         FetchSettings::default(),
     );
     fetcher.limit(&config.limits);
-    let fetcher = (fetcher.measured_by(shared.meter.clone()), shared.listening.clone());
+    let fetcher =
+        (fetcher.with_meter(link_state.meter.clone()), link_state.part_subscriptions.clone());
     let registry = Registry::new(client.clone(), base.clone(), credential.clone());
     let robot = Arc::new(Robot::new(
         data.clone(),
@@ -105,17 +107,12 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         identity.mac,
     ));
     let instance = InstanceId::random();
-    let orders =
-        Orders::new(identity.robot_id.clone(), instance.clone(), identity.server_key.clone());
-    let speaker = Speaker {
-        robot_id: identity.robot_id.clone(),
-        server_key: identity.server_key.clone(),
-        instance: instance.clone(),
-        place,
-        boot_id: clock::boot_id().context("cannot read the kernel's boot id")?,
-        name: config.name.clone(),
-        labels: config.labels.clone(),
-    };
+    let verifier = RequestVerifier::new(
+        identity.robot_id.clone(),
+        instance.clone(),
+        identity.server_key.clone(),
+    );
+    let agent_identity = agent_identity(&identity, &config, instance.clone(), place)?;
     let status = Status {
         online: true,
         start: ledger.start + 1,
@@ -123,15 +120,20 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         connection: 0,
         place,
     };
-    let driver = Driver::new(robot.clone(), speaker, shared.clone(), ledger, lost).await;
+    let driver = Driver::new(robot.clone(), agent_identity, link_state.clone(), ledger, lost).await;
     tracing::info!(robot = %identity.robot_id, server = %base, "task-agent runs");
 
-    let (heard, messages) = mpsc::channel(QUEUED_MESSAGES);
+    let (server_messages, messages) = mpsc::channel(QUEUED_MESSAGES);
     let server = Server::new(client, base.clone(), identity.robot_id.clone(), credential.clone());
-    let server = server.speaking_as(&instance, place);
+    let server = server.with_instance(&instance, place);
     let intervals =
-        Intervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
-    tokio::spawn(state::over_http(server.clone(), shared.clone(), intervals, heard.clone()));
+        PollIntervals { slow: config.poll_interval, fast: config.poll_interval_without_mqtt };
+    tokio::spawn(state::run_http(
+        server.clone(),
+        link_state.clone(),
+        intervals,
+        server_messages.clone(),
+    ));
     let rotation = Rotation {
         server: server.clone(),
         credential: credential.clone(),
@@ -139,44 +141,80 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
         path: data.identity(),
         lifetime: config.token_lifetime,
     };
-    tokio::spawn(rotation.run(shared.clone(), clock::wall_ms));
-    let telemetry = vitals::Sender {
-        robot_id: identity.robot_id.clone(),
-        interval: config.vitals_interval,
-        source: Gauge::new(Places::of_this_machine(data.root())),
-        server: server.clone(),
-    };
+    tokio::spawn(rotation.run(link_state.clone(), clock::wall_ms));
     let (said, messages_out) = mpsc::channel(QUEUED_MESSAGES);
-    tokio::spawn(telemetry.run(shared.clone(), said.clone()));
+    let vitals = vitals_sender(&identity, &config, &data, server.clone());
+    tokio::spawn(vitals.run(link_state.clone(), said.clone()));
     if config.mqtt {
-        let host = base.host_str().map(str::to_owned).unwrap_or_default();
-        let (port, prefix) = (identity.mqtt.port, identity.mqtt.prefix.clone());
-        shared.endpoint.send_replace(Some(identity.mqtt));
-        tokio::spawn(endpoint::follow(server, shared.clone(), config.poll_interval));
-        let (robot_id, message_bytes) = (identity.robot_id, mqtt::MESSAGE_BYTES);
-        let ways = Ways::new(&base, Arc::new(tls), config.mqtt_transport);
-        let access = MqttAccess {
-            host,
-            port,
-            prefix,
-            robot: robot_id,
-            token: credential,
-            status,
-            message_bytes,
-            ways,
-        };
-        let talk = (said, messages_out);
-        converse(access, shared, heard, data, robot, orders, talk);
+        let routes = Routes::new(&base, Arc::new(tls), config.mqtt_transport);
+        let access = mqtt_access(&identity, &base, credential, status, routes);
+        link_state.endpoint.send_replace(Some(identity.mqtt));
+        tokio::spawn(endpoint::follow(server, link_state.clone(), config.poll_interval));
+        let channels = (said, messages_out);
+        start_mqtt(access, link_state, server_messages, data, robot, verifier, channels);
     } else {
         // Nothing may wait for a session, or for parts.
-        shared.mqtt_tried.send_replace(true);
-        shared.listening.session(false);
+        link_state.mqtt.send_replace(MqttState::Down);
+        link_state.part_subscriptions.set_session_up(false);
     }
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;
     stop.abort();
     tracing::info!("task-agent ends; its tasks go on running");
     Ok(())
+}
+
+/// Sends the figures of this machine.
+fn vitals_sender(
+    identity: &Identity,
+    config: &Config,
+    data: &Layout,
+    server: Server,
+) -> vitals::Sender<VitalsReader> {
+    vitals::Sender {
+        robot_id: identity.robot_id.clone(),
+        interval: config.vitals_interval,
+        source: VitalsReader::new(VitalsPaths::of_this_machine(data.root())),
+        server,
+    }
+}
+
+/// The identity that reports carry.
+fn agent_identity(
+    identity: &Identity,
+    config: &Config,
+    instance: InstanceId,
+    place: Option<Digest>,
+) -> anyhow::Result<AgentIdentity> {
+    Ok(AgentIdentity {
+        robot_id: identity.robot_id.clone(),
+        server_key: identity.server_key.clone(),
+        instance,
+        place,
+        boot_id: clock::boot_id().context("cannot read the kernel's boot id")?,
+        name: config.name.clone(),
+        labels: config.labels.clone(),
+    })
+}
+
+/// The MQTT access from the enrollment, until the server names another endpoint.
+fn mqtt_access(
+    identity: &Identity,
+    base: &reqwest::Url,
+    token: Credential,
+    status: Status,
+    routes: Routes,
+) -> MqttAccess {
+    MqttAccess {
+        host: base.host_str().map(str::to_owned).unwrap_or_default(),
+        port: identity.mqtt.port,
+        prefix: identity.mqtt.prefix.clone(),
+        robot: identity.robot_id.clone(),
+        token,
+        status,
+        message_bytes: mqtt::MESSAGE_BYTES,
+        routes,
+    }
 }
 
 /// The server's URL: from the settings, else from the enrollment.
@@ -187,34 +225,39 @@ fn server_of(config: &Config, identity: &Identity) -> anyhow::Result<reqwest::Ur
 }
 
 /// Keeps a session up, answers its requests and publishes the messages of tasks.
-fn converse(
+fn start_mqtt(
     access: MqttAccess,
-    shared: Shared,
-    heard: mpsc::Sender<Heard>,
+    link_state: LinkState,
+    server_messages: mpsc::Sender<ServerMessage>,
     data: Layout,
     robot: Arc<Robot>,
-    orders: Orders,
+    verifier: RequestVerifier,
     (messages, said): (mpsc::Sender<Message>, mpsc::Receiver<Message>),
 ) {
     let robot_id = access.robot.clone();
-    let vitals = vitals::Asked::new(Places::of_this_machine(data.root()));
+    let vitals = vitals::OnDemandVitals::new(VitalsPaths::of_this_machine(data.root()));
     let logs = Logs::new(data.clone());
     let forwarder = Forwarder::new(robot_id.clone(), data, robot.forward(), logs.following());
-    let (requests, asked) = mpsc::channel(QUEUED_QUESTIONS);
+    let (requests, questions) = mpsc::channel(QUEUED_REQUESTS);
     let (batches, lines) = mpsc::channel(1);
     tokio::spawn(
-        Answers { robot_id, orders, logs, graph: GraphAnswers { robot }, vitals }
-            .run(asked, messages),
+        RequestHandler { robot_id, verifier, logs, graph: GraphRequests { robot }, vitals }
+            .run(questions, messages),
     );
-    tokio::spawn(forwarder.run(shared.mqtt_up.subscribe(), batches));
-    tokio::spawn(mqtt::run(access, shared, heard, Talk { requests, messages: said, lines }));
+    tokio::spawn(forwarder.run(link_state.mqtt.subscribe(), MqttState::is_up, batches));
+    tokio::spawn(mqtt::run(
+        access,
+        link_state,
+        server_messages,
+        MqttChannels { requests, messages: said, lines },
+    ));
 }
 
 fn start_logging() {
     let filter = tracing_subscriber::EnvFilter::try_from_env("TASK_AGENT_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info,rumqttc=warn,rustdds=error"));
     let colours = std::io::stderr().is_terminal();
-    let writer = move || OneLineEach::new(std::io::stderr(), colours);
+    let writer = move || SingleLineWriter::new(std::io::stderr(), colours);
     tracing_subscriber::fmt().with_env_filter(filter).with_ansi(colours).with_writer(writer).init();
 }
 
@@ -245,15 +288,16 @@ fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
     // count of starts.
     let rebuilt = || Ledger::new(clock::wall_ms().max(clock::PROGRAM_EXISTS_SINCE_MS) / 1000);
     Ok(match Ledger::read(&data.ledger())? {
-        Found::Ledger(ledger) => (*ledger, None),
-        Found::Nothing if data.task_names()?.is_empty() => (Ledger::new(0), None),
-        Found::Nothing => (
+        LedgerFile::Valid(ledger) => (*ledger, None),
+        LedgerFile::Missing if data.task_names()?.is_empty() => (Ledger::new(0), None),
+        LedgerFile::Missing => (
             rebuilt(),
             Some("the ledger was gone: it was rebuilt from the running processes".to_owned()),
         ),
-        Found::Unreadable(aside) => {
+        LedgerFile::Unreadable(aside) => {
             let text = format!(
-                "the ledger could not be read and was moved to {}: it was rebuilt from the running processes",
+                "the ledger could not be read and was moved to {}: \
+                 it was rebuilt from the running processes",
                 aside.display()
             );
             (rebuilt(), Some(text))
@@ -263,7 +307,8 @@ fn open_ledger(data: &Layout) -> anyhow::Result<(Ledger, Option<String>)> {
 
 async fn cancel_on_signal(shutdown: CancellationToken) {
     use tokio::signal::unix::{SignalKind, signal};
-    let (interrupt, terminate) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate()));
+    let interrupt = signal(SignalKind::interrupt());
+    let terminate = signal(SignalKind::terminate());
     match (interrupt, terminate) {
         (Ok(mut interrupt), Ok(mut terminate)) => {
             tokio::select! {
@@ -289,7 +334,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_lock_is_for_nobody_else_whatever_an_earlier_agent_made() {
+    fn lock_file_is_private_even_if_an_earlier_agent_made_it() {
         let dir = tempfile::tempdir().expect("a directory");
         let data = Layout::new(dir.path()).expect("a data directory");
         let path = data.root().join("lock");

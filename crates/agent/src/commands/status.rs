@@ -10,8 +10,8 @@ use crate::system::identity::Identity;
 use crate::system::layout::DataDir as Layout;
 use crate::system::layout::HOLD_FILE;
 use crate::task::ledger::{Ledger, TaskRecord};
+use crate::task::run::ActiveRun;
 
-/// Arguments of `status`.
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
     /// How to print the result
@@ -49,11 +49,9 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
             ));
             say(format_args!("agent    {}", if agent { "runs" } else { "does not run" }));
             if held {
-                say(format_args!(
-                    "held     nothing is started or switched until task-agent release"
-                ));
+                say(format_args!("held     no starts or switches until task-agent release"));
             }
-            if let Some(text) = ledger.removal() {
+            if let Some(text) = ledger.removal_message() {
                 say(format_args!("removed  {}", text));
             }
             say(format_args!(
@@ -69,11 +67,11 @@ pub fn run(arguments: Arguments) -> anyhow::Result<ExitCode> {
 }
 
 fn pid(record: &TaskRecord) -> Option<u32> {
-    record.active.as_ref()?.process.as_ref()?.pid
+    record.active.as_ref()?.process()?.pid
 }
 
 fn task_row(record: &TaskRecord) -> String {
-    let (phase, failure) = record.standing();
+    let (phase, failure) = record.order_phase();
     let pid = pid(record).map_or_else(|| "-".to_owned(), |pid| pid.to_string());
     let failure = failure.map(ToString::to_string).unwrap_or_default();
     let order = &record.order;
@@ -87,7 +85,7 @@ fn task_row(record: &TaskRecord) -> String {
 }
 
 fn task_json(record: &TaskRecord) -> serde_json::Value {
-    let (phase, failure) = record.standing();
+    let (phase, failure) = record.order_phase();
     json!({
         "task": record.order.task,
         "version": record.order.package.version,
@@ -96,7 +94,7 @@ fn task_json(record: &TaskRecord) -> serde_json::Value {
         "run": record.order.run,
         "phase": phase,
         "failure": failure,
-        "restarts": record.active.as_ref().map_or(0, |active| active.restarts),
+        "restarts": record.active.as_ref().map_or(0, ActiveRun::restarts),
         "active_version": record.active.as_ref().map(|active| &active.package.version),
         "pid": pid(record),
     })

@@ -9,13 +9,13 @@
 use std::path::{Path, PathBuf};
 
 use task_proto::AbsolutePath;
-use task_proto::log::LogLevel;
-use task_proto::settings::{EffectiveSettings, RobotSettings};
+use task_proto::desired::settings::{EffectiveSettings, RobotSettings};
+use task_proto::telemetry::log::LogLevel;
 
 use crate::config::{Config, count};
 
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settled {
+pub struct MergedSettings {
     /// The robot's settings with the values taken from the server.
     pub config: Config,
     /// The same settings for the report; `None`: all have their defaults.
@@ -28,7 +28,7 @@ const SHELL_KEYS: [&str; 2] = ["underlays", "workspace"];
 /// Combines the robot's `own` settings with the values `set` at the server. The server has checked
 /// its values, and they are checked again here, each separately: a server's mistake must not keep
 /// the robot from its tasks, nor from the other settings.
-pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
+pub fn merge_settings(own: &Config, set: &RobotSettings) -> MergedSettings {
     let mut config = own.clone();
     let mut mine = Vec::new();
     let (set, mut refused) = set.clone().usable();
@@ -75,7 +75,7 @@ pub fn settle(own: &Config, set: &RobotSettings) -> Settled {
     };
     let effective = EffectiveSettings { values, own: mine, refused };
     let effective = Some(effective).filter(|effective| *effective != EffectiveSettings::default());
-    Settled { config, effective }
+    MergedSettings { config, effective }
 }
 
 /// The path in its wire form, where it has one: a user at the robot may have named a path that the
@@ -105,17 +105,17 @@ mod tests {
     }
 
     #[test]
-    fn what_the_robot_does_not_say_is_the_servers() {
+    fn unset_settings_come_from_the_server() {
         let own = own("", &[]);
         assert_eq!(
-            settle(&own, &RobotSettings::default()),
-            Settled { config: own.clone(), effective: None }
+            merge_settings(&own, &RobotSettings::default()),
+            MergedSettings { config: own.clone(), effective: None }
         );
         let set = set(json!({
             "underlays": ["/opt/ros/jazzy/setup.bash"], "workspace": "/home/robot/ws", "ros_domain_id": 7,
             "forward_level": "error", "limits": { "task_pids": 64, "parallel_tasks": 5 }
         }));
-        let Settled { config, effective } = settle(&own, &set);
+        let MergedSettings { config, effective } = merge_settings(&own, &set);
         assert_eq!(config.underlays, [PathBuf::from("/opt/ros/jazzy/setup.bash")]);
         assert_eq!(config.workspace, Some(PathBuf::from("/home/robot/ws")));
         assert_eq!((config.ros_domain_id, config.forward.level), (Some(7), LogLevel::Error));
@@ -134,7 +134,7 @@ mod tests {
             "underlays": ["/theirs/setup.bash"], "ros_domain_id": 7, "forward_level": "fatal",
             "limits": { "log_bytes": 5000, "task_pids": 64 }
         }));
-        let Settled { config, effective } = settle(&own, &set);
+        let MergedSettings { config, effective } = merge_settings(&own, &set);
         assert_eq!(config.underlays, [PathBuf::from("/own/setup.bash")]);
         assert_eq!((config.ros_domain_id, config.forward.level), (Some(3), LogLevel::Info));
         assert_eq!((config.limits.log_bytes, config.task_pids), (Some(9000), 64));
@@ -151,19 +151,19 @@ mod tests {
 
     #[test]
     fn a_robot_that_trusts_publishers_takes_no_setup_file_from_its_server() {
-        let key = task_proto::envelope::SigningKey::from_bytes([7; 32]).public_key();
+        let key = task_proto::trust::envelope::SigningKey::from_bytes([7; 32]).public_key();
         let trusting = format!("[trusted_publishers]\nkeys = [\"{key}\"]\n");
         let set = set(
             json!({ "underlays": ["/tmp/evil.sh"], "workspace": "/tmp/evil", "ros_domain_id": 7 }),
         );
-        let Settled { config, effective } = settle(&own(&trusting, &[]), &set);
+        let MergedSettings { config, effective } = merge_settings(&own(&trusting, &[]), &set);
         assert_eq!(
             (config.underlays.len(), config.workspace, config.ros_domain_id),
             (0, None, Some(7))
         );
         assert_eq!(effective.expect("reported").refused, ["underlays", "workspace"]);
         let allows = format!("server_underlays = true\n{trusting}");
-        let Settled { config, effective } = settle(&own(&allows, &[]), &set);
+        let MergedSettings { config, effective } = merge_settings(&own(&allows, &[]), &set);
         assert_eq!(
             (config.underlays.len(), config.workspace),
             (1, Some(PathBuf::from("/tmp/evil")))
@@ -172,12 +172,12 @@ mod tests {
     }
 
     #[test]
-    fn what_can_not_be_is_not_taken() {
+    fn invalid_server_settings_are_refused() {
         let own = own("", &[]);
         let set =
             set(json!({ "ros_domain_id": 7, "limits": { "parallel_tasks": 0, "task_pids": 64 } }));
         let set = RobotSettings { unreadable: vec!["forward_level".to_owned()], ..set };
-        let Settled { config, effective } = settle(&own, &set);
+        let MergedSettings { config, effective } = merge_settings(&own, &set);
         assert_eq!(
             (config.ros_domain_id, config.task_pids, config.parallel_tasks),
             (Some(7), 64, own.parallel_tasks)

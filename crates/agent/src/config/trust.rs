@@ -9,12 +9,12 @@ use std::sync::{PoisonError, RwLock, RwLockReadGuard};
 use serde::{Deserialize, Serialize};
 use task_proto::Digest;
 use task_proto::desired::PackageRef;
-use task_proto::envelope::Envelope;
-use task_proto::publisher::{
-    MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, MAX_SIGNATURES, PublisherList, Refused, Role, Unsigned,
-    vouching,
+use task_proto::messages::report::{Failure, FailureCode};
+use task_proto::packages::publisher::{
+    MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, MAX_SIGNATURES, MissingSignatures, PublisherError,
+    PublisherList, Role, check_threshold,
 };
-use task_proto::report::{Failure, FailureCode};
+use task_proto::trust::envelope::Envelope;
 
 use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
 use crate::system::durable;
@@ -33,25 +33,25 @@ pub struct TrustSettings {
 
 /// The intended use of a package.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Use {
+pub enum PackageUse {
     /// The package is new on this robot.
-    Begin,
+    New,
     /// The package has run on this robot and is started again.
-    GoOn,
+    Restart,
 }
 
 /// Reasons why a package is not run.
 #[derive(Debug, thiserror::Error)]
-pub enum Distrust {
+pub enum TrustError {
     /// Too few publishers have signed the package.
     #[error(transparent)]
-    Unsigned(#[from] Unsigned),
+    Unsigned(#[from] MissingSignatures),
     /// The publishers have withdrawn the package.
     #[error("version {0} of the list of publishers withdraws it")]
     Withdrawn(u64),
     /// An attacker may be withholding a newer list from the robot.
     #[error(
-        "version {version} of the list of publishers, the newest this robot was shown, has expired"
+        "version {version} of the list of publishers, the newest that this robot has, has expired"
     )]
     Expired {
         /// Version of the list.
@@ -59,19 +59,17 @@ pub enum Distrust {
     },
     /// The list that applied is no longer known. A fallback to the settings could be a rollback to
     /// older keys.
-    #[error("the list of publishers in {path} can't be read: only a person can remove it")]
+    #[error("cannot read the list of publishers in {path}: an operator must remove it")]
     Unreadable {
         /// Path of the stored list.
         path: PathBuf,
     },
     /// The settings require a list and there is none.
-    #[error(
-        "trusted_publishers.require_list is set, and this robot was shown no list of publishers"
-    )]
+    #[error("trusted_publishers.require_list is set, and this robot has no list of publishers")]
     NoList,
 }
 
-impl Distrust {
+impl TrustError {
     /// The error as a failure of the order for `package`.
     pub fn failure(&self, package: &PackageRef) -> Failure {
         let code = if self.may_pass() {
@@ -90,12 +88,12 @@ impl Distrust {
 
 /// Reasons why a list was not accepted.
 #[derive(Debug, thiserror::Error)]
-pub enum NotTaken {
+pub enum ListError {
     /// The list is no valid successor of the current one.
     #[error(transparent)]
-    Refused(#[from] Refused),
+    Refused(#[from] PublisherError),
     /// The list could not be stored, and a list that is lost at the next start must not apply now.
-    #[error("the list can't be kept")]
+    #[error("cannot store the list")]
     Disk(#[source] io::Error),
 }
 
@@ -105,11 +103,11 @@ pub struct Trust {
     path: PathBuf,
     /// Whether the list at `path` exists and can't be read.
     is_unreadable: bool,
-    list: RwLock<Option<Counting>>,
+    list: RwLock<Option<CurrentList>>,
 }
 
 /// The list that applies.
-struct Counting {
+struct CurrentList {
     list: PublisherList,
     /// Digest of the bytes in which the list arrived.
     digest: Digest,
@@ -117,7 +115,7 @@ struct Counting {
 
 /// Content of the stored file.
 #[derive(Serialize, Deserialize)]
-struct Kept {
+struct StoredList {
     /// The list with its signatures.
     envelope: Envelope,
     /// Digest by which the list was fetched.
@@ -130,12 +128,12 @@ impl Trust {
     /// The trust given by `settings`, and by the list at `path` if one is stored there.
     pub fn open(settings: TrustSettings, path: PathBuf) -> Self {
         let list = match untrusted_file::read(&path, 2 * MAX_LIST_BYTES) {
-            Ok(bytes) => Kept::read(&bytes).and_then(|kept| kept.list(&settings)),
+            Ok(bytes) => StoredList::read(&bytes).and_then(|kept| kept.list(&settings)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
             Err(error) => Err(error),
         };
         if let Err(error) = &list {
-            tracing::error!(path = %path.display(), %error, "the list of publishers can't be read: nothing is run");
+            tracing::error!(path = %path.display(), %error, "cannot read the list of publishers: no task is started");
         }
         Self {
             settings,
@@ -147,93 +145,94 @@ impl Trust {
 
     /// The version of the list that applies; 0: the settings apply.
     pub fn version(&self) -> u64 {
-        self.list().as_ref().map_or(0, |counting| counting.list.version)
+        self.list().as_ref().map_or(0, |current| current.list.version)
     }
 
     /// The digest of the list that applies.
-    pub fn counting(&self) -> Option<Digest> {
-        self.list().as_ref().map(|counting| counting.digest)
+    pub fn list_digest(&self) -> Option<Digest> {
+        self.list().as_ref().map(|current| current.digest)
     }
 
     /// Accepts a list, which arrived in bytes with this digest, if it may follow the current one.
-    pub fn take(&self, envelope: &Envelope, digest: Digest) -> Result<(), NotTaken> {
+    pub fn accept_list(&self, envelope: &Envelope, digest: Digest) -> Result<(), ListError> {
         if self.is_unreadable {
-            return Err(NotTaken::Disk(io::Error::other("there is one that can't be read")));
+            return Err(ListError::Disk(io::Error::other("the stored list can't be read")));
         }
         // The lock is held during the write to the disk: lists are accepted one after another.
         let mut current = self.list.write().unwrap_or_else(PoisonError::into_inner);
         let (keepers, version) =
-            current.as_ref().map_or((&self.settings.keepers, 0), |Counting { list, .. }| {
+            current.as_ref().map_or((&self.settings.keepers, 0), |CurrentList { list, .. }| {
                 (&list.keepers, list.version)
             });
-        let list = PublisherList::follow(envelope, keepers, version)?;
-        let kept = Kept { envelope: envelope.clone(), digest, settings: self.settings.clone() };
-        let bytes = serde_json::to_vec(&kept).map_err(|error| NotTaken::Disk(error.into()))?;
-        durable::write(&self.path, &bytes, 0o600).map_err(NotTaken::Disk)?;
-        *current = Some(Counting { list, digest });
+        let list = PublisherList::verify_successor(envelope, keepers, version)?;
+        let kept =
+            StoredList { envelope: envelope.clone(), digest, settings: self.settings.clone() };
+        let bytes = serde_json::to_vec(&kept).map_err(|error| ListError::Disk(error.into()))?;
+        durable::write(&self.path, &bytes, 0o600).map_err(ListError::Disk)?;
+        *current = Some(CurrentList { list, digest });
         Ok(())
     }
 
     /// The envelopes of `envelopes` that allow this use of `package`; or the reason why the use is
     /// refused.
-    pub fn judge<'a>(
+    pub fn check_package<'a>(
         &self,
         package: &PackageRef,
         envelopes: &'a [Envelope],
-        purpose: Use,
+        purpose: PackageUse,
         wall_ms: u64,
-    ) -> Result<Vec<&'a Envelope>, Distrust> {
+    ) -> Result<Vec<&'a Envelope>, TrustError> {
         if self.is_unreadable {
-            return Err(Distrust::Unreadable { path: self.path.clone() });
+            return Err(TrustError::Unreadable { path: self.path.clone() });
         }
         let list = self.list();
-        let Some(Counting { list, .. }) = &*list else {
+        let Some(CurrentList { list, .. }) = &*list else {
             if self.settings.requires_list {
-                return Err(Distrust::NoList);
+                return Err(TrustError::NoList);
             }
-            return Ok(vouching(&self.settings.publishers, package, envelopes)?);
+            return Ok(check_threshold(&self.settings.publishers, package, envelopes)?);
         };
         if list.withdrawn.contains(&package.manifest.digest) {
-            return Err(Distrust::Withdrawn(list.version));
+            return Err(TrustError::Withdrawn(list.version));
         }
-        let counted = vouching(&list.publishers, package, envelopes)?;
-        if purpose == Use::Begin && is_over(list, wall_ms) {
-            return Err(Distrust::Expired { version: list.version });
+        let counted = check_threshold(&list.publishers, package, envelopes)?;
+        if purpose == PackageUse::New && is_list_expired(list, wall_ms) {
+            return Err(TrustError::Expired { version: list.version });
         }
         Ok(counted)
     }
 
     /// Whether the list that applies has expired.
-    pub fn is_over(&self, wall_ms: u64) -> bool {
-        self.list().as_ref().is_some_and(|Counting { list, .. }| is_over(list, wall_ms))
+    pub fn is_list_expired(&self, wall_ms: u64) -> bool {
+        self.list().as_ref().is_some_and(|CurrentList { list, .. }| is_list_expired(list, wall_ms))
     }
 
-    fn list(&self) -> RwLockReadGuard<'_, Option<Counting>> {
+    fn list(&self) -> RwLockReadGuard<'_, Option<CurrentList>> {
         // A list is always replaced as a whole.
         self.list.read().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Kept {
+impl StoredList {
     fn read(bytes: &[u8]) -> io::Result<Self> {
         Ok(serde_json::from_slice(bytes)?)
     }
 
     /// The list, if it applies under `settings`. The settings have the last word: after a change of
     /// the settings the list applies only if the keepers in the new settings have signed it.
-    fn list(&self, settings: &TrustSettings) -> io::Result<Option<Counting>> {
+    fn list(&self, settings: &TrustSettings) -> io::Result<Option<CurrentList>> {
         let list = if self.settings.keepers == settings.keepers {
             Some(PublisherList::unverified(&self.envelope).map_err(io::Error::other)?)
         } else {
-            PublisherList::follow(&self.envelope, &settings.keepers, 0).ok()
+            PublisherList::verify_successor(&self.envelope, &settings.keepers, 0).ok()
         };
-        Ok(list.map(|list| Counting { list, digest: self.digest }))
+        Ok(list.map(|list| CurrentList { list, digest: self.digest }))
     }
 }
 
 /// As with desired states: a clock that shows a time before this program existed is wrong and must
 /// not lock the robot out.
-fn is_over(list: &PublisherList, wall_ms: u64) -> bool {
+fn is_list_expired(list: &PublisherList, wall_ms: u64) -> bool {
     wall_ms >= PROGRAM_EXISTS_SINCE_MS && list.is_expired(wall_ms)
 }
 
@@ -257,8 +256,8 @@ mod tests {
     use std::fs;
 
     use task_proto::desired::BlobRef;
-    use task_proto::envelope::SigningKey;
-    use task_proto::publisher::{LIST_TYPE, PackageStatement};
+    use task_proto::packages::publisher::{LIST_TYPE, PackageStatement};
+    use task_proto::trust::envelope::SigningKey;
 
     use super::*;
 
@@ -320,37 +319,43 @@ mod tests {
             Trust::open(settings, dir.path().join("publishers.json"))
         }
 
-        fn take(&self, envelope: &Envelope) -> Result<(), NotTaken> {
-            self.trust.take(envelope, Digest::of(&serde_json::to_vec(envelope).expect("json")))
+        fn take(&self, envelope: &Envelope) -> Result<(), ListError> {
+            self.trust
+                .accept_list(envelope, Digest::of(&serde_json::to_vec(envelope).expect("json")))
         }
 
         fn restart(&mut self) {
             self.trust = Self::open(&self.dir, 1, 2, false);
         }
 
-        fn judge(&self, seed: u8, purpose: Use, wall_ms: u64) -> Result<usize, String> {
+        fn check_package(
+            &self,
+            seed: u8,
+            purpose: PackageUse,
+            wall_ms: u64,
+        ) -> Result<usize, String> {
             let talker = package("talker");
             let envelopes = signed(seed, &talker);
-            let judged = self.trust.judge(&talker, &envelopes, purpose, wall_ms);
+            let judged = self.trust.check_package(&talker, &envelopes, purpose, wall_ms);
             judged
                 .map(|counted| counted.len())
-                .map_err(|distrust| distrust.failure(&talker).code.as_str().to_owned())
+                .map_err(|trust_error| trust_error.failure(&talker).code.as_str().to_owned())
         }
 
         fn trusts(&self, seed: u8) -> bool {
-            self.judge(seed, Use::Begin, NOW_MS).is_ok()
+            self.check_package(seed, PackageUse::New, NOW_MS).is_ok()
         }
     }
 
     #[test]
-    fn keys_are_rotated_and_revoked_by_a_list_and_stay_so_after_a_restart() {
+    fn publisher_list_rotates_and_revokes_keys_across_restarts() {
         let mut robot = Robot::new();
         assert!(robot.trusts(1) && !robot.trusts(3));
         robot.take(&list(1, 3, 2).seal(&key(2))).expect("follows");
         for _ in 0..2 {
             assert!(!robot.trusts(1) && robot.trusts(3));
             assert_eq!(
-                robot.judge(1, Use::GoOn, NOW_MS),
+                robot.check_package(1, PackageUse::Restart, NOW_MS),
                 Err("untrusted_package".to_owned()),
                 "nor started again"
             );
@@ -358,18 +363,18 @@ mod tests {
             robot.restart();
         }
         // Neither the publisher's key nor a former keeper's key may sign a list.
-        assert!(matches!(robot.take(&list(2, 9, 9).seal(&key(3))), Err(NotTaken::Refused(_))));
+        assert!(matches!(robot.take(&list(2, 9, 9).seal(&key(3))), Err(ListError::Refused(_))));
         let mut handed_on = list(2, 4, 5).seal(&key(2));
-        handed_on.sign_also(LIST_TYPE, &key(5)).expect("signed");
+        handed_on.add_signature(LIST_TYPE, &key(5)).expect("signed");
         robot.take(&handed_on).expect("follows");
         robot.restart();
-        assert!(matches!(robot.take(&list(3, 1, 2).seal(&key(2))), Err(NotTaken::Refused(_))));
+        assert!(matches!(robot.take(&list(3, 1, 2).seal(&key(2))), Err(ListError::Refused(_))));
         robot.take(&list(7, 6, 5).seal(&key(5))).expect("versions may be left out");
         assert!(robot.trusts(6) && !robot.trusts(4));
     }
 
     #[test]
-    fn a_rollback_to_an_older_list_is_refused_also_after_a_restart() {
+    fn older_publisher_list_is_refused_across_restarts() {
         let mut robot = Robot::new();
         let (old, new) = (list(1, 1, 2).seal(&key(2)), list(2, 3, 2).seal(&key(2)));
         robot.take(&old).expect("follows");
@@ -378,9 +383,9 @@ mod tests {
             let refused = robot.take(&old);
             assert!(matches!(
                 refused,
-                Err(NotTaken::Refused(Refused::NotNewer { offered: 1, known: 2 }))
+                Err(ListError::Refused(PublisherError::NotNewer { offered: 1, known: 2 }))
             ));
-            assert!(robot.take(&new).is_err() && robot.trust.counting().is_some());
+            assert!(robot.take(&new).is_err() && robot.trust.list_digest().is_some());
             let forked = list(2, 1, 2).seal(&key(2));
             assert!(robot.take(&forked).is_err(), "another of the same version");
             assert!(!robot.trusts(1));
@@ -389,46 +394,64 @@ mod tests {
     }
 
     #[test]
-    fn a_freeze_ends_with_the_lists_lifetime() {
+    fn expired_publisher_list_blocks_new_packages_only() {
         let robot = Robot::new();
         robot.take(&list(1, 3, 2).seal(&key(2))).expect("follows");
-        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 999), Ok(1));
-        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 1000), Err("publishers_expired".to_owned()));
-        assert_eq!(robot.judge(3, Use::GoOn, NOW_MS + 1000), Ok(1), "what runs goes on");
-        assert_eq!(robot.judge(9, Use::Begin, NOW_MS + 1000), Err("untrusted_package".to_owned()));
+        assert_eq!(robot.check_package(3, PackageUse::New, NOW_MS + 999), Ok(1));
+        assert_eq!(
+            robot.check_package(3, PackageUse::New, NOW_MS + 1000),
+            Err("publishers_expired".to_owned())
+        );
+        assert_eq!(
+            robot.check_package(3, PackageUse::Restart, NOW_MS + 1000),
+            Ok(1),
+            "what runs goes on"
+        );
+        assert_eq!(
+            robot.check_package(9, PackageUse::New, NOW_MS + 1000),
+            Err("untrusted_package".to_owned())
+        );
         // A clock value that can't be right.
-        assert_eq!(robot.judge(3, Use::Begin, 0), Ok(1));
+        assert_eq!(robot.check_package(3, PackageUse::New, 0), Ok(1));
         let renewed = PublisherList { expires_at_ms: NOW_MS + 9000, ..list(2, 3, 2) };
         robot.take(&renewed.seal(&key(2))).expect("follows");
-        assert_eq!(robot.judge(3, Use::Begin, NOW_MS + 1000), Ok(1));
+        assert_eq!(robot.check_package(3, PackageUse::New, NOW_MS + 1000), Ok(1));
     }
 
     #[test]
-    fn without_a_list_that_it_must_have_a_robot_runs_nothing() {
+    fn required_publisher_list_missing_blocks_all_packages() {
         let dir = tempfile::tempdir().expect("a directory");
         let robot = Robot { trust: Robot::open(&dir, 1, 2, true), dir };
-        for purpose in [Use::Begin, Use::GoOn] {
-            assert_eq!(robot.judge(1, purpose, NOW_MS), Err("publishers_expired".to_owned()));
+        for purpose in [PackageUse::New, PackageUse::Restart] {
+            assert_eq!(
+                robot.check_package(1, purpose, NOW_MS),
+                Err("publishers_expired".to_owned())
+            );
         }
         robot.take(&list(1, 1, 2).seal(&key(2))).expect("follows");
         assert!(robot.trusts(1));
     }
 
     #[test]
-    fn a_withdrawn_package_is_not_run_whoever_signed_it() {
+    fn withdrawn_package_is_refused_despite_valid_signatures() {
         let robot = Robot::new();
         let withdrawn = vec![Digest::of(b"talker manifest")];
         let list = PublisherList { withdrawn, ..list(1, 1, 2) };
         robot.take(&list.seal(&key(2))).expect("follows");
-        for purpose in [Use::Begin, Use::GoOn] {
-            assert_eq!(robot.judge(1, purpose, NOW_MS), Err("untrusted_package".to_owned()));
+        for purpose in [PackageUse::New, PackageUse::Restart] {
+            assert_eq!(
+                robot.check_package(1, purpose, NOW_MS),
+                Err("untrusted_package".to_owned())
+            );
         }
         let other = package("other");
-        assert!(robot.trust.judge(&other, &signed(1, &other), Use::Begin, NOW_MS).is_ok());
+        assert!(
+            robot.trust.check_package(&other, &signed(1, &other), PackageUse::New, NOW_MS).is_ok()
+        );
     }
 
     #[test]
-    fn whoever_changes_the_settings_has_the_last_word() {
+    fn changed_keeper_settings_void_the_stored_list() {
         let robot = Robot::new();
         robot.take(&list(5, 3, 2).seal(&key(2))).expect("follows");
         // Other publishers, the same keeper: the list and its version still apply.
@@ -439,11 +462,11 @@ mod tests {
     }
 
     #[test]
-    fn a_list_that_can_not_be_kept_or_read_does_not_count_nor_does_what_was_before() {
+    fn unreadable_publisher_list_blocks_all_packages() {
         let mut robot = Robot::new();
         let path = robot.dir.path().join("publishers.json");
         fs::create_dir(path.with_extension("json.tmp")).expect("in the way");
-        assert!(matches!(robot.take(&list(1, 3, 2).seal(&key(2))), Err(NotTaken::Disk(_))));
+        assert!(matches!(robot.take(&list(1, 3, 2).seal(&key(2))), Err(ListError::Disk(_))));
         assert_eq!((robot.trust.version(), robot.trusts(3)), (0, false));
         fs::write(&path, "{").expect("written");
         robot.restart();
@@ -451,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn signatures_are_kept_beside_their_version() {
+    fn stored_signatures_read_back() {
         let dir = tempfile::tempdir().expect("a directory");
         let path = dir.path().join("tasks/talker/x.signatures");
         assert!(read_signatures(&path).is_empty());

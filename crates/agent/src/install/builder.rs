@@ -9,8 +9,9 @@ use std::io::{self, PipeReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use task_proto::manifest::BuildTool;
-use task_proto::report::FailureCode;
+use task_proto::messages::report::FailureCode;
+use task_proto::packages::manifest::BuildTool;
+use task_proto::size::format_bytes;
 use tokio_util::sync::CancellationToken;
 
 use crate::process::cgroup::{Cgroups, RunLimits};
@@ -37,7 +38,7 @@ const MAX_PACKAGE_XML_BYTES: u64 = 1024 * 1024;
 
 /// A build: tool, place, environment and limits.
 #[derive(Debug, Clone)]
-pub struct BuildOrder {
+pub struct BuildSpec {
     pub tool: BuildTool,
     /// The version's directory, with `src`; `build` and `install` are created there.
     pub version: VersionDir,
@@ -99,10 +100,9 @@ pub enum BuildError {
         output: Output,
     },
     /// The build exceeded its memory limit.
-    #[error("the build used more than the {limit_mb} MiB of memory it may; {output}")]
+    #[error("the build exceeded the memory limit of {}; {output}", format_bytes(*limit_bytes))]
     OutOfMemory {
-        /// The memory limit, in MiB.
-        limit_mb: u64,
+        limit_bytes: u64,
         /// Output of the build.
         output: Output,
     },
@@ -160,73 +160,75 @@ impl std::fmt::Display for Output {
     }
 }
 
-/// Builds `order`; returns at once if the package needs no build. On return, all processes of the
+/// Builds `spec`; returns at once if the package needs no build. On return, all processes of the
 /// build have ended and the installed files are on the disk.
-pub async fn build(order: &BuildOrder, cancel: &CancellationToken) -> Result<(), BuildError> {
-    let Some(text) = script::build_script(order.tool, &order.version, &order.underlays) else {
+pub async fn build(spec: &BuildSpec, cancel: &CancellationToken) -> Result<(), BuildError> {
+    let Some(text) = script::build_script(spec.tool, &spec.version, &spec.underlays) else {
         return Ok(());
     };
-    let root = order.version.root();
-    let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.group(root).path().to_owned());
+    let root = spec.version.root();
+    let cgroup = spec.cgroups.as_ref().map(|cgroups| cgroups.group(root).path().to_owned());
     let guard = KillOnDrop::new(Containment::new(root, None, cgroup));
     // If an agent was killed, its build is still running.
     guard.end(KILL_TIMEOUT).await?;
-    prepare(order, &text)?;
-    let Ran { status, tail, out_of_memory } = run(order, &guard, cancel).await?;
+    prepare(spec, &text)?;
+    let BuildRun { status, tail, out_of_memory } = run(spec, &guard, cancel).await?;
     let output =
-        Output { log: order.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
-    match (status, order.limits.memory_bytes.filter(|_| out_of_memory)) {
+        Output { log: spec.log.clone(), tail: String::from_utf8_lossy(&tail).trim().to_owned() };
+    match (status, spec.limits.memory_bytes.filter(|_| out_of_memory)) {
         (Some(ExitStatus::Code(0)), _) => {}
         (Some(_), Some(limit)) => {
-            return Err(BuildError::OutOfMemory { limit_mb: limit >> 20, output });
+            return Err(BuildError::OutOfMemory { limit_bytes: limit, output });
         }
         (Some(status), None) => return Err(BuildError::Failed { status, output }),
         (None, _) if cancel.is_cancelled() => return Err(BuildError::Cancelled),
-        (None, _) => return Err(BuildError::TimedOut { timeout: order.limits.timeout, output }),
+        (None, _) => return Err(BuildError::TimedOut { timeout: spec.limits.timeout, output }),
     }
-    let version = order.version.clone();
-    let missing = task_user::do_as(order.user.as_ref(), move || missing_package(&version))
+    let version = spec.version.clone();
+    let missing = task_user::do_as(spec.user.as_ref(), move || missing_package(&version))
         .await
         .map_err(failed(root))?;
     if let Some(missing) = missing {
         return Err(BuildError::NotInstalled { missing, output });
     }
-    let (version, user) = (order.version.clone(), order.user.clone());
+    let version = spec.version.clone();
+    let user = spec.user.clone();
     let finishing = tokio::task::spawn_blocking(move || {
         // All accounts may run the built files, and none may change them.
-        let made = user.iter().flat_map(|user| made(&version).map(|tree| (tree, user.uid)));
-        made.into_iter().try_for_each(|(tree, uid)| task_user::take_back(&tree, uid))?;
+        let trees =
+            user.iter().flat_map(|user| build_outputs(&version).map(|tree| (tree, user.uid)));
+        trees.into_iter().try_for_each(|(tree, uid)| task_user::return_to_root(&tree, uid))?;
         durable::sync_file_system(version.root())
     });
     finishing.await.unwrap_or_else(|error| Err(error.into())).map_err(failed(root))
 }
 
 /// Directories that a build writes.
-fn made(version: &VersionDir) -> [PathBuf; 3] {
+fn build_outputs(version: &VersionDir) -> [PathBuf; 3] {
     [version.build(), version.install(), version.root().join("log")]
 }
 
-fn prepare(order: &BuildOrder, script: &str) -> Result<(), BuildError> {
-    let root = order.version.root();
-    for tree in made(&order.version) {
+fn prepare(spec: &BuildSpec, script: &str) -> Result<(), BuildError> {
+    let root = spec.version.root();
+    for tree in build_outputs(&spec.version) {
         durable::remove_dir_all(&tree).map_err(failed(&tree))?;
         // The rest of the version is read-only for the build.
-        order.user.as_ref().map_or(Ok(()), |user| user.make_home(&tree)).map_err(failed(&tree))?;
+        spec.user.as_ref().map_or(Ok(()), |user| user.make_home(&tree)).map_err(failed(&tree))?;
     }
-    if let Some(logs) = order.log.parent() {
+    if let Some(logs) = spec.log.parent() {
         durable::create_dir_all(logs).map_err(failed(logs))?;
     }
-    let path = script_path(order);
+    let path = script_path(spec);
     durable::write(&path, script.as_bytes(), 0o755).map_err(failed(&path))?;
-    order.user.as_ref().map_or(Ok(()), |user| user.admit(root)).map_err(failed(root))
+    spec.user.as_ref().map_or(Ok(()), |user| user.grant_entry(root)).map_err(failed(root))
 }
 
-fn script_path(order: &BuildOrder) -> PathBuf {
-    order.version.root().join("build.sh")
+fn script_path(spec: &BuildSpec) -> PathBuf {
+    spec.version.root().join("build.sh")
 }
 
 /// Result of the build's process.
-struct Ran {
+struct BuildRun {
     /// Exit status, or `None` if we ended the process.
     status: Option<ExitStatus>,
     /// The last bytes of the output.
@@ -235,50 +237,53 @@ struct Ran {
 }
 
 async fn run(
-    order: &BuildOrder,
+    spec: &BuildSpec,
     containment: &Containment,
     cancel: &CancellationToken,
-) -> Result<Ran, BuildError> {
-    let (root, script) = (order.version.root(), script_path(order));
-    let mut environment = order.environment.clone();
+) -> Result<BuildRun, BuildError> {
+    let root = spec.version.root();
+    let script = script_path(spec);
+    let mut environment = spec.environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), root.display().to_string());
-    let log = File::create(&order.log).map_err(failed(&order.log))?;
+    let log = File::create(&spec.log).map_err(failed(&spec.log))?;
     let (reader, writer) = io::pipe().map_err(failed(&script))?;
-    let BuildLimits { memory_bytes, pids, filter_calls, .. } = order.limits;
+    let BuildLimits { memory_bytes, pids, filter_calls, .. } = spec.limits;
     let limits = RunLimits { memory_bytes, cpu_weight: None, pids, filter_calls };
-    let cgroup = order.cgroups.as_ref().map(|cgroups| cgroups.create(root, &limits)).transpose();
+    let cgroup = spec.cgroups.as_ref().map(|cgroups| cgroups.create(root, &limits)).transpose();
     let cgroup = cgroup.map_err(failed(root))?;
-    let confined = Confinement::new(&script, cgroup.as_ref(), &limits, order.user.as_ref())
+    let confined = Confinement::new(&script, cgroup.as_ref(), &limits, spec.user.as_ref())
         .map_err(failed(&script))?;
-    order.user.as_ref().map_or(Ok(()), |user| user.own(&writer)).map_err(failed(&script))?;
+    spec.user.as_ref().map_or(Ok(()), |user| user.chown(&writer)).map_err(failed(&script))?;
     let mut child = program::spawn_build(&script, root, &environment, NICE, confined, writer)
         .map_err(failed(&script))?;
-    let log_bytes = order.limits.log_bytes;
+    let log_bytes = spec.limits.log_bytes;
     let copying = tokio::task::spawn_blocking(move || copy_output(reader, log, log_bytes));
     let status = tokio::select! {
         status = child.wait() => Some(status.map_err(failed(&script))?),
         () = cancel.cancelled() => None,
-        () = tokio::time::sleep(order.limits.timeout) => None,
+        () = tokio::time::sleep(spec.limits.timeout) => None,
     };
-    let (status, out_of_memory) = (status.map(ExitStatus::from), containment.is_out_of_memory());
+    let status = status.map(ExitStatus::from);
+    let out_of_memory = containment.is_out_of_memory();
     // The output ends with the last process that holds the pipe.
     containment.end(KILL_TIMEOUT).await?;
     let Ok(copied) = tokio::time::timeout(DRAIN_TIMEOUT, copying).await else {
         // A process that cleared its environment has escaped and holds the output open.
-        return Ok(Ran {
+        return Ok(BuildRun {
             status,
-            tail: b"a process of the build got away and still writes".to_vec(),
+            tail: b"a process of the build escaped and is still writing".to_vec(),
             out_of_memory,
         });
     };
-    let tail = copied.map_err(|error| failed(&order.log)(error.into()))?;
-    Ok(Ran { status, tail, out_of_memory })
+    let tail = copied.map_err(|error| failed(&spec.log)(error.into()))?;
+    Ok(BuildRun { status, tail, out_of_memory })
 }
 
 /// Copies the first `limit` bytes of `output` into `log`, reads `output` to its end, and returns
 /// the last bytes.
 fn copy_output(mut output: PipeReader, mut log: File, limit: u64) -> Vec<u8> {
-    let (mut room, mut tail) = (limit, VecDeque::with_capacity(TAIL_BYTES));
+    let mut room = limit;
+    let mut tail = VecDeque::with_capacity(TAIL_BYTES);
     let mut buffer = vec![0; 16 * 1024];
     loop {
         let count = match output.read(&mut buffer) {
@@ -307,10 +312,8 @@ fn missing_package(version: &VersionDir) -> Option<String> {
     }
     let holds_package = |entry: fs::DirEntry| entry.path().is_dir();
     let any = fs::read_dir(&installed).is_ok_and(|entries| entries.flatten().any(holds_package));
-    (!any).then(|| {
-        "anything: there is no package.xml in the package, or none the build tool accepts"
-            .to_owned()
-    })
+    (!any)
+        .then(|| "anything: the package has no package.xml that the build tool accepts".to_owned())
 }
 
 /// Reads the name in a `package.xml`. The push already checked the file, so searching for the

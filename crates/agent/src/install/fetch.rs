@@ -10,8 +10,8 @@
 
 mod download;
 mod error;
+mod inline_blobs;
 mod intake;
-mod offered;
 mod part_map;
 mod pushed;
 mod repair;
@@ -28,10 +28,10 @@ use std::time::Duration;
 use bytes::Bytes;
 use http::header::CONNECTION;
 use task_archive::Limits;
+use task_proto::desired::settings::RobotLimits;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::TaskManifest;
-use task_proto::report::Progress;
-use task_proto::settings::RobotLimits;
+use task_proto::messages::report::Progress;
+use task_proto::packages::manifest::TaskManifest;
 use task_proto::{Digest, RepositoryName};
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio::time::Instant;
@@ -40,18 +40,18 @@ use tokio_util::sync::CancellationToken;
 use self::download::Download;
 pub(crate) use self::download::MAX_RETRY_AFTER;
 pub use self::error::FetchError;
+use self::inline_blobs::InlineBlobs;
 use self::intake::Intake;
-use self::offered::Offered;
-use self::pushed::Gathering;
-pub use self::pushed::PartPatience;
+use self::pushed::PartCollector;
+pub use self::pushed::PartTimeouts;
 use crate::system::disk::{self, Need};
 use crate::system::durable;
 use crate::system::layout::DataDir;
 use crate::system::untrusted_file;
 use crate::transfer::credential::Credential;
 use crate::transfer::link_meter::LinkMeter;
-use crate::transfer::parts::Asks;
-use crate::transfer::parts::Listening;
+use crate::transfer::parts::PartRequest;
+use crate::transfer::parts::PartSubscriptions;
 
 /// The largest task manifest that is held in memory.
 const MAX_MANIFEST_BYTES: u64 = 1 << 20;
@@ -69,7 +69,7 @@ const MAX_GIVEN_UP: usize = 64;
 enum Source {
     Download(Box<Download>),
     /// The bytes came with the order.
-    Offered(Bytes),
+    Inline(Bytes),
     /// No bytes are missing.
     Nothing,
 }
@@ -87,7 +87,7 @@ pub struct FetchSettings {
     /// reconnect.
     pub reconnect_wait: Duration,
     /// Timeouts for parts that the server pushes.
-    pub parts: PartPatience,
+    pub parts: PartTimeouts,
 }
 
 impl Default for FetchSettings {
@@ -97,7 +97,7 @@ impl Default for FetchSettings {
             reserve_bytes: 256 << 20,
             stall_timeout: Duration::from_secs(30),
             reconnect_wait: Duration::from_secs(2),
-            parts: PartPatience::default(),
+            parts: PartTimeouts::default(),
         }
     }
 }
@@ -111,9 +111,9 @@ pub struct Fetcher {
     /// The configured settings, before the robot's limits apply.
     given: FetchSettings,
     settings: RwLock<FetchSettings>,
-    turns: Turns,
+    locks: ContentLocks,
     meter: LinkMeter,
-    offered: Offered,
+    inline_blobs: InlineBlobs,
     /// Pushed contents that did not arrive completely. We no longer wait for their parts.
     given_up: Mutex<HashSet<Digest>>,
 }
@@ -147,22 +147,22 @@ impl Fetcher {
             data,
             given: settings,
             settings: RwLock::new(settings),
-            turns: Turns::default(),
+            locks: ContentLocks::default(),
             meter: LinkMeter::default(),
-            offered: Offered::default(),
+            inline_blobs: InlineBlobs::default(),
             given_up: Mutex::default(),
         }
     }
 
     /// Reports the transfers' link measurements to `meter`.
-    pub fn measured_by(self, meter: LinkMeter) -> Self {
+    pub fn with_meter(self, meter: LinkMeter) -> Self {
         Self { meter, ..self }
     }
 
     /// Stores blobs that came with an order. Blobs that do not match their digest are ignored.
-    pub fn offer(&self, blobs: impl IntoIterator<Item = (BlobRef, Bytes)>) {
-        let is_itself = |(blob, bytes): &(BlobRef, Bytes)| Digest::of(bytes) == blob.digest;
-        self.offered.replace(blobs.into_iter().filter(is_itself));
+    pub fn add_inline_blobs(&self, blobs: impl IntoIterator<Item = (BlobRef, Bytes)>) {
+        let matches_digest = |(blob, bytes): &(BlobRef, Bytes)| Digest::of(bytes) == blob.digest;
+        self.inline_blobs.replace(blobs.into_iter().filter(matches_digest));
     }
 
     /// Returns the package's task manifest, from the disk if a complete copy is there. The bytes
@@ -175,7 +175,7 @@ impl Fetcher {
         if let Some(manifest) = stored_manifest(&self.data, package) {
             return Ok(manifest);
         }
-        let bytes = match self.offered.get(&package.config) {
+        let bytes = match self.inline_blobs.get(&package.config) {
             Some(bytes) => bytes.into(),
             None => {
                 let pulled = cancel.run_until_cancelled(self.pull_manifest(package)).await;
@@ -189,9 +189,9 @@ impl Fetcher {
             .and_then(|()| durable::write(&path, &bytes, 0o644));
         kept.map_err(|source| {
             FetchError::disk(&path, source)
-                .for_want_of_room(self.data.root(), Need::of_file(bytes.len() as u64))
+                .or_disk_full(self.data.root(), Need::of_file(bytes.len() as u64))
         })?;
-        self.offered.forget(&package.config.digest);
+        self.inline_blobs.forget(&package.config.digest);
         Ok(manifest)
     }
 
@@ -205,88 +205,91 @@ impl Fetcher {
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<(), FetchError> {
-        let turn = self.turn(package, cancel).await?;
-        self.content_in_turn(package, manifest, progress, cancel, turn).await
+        let lock = self.lock_content(package, cancel).await?;
+        self.locked_content(package, manifest, progress, cancel, lock).await
     }
 
     /// Like [`Self::content`], for a content that the server pushes: collects parts from
-    /// `listening` first, then pulls the missing rest. `asks` carries the missing parts for the
-    /// robot's report.
+    /// `part_subscriptions` first, then pulls the missing rest. `part_requests` carries the missing
+    /// parts for the robot's report.
     pub async fn pushed_content(
         &self,
         package: &PackageRef,
         manifest: &TaskManifest,
-        listening: &Listening,
-        (progress, asks): (&watch::Sender<Progress>, &watch::Sender<Asks>),
+        part_subscriptions: &PartSubscriptions,
+        (progress, part_requests): (&watch::Sender<Progress>, &watch::Sender<PartRequest>),
         cancel: &CancellationToken,
     ) -> Result<(), FetchError> {
-        let turn = self.turn(package, cancel).await?;
+        let lock = self.lock_content(package, cancel).await?;
         let content = package.content;
-        let is_there = self.src(package).is_dir() || self.offered.get(&content).is_some();
+        let is_there = self.src(package).is_dir() || self.inline_blobs.get(&content).is_some();
         if !is_there
             && self.present(package)? < content.size
             && !self.given_up().contains(&content.digest)
         {
-            let gathering = Gathering::open(self, package, progress, asks, turn.clone())?;
+            let collector =
+                PartCollector::open(self, package, progress, part_requests, lock.clone())?;
             let need =
-                Need::of(package, manifest, gathering.bytes(), self.settings().reserve_bytes);
-            let gathered = match self.check_room(need) {
+                Need::of(package, manifest, collector.bytes(), self.settings().reserve_bytes);
+            let collected = match self.check_room(need) {
                 Ok(()) => {
-                    gathering.run(listening.listen(content.digest, content.size), cancel).await
+                    collector
+                        .run(part_subscriptions.subscribe(content.digest, content.size), cancel)
+                        .await
                 }
                 Err(error) => Err(error),
             };
-            match gathered.map_err(|error| error.for_want_of_room(self.data.root(), need)) {
+            match collected.map_err(|error| error.or_disk_full(self.data.root(), need)) {
                 Ok(Ok(())) => {}
                 Ok(Err(why)) => {
-                    tracing::info!(package = %package.name, "what is pushed is pulled: {why}");
+                    tracing::info!(package = %package.name, "pulling content that the server pushes: {why}");
                     self.meter.lost_transfer(Instant::now());
                     self.give_up(content.digest);
                 }
                 Err(error) => {
-                    if error.spoils_gathered() {
+                    if error.discards_content() {
                         self.discard(package)?;
                     }
                     return Err(error);
                 }
             }
         }
-        self.content_in_turn(package, manifest, progress, cancel, turn).await
+        self.locked_content(package, manifest, progress, cancel, lock).await
     }
 
-    async fn content_in_turn(
+    async fn locked_content(
         &self,
         package: &PackageRef,
         manifest: &TaskManifest,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-        turn: Arc<OwnedMutexGuard<()>>,
+        lock: Arc<OwnedMutexGuard<()>>,
     ) -> Result<(), FetchError> {
         let content = package.content;
-        pushed::hand_over(&self.data, content)
+        pushed::convert_to_part(&self.data, content)
             .map_err(|source| FetchError::disk(&self.data.blob_parts(&content.digest), source))?;
-        let result = self.pull_until_verified(package, manifest, progress, cancel, turn).await;
+        let result = self.pull_until_verified(package, manifest, progress, cancel, lock).await;
         match &result {
             Ok(()) => {
-                self.offered.forget(&content.digest);
+                self.inline_blobs.forget(&content.digest);
                 self.given_up().remove(&content.digest);
             }
             // No later attempt uses these bytes, or the disk is full and the ledger needs the
             // space.
-            Err(error) if error.spoils_gathered() => self.discard(package)?,
+            Err(error) if error.discards_content() => self.discard(package)?,
             Err(_) => {}
         }
         result
     }
 
     /// Locks the content: two tasks may share one, and a dropped pull takes a moment to end.
-    async fn turn(
+    async fn lock_content(
         &self,
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> Result<Arc<OwnedMutexGuard<()>>, FetchError> {
-        let turn = cancel.run_until_cancelled(self.turns.take(package.content.digest)).await;
-        turn.map(Arc::new).ok_or(FetchError::Cancelled)
+        let lock = cancel.run_until_cancelled(self.locks.lock(package.content.digest)).await;
+        lock.map(Arc::new).ok_or(FetchError::Cancelled)
     }
 
     async fn pull_manifest(&self, package: &PackageRef) -> Result<Vec<u8>, FetchError> {
@@ -301,7 +304,7 @@ impl Fetcher {
     }
 
     /// Returns a blob of at most `most` bytes in memory, from the order or by a pull.
-    pub async fn small(
+    pub async fn small_blob(
         &self,
         repository: &RepositoryName,
         blob: BlobRef,
@@ -311,7 +314,7 @@ impl Fetcher {
         if blob.size > most {
             return Err(FetchError::TooLarge { digest: blob.digest, size: blob.size, most });
         }
-        if let Some(bytes) = self.offered.get(&blob) {
+        if let Some(bytes) = self.inline_blobs.get(&blob) {
             return Ok(bytes.into());
         }
         let pulled = cancel.run_until_cancelled(self.pull_whole(repository, blob)).await;
@@ -324,7 +327,7 @@ impl Fetcher {
         manifest: &TaskManifest,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-        turn: Arc<OwnedMutexGuard<()>>,
+        lock: Arc<OwnedMutexGuard<()>>,
     ) -> Result<(), FetchError> {
         let src = self.src(package);
         if src.is_dir() {
@@ -338,8 +341,8 @@ impl Fetcher {
         // would wear the disk out.
         let source = if offset == package.content.size {
             Source::Nothing
-        } else if let Some(bytes) = self.offered.get(&package.content) {
-            Source::Offered(bytes.slice(offset as usize..))
+        } else if let Some(bytes) = self.inline_blobs.get(&package.content) {
+            Source::Inline(bytes.slice(offset as usize..))
         } else {
             let answer = cancel.run_until_cancelled(self.download_content(package, offset)).await;
             Source::Download(Box::new(answer.ok_or(FetchError::Cancelled)??))
@@ -348,14 +351,14 @@ impl Fetcher {
         let stop = cancel.child_token();
         let _stop_on_drop = stop.clone().drop_guard();
         let (sender, receiver) = mpsc::channel(QUEUED_CHUNKS);
-        let intake = Intake::new(self, package, offset, receiver, progress.clone(), stop, turn);
+        let intake = Intake::new(self, package, offset, receiver, progress.clone(), stop, lock);
         let facts = manifest.content;
         let unpacking = tokio::task::spawn_blocking(move || intake.run(&facts, &src, need));
         let feeding = async {
             match source {
                 Source::Download(download) => return self.feed(package, *download, sender).await,
                 // Sending fails only if the disk failed, and the blocking half reports that error.
-                Source::Offered(bytes) => drop(sender.send(bytes).await),
+                Source::Inline(bytes) => drop(sender.send(bytes).await),
                 Source::Nothing => {}
             }
             drop(sender);
@@ -381,7 +384,7 @@ impl Fetcher {
         mut download: Download,
         sender: mpsc::Sender<Bytes>,
     ) -> Result<(), FetchError> {
-        let mut cut = match self.pass_on(&mut download, &sender).await {
+        let mut cut = match self.forward(&mut download, &sender).await {
             Err(error) if error.is_cut() => error,
             ended => return ended,
         };
@@ -389,13 +392,13 @@ impl Fetcher {
         let mut reconnects = 0;
         while reconnects < MAX_RECONNECTS {
             reconnects += 1;
-            tracing::info!(package = %package.name, position, %cut, "connecting anew");
+            tracing::info!(package = %package.name, position, %cut, "reconnecting");
             // Random wait: a server restart cuts off the whole fleet at once.
             let longest = self.settings().reconnect_wait * reconnects;
             tokio::time::sleep(longest.mul_f64(rand::random())).await;
             let ended = match self.download_content(package, position).await {
                 Ok(mut download) => {
-                    let ended = self.pass_on(&mut download, &sender).await;
+                    let ended = self.forward(&mut download, &sender).await;
                     // Reset on progress: on a network with constant cuts the pull still advances.
                     if download.position() - position >= PROGRESS_BYTES {
                         reconnects = 0;
@@ -414,14 +417,14 @@ impl Fetcher {
     }
 
     /// Forwards the bytes of one answer and measures the transfer.
-    async fn pass_on(
+    async fn forward(
         &self,
         download: &mut Download,
         sender: &mpsc::Sender<Bytes>,
     ) -> Result<(), FetchError> {
         let from = download.position();
-        let ended = download.pass_on(sender).await;
-        self.meter.transferred(download.position() - from, download.asked_at().elapsed());
+        let ended = download.forward(sender).await;
+        self.meter.transferred(download.position() - from, download.requested_at().elapsed());
         if ended.as_ref().is_err_and(FetchError::is_cut) {
             self.meter.lost_transfer(Instant::now());
         }
@@ -495,7 +498,7 @@ impl Fetcher {
 
     fn check_room(&self, need: Need) -> Result<(), FetchError> {
         let root = self.data.root();
-        Ok(need.check(disk::room(root).map_err(|source| FetchError::disk(root, source))?)?)
+        Ok(need.check(disk::space(root).map_err(|source| FetchError::disk(root, source))?)?)
     }
 
     fn given_up(&self) -> MutexGuard<'_, HashSet<Digest>> {
@@ -548,7 +551,7 @@ fn read_manifest(bytes: &[u8], package: &PackageRef) -> Result<TaskManifest, Fet
         .map_err(|error| FetchError::ManifestInvalid(error.to_string()))?;
     if manifest.name != package.name || manifest.version != package.version {
         let reason = format!(
-            "it is for {} {}, ordered was {} {}",
+            "it is for {} {}, expected {} {}",
             manifest.name, manifest.version, package.name, package.version
         );
         return Err(FetchError::ManifestInvalid(reason));
@@ -561,21 +564,21 @@ fn read_manifest(bytes: &[u8], package: &PackageRef) -> Result<TaskManifest, Fet
 
 /// Locks per digest: a blob has at most one pull at a time.
 #[derive(Default)]
-struct Turns(Mutex<HashMap<Digest, Weak<tokio::sync::Mutex<()>>>>);
+struct ContentLocks(Mutex<HashMap<Digest, Weak<tokio::sync::Mutex<()>>>>);
 
-impl Turns {
-    async fn take(&self, digest: Digest) -> OwnedMutexGuard<()> {
+impl ContentLocks {
+    async fn lock(&self, digest: Digest) -> OwnedMutexGuard<()> {
         self.of(digest).lock_owned().await
     }
 
     fn of(&self, digest: Digest) -> Arc<tokio::sync::Mutex<()>> {
-        let mut turns = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        turns.retain(|_, turn| turn.strong_count() > 0);
-        if let Some(turn) = turns.get(&digest).and_then(Weak::upgrade) {
-            return turn;
+        let mut locks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        locks.retain(|_, lock| lock.strong_count() > 0);
+        if let Some(lock) = locks.get(&digest).and_then(Weak::upgrade) {
+            return lock;
         }
-        let turn = Arc::default();
-        turns.insert(digest, Arc::downgrade(&turn));
-        turn
+        let lock = Arc::default();
+        locks.insert(digest, Arc::downgrade(&lock));
+        lock
     }
 }

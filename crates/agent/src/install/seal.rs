@@ -36,7 +36,7 @@ pub struct Seal {
 
 /// The tree that does not match its seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Broken {
+pub enum SealMismatch {
     Source,
     Install,
 }
@@ -66,29 +66,29 @@ impl Seal {
     }
 
     /// The first tree of `version` that does not match this seal.
-    pub fn broken(&self, version: &VersionDir) -> io::Result<Option<Broken>> {
+    pub fn mismatch(&self, version: &VersionDir) -> io::Result<Option<SealMismatch>> {
         let now = match Self::of(version) {
             // The package is missing, or contains an entry that no package contains.
             Err(error)
                 if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidData) =>
             {
-                return Ok(Some(Broken::Source));
+                return Ok(Some(SealMismatch::Source));
             }
             now => now?,
         };
         Ok(match (now.src == self.src, now.install == self.install) {
             (true, true) => None,
-            (false, _) => Some(Broken::Source),
-            (true, false) => Some(Broken::Install),
+            (false, _) => Some(SealMismatch::Source),
+            (true, false) => Some(SealMismatch::Install),
         })
     }
 }
 
-impl std::fmt::Display for Broken {
+impl std::fmt::Display for SealMismatch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
-            Self::Source => "src is not what was unpacked",
-            Self::Install => "install is not what was built",
+            Self::Source => "src was changed after unpacking",
+            Self::Install => "install was changed after the build",
         })
     }
 }
@@ -96,7 +96,7 @@ impl std::fmt::Display for Broken {
 /// The digest of the tree at `root`.
 fn tree(root: &Path) -> io::Result<Digest> {
     if !fs::symlink_metadata(root)?.is_dir() {
-        return Err(io::Error::new(io::ErrorKind::InvalidData, "it is no directory"));
+        return Err(io::Error::new(io::ErrorKind::InvalidData, "not a directory"));
     }
     let mut hasher = Sha256::new();
     add_directory(&mut hasher, root, 0)?;
@@ -141,7 +141,8 @@ fn add_text(hasher: &mut Sha256, kind: u8, text: &[u8]) {
 }
 
 fn add_content(hasher: &mut Sha256, mut file: File) -> io::Result<()> {
-    let (mut size, mut buffer) = (0_u64, vec![0; 128 * 1024]);
+    let mut size = 0_u64;
+    let mut buffer = vec![0; 128 * 1024];
     loop {
         match file.read(&mut buffer)? {
             // The size comes last: a file that grows while being read can't pass as another file
@@ -181,35 +182,41 @@ mod tests {
     fn every_change_to_a_tree_breaks_its_seal() {
         let temp = tempfile::tempdir().expect("a directory");
         type Change = fn(&VersionDir) -> io::Result<()>;
-        let changes: [(Broken, Change); 9] = [
-            (Broken::Source, |v| fs::write(v.src().join("bin/run"), "echo two")),
-            (Broken::Source, |v| fs::write(v.src().join("more"), "")),
-            (Broken::Source, |v| fs::remove_file(v.src().join("run"))),
-            (Broken::Source, |v| fs::rename(v.src().join("bin/run"), v.src().join("bin/walk"))),
-            (Broken::Source, |v| fs::create_dir(v.src().join("empty"))),
-            (Broken::Source, |v| fs::remove_dir_all(v.src())),
-            (Broken::Source, |v| {
+        let changes: [(SealMismatch, Change); 9] = [
+            (SealMismatch::Source, |v| fs::write(v.src().join("bin/run"), "echo two")),
+            (SealMismatch::Source, |v| fs::write(v.src().join("more"), "")),
+            (SealMismatch::Source, |v| fs::remove_file(v.src().join("run"))),
+            (SealMismatch::Source, |v| {
+                fs::rename(v.src().join("bin/run"), v.src().join("bin/walk"))
+            }),
+            (SealMismatch::Source, |v| fs::create_dir(v.src().join("empty"))),
+            (SealMismatch::Source, |v| fs::remove_dir_all(v.src())),
+            (SealMismatch::Source, |v| {
                 fs::set_permissions(v.src().join("bin/run"), fs::Permissions::from_mode(0o755))
             }),
-            (Broken::Source, |v| {
+            (SealMismatch::Source, |v| {
                 fs::remove_file(v.src().join("run"))?;
                 symlink("/bin/sh", v.src().join("run"))
             }),
-            (Broken::Install, |v| fs::write(v.install().join("lib/node.py"), "print(1)")),
+            (SealMismatch::Install, |v| fs::write(v.install().join("lib/node.py"), "print(1)")),
         ];
         for (number, (expected, change)) in changes.into_iter().enumerate() {
             let version = version(&temp.path().join(number.to_string()));
             let note = version.root().join("seal");
             Seal::of(&version).expect("sealed").write(&note).expect("written");
             let seal = Seal::read(&note).expect("read").expect("there").expect("understood");
-            assert_eq!(seal.broken(&version).expect("compared"), None);
+            assert_eq!(seal.mismatch(&version).expect("compared"), None);
             change(&version).expect("changed");
-            assert_eq!(seal.broken(&version).expect("compared"), Some(expected), "change {number}");
+            assert_eq!(
+                seal.mismatch(&version).expect("compared"),
+                Some(expected),
+                "change {number}"
+            );
         }
     }
 
     #[test]
-    fn name_that_reads_like_content_makes_no_equal_tree() {
+    fn name_that_looks_like_content_changes_the_digest() {
         let temp = tempfile::tempdir().expect("a directory");
         let [one, two] = ["one", "two"].map(|name| temp.path().join(name));
         for dir in [&one, &two] {
@@ -221,12 +228,12 @@ mod tests {
     }
 
     #[test]
-    fn pipe_in_a_tree_breaks_its_seal_and_keeps_nobody_waiting() {
+    fn pipe_in_a_tree_breaks_its_seal_without_blocking() {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
         let seal = Seal::of(&version).expect("sealed");
         nix::unistd::mkfifo(&version.src().join("pipe"), nix::sys::stat::Mode::S_IRWXU)
             .expect("a pipe");
-        assert_eq!(seal.broken(&version).expect("compared"), Some(Broken::Source));
+        assert_eq!(seal.mismatch(&version).expect("compared"), Some(SealMismatch::Source));
     }
 }

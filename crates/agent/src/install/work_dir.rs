@@ -9,7 +9,7 @@ use std::io;
 use std::os::unix::fs::{MetadataExt as _, symlink};
 use std::path::{Path, PathBuf};
 
-use task_proto::manifest::BuildTool;
+use task_proto::packages::manifest::BuildTool;
 
 use crate::system::durable;
 use crate::system::layout::VersionDir;
@@ -47,7 +47,7 @@ pub fn refresh(tool: BuildTool, version: &VersionDir, user: Option<&TaskUser>) -
     user.hand_over(&work)?;
     // A task controls the content of its directory, so the links are made with the task's rights
     // only.
-    user.with_its_rights(link)?
+    user.run_with_file_rights(link)?
 }
 
 /// Links every file in `from` to the same name in `to`. Directories are created, not linked, so
@@ -95,7 +95,7 @@ pub fn handed_over(version: &VersionDir) -> io::Result<(i64, i64)> {
 pub fn move_written(tool: BuildTool, version: &VersionDir, since: (i64, i64)) -> io::Result<()> {
     let mut found = Vec::new();
     if tool == BuildTool::None {
-        find_younger(&version.src(), &version.work(), since, 0, &mut found)?;
+        find_newer(&version.src(), &version.work(), since, 0, &mut found)?;
     } else {
         for entry in fs::read_dir(version.root())? {
             let entry = entry?;
@@ -114,7 +114,7 @@ pub fn move_written(tool: BuildTool, version: &VersionDir, since: (i64, i64)) ->
     Ok(())
 }
 
-fn find_younger(
+fn find_newer(
     from: &Path,
     to: &Path,
     than: (i64, i64),
@@ -131,7 +131,7 @@ fn find_younger(
             entry.and_then(|entry| entry.metadata().map(|about| (entry, about)))?;
         let place = to.join(entry.file_name());
         if about.is_dir() {
-            find_younger(&entry.path(), &place, than, depth + 1, found)?;
+            find_newer(&entry.path(), &place, than, depth + 1, found)?;
         } else if (about.mtime(), about.mtime_nsec()) > than {
             found.push((entry.path(), place));
         }
@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_the_package_are_its_own_again_and_what_was_written_beside_them_stays() {
+    fn refresh_restores_package_links_and_keeps_written_files() {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
         let work = version.work();
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn package_that_is_built_has_its_trees_by_their_names() {
+    fn built_package_has_links_to_its_trees() {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
         fs::create_dir_all(version.install()).expect("made");
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_task_wrote_into_its_package_moves_to_where_it_runs() {
+    fn files_written_into_the_package_move_to_the_work_dir() {
         let temp = tempfile::tempdir().expect("a directory");
         let version = version(temp.path());
         // The manifest's owner changes at the first start, after the package was unpacked.

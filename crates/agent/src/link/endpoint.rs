@@ -4,49 +4,53 @@
 
 use std::time::Duration;
 
-use crate::link::state::Shared;
-use crate::system::error_chain::chain;
+use task_proto::error_chain::chain;
+
+use crate::link::state::LinkState;
 use crate::transfer::server::Server;
 
 /// Asks the server for the endpoint at the start, whenever no session can be opened, and every
 /// `interval` while the sessions go to an external broker, which stays up when the server switches
 /// to another. Runs until the agent ends.
-pub async fn follow(server: Server, shared: Shared, interval: Duration) {
+pub async fn follow(server: Server, link_state: LinkState, interval: Duration) {
     loop {
         tokio::select! {
             // Dropping the request at the agent's end has no effect.
-            () = ask(&server, &shared) => {}
-            () = shared.shutdown.cancelled() => return,
+            () = request_endpoint(&server, &link_state) => {}
+            () = link_state.shutdown.cancelled() => return,
         }
-        let is_external =
-            shared.endpoint.borrow().as_ref().is_some_and(|endpoint| endpoint.external.is_some());
+        let is_external = link_state
+            .endpoint
+            .borrow()
+            .as_ref()
+            .is_some_and(|endpoint| endpoint.external.is_some());
         let spread = 0.5 + rand::random::<f64>();
         tokio::select! {
             // Cancel-safe: the timer is recreated on each iteration.
             () = tokio::time::sleep(interval.mul_f64(spread)), if is_external => {}
             // Cancel-safe: a permit that was not taken stays.
-            () = shared.find.notified() => {}
+            () = link_state.refresh_endpoint.notified() => {}
             // Cancel-safe: a token can be awaited again.
-            () = shared.shutdown.cancelled() => return,
+            () = link_state.shutdown.cancelled() => return,
         }
     }
 }
 
-async fn ask(server: &Server, shared: &Shared) {
+async fn request_endpoint(server: &Server, link_state: &LinkState) {
     match server.mqtt_endpoint().await {
         Ok(endpoint) => {
-            shared.endpoint.send_if_modified(|known| {
+            link_state.endpoint.send_if_modified(|known| {
                 let is_news = known.as_ref() != Some(&endpoint);
                 if is_news {
-                    tracing::info!(?endpoint, "the server says where MQTT is");
+                    tracing::info!(?endpoint, "received the MQTT endpoint");
                     *known = Some(endpoint);
                 }
                 is_news
             });
-            shared.endpoint_answers.send_modify(|answers| *answers += 1);
+            link_state.endpoint_answers.send_modify(|answers| *answers += 1);
         }
         Err(error) => {
-            tracing::debug!(error = %chain(&error), "the server does not say where MQTT is")
+            tracing::debug!(error = %chain(&error), "cannot get the MQTT endpoint")
         }
     }
 }

@@ -6,11 +6,11 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use task_proto::error_chain::chain;
 use tokio::time::sleep;
 
-use crate::link::state::Shared;
+use crate::link::state::LinkState;
 use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
-use crate::system::error_chain::chain;
 use crate::system::identity::Identity;
 use crate::transfer::credential::Credential;
 use crate::transfer::server::{Server, ServerError};
@@ -36,7 +36,7 @@ pub struct Rotation {
 
 impl Rotation {
     /// Rotates the token until the agent ends.
-    pub async fn run(mut self, shared: Shared, wall_ms: impl Fn() -> u64) {
+    pub async fn run(mut self, link_state: LinkState, wall_ms: impl Fn() -> u64) {
         // Random wait: robots that were enrolled together must not ask together.
         let mut wait =
             if self.identity.next_token.is_some() { Duration::ZERO } else { spread(CHECK) };
@@ -45,14 +45,14 @@ impl Rotation {
                 // Cancel-safe: the timer is recreated on each iteration.
                 () = sleep(wait) => {}
                 // Cancel-safe: a permit that was not taken stays.
-                () = shared.token_refused.notified(), if self.identity.next_token.is_some() => {}
+                () = link_state.token_refused.notified(), if self.identity.next_token.is_some() => {}
                 // Cancel-safe: a token can be awaited again.
-                () = shared.shutdown.cancelled() => return,
+                () = link_state.shutdown.cancelled() => return,
             }
             // A request dropped at the agent's end is repeated after the next start.
             wait = tokio::select! {
                 wait = self.step(wall_ms()) => wait,
-                () = shared.shutdown.cancelled() => return,
+                () = link_state.shutdown.cancelled() => return,
             };
         }
     }
@@ -61,11 +61,11 @@ impl Rotation {
     /// step.
     pub async fn step(&mut self, wall_ms: u64) -> Duration {
         if self.identity.next_token.is_some() {
-            return self.go_over(wall_ms).await;
+            return self.switch_token(wall_ms).await;
         }
         // The clock was ahead when the token was issued: restart the token's age.
         if (PROGRAM_EXISTS_SINCE_MS..self.identity.token_since_ms).contains(&wall_ms) {
-            self.keep(Identity { token_since_ms: wall_ms, ..self.identity.clone() });
+            self.store_identity(Identity { token_since_ms: wall_ms, ..self.identity.clone() });
         }
         let age_ms = wall_ms.saturating_sub(self.identity.token_since_ms);
         if u128::from(age_ms) < self.lifetime.as_millis() {
@@ -74,7 +74,7 @@ impl Rotation {
         match self.server.next_token().await {
             Ok(token) => {
                 let identity = Identity { next_token: Some(token), ..self.identity.clone() };
-                if self.keep(identity) { Duration::ZERO } else { spread(RETRY) }
+                if self.store_identity(identity) { Duration::ZERO } else { spread(RETRY) }
             }
             Err(error) => {
                 tracing::info!(error = %chain(&error), "no new token");
@@ -84,7 +84,7 @@ impl Rotation {
     }
 
     /// Uses the prepared token. The server's answer shows whether the token is valid.
-    async fn go_over(&mut self, wall_ms: u64) -> Duration {
+    async fn switch_token(&mut self, wall_ms: u64) -> Duration {
         let Some(next) = self.identity.next_token.clone() else { return Duration::ZERO };
         match self.server.with_token(next.clone()).desired(None).await {
             Ok(_) | Err(ServerError::Refused { .. }) => {
@@ -95,18 +95,18 @@ impl Rotation {
                     token_since_ms: wall_ms,
                     ..self.identity.clone()
                 };
-                if !self.keep(identity) {
+                if !self.store_identity(identity) {
                     return spread(RETRY);
                 }
-                tracing::info!("went over to a new token");
+                tracing::info!("switched to a new token");
                 spread(CHECK)
             }
             Err(ServerError::TokenRefused(_)) => {
-                tracing::info!("the server does not accept the token that lay ready");
+                tracing::info!("the server does not accept the new token");
                 // The prepared token was issued in vain, so the next one is not urgent.
                 let identity =
                     Identity { next_token: None, token_since_ms: wall_ms, ..self.identity.clone() };
-                if self.keep(identity) { spread(CHECK) } else { spread(RETRY) }
+                if self.store_identity(identity) { spread(CHECK) } else { spread(RETRY) }
             }
             Err(error) => {
                 tracing::info!(error = %chain(&error), "the new token could not be tried");
@@ -117,18 +117,18 @@ impl Rotation {
 
     /// Writes the identity, unless the robot was registered anew meanwhile. That new identity must
     /// not be overwritten.
-    fn keep(&mut self, identity: Identity) -> bool {
+    fn store_identity(&mut self, identity: Identity) -> bool {
         let is_another = |known: Identity| {
             known.robot_id != identity.robot_id || known.token != self.identity.token
         };
         if Identity::read(&self.path).is_ok_and(is_another) {
-            tracing::warn!("this robot was registered anew: restart the agent");
+            tracing::warn!("this robot was registered again: restart the agent");
             return false;
         }
         match identity.write(&self.path) {
             Ok(()) => self.identity = identity,
             Err(error) => {
-                tracing::warn!(error = %chain(&error), "the token can't be written down");
+                tracing::warn!(error = %chain(&error), "cannot store the token");
                 return false;
             }
         }

@@ -7,19 +7,19 @@ use std::time::Duration;
 
 use task_proto::api::{MqttEndpoint, ReportReply};
 use task_proto::desired::Inline;
-use task_proto::envelope::Envelope;
-use task_proto::report::Report;
-use task_proto::request::Request;
-use task_proto::topic::RobotTopic;
+use task_proto::error_chain::chain;
+use task_proto::messages::report::Report;
+use task_proto::messages::request::Request;
+use task_proto::messages::topic::RobotTopic;
+use task_proto::trust::envelope::Envelope;
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-use crate::system::error_chain::chain;
-use crate::task::plan::backoff_ms;
+use crate::task::timing::backoff_ms;
 use crate::transfer::link_meter::LinkMeter;
-use crate::transfer::parts::Listening;
-use crate::transfer::server::{Sent, Server, ServerError};
+use crate::transfer::parts::PartSubscriptions;
+use crate::transfer::server::{DesiredResponse, Server, ServerError};
 
 /// Longest wait before a report is posted again.
 const MAX_POST_BACKOFF_MS: u64 = 60 * 1000;
@@ -32,7 +32,7 @@ pub(crate) const REFUSED_POLL: Duration = Duration::from_secs(300);
 
 /// Messages from the link to the driver.
 #[derive(Debug)]
-pub enum Heard {
+pub enum ServerMessage {
     /// A desired state with an unverified signature.
     Desired {
         envelope: Box<Envelope>,
@@ -55,7 +55,7 @@ pub enum Heard {
     /// The server refuses this robot's token, for the given reason.
     TokenRefused(String),
     /// The server knows the robot but sends no state now.
-    Withheld {
+    StateUnavailable {
         /// The server's error code.
         code: String,
         /// The server's error text.
@@ -66,7 +66,7 @@ pub enum Heard {
 /// State shared by the driver and the link. The driver writes `reports` and `settled`; the link
 /// writes the rest.
 #[derive(Clone)]
-pub struct Shared {
+pub struct LinkState {
     pub reports: watch::Sender<Option<Arc<Report>>>,
     /// Sequence number of the newest stored report.
     pub confirmed: watch::Sender<u64>,
@@ -78,14 +78,8 @@ pub struct Shared {
     /// Number of the server's answers about the endpoint, changed or not.
     pub endpoint_answers: watch::Sender<u64>,
     /// Requests the endpoint from the server.
-    pub find: Arc<Notify>,
-    /// Whether an MQTT session is up.
-    pub mqtt_up: watch::Sender<bool>,
-    /// Whether the first attempt to open a session has ended.
-    pub mqtt_tried: watch::Sender<bool>,
-    /// Whether a session is up whose acknowledgements come from the server itself. Such a session
-    /// accepts reports.
-    pub mqtt_stores: watch::Sender<bool>,
+    pub refresh_endpoint: Arc<Notify>,
+    pub mqtt: watch::Sender<MqttState>,
     /// Signals that the server refused the token.
     pub token_refused: Arc<Notify>,
     /// Requests a poll now.
@@ -93,17 +87,48 @@ pub struct Shared {
     /// Requests a report over HTTP now, even while MQTT is up.
     pub post: Arc<Notify>,
     /// Contents with wanted parts.
-    pub listening: Listening,
+    pub part_subscriptions: PartSubscriptions,
     /// Measurements of the link.
     pub meter: LinkMeter,
     /// Cancelled when the agent ends.
     pub shutdown: CancellationToken,
 }
 
+/// The state of the MQTT session.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MqttState {
+    /// The first attempt to open a session has not ended yet.
+    FirstAttempt,
+    /// No session is up.
+    Down,
+    /// A session is up at an external broker. Its acknowledgements say nothing about the server, so
+    /// it accepts no reports.
+    UpAtExternalBroker,
+    /// A session is up at the server itself, which acknowledges a report once it is stored.
+    UpAtServer,
+}
+
+impl MqttState {
+    /// Whether a session is up.
+    pub fn is_up(self) -> bool {
+        matches!(self, Self::UpAtExternalBroker | Self::UpAtServer)
+    }
+
+    /// Whether a session is up that accepts reports.
+    pub fn accepts_reports(self) -> bool {
+        self == Self::UpAtServer
+    }
+
+    /// Whether the first attempt to open a session has ended.
+    pub fn was_tried(self) -> bool {
+        self != Self::FirstAttempt
+    }
+}
+
 /// Channels between an MQTT session and the agent's tasks that answer requests and publish
 /// messages. Both directions are bounded and lossy, because their messages are useful only at the
 /// moment.
-pub struct Talk {
+pub struct MqttChannels {
     /// Incoming requests, each with its time of arrival.
     pub requests: mpsc::Sender<(Request, Instant)>,
     pub messages: mpsc::Receiver<Message>,
@@ -122,14 +147,14 @@ pub struct Message {
 }
 
 #[derive(Debug, Clone, Copy)]
-pub struct Intervals {
+pub struct PollIntervals {
     /// Interval while MQTT is up.
     pub slow: Duration,
     /// Interval while MQTT is down.
     pub fast: Duration,
 }
 
-impl Shared {
+impl LinkState {
     /// Initial state, before any message.
     pub fn new(shutdown: CancellationToken) -> Self {
         Self {
@@ -138,16 +163,29 @@ impl Shared {
             settled: watch::Sender::new(false),
             endpoint: watch::Sender::new(None),
             endpoint_answers: watch::Sender::new(0),
-            find: Arc::default(),
-            mqtt_up: watch::Sender::new(false),
-            mqtt_tried: watch::Sender::new(false),
-            mqtt_stores: watch::Sender::new(false),
+            refresh_endpoint: Arc::default(),
+            mqtt: watch::Sender::new(MqttState::FirstAttempt),
             token_refused: Arc::default(),
             poll: Arc::default(),
             post: Arc::default(),
-            listening: Listening::default(),
+            part_subscriptions: PartSubscriptions::default(),
             meter: LinkMeter::default(),
             shutdown,
+        }
+    }
+
+    /// The state of the MQTT session now.
+    pub fn mqtt_now(&self) -> MqttState {
+        *self.mqtt.borrow()
+    }
+
+    /// Waits for the end of the first attempt to open a session. Returns false if the agent ends.
+    pub async fn first_attempt_ended(&self) -> bool {
+        let mut mqtt = self.mqtt.subscribe();
+        tokio::select! {
+            // Cancel-safe: a watch remembers its value, and a token can be awaited again.
+            _ = mqtt.wait_for(|mqtt| mqtt.was_tried()) => true,
+            () = self.shutdown.cancelled() => false,
         }
     }
 }
@@ -155,49 +193,46 @@ impl Shared {
 /// Runs the HTTP half of the link until the agent ends. It first waits for the end of the first
 /// MQTT attempt: a session delivers the same data at less cost, above all when a whole fleet starts
 /// at once.
-pub async fn over_http(
+pub async fn run_http(
     server: Server,
-    shared: Shared,
-    intervals: Intervals,
-    heard: mpsc::Sender<Heard>,
+    link_state: LinkState,
+    intervals: PollIntervals,
+    server_messages: mpsc::Sender<ServerMessage>,
 ) {
-    let mut tried = shared.mqtt_tried.subscribe();
-    tokio::select! {
-        // Cancel-safe: a watch remembers its value, and a token can be awaited again.
-        _ = tried.wait_for(|tried| *tried) => {}
-        () = shared.shutdown.cancelled() => return,
+    if !link_state.first_attempt_ended().await {
+        return;
     }
-    let polling = poll(server.clone(), shared.clone(), intervals, heard.clone());
-    let stores = *shared.mqtt_stores.borrow();
+    let polling = poll(server.clone(), link_state.clone(), intervals, server_messages.clone());
+    let accepts_reports = link_state.mqtt_now().accepts_reports();
     let asking = async {
-        if !stores {
+        if !accepts_reports {
             return;
         }
         tokio::time::sleep(FIRST_POST.mul_f64(rand::random())).await;
-        shared.post.notify_one();
+        link_state.post.notify_one();
     };
-    tokio::join!(polling, post(server, shared.clone(), heard), asking);
+    tokio::join!(polling, post(server, link_state.clone(), server_messages), asking);
 }
 
 /// Polls for the desired state until the agent ends. The first poll is immediate, unless a session
 /// is up, which receives the state without a request.
 pub async fn poll(
     server: Server,
-    shared: Shared,
-    intervals: Intervals,
-    heard: mpsc::Sender<Heard>,
+    link_state: LinkState,
+    intervals: PollIntervals,
+    server_messages: mpsc::Sender<ServerMessage>,
 ) {
     let mut tag = None;
-    if *shared.mqtt_up.borrow() && !next_poll(&shared, intervals, Duration::ZERO).await {
+    if link_state.mqtt_now().is_up() && !next_poll(&link_state, intervals, Duration::ZERO).await {
         return;
     }
     loop {
-        let known = tag.as_ref().filter(|_| *shared.settled.borrow());
+        let known = tag.as_ref().filter(|_| *link_state.settled.borrow());
         let begun = Instant::now();
         let outcome = server.desired(known).await;
         // An MQTT session measures more often and without the cost of a new connection.
-        if outcome.is_ok() && !*shared.mqtt_up.borrow() {
-            shared.meter.round_trip(begun.elapsed());
+        if outcome.is_ok() && !link_state.mqtt_now().is_up() {
+            link_state.meter.round_trip(begun.elapsed());
         }
         let least = match &outcome {
             // Spread like all other waits: robots that were refused together must not poll
@@ -210,10 +245,10 @@ pub async fn poll(
             tag.clone_from(&sent.tag);
         }
         if matches!(outcome, Err(ServerError::TokenRefused(_))) {
-            shared.token_refused.notify_one();
+            link_state.token_refused.notify_one();
         }
-        if heard.send(heard_of(outcome)).await.is_err()
-            || !next_poll(&shared, intervals, least).await
+        if server_messages.send(server_message(outcome)).await.is_err()
+            || !next_poll(&link_state, intervals, least).await
         {
             return;
         }
@@ -221,11 +256,11 @@ pub async fn poll(
 }
 
 /// Waits until the next poll is due, at least for `least`. Returns false if the agent ends.
-async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bool {
-    let mut mqtt_up = shared.mqtt_up.subscribe();
+async fn next_poll(link_state: &LinkState, intervals: PollIntervals, least: Duration) -> bool {
+    let mut mqtt = link_state.mqtt.subscribe();
     let (asked_at, spread) = (Instant::now(), spread());
     loop {
-        let up = *mqtt_up.borrow_and_update();
+        let up = mqtt.borrow_and_update().is_up();
         let interval =
             (if up { intervals.slow } else { intervals.fast }).mul_f64(spread).max(least);
         tokio::select! {
@@ -234,65 +269,74 @@ async fn next_poll(shared: &Shared, intervals: Intervals, least: Duration) -> bo
             () = tokio::time::sleep_until(asked_at + interval) => {
                 // A report over HTTP returns the name and labels that the server holds. MQTT does
                 // not.
-                shared.post.notify_one();
+                link_state.post.notify_one();
                 return true;
             }
             // Cancel-safe: a permit that was not taken stays.
-            () = shared.poll.notified() => return true,
+            () = link_state.poll.notified() => return true,
             // Cancel-safe: a watch remembers a change. The other interval applies from now on.
-            Ok(()) = mqtt_up.changed() => {}
+            Ok(()) = mqtt.changed() => {}
             // Cancel-safe: a token can be awaited again.
-            () = shared.shutdown.cancelled() => return false,
+            () = link_state.shutdown.cancelled() => return false,
         }
     }
 }
 
-fn heard_of(outcome: Result<Option<Sent>, ServerError>) -> Heard {
+fn server_message(outcome: Result<Option<DesiredResponse>, ServerError>) -> ServerMessage {
     match outcome {
-        Ok(Some(sent)) => Heard::Desired {
+        Ok(Some(sent)) => ServerMessage::Desired {
             envelope: Box::new(sent.envelope),
             inline: Inline::default(),
             was_asked_for: true,
         },
-        Ok(None) => Heard::Unchanged,
-        Err(ServerError::TokenRefused(why)) => Heard::TokenRefused(why),
-        Err(ServerError::Refused { code, message }) => Heard::Withheld { code, text: message },
+        Ok(None) => ServerMessage::Unchanged,
+        Err(ServerError::TokenRefused(why)) => ServerMessage::TokenRefused(why),
+        Err(ServerError::Refused { code, message }) => {
+            ServerMessage::StateUnavailable { code, text: message }
+        }
         Err(error) => {
             tracing::info!(error = %chain(&error), "no desired state over HTTP");
-            Heard::Withheld { code: "server_unreachable".to_owned(), text: chain(&error) }
+            ServerMessage::StateUnavailable {
+                code: "server_unreachable".to_owned(),
+                text: chain(&error),
+            }
         }
     }
 }
 
 /// Posts reports over HTTP while no MQTT session stores them, and on request while one does, until
 /// the agent ends.
-pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
-    let (mut reports, mut mqtt_stores) =
-        (shared.reports.subscribe(), shared.mqtt_stores.subscribe());
-    let mut asked = !*mqtt_stores.borrow();
+pub async fn post(
+    server: Server,
+    link_state: LinkState,
+    server_messages: mpsc::Sender<ServerMessage>,
+) {
+    let (mut reports, mut mqtt) = (link_state.reports.subscribe(), link_state.mqtt.subscribe());
+    let mut asked = !mqtt.borrow().accepts_reports();
     let mut failures = 0;
     loop {
         let newest = reports.borrow_and_update().clone();
-        let stores = *mqtt_stores.borrow_and_update();
-        let due =
-            newest.filter(|report| asked || (!stores && report.seq > *shared.confirmed.borrow()));
+        let mqtt_then = *mqtt.borrow_and_update();
+        let due = newest.filter(|report| {
+            asked || (!mqtt_then.accepts_reports() && report.seq > *link_state.confirmed.borrow())
+        });
         let mut retry = Duration::MAX;
         if let Some(report) = due {
             match server.report(&report).await {
                 Ok(reply) => {
                     (asked, failures) = (false, 0);
-                    shared
+                    link_state
                         .confirmed
                         .send_modify(|confirmed| *confirmed = (*confirmed).max(report.seq));
-                    // An external broker may have lost the doorbell.
-                    if !stores
-                        && *shared.mqtt_up.borrow()
+                    // An external broker may have lost the notice.
+                    if !mqtt_then.accepts_reports()
+                        && link_state.mqtt_now().is_up()
                         && reply.generation > report.observed_generation
                     {
-                        shared.poll.notify_one();
+                        link_state.poll.notify_one();
                     }
-                    if heard
-                        .send(Heard::Confirmed { seq: report.seq, reply: Some(reply) })
+                    if server_messages
+                        .send(ServerMessage::Confirmed { seq: report.seq, reply: Some(reply) })
                         .await
                         .is_err()
                     {
@@ -313,7 +357,8 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
                         ServerError::TokenRefused(why) => {
                             // Polling detects when the token is accepted again.
                             retry = REFUSED_POLL.mul_f64(spread());
-                            if heard.send(Heard::TokenRefused(why)).await.is_err() {
+                            if server_messages.send(ServerMessage::TokenRefused(why)).await.is_err()
+                            {
                                 return;
                             }
                         }
@@ -334,11 +379,11 @@ pub async fn post(server: Server, shared: Shared, heard: mpsc::Sender<Heard>) {
             // Cancel-safe: a watch remembers a change, and the timer is recreated.
             () = newer => {}
             // Cancel-safe: a watch remembers a change.
-            Ok(()) = mqtt_stores.changed() => {}
+            Ok(()) = mqtt.changed() => {}
             // Cancel-safe: a permit that was not taken stays.
-            () = shared.post.notified() => asked = true,
+            () = link_state.post.notified() => asked = true,
             // Cancel-safe: a token can be awaited again.
-            () = shared.shutdown.cancelled() => return,
+            () = link_state.shutdown.cancelled() => return,
         }
     }
 }

@@ -7,9 +7,10 @@ use std::os::unix::fs::{FileExt as _, MetadataExt as _};
 use std::time::UNIX_EPOCH;
 
 use task_proto::TaskName;
-use task_proto::log::{LogLevel, LogLine, MAX_BATCH_BYTES, MAX_KEPT_LINES};
+use task_proto::telemetry::log::{LogLevel, LogLine, MAX_BATCH_BYTES, MAX_KEPT_LINES};
+use task_proto::time::millis;
 
-use super::line::{Entry, LogFile, Twins};
+use super::line::{Deduplicator, Entry, LogFile};
 use super::record::Record;
 use super::rotated::aged;
 use crate::system::clock;
@@ -26,7 +27,7 @@ const BATCH_OVERHEAD_BYTES: usize = 1024;
 
 /// Selection of log lines.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Wanted {
+pub struct LogQuery {
     /// Only lines of this task.
     pub task: Option<TaskName>,
     /// Only lines of this level and more serious ones.
@@ -38,22 +39,24 @@ pub struct Wanted {
 }
 
 /// The newest matching lines of `files` that fit into an answer, the oldest first.
-pub fn newest(files: &[LogFile], wanted: &Wanted, now_ms: u64) -> Vec<LogLine> {
-    let cutoff_ms = wanted.since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms));
-    let max_lines = usize::try_from(wanted.max_lines).unwrap_or(usize::MAX).min(MAX_KEPT_LINES);
-    let files = files.iter().filter(|file| wanted.task.is_none() || file.task == wanted.task);
+pub fn newest(files: &[LogFile], query: &LogQuery, now_ms: u64) -> Vec<LogLine> {
+    let cutoff_ms = query.since_ms.map_or(0, |since_ms| now_ms.saturating_sub(since_ms));
+    let max_lines = usize::try_from(query.max_lines).unwrap_or(usize::MAX).min(MAX_KEPT_LINES);
+    let files = files.iter().filter(|file| query.task.is_none() || file.task == query.task);
     let mut sources: Vec<Source> =
-        files.map(|file| Source::new(file, wanted.level, cutoff_ms)).collect();
-    let mut room = MAX_SCAN_BYTES;
-    sources.iter_mut().for_each(|source| source.advance(&mut room));
-    let (mut twins, mut lines, mut bytes) = (Twins::default(), Vec::new(), BATCH_OVERHEAD_BYTES);
+        files.map(|file| Source::new(file, query.level, cutoff_ms)).collect();
+    let mut scan_budget = MAX_SCAN_BYTES;
+    sources.iter_mut().for_each(|source| source.advance(&mut scan_budget));
+    let mut deduplicator = Deduplicator::default();
+    let mut lines = Vec::new();
+    let mut bytes = BATCH_OVERHEAD_BYTES;
     while lines.len() < max_lines {
         let newest = sources.iter_mut().filter(|source| source.head.is_some());
         let newest = newest.max_by_key(|source| source.head.as_ref().map(|entry| entry.line.at_ms));
         let Some(source) = newest else { break };
         let Some(entry) = source.head.take() else { break };
-        source.advance(&mut room);
-        if twins.knows(&entry) {
+        source.advance(&mut scan_budget);
+        if deduplicator.is_duplicate(&entry) {
             continue;
         }
         bytes += serde_json::to_vec(&entry.line).map_or(0, |json| json.len() + 1);
@@ -71,7 +74,7 @@ struct Source<'a> {
     file: &'a LogFile,
     level: LogLevel,
     cutoff_ms: u64,
-    lines: Backwards,
+    lines: ReverseLines,
     at_ms: u64,
     head: Option<Entry>,
 }
@@ -97,14 +100,14 @@ impl<'a> Source<'a> {
         let written = files.first().and_then(|file| {
             file.metadata().ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()
         });
-        let at_ms = written.map_or(0, |since| u64::try_from(since.as_millis()).unwrap_or(0));
-        Self { file, level, cutoff_ms, lines: Backwards::new(files.into()), at_ms, head: None }
+        let at_ms = written.map_or(0, millis);
+        Self { file, level, cutoff_ms, lines: ReverseLines::new(files.into()), at_ms, head: None }
     }
 
     /// Finds the next matching line.
-    fn advance(&mut self, room: &mut u64) {
+    fn advance(&mut self, scan_budget: &mut u64) {
         self.head = None;
-        while let Some(line) = self.lines.next_line(room) {
+        while let Some(line) = self.lines.next_line(scan_budget) {
             let record = Record::parse(&line);
             self.at_ms = record.at_ms.unwrap_or(self.at_ms);
             if self.at_ms < self.cutoff_ms {
@@ -126,7 +129,7 @@ impl<'a> Source<'a> {
 }
 
 /// The lines of files, the newest first.
-struct Backwards {
+struct ReverseLines {
     files: VecDeque<File>,
     /// The file that is read, and the length of its unread beginning.
     current: Option<(File, u64)>,
@@ -135,12 +138,12 @@ struct Backwards {
     is_newest: bool,
 }
 
-impl Backwards {
+impl ReverseLines {
     fn new(files: VecDeque<File>) -> Self {
         Self { files, current: None, buffer: Vec::new(), is_newest: true }
     }
 
-    fn next_line(&mut self, room: &mut u64) -> Option<Vec<u8>> {
+    fn next_line(&mut self, scan_budget: &mut u64) -> Option<Vec<u8>> {
         loop {
             if let Some(end) = self.buffer.iter().rposition(|byte| *byte == b'\n') {
                 let line = self.buffer.split_off(end + 1);
@@ -159,10 +162,10 @@ impl Backwards {
                 }
                 Some((file, unread)) => {
                     let count = (*unread).min(CHUNK_BYTES as u64);
-                    if *room < count {
+                    if *scan_budget < count {
                         return None;
                     }
-                    *room -= count;
+                    *scan_budget -= count;
                     *unread -= count;
                     let mut chunk = vec![0; count as usize];
                     if file.read_exact_at(&mut chunk, *unread).is_err() {
@@ -210,7 +213,7 @@ fn whole_lines(file: &File, size: u64) -> u64 {
 mod tests {
     use std::path::Path;
 
-    use task_proto::log::LogSource;
+    use task_proto::telemetry::log::LogSource;
     use task_proto::time::timestamp;
 
     use super::*;
@@ -229,8 +232,8 @@ mod tests {
         }
     }
 
-    fn everything() -> Wanted {
-        Wanted { task: None, level: LogLevel::Debug, since_ms: None, max_lines: 100 }
+    fn everything() -> LogQuery {
+        LogQuery { task: None, level: LogLevel::Debug, since_ms: None, max_lines: 100 }
     }
 
     fn write(path: &Path, lines: &[(u64, LogSource, &str)]) {
@@ -241,8 +244,8 @@ mod tests {
         RotatedLog::new(LogSpec::at(path.to_owned())).write(&log);
     }
 
-    fn texts(files: &[LogFile], wanted: &Wanted) -> Vec<String> {
-        newest(files, wanted, NOW_MS).into_iter().map(|line| line.text).collect()
+    fn texts(files: &[LogFile], query: &LogQuery) -> Vec<String> {
+        newest(files, query, NOW_MS).into_iter().map(|line| line.text).collect()
     }
 
     #[test]
@@ -258,13 +261,16 @@ mod tests {
         let files =
             [file(&one, "one"), file(&two, "two"), file(&temp.path().join("none.log"), "one")];
         assert_eq!(texts(&files, &everything()), ["a", "b", "c", "d", "e"]);
-        assert_eq!(texts(&files, &Wanted { max_lines: 2, ..everything() }), ["d", "e"]);
-        assert_eq!(texts(&files, &Wanted { level: LogLevel::Warn, ..everything() }), ["c", "d"]);
+        assert_eq!(texts(&files, &LogQuery { max_lines: 2, ..everything() }), ["d", "e"]);
+        assert_eq!(texts(&files, &LogQuery { level: LogLevel::Warn, ..everything() }), ["c", "d"]);
         assert_eq!(
-            texts(&files, &Wanted { task: Some("two".parse().unwrap()), ..everything() }),
+            texts(&files, &LogQuery { task: Some("two".parse().unwrap()), ..everything() }),
             ["b", "d"]
         );
-        assert_eq!(texts(&files, &Wanted { since_ms: Some(30), ..everything() }), ["c", "d", "e"]);
+        assert_eq!(
+            texts(&files, &LogQuery { since_ms: Some(30), ..everything() }),
+            ["c", "d", "e"]
+        );
     }
 
     #[test]
@@ -284,7 +290,7 @@ mod tests {
             );
             log.write(&line);
         }
-        let found = texts(&[file(&path, "t")], &Wanted { max_lines: u64::MAX, ..everything() });
+        let found = texts(&[file(&path, "t")], &LogQuery { max_lines: u64::MAX, ..everything() });
         let expected: Vec<String> =
             (2000 - found.len()..2000).map(|number| number.to_string()).collect();
         assert_eq!(found, expected);
@@ -292,18 +298,19 @@ mod tests {
     }
 
     #[test]
-    fn an_answer_fits_into_its_message() {
+    fn result_fits_into_one_message() {
         let temp = tempfile::tempdir().unwrap();
         let path = temp.path().join("task.log");
         let text = "\"".repeat(record::MAX_TEXT_BYTES);
         write(&path, &vec![(NOW_MS, LogSource::Stdout, text.as_str()); 300]);
-        let lines = newest(&[file(&path, "t")], &Wanted { max_lines: 300, ..everything() }, NOW_MS);
+        let lines =
+            newest(&[file(&path, "t")], &LogQuery { max_lines: 300, ..everything() }, NOW_MS);
         let bytes = serde_json::to_vec(&lines).unwrap().len();
         assert!(bytes < MAX_BATCH_BYTES && bytes > MAX_BATCH_BYTES / 2, "{bytes}");
     }
 
     #[test]
-    fn lines_of_1970_do_not_hide_those_before_them_and_old_ones_end_the_search() {
+    fn lines_without_a_clock_are_skipped_and_old_lines_end_the_search() {
         let temp = tempfile::tempdir().unwrap();
         let path = temp.path().join("task.log");
         let at = |ago_ms: u64| NOW_MS - ago_ms;
@@ -318,7 +325,7 @@ mod tests {
             ],
         );
         assert_eq!(
-            texts(&[file(&path, "t")], &Wanted { since_ms: Some(1000), ..everything() }),
+            texts(&[file(&path, "t")], &LogQuery { since_ms: Some(1000), ..everything() }),
             ["before", "after"]
         );
     }
@@ -334,7 +341,7 @@ mod tests {
         std::fs::write(&path, vec![0; 3 * MAX_LINE_BYTES]).unwrap();
         let lines = newest(&[file(&path, "t")], &everything(), NOW_MS);
         assert!(
-            lines.iter().all(|line| line.text.len() <= task_proto::log::MAX_LINE_BYTES),
+            lines.iter().all(|line| line.text.len() <= task_proto::telemetry::log::MAX_LINE_BYTES),
             "{}",
             lines.len()
         );

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use task_proto::log::LogSource;
+use task_proto::telemetry::log::LogSource;
 use task_proto::time::timestamp;
 
 use super::record::{self, MAX_TEXT_BYTES};
@@ -21,7 +21,7 @@ use crate::system::clock;
 const PARTIAL_TIMEOUT: Duration = Duration::from_secs(1);
 /// Maximum time that a full queue may block the task's output. After that, output is dropped until
 /// there is room.
-const QUEUE_PATIENCE: Duration = Duration::from_secs(1);
+const QUEUE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Maximum number of bytes that wait for the disk.
 const QUEUE_BYTES: usize = 1024 * 1024;
 /// Size of one read. Even if each byte were an empty line, the queue would just hold the records.
@@ -183,12 +183,12 @@ fn character_boundary(bytes: &[u8]) -> usize {
 /// Output that was read and not yet written: whole lines, then perhaps a gap.
 #[derive(Default)]
 struct Queue {
-    waiting: Mutex<Waiting>,
+    waiting: Mutex<QueuedLines>,
     changed: Condvar,
 }
 
 #[derive(Default)]
-struct Waiting {
+struct QueuedLines {
     lines: Vec<u8>,
     lost_bytes: u64,
     ended: bool,
@@ -203,12 +203,12 @@ impl Queue {
         let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         // After a gap no lines are added before the gap is recorded; otherwise the record of the
         // gap would be in the wrong place.
-        let is_full = |waiting: &mut Waiting| {
+        let is_full = |waiting: &mut QueuedLines| {
             waiting.lost_bytes == 0
                 && !waiting.lines.is_empty()
                 && waiting.lines.len() + lines.len() > QUEUE_BYTES
         };
-        let waited = self.changed.wait_timeout_while(waiting, QUEUE_PATIENCE, is_full);
+        let waited = self.changed.wait_timeout_while(waiting, QUEUE_TIMEOUT, is_full);
         let (mut waiting, _) = waited.unwrap_or_else(PoisonError::into_inner);
         if waiting.lost_bytes > 0 || is_full(&mut waiting) {
             waiting.lost_bytes += lines.len() as u64;
@@ -227,13 +227,13 @@ impl Queue {
     fn write_to(&self, log: &mut RotatedLog) {
         loop {
             let waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-            let is_idle = |waiting: &mut Waiting| {
+            let is_idle = |waiting: &mut QueuedLines| {
                 waiting.lines.is_empty() && waiting.lost_bytes == 0 && !waiting.ended
             };
             let mut waiting =
                 self.changed.wait_while(waiting, is_idle).unwrap_or_else(PoisonError::into_inner);
-            let (lines, lost_bytes) =
-                (std::mem::take(&mut waiting.lines), std::mem::take(&mut waiting.lost_bytes));
+            let lines = std::mem::take(&mut waiting.lines);
+            let lost_bytes = std::mem::take(&mut waiting.lost_bytes);
             let ended = waiting.ended;
             drop(waiting);
             self.changed.notify_all();
@@ -266,8 +266,9 @@ mod tests {
     }
 
     #[test]
-    fn lines_are_put_together_from_whatever_pieces_arrive() {
-        let (mut stream, mut lines) = (stream(), Vec::new());
+    fn lines_are_assembled_from_pieces() {
+        let mut stream = stream();
+        let mut lines = Vec::new();
         for piece in ["on", "e\ntwo", "\n\nthr", "ee\n"] {
             stream.take(piece.as_bytes(), STAMP, &mut lines);
         }
@@ -276,8 +277,9 @@ mod tests {
     }
 
     #[test]
-    fn a_line_that_waits_is_flushed_and_goes_on() {
-        let (mut stream, mut lines) = (stream(), Vec::new());
+    fn partial_line_is_flushed_and_continued() {
+        let mut stream = stream();
+        let mut lines = Vec::new();
         stream.take(b"name? ", STAMP, &mut lines);
         assert!(stream.deadline().is_some() && lines.is_empty());
         stream.flush(STAMP, &mut lines);
@@ -290,7 +292,8 @@ mod tests {
 
     #[test]
     fn long_lines_are_cut_between_characters() {
-        let (mut stream, mut lines) = (stream(), Vec::new());
+        let mut stream = stream();
+        let mut lines = Vec::new();
         let text = format!("x{}", "é".repeat(MAX_TEXT_BYTES / 2));
         stream.take(
             format!("{text}\n{}\nend\n", "y".repeat(MAX_TEXT_BYTES)).as_bytes(),
@@ -307,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_disk_does_not_take_in_time_is_counted_in_its_place() {
+    fn output_the_disk_does_not_accept_in_time_is_counted() {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("task.log");
         let queue = Queue::default();

@@ -3,8 +3,8 @@
 //! simulated time and colours, and names no node. `ros2 launch` puts `[talker-1] ` before the line.
 //! The module keeps no state.
 
-use task_proto::id::GraphName;
-use task_proto::log::{LogLevel, MAX_LINE_BYTES};
+use task_proto::ids::GraphName;
+use task_proto::telemetry::log::{LogLevel, MAX_LINE_BYTES};
 
 /// Replaces a byte or character that must not reach a terminal.
 const REPLACEMENT: char = char::REPLACEMENT_CHARACTER;
@@ -13,7 +13,7 @@ const ELLIPSIS: char = '…';
 
 /// A parsed line in console format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Said<'a> {
+pub struct ConsoleLine<'a> {
     /// Severity of the line.
     pub level: LogLevel,
     /// Time of the line, as the node wrote it.
@@ -25,7 +25,7 @@ pub struct Said<'a> {
 }
 
 /// Parses a line in console format; `None` for any other. `line` is the output of [`printable`].
-pub fn parse(line: &str) -> Option<Said<'_>> {
+pub fn parse(line: &str) -> Option<ConsoleLine<'_>> {
     let line = line.trim_start();
     let (first, rest) = bracket(line)?;
     let (level, rest) = match level_of(first) {
@@ -35,8 +35,12 @@ pub fn parse(line: &str) -> Option<Said<'_>> {
             bracket(rest.trim_start()).and_then(|(second, rest)| Some((level_of(second)?, rest)))?
         }
     };
-    let unstamped =
-        Said { level, stamp: None, logger: None, text: rest.trim_start_matches(':').trim_start() };
+    let unstamped = ConsoleLine {
+        level,
+        stamp: None,
+        logger: None,
+        text: rest.trim_start_matches(':').trim_start(),
+    };
     let Some((stamp, rest)) = bracket(rest.trim_start()).filter(|(stamp, _)| is_stamp(stamp))
     else {
         return Some(unstamped);
@@ -46,7 +50,7 @@ pub fn parse(line: &str) -> Option<Said<'_>> {
         _ => (None, rest),
     };
     let text = rest.strip_prefix(':').unwrap_or(rest).trim_start();
-    Some(Said { level, stamp: Some(stamp), logger, text })
+    Some(ConsoleLine { level, stamp: Some(stamp), logger, text })
 }
 
 /// The node of a logger, by its name: `robot.talker` belongs to `/robot/talker`.
@@ -159,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nodes_of_ros_1_and_2_print_is_understood() {
+    fn console_formats_of_ros_1_and_2_are_parsed() {
         use LogLevel::{Debug, Error, Fatal, Info, Warn};
         for (line, meant) in [
             (
@@ -198,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn other_lines_are_left_alone() {
+    fn other_lines_are_not_parsed() {
         for line in [
             "",
             "plain",
@@ -223,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_reaches_a_terminal_but_text() {
+    fn control_characters_are_removed() {
         let shown = |bytes: &[u8]| printable(bytes);
         assert_eq!(
             shown(b"\x1b[1;31mred\x1b[0m \x1b]0;title\x07x \x1b]8;;u\x1b\\link"),

@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use task_proto::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES};
+use task_proto::telemetry::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES};
 use task_proto::{RobotId, TaskName};
 use tokio::sync::{mpsc, watch};
 
-use super::line::{Entry, LogFile, Twins};
+use super::line::{Deduplicator, Entry, LogFile};
 use super::record::Record;
 use super::tail::Tail;
 use super::{Following, files};
@@ -38,7 +38,7 @@ const BURST_S: u32 = 10;
 /// Approximate maximum size of a batch, because a report may wait behind it on a slow link.
 const BATCH_BYTES: usize = 32 * 1024;
 /// Maximum bytes of all files that are examined in one pass.
-const ROOM_BYTES: usize = 4 * 1024 * 1024;
+const MAX_PASS_BYTES: usize = 4 * 1024 * 1024;
 /// Maximum bytes of a log written without a link that are published afterwards.
 const MISSED_BYTES: u64 = 64 * 1024;
 /// Interval at which a count is published when no line is.
@@ -48,7 +48,7 @@ const COUNT_INTERVAL: Duration = Duration::from_secs(5);
 pub struct Forwarder {
     settings: watch::Receiver<ForwardSettings>,
     following: watch::Receiver<Option<Following>>,
-    gatherer: Gatherer,
+    builder: BatchBuilder,
 }
 
 impl Forwarder {
@@ -59,40 +59,45 @@ impl Forwarder {
         settings: watch::Receiver<ForwardSettings>,
         following: watch::Receiver<Option<Following>>,
     ) -> Self {
-        let mut gatherer = Gatherer::new(robot_id, data);
-        gatherer.skip(0);
-        Self { settings, following, gatherer }
+        let mut builder = BatchBuilder::new(robot_id, data);
+        builder.skip(0);
+        Self { settings, following, builder }
     }
 
     /// Puts batches, as JSON, into `batches` while a session is up and accepts them.
-    pub async fn run(mut self, mut mqtt_up: watch::Receiver<bool>, batches: mpsc::Sender<Vec<u8>>) {
+    pub async fn run<S: Copy>(
+        mut self,
+        mut session: watch::Receiver<S>,
+        is_up: impl Fn(S) -> bool,
+        batches: mpsc::Sender<Vec<u8>>,
+    ) {
         loop {
-            let was_up = *mqtt_up.borrow();
-            if mqtt_up.wait_for(|up| *up).await.is_err() {
+            let was_up = is_up(*session.borrow());
+            if session.wait_for(|session| is_up(*session)).await.is_err() {
                 return;
             }
             let Ok(room) = batches.reserve().await else { return };
-            let wanted = Wanted::new(
+            let filter = LineFilter::new(
                 *self.settings.borrow(),
                 *self.following.borrow_and_update(),
                 Instant::now(),
             );
-            let mut gatherer = self.gatherer;
-            let gathered = tokio::task::spawn_blocking(move || {
+            let mut builder = self.builder;
+            let built = tokio::task::spawn_blocking(move || {
                 if !was_up {
-                    gatherer.skip(MISSED_BYTES);
+                    builder.skip(MISSED_BYTES);
                 }
-                let batch = gatherer.gather(&wanted, Instant::now());
-                (gatherer, batch)
+                let batch = builder.next_batch(&filter, Instant::now());
+                (builder, batch)
             });
-            let Ok((gatherer, batch)) = gathered.await else { return };
-            self.gatherer = gatherer;
+            let Ok((builder, batch)) = built.await else { return };
+            self.builder = builder;
             match batch.as_ref().map(serde_json::to_vec) {
                 Some(Ok(payload)) => room.send(payload),
                 Some(Err(error)) => tracing::error!(%error, "log lines can't be written as JSON"),
                 None => drop(room),
             }
-            let pause = if self.gatherer.has_more { Duration::ZERO } else { wanted.pause };
+            let pause = if self.builder.has_more { Duration::ZERO } else { filter.pause };
             tokio::select! {
                 // Cancel-safe: a timer that is made anew each time.
                 () = tokio::time::sleep(pause) => {}
@@ -106,7 +111,7 @@ impl Forwarder {
 
 /// Selection of the lines that are published now.
 #[derive(Debug, Clone, Copy)]
-struct Wanted {
+struct LineFilter {
     level: LogLevel,
     lines_per_s: u32,
     /// Whether to include lines that belong to none of our tasks.
@@ -114,7 +119,7 @@ struct Wanted {
     pause: Duration,
 }
 
-impl Wanted {
+impl LineFilter {
     fn new(settings: ForwardSettings, following: Option<Following>, now: Instant) -> Self {
         let ForwardSettings { level, lines_per_s } = settings;
         match following.filter(|following| now < following.until) {
@@ -130,12 +135,12 @@ impl Wanted {
 }
 
 /// Read position of each log, and counts of the lines left out.
-struct Gatherer {
+struct BatchBuilder {
     robot_id: RobotId,
     data: DataDir,
     tails: BTreeMap<PathBuf, Tail>,
     budgets: BTreeMap<Option<TaskName>, Budget>,
-    twins: Twins,
+    deduplicator: Deduplicator,
     suppressed: u64,
     counted_at: Option<Instant>,
     has_more: bool,
@@ -150,14 +155,14 @@ struct Budget {
     at: Instant,
 }
 
-impl Gatherer {
+impl BatchBuilder {
     fn new(robot_id: RobotId, data: DataDir) -> Self {
         Self {
             robot_id,
             data,
             tails: BTreeMap::new(),
             budgets: BTreeMap::new(),
-            twins: Twins::default(),
+            deduplicator: Deduplicator::default(),
             suppressed: 0,
             counted_at: None,
             has_more: false,
@@ -173,22 +178,23 @@ impl Gatherer {
     }
 
     /// The next batch, if there are lines or counts to publish.
-    fn gather(&mut self, wanted: &Wanted, now: Instant) -> Option<LogBatch> {
+    fn next_batch(&mut self, filter: &LineFilter, now: Instant) -> Option<LogBatch> {
         let mut files = files(&self.data);
         self.tails.retain(|path, _| files.iter().any(|file| file.path == *path));
         self.budgets.retain(|task, _| files.iter().any(|file| file.task == *task));
-        let (mut batch, mut room) = (Gathered::default(), ROOM_BYTES);
+        let mut batch = PartialBatch::default();
+        let mut room = MAX_PASS_BYTES;
         // A file with more lines than fit into a batch leaves the next batch to the files after it.
         let first = std::mem::take(&mut self.next).checked_rem(files.len()).unwrap_or_default();
         files.rotate_left(first);
         self.has_more = false;
-        for (place, file) in files.iter().enumerate() {
-            if file.task.is_none() && !wanted.others {
+        for (index, file) in files.iter().enumerate() {
+            if file.task.is_none() && !filter.others {
                 self.tails.entry(file.path.clone()).or_default().skip(&file.path, 0);
             } else if !self.has_more {
-                self.read(file, wanted, now, &mut batch, &mut room);
+                self.read(file, filter, now, &mut batch, &mut room);
                 self.has_more = batch.is_full() || room == 0;
-                self.next = if self.has_more { first + place + 1 } else { 0 };
+                self.next = if self.has_more { first + index + 1 } else { 0 };
             }
         }
         let is_due = || self.counted_at.is_none_or(|at| now.duration_since(at) >= COUNT_INTERVAL);
@@ -209,19 +215,19 @@ impl Gatherer {
     fn read(
         &mut self,
         file: &LogFile,
-        wanted: &Wanted,
+        filter: &LineFilter,
         now: Instant,
-        batch: &mut Gathered,
+        batch: &mut PartialBatch,
         room: &mut usize,
     ) {
-        let Self { tails, budgets, twins, suppressed, .. } = self;
-        let burst = wanted.lines_per_s.saturating_mul(BURST_S);
+        let Self { tails, budgets, deduplicator, suppressed, .. } = self;
+        let burst = filter.lines_per_s.saturating_mul(BURST_S);
         let budget =
             budgets.entry(file.task.clone()).or_insert(Budget { lines: f64::from(burst), at: now });
-        budget.refill(wanted.lines_per_s, now);
+        budget.refill(filter.lines_per_s, now);
         let each = |line: &[u8]| {
             let record = Record::parse(line);
-            if record.level(file.unmarked) < wanted.level {
+            if record.level(file.unmarked) < filter.level {
                 return true;
             }
             if budget.lines < 1.0 {
@@ -230,7 +236,7 @@ impl Gatherer {
                 return true;
             }
             let Some(entry) = Entry::of(&record, file, clock::wall_ms()) else { return true };
-            if twins.knows(&entry) {
+            if deduplicator.is_duplicate(&entry) {
                 return true;
             }
             budget.lines -= 1.0;
@@ -254,12 +260,12 @@ impl Budget {
 
 /// A batch under construction.
 #[derive(Default)]
-struct Gathered {
+struct PartialBatch {
     lines: Vec<LogLine>,
     bytes: usize,
 }
 
-impl Gathered {
+impl PartialBatch {
     fn add(&mut self, line: LogLine) {
         self.bytes += serde_json::to_vec(&line).map_or(0, |json| json.len() + 1);
         self.lines.push(line);
@@ -274,7 +280,7 @@ impl Gathered {
 mod tests {
     use std::io::Write as _;
 
-    use task_proto::log::LogSource;
+    use task_proto::telemetry::log::LogSource;
     use task_proto::time::timestamp;
 
     use super::*;
@@ -285,7 +291,7 @@ mod tests {
     struct Bench {
         _temp: tempfile::TempDir,
         data: DataDir,
-        gatherer: Gatherer,
+        builder: BatchBuilder,
         now: Instant,
     }
 
@@ -293,8 +299,8 @@ mod tests {
         fn new() -> Self {
             let temp = tempfile::tempdir().unwrap();
             let data = DataDir::new(temp.path()).unwrap();
-            let gatherer = Gatherer::new("r00000000000000a1".parse().unwrap(), data.clone());
-            Self { _temp: temp, data, gatherer, now: Instant::now() }
+            let builder = BatchBuilder::new("r00000000000000a1".parse().unwrap(), data.clone());
+            Self { _temp: temp, data, builder, now: Instant::now() }
         }
 
         fn say(&self, task: &str, source: LogSource, lines: impl IntoIterator<Item = String>) {
@@ -322,12 +328,16 @@ mod tests {
 
         /// The batch published `later` than the last one: the texts, and the number of lines left
         /// out.
-        fn gather(&mut self, later: Duration, following: Option<LogLevel>) -> (Vec<String>, u64) {
+        fn next_batch(
+            &mut self,
+            later: Duration,
+            following: Option<LogLevel>,
+        ) -> (Vec<String>, u64) {
             self.now += later;
             let following = following
                 .map(|level| Following { level, until: self.now + Duration::from_secs(1) });
-            let wanted = Wanted::new(QUIET, following, self.now);
-            let batch = self.gatherer.gather(&wanted, self.now);
+            let filter = LineFilter::new(QUIET, following, self.now);
+            let batch = self.builder.next_batch(&filter, self.now);
             batch.map_or_else(Default::default, |batch| {
                 (batch.lines.into_iter().map(|line| line.text).collect(), batch.suppressed)
             })
@@ -337,7 +347,7 @@ mod tests {
     const SECOND: Duration = Duration::from_secs(1);
 
     #[test]
-    fn what_matters_is_published_and_more_while_somebody_follows() {
+    fn warnings_are_published_and_more_while_a_client_follows() {
         let mut bench = Bench::new();
         bench.say("one", LogSource::Stdout, ["info".to_owned()]);
         bench.say(
@@ -345,41 +355,42 @@ mod tests {
             LogSource::Stderr,
             ["warn".to_owned(), "[DEBUG] [1.0] [n]: debug".to_owned()],
         );
-        assert_eq!(bench.gather(SECOND, None), (vec!["warn".to_owned()], 0));
+        assert_eq!(bench.next_batch(SECOND, None), (vec!["warn".to_owned()], 0));
         assert_eq!(
-            bench.gather(SECOND, Some(LogLevel::Debug)),
+            bench.next_batch(SECOND, Some(LogLevel::Debug)),
             (vec![], 0),
             "what was passed over is kept, not sent"
         );
         bench.say("one", LogSource::Stdout, ["more".to_owned()]);
-        assert_eq!(bench.gather(SECOND, Some(LogLevel::Info)), (vec!["more".to_owned()], 0));
+        assert_eq!(bench.next_batch(SECOND, Some(LogLevel::Info)), (vec!["more".to_owned()], 0));
     }
 
     #[test]
-    fn a_flood_is_counted_and_drowns_no_other_task() {
+    fn flood_of_one_task_is_counted_and_suppresses_no_other() {
         let mut bench = Bench::new();
         bench.say("loud", LogSource::Stderr, (0..100_000).map(|number| format!("line {number}")));
         bench.say("quiet", LogSource::Stderr, ["help".to_owned()]);
-        let (mut sent, mut left_out) = (Vec::new(), 0);
+        let mut sent = Vec::new();
+        let mut left_out = 0;
         loop {
-            let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+            let (lines, suppressed) = bench.next_batch(Duration::ZERO, None);
             sent.extend(lines);
             left_out += suppressed;
-            if !bench.gatherer.has_more {
+            if !bench.builder.has_more {
                 break;
             }
         }
         assert_eq!(sent.len(), 101, "a burst of one task, and the other's line");
         assert!(sent.contains(&"help".to_owned()));
-        let (lines, suppressed) = bench.gather(COUNT_INTERVAL, None);
+        let (lines, suppressed) = bench.next_batch(COUNT_INTERVAL, None);
         assert_eq!((lines, left_out + suppressed), (vec![], 99_900));
         bench.say("loud", LogSource::Stderr, (0..100).map(|number| format!("later {number}")));
-        let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+        let (lines, suppressed) = bench.next_batch(Duration::ZERO, None);
         assert_eq!((lines.len(), suppressed), (50, 50), "ten lines for each second that passed");
     }
 
     #[test]
-    fn one_that_fills_every_batch_leaves_others_theirs() {
+    fn task_that_fills_every_batch_does_not_starve_others() {
         let mut bench = Bench::new();
         let long = "x".repeat(3000);
         for task in ["one", "two"] {
@@ -390,7 +401,7 @@ mod tests {
             );
         }
         let first_of_both: String =
-            (0..2).map(|_| bench.gather(Duration::ZERO, None).0.remove(0)).collect();
+            (0..2).map(|_| bench.next_batch(Duration::ZERO, None).0.remove(0)).collect();
         assert!(
             first_of_both.contains("one 0") && first_of_both.contains("two 0"),
             "{first_of_both:.40}"
@@ -398,15 +409,15 @@ mod tests {
     }
 
     #[test]
-    fn batches_are_small_and_the_rest_comes_in_the_next() {
+    fn large_output_is_split_into_small_batches() {
         let mut bench = Bench::new();
         let long = "x".repeat(3000);
         bench.say("one", LogSource::Stderr, (0..60).map(|number| format!("{number} {long}")));
-        let (first, _) = bench.gather(Duration::ZERO, None);
-        assert!(bench.gatherer.has_more && first.len() < 15, "{}", first.len());
+        let (first, _) = bench.next_batch(Duration::ZERO, None);
+        assert!(bench.builder.has_more && first.len() < 15, "{}", first.len());
         let mut all = first;
-        while bench.gatherer.has_more {
-            all.extend(bench.gather(Duration::ZERO, None).0);
+        while bench.builder.has_more {
+            all.extend(bench.next_batch(Duration::ZERO, None).0);
         }
         assert_eq!(all.len(), 60);
         assert!(
@@ -415,7 +426,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_node_says_on_both_ways_is_published_once() {
+    fn message_on_console_and_rosout_is_published_once() {
         let mut bench = Bench::new();
         bench.say("one", LogSource::Stderr, ["[WARN] [1.123456789] [n]: low".to_owned()]);
         bench.say(
@@ -423,16 +434,19 @@ mod tests {
             LogSource::Rosout,
             ["[WARN] [1.123] [n]: low".to_owned(), "[WARN] [2.000] [n]: only here".to_owned()],
         );
-        assert_eq!(bench.gather(SECOND, None), (vec!["low".to_owned(), "only here".to_owned()], 0));
+        assert_eq!(
+            bench.next_batch(SECOND, None),
+            (vec!["low".to_owned(), "only here".to_owned()], 0)
+        );
     }
 
     #[test]
-    fn after_a_time_without_link_only_the_last_of_it_is_published() {
+    fn only_the_last_lines_are_published_after_a_lost_link() {
         let mut bench = Bench::new();
-        bench.gatherer.skip(0);
+        bench.builder.skip(0);
         bench.say("one", LogSource::Stderr, (0..10_000).map(|number| format!("line {number}")));
-        bench.gatherer.skip(MISSED_BYTES);
-        let (lines, suppressed) = bench.gather(Duration::ZERO, None);
+        bench.builder.skip(MISSED_BYTES);
+        let (lines, suppressed) = bench.next_batch(Duration::ZERO, None);
         assert_eq!(lines.len(), 100);
         assert!((1000..3000).contains(&suppressed), "{suppressed}");
     }

@@ -5,14 +5,14 @@
 use std::path::PathBuf;
 
 use task_proto::TaskName;
-use task_proto::log::{LogLine, LogSource};
+use task_proto::telemetry::log::{LogLine, LogSource};
 
 use super::console;
 use super::record::Record;
-use crate::system::recent_set::Recent;
+use crate::system::recent_set::RecentSet;
 
 /// Number of lines among which the second of two is searched.
-const TWIN_WINDOW: usize = 4096;
+const DEDUPLICATION_WINDOW: usize = 4096;
 /// A node's time is accepted only within this distance of the robot's time: it may be a simulated
 /// one.
 const MAX_SKEW_MS: u64 = 5 * 60 * 1000;
@@ -32,20 +32,20 @@ pub struct LogFile {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
     pub line: LogLine,
-    mark: Option<Mark>,
+    key: Option<MessageKey>,
 }
 
 /// Fields that both forms of a node's message share: the sender, and the millisecond by the node's
 /// clock.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-struct Mark {
+struct MessageKey {
     logger: String,
     stamp: String,
 }
 
 /// The recent messages of nodes.
 #[derive(Debug, Default)]
-pub struct Twins(Recent<(Mark, LogSource), TWIN_WINDOW>);
+pub struct Deduplicator(RecentSet<(MessageKey, LogSource), DEDUPLICATION_WINDOW>);
 
 impl Entry {
     /// The entry for `record` of `file`; `None` if it has no text. `at_ms` is for a record without
@@ -54,15 +54,15 @@ impl Entry {
         let at_ms = record.at_ms.unwrap_or(at_ms);
         let source = record.source.unwrap_or(file.unmarked);
         let text = console::printable(record.text);
-        let said = console::parse(&text);
-        let level = said.map_or_else(|| Record::level_of_source(source), |said| said.level);
-        let logger = said.and_then(|said| said.logger);
+        let parsed = console::parse(&text);
+        let level = parsed.map_or_else(|| Record::level_of_source(source), |parsed| parsed.level);
+        let logger = parsed.and_then(|parsed| parsed.logger);
         let node = logger.and_then(console::node_of);
-        let stamp = said.and_then(|said| said.stamp);
-        let mark = logger.zip(stamp).map(|(logger, stamp)| Mark::new(logger, stamp));
-        let shown = match said {
+        let stamp = parsed.and_then(|parsed| parsed.stamp);
+        let key = logger.zip(stamp).map(|(logger, stamp)| MessageKey::new(logger, stamp));
+        let shown = match parsed {
             // A logger name that belongs to no node stays in the text.
-            Some(said) if logger.is_some() == node.is_some() => said.text,
+            Some(parsed) if logger.is_some() == node.is_some() => parsed.text,
             _ => &text,
         };
         let line = LogLine {
@@ -76,11 +76,11 @@ impl Entry {
             node,
             text: shown.to_owned(),
         };
-        (!line.text.is_empty()).then_some(Self { line, mark })
+        (!line.text.is_empty()).then_some(Self { line, key })
     }
 }
 
-impl Mark {
+impl MessageKey {
     fn new(logger: &str, stamp: &str) -> Self {
         // The console shows nanoseconds; stored lines of the topic have milliseconds.
         let (seconds, fraction) = stamp.split_once('.').unwrap_or((stamp, ""));
@@ -97,16 +97,16 @@ fn millis(stamp: &str) -> Option<u64> {
     seconds.parse::<u64>().ok()?.checked_mul(1000)?.checked_add(fraction)
 }
 
-impl Twins {
+impl Deduplicator {
     /// Whether the same message came before by another way.
-    pub fn knows(&mut self, entry: &Entry) -> bool {
-        let Some(mark) = &entry.mark else { return false };
+    pub fn is_duplicate(&mut self, entry: &Entry) -> bool {
+        let Some(key) = &entry.key else { return false };
         let others = [LogSource::Stdout, LogSource::Stderr, LogSource::Rosout].into_iter();
         let mut others = others.filter(|source| *source != entry.line.source);
-        if others.any(|source| self.0.contains(&(mark.clone(), source))) {
+        if others.any(|source| self.0.contains(&(key.clone(), source))) {
             return true;
         }
-        self.0.see((mark.clone(), entry.line.source));
+        self.0.insert((key.clone(), entry.line.source));
         false
     }
 }
@@ -114,7 +114,7 @@ impl Twins {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use task_proto::log::LogLevel;
+    use task_proto::telemetry::log::LogLevel;
 
     fn entry(line: &str) -> Option<Entry> {
         let file = LogFile {
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_is_shown_without_what_is_known_of_it_otherwise() {
+    fn line_is_shown_without_its_parsed_fields() {
         let line = entry("2026-11-21T10:00:00.123Z E [ERROR] [1.5] [robot.talker]: no \x1b[31mway")
             .unwrap()
             .line;
@@ -154,14 +154,17 @@ mod tests {
     }
 
     #[test]
-    fn what_is_said_twice_is_shown_once_but_not_what_is_repeated() {
+    fn duplicate_message_is_shown_once_but_repeats_are_kept() {
         let console = entry("2026-11-21T10:00:00.123Z E [INFO] [1.5] [talker]: tick").unwrap();
         let rosout = entry("2026-11-21T10:00:00.120Z R [INFO] [1.5] [talker]: tick").unwrap();
         let other = entry("2026-11-21T10:00:00.120Z R [INFO] [1.6] [talker]: tick").unwrap();
         for (first, second) in [(&console, &rosout), (&rosout, &console)] {
-            let mut twins = Twins::default();
-            assert!(!twins.knows(first) && !twins.knows(first), "two messages in one nanosecond");
-            assert!(twins.knows(second) && !twins.knows(&other));
+            let mut deduplicator = Deduplicator::default();
+            assert!(
+                !deduplicator.is_duplicate(first) && !deduplicator.is_duplicate(first),
+                "two messages in one nanosecond"
+            );
+            assert!(deduplicator.is_duplicate(second) && !deduplicator.is_duplicate(&other));
         }
     }
 }

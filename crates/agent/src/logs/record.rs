@@ -10,7 +10,7 @@
 //! line before, which was too long, or whose end came late. Lines of earlier versions have no time
 //! and no letter. The module never changes a text.
 
-use task_proto::log::{LogLevel, LogSource};
+use task_proto::telemetry::log::{LogLevel, LogSource};
 use task_proto::time::{parse_timestamp, timestamp};
 
 use super::console;
@@ -132,7 +132,7 @@ mod tests {
     const STAMP: &str = "2026-11-21T10:00:00.123Z";
 
     #[test]
-    fn a_stored_line_reads_back_whatever_its_bytes() {
+    fn stored_line_reads_back_with_any_bytes() {
         for (source, continues) in [(LogSource::Stdout, false), (LogSource::Diagnostics, true)] {
             let mut log = Vec::new();
             write(&mut log, STAMP, source, continues, b"\xff O \x1b[0m");
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn the_level_is_what_the_line_says_or_its_source() {
+    fn level_comes_from_the_line_or_its_source() {
         let level = |line: &str| Record::parse(line.as_bytes()).level(LogSource::Stdout);
         assert_eq!(level("plain"), LogLevel::Info);
         assert_eq!(level(&format!("{STAMP} O plain")), LogLevel::Info);

@@ -7,7 +7,7 @@ use std::io::{self, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use task_proto::log::LogSource;
+use task_proto::telemetry::log::LogSource;
 use task_proto::time::timestamp;
 
 use super::record;
@@ -56,7 +56,7 @@ impl RotatedLog {
 
     fn write_some(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let max_bytes = self.spec.max_bytes.max(1);
-        self.admit_dropped()?;
+        self.write_drop_note()?;
         let current = self.current()?;
         let room = usize::try_from(max_bytes.saturating_sub(current.size)).unwrap_or(usize::MAX);
         let count = if bytes.len() <= room {
@@ -77,7 +77,7 @@ impl RotatedLog {
     }
 
     /// Records the number of missing bytes, once writing works again.
-    fn admit_dropped(&mut self) -> io::Result<()> {
+    fn write_drop_note(&mut self) -> io::Result<()> {
         if self.dropped_bytes > 0 {
             let text =
                 format!("[WARN] {} bytes of output could not be written here", self.dropped_bytes);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn output_that_cannot_be_written_is_counted_and_admitted() {
+    fn unwritable_output_is_counted_and_noted() {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("later").join("task.log");
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 1000, files: 2 });

@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_was_added_is_read_and_only_whole_lines() {
+    fn only_new_complete_lines_are_read() {
         let temp = tempfile::tempdir().unwrap();
         let log = temp.path().join("task.log");
         let mut tail = Tail::default();
@@ -195,11 +195,12 @@ mod tests {
     }
 
     #[test]
-    fn rotation_loses_nothing_that_is_still_there() {
+    fn rotation_loses_no_existing_line() {
         let temp = tempfile::tempdir().unwrap();
         let log = temp.path().join("task.log");
         let mut written = RotatedLog::new(LogSpec { path: log.clone(), max_bytes: 100, files: 5 });
-        let (mut tail, mut seen) = (Tail::default(), Vec::new());
+        let mut tail = Tail::default();
+        let mut seen = Vec::new();
         for number in 0..200 {
             written.write(format!("line {number}\n").as_bytes());
             // Sometimes a whole file and more is added between two reads.
@@ -219,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn a_log_that_somebody_deleted_is_not_read_again() {
+    fn deleted_log_is_not_read_again() {
         let temp = tempfile::tempdir().unwrap();
         let log = temp.path().join("task.log");
         let mut written = RotatedLog::new(LogSpec { path: log.clone(), max_bytes: 100, files: 5 });
@@ -236,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn reading_stops_where_it_is_told_to_and_goes_on_there() {
+    fn reading_stops_on_request_and_continues_there() {
         let temp = tempfile::tempdir().unwrap();
         let log = temp.path().join("task.log");
         std::fs::write(&log, "one\ntwo\nthree\n").unwrap();

@@ -128,7 +128,7 @@ const NEW_NAMESPACES: u32 = (libc::CLONE_NEWNS
     | libc::CLONE_NEWNET) as u32;
 const NEW_TIME_NAMESPACE: u32 = 0x80;
 /// Requests of `ioctl` that type into a terminal, which other processes may share.
-const TYPING: [u32; 2] = [0x5412, 0x541C];
+const TERMINAL_INPUT: [u32; 2] = [0x5412, 0x541C];
 
 /// Offsets in `seccomp_data` of the call's number, the architecture and the low half of each
 /// argument.
@@ -206,15 +206,15 @@ fn kernel_filters() -> bool {
 
 fn program(architecture: u32) -> Vec<sock_filter> {
     let mut program =
-        vec![load(ARCHITECTURE_AT), jump(libc::BPF_JEQ, architecture, 1, 0), answer(DENY)];
+        vec![load(ARCHITECTURE_AT), jump(libc::BPF_JEQ, architecture, 1, 0), return_action(DENY)];
     program.push(load(NUMBER_AT));
     if cfg!(target_arch = "x86_64") {
-        program.extend([jump(libc::BPF_JGE, X32_BIT, 0, 1), answer(DENY)]);
+        program.extend([jump(libc::BPF_JGE, X32_BIT, 0, 1), return_action(DENY)]);
     }
     for call in DENIED {
-        program.extend([jump(libc::BPF_JEQ, call as u32, 0, 1), answer(DENY)]);
+        program.extend([jump(libc::BPF_JEQ, call as u32, 0, 1), return_action(DENY)]);
     }
-    program.extend([jump(libc::BPF_JEQ, CLONE3 as u32, 0, 1), answer(UNKNOWN)]);
+    program.extend([jump(libc::BPF_JEQ, CLONE3 as u32, 0, 1), return_action(UNKNOWN)]);
     for (call, flags) in [
         (libc::SYS_clone, NEW_NAMESPACES),
         (libc::SYS_unshare, NEW_NAMESPACES | NEW_TIME_NAMESPACE),
@@ -223,17 +223,17 @@ fn program(architecture: u32) -> Vec<sock_filter> {
             jump(libc::BPF_JEQ, call as u32, 0, 4),
             load(FIRST_ARGUMENT_AT),
             jump(libc::BPF_JSET, flags, 0, 1),
-            answer(DENY),
-            answer(ALLOW),
+            return_action(DENY),
+            return_action(ALLOW),
         ]);
     }
     program.extend([
         jump(libc::BPF_JEQ, libc::SYS_ioctl as u32, 0, 4),
         load(SECOND_ARGUMENT_AT),
-        jump(libc::BPF_JEQ, TYPING[0], 1, 0),
-        jump(libc::BPF_JEQ, TYPING[1], 0, 1),
-        answer(DENY),
-        answer(ALLOW),
+        jump(libc::BPF_JEQ, TERMINAL_INPUT[0], 1, 0),
+        jump(libc::BPF_JEQ, TERMINAL_INPUT[1], 0, 1),
+        return_action(DENY),
+        return_action(ALLOW),
     ]);
     program
 }
@@ -251,8 +251,8 @@ fn jump(condition: u32, with: u32, if_so: u8, if_not: u8) -> sock_filter {
     }
 }
 
-fn answer(what: u32) -> sock_filter {
-    sock_filter { code: (libc::BPF_RET | libc::BPF_K) as u16, jt: 0, jf: 0, k: what }
+fn return_action(action: u32) -> sock_filter {
+    sock_filter { code: (libc::BPF_RET | libc::BPF_K) as u16, jt: 0, jf: 0, k: action }
 }
 
 #[cfg(test)]
@@ -320,7 +320,7 @@ print("works")
 "#;
 
     /// Output of `script` when it runs as a build, with or without the filter.
-    async fn said_by(script: &str, filter_calls: bool) -> String {
+    async fn output_of(script: &str, filter_calls: bool) -> String {
         let temp = tempfile::tempdir().expect("a directory");
         let path = temp.path().join("script");
         std::fs::write(&path, format!("exec python3 - <<'END'\n{script}\nEND\n")).expect("written");
@@ -339,26 +339,26 @@ print("works")
 
     #[tokio::test]
     async fn filtered_program_is_denied_each_class_of_calls() {
-        let said = said_by(CALLS, true).await;
+        let said = output_of(CALLS, true).await;
         assert!(said.lines().count() > 20, "{said}");
         for line in said.lines() {
             let denied = if line.starts_with("clone3 ") { "ENOSYS" } else { "EPERM" };
             let is_x86_only = line.starts_with("x32 ") && !cfg!(target_arch = "x86_64");
             assert!(line.ends_with(denied) || is_x86_only, "{line}\n\n{said}");
         }
-        let unfiltered = said_by(CALLS, false).await;
+        let unfiltered = output_of(CALLS, false).await;
         let allowed = unfiltered.lines().filter(|line| !line.ends_with("EPERM")).count();
         assert!(allowed > 6, "without the filter: {unfiltered}");
     }
 
     #[tokio::test]
     async fn filtered_program_runs_threads_processes_and_sockets() {
-        let said = said_by(USES, true).await;
+        let said = output_of(USES, true).await;
         assert!(said.ends_with("works\n"), "{said}");
     }
 
     #[test]
-    fn filter_is_the_default_of_tasks_with_an_account_and_has_to_be_said_otherwise() {
+    fn filter_is_the_default_only_for_tasks_with_their_own_account() {
         assert!(is_wanted(None, true) && !is_wanted(None, false));
         assert!(is_wanted(Some(Seccomp::Default), false) && !is_wanted(Some(Seccomp::Off), true));
     }

@@ -251,7 +251,7 @@ impl Cgroup {
             dirs.extend(below.map(|entry| entry.path()));
             if dirs.len() > MAX_NESTED {
                 return Err(io::Error::other(format!(
-                    "more than {MAX_NESTED} groups lie below {}",
+                    "more than {MAX_NESTED} groups below {}",
                     self.0.display()
                 )));
             }
@@ -262,7 +262,7 @@ impl Cgroup {
 
 /// Capability of control groups on this machine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Outlook {
+pub enum Capability {
     /// They end runs reliably and keep them from starving their neighbours.
     Isolates,
     /// They end runs reliably, but do not isolate them.
@@ -273,13 +273,13 @@ pub enum Outlook {
 
 /// The capability that an agent with sufficient rights would find. This function tests nothing, so
 /// it changes nothing.
-pub fn outlook() -> Outlook {
+pub fn capability() -> Capability {
     let table = fs::read_to_string("/proc/self/mountinfo").unwrap_or_default();
-    let Some(mount) = Mount::find(&table) else { return Outlook::Nothing };
+    let Some(mount) = Mount::find(&table) else { return Capability::Nothing };
     let controllers =
         fs::read_to_string(mount.point.join("cgroup.controllers")).unwrap_or_default();
     let has = |name| controllers.split_whitespace().any(|controller| controller == name);
-    if has("memory") && has("pids") { Outlook::Isolates } else { Outlook::Counts }
+    if has("memory") && has("pids") { Capability::Isolates } else { Capability::Counts }
 }
 
 /// Mount point of the hierarchy and the mounted part of it.
@@ -293,7 +293,8 @@ impl Mount {
         mount_table.lines().find_map(|line| {
             let (fields, kind) = line.split_once(" - ")?;
             let mut fields = fields.split(' ').skip(3);
-            let (root, point) = (PathBuf::from(fields.next()?), PathBuf::from(fields.next()?));
+            let root = PathBuf::from(fields.next()?);
+            let point = PathBuf::from(fields.next()?);
             kind.starts_with("cgroup2 ").then_some(Self { point, root })
         })
     }
@@ -423,7 +424,7 @@ mod tests {
     }
 
     #[test]
-    fn a_delegated_agent_divides_what_it_was_given_and_root_the_machine() {
+    fn delegated_agent_uses_its_own_group_and_root_the_whole_machine() {
         let mount = Mount::find(HYBRID).expect("found");
         let own = own_path("4:memory:/x\n0::/system.slice/robot.service/agent\n").expect("found");
         let service = Path::new("/sys/fs/cgroup/unified/system.slice/robot.service");
@@ -435,14 +436,14 @@ mod tests {
     }
 
     #[test]
-    fn every_directory_has_a_group_of_its_own() {
+    fn each_directory_has_its_own_group() {
         assert_eq!(name(Path::new("/a/run/1")), name(Path::new("/a/run/1")));
         assert_ne!(name(Path::new("/a/run/1")), name(Path::new("/a/run/2")));
         assert_eq!(name(Path::new("/a")).len(), 20);
     }
 
     #[test]
-    fn a_group_that_is_gone_has_no_processes_and_is_removed_and_killed_with_ease() {
+    fn missing_group_is_empty_and_can_be_killed_and_removed() {
         let gone = Cgroup::at(PathBuf::from("/nonexistent/taskd/run-1"));
         assert_eq!(gone.pids().expect("none"), Vec::<u32>::new());
         assert!(gone.kill().is_ok() && gone.remove().is_ok() && !gone.is_out_of_memory());

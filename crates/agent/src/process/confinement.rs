@@ -102,7 +102,7 @@ impl Confinement {
             setrlimit(Resource::RLIMIT_NPROC, count, count)?;
         }
         if let Some(user) = &self.user {
-            user.become_it()?;
+            user.switch_account()?;
         }
         access(self.script.as_c_str(), AccessFlags::R_OK)?;
         self.calls.as_ref().map_or(Ok(()), CallFilter::install)
@@ -111,7 +111,7 @@ impl Confinement {
 
 impl Account {
     /// Gives up root permanently: no capability is left, and no executed program can regain one.
-    fn become_it(&self) -> io::Result<()> {
+    fn switch_account(&self) -> io::Result<()> {
         prctl::set_no_new_privs()?;
         for capability in 0..=LAST_CAPABILITY {
             // SAFETY: takes integers only.

@@ -39,10 +39,10 @@ pub struct Containment {
 #[derive(Debug, thiserror::Error)]
 pub enum ContainmentError {
     /// The process table could not be read, or a process could not be signalled.
-    #[error("cannot look through the process table")]
+    #[error("cannot read the process table")]
     Io(#[from] io::Error),
     /// Processes that SIGKILL did not end in time: they hang in the kernel.
-    #[error("processes {pids:?} do not end, not even by SIGKILL")]
+    #[error("processes {pids:?} do not end, even after SIGKILL")]
     Survivors { pids: Vec<u32> },
 }
 
@@ -167,7 +167,7 @@ impl Containment {
             .copied()
             .collect();
         let marker = self.marker.clone();
-        let marked = environments::look(others, move |entry| entry.was_started_with(&marker));
+        let marked = environments::read_all(others, move |entry| entry.was_started_with(&marker));
         known
             .extend(marked.into_iter().filter(|(_, is_ours)| *is_ours).map(|(entry, _)| entry.pid));
         // The group's entries were read later than the table, so their pids are more current.
@@ -217,7 +217,10 @@ fn grouped(cgroup: &Cgroup) -> io::Result<Vec<ProcessEntry>> {
             return Ok(sure);
         }
     }
-    Err(io::Error::other(format!("the processes in {} change too fast", cgroup.path().display())))
+    Err(io::Error::other(format!(
+        "the processes in {} change too quickly",
+        cgroup.path().display()
+    )))
 }
 
 /// Signals all processes, even if one of them can't be signalled, and then returns the last error.
@@ -233,7 +236,7 @@ pub fn signal_each<'a>(
             tracing::warn!(
                 pid = member.pid,
                 signal = signal.as_str(),
-                "a process of a task may not be signalled"
+                "no permission to signal a process of a task"
             );
             None
         }
@@ -261,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn descendants_are_found_in_any_order_and_loops_end() {
+    fn descendants_are_found_in_any_order_and_cycles_end() {
         let table = [entry(5, 4), entry(4, 2), entry(2, 1), entry(3, 1), entry(9, 9)];
         assert_eq!(descendants(&table, 2), HashSet::from([4, 5]));
         assert_eq!(descendants(&table, 9), HashSet::from([9]));
@@ -269,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_belongs_to_a_directory_nobody_was_started_for() {
+    fn unused_directory_has_no_members() {
         let containment = Containment::new(
             Path::new("/nonexistent/run"),
             None,

@@ -224,7 +224,8 @@ impl PidFd {
 
     /// Sends `signal`; a process that has ended meanwhile is no error.
     pub fn signal(&self, signal: Signal) -> io::Result<()> {
-        let (fd, no_info) = (self.0.as_raw_fd(), std::ptr::null::<libc::siginfo_t>());
+        let fd = self.0.as_raw_fd();
+        let no_info = std::ptr::null::<libc::siginfo_t>();
         // SAFETY: a null siginfo is allowed and means the same as kill(2); the descriptor is open
         // while `self` lives.
         let result = unsafe {
@@ -585,7 +586,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn this_process_knows_itself_but_not_its_predecessor() {
+    fn identity_matches_this_process_but_not_an_earlier_one() {
         let own = ProcessIdentity::of(std::process::id()).expect("stat").expect("alive");
         assert!(own.is_alive());
         assert!(own.open().expect("pidfd").is_some());
@@ -653,7 +654,7 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_larger_than_any_that_something_is_started_with_is_nobodys() {
+    fn oversized_environment_counts_as_foreign() {
         let mut memory = vec![0; 64 << 20];
         memory[..9].copy_from_slice(b"LIE=told\0");
         let start = memory.as_ptr() as u64;

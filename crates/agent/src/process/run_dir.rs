@@ -88,7 +88,7 @@ pub enum RunDirError {
     #[error("cannot use {}", path.display())]
     Io { path: PathBuf, source: io::Error },
     /// The file is not in the format that this version writes.
-    #[error("{} is not readable as what it should be", path.display())]
+    #[error("{} is damaged", path.display())]
     Malformed { path: PathBuf, source: serde_json::Error },
 }
 
@@ -145,7 +145,7 @@ impl RunDir {
     }
 
     /// Removes that record, because nothing ran after all.
-    pub fn forget_begun(&self) -> Result<(), RunDirError> {
+    pub fn remove_begun(&self) -> Result<(), RunDirError> {
         let path = self.0.join("begun");
         durable::remove_file(&path).map_err(|source| RunDirError::Io { path, source })
     }
@@ -225,7 +225,7 @@ mod tests {
     use crate::system::durable::own_mounts::with_own_mounts;
 
     #[test]
-    fn a_run_on_a_disk_that_became_read_only_can_be_locked() {
+    fn run_on_a_read_only_disk_can_be_locked() {
         let temp = tempfile::tempdir().expect("temp dir");
         with_own_mounts(|| {
             let mounted =

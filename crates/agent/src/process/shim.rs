@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use serde::{Deserialize, Serialize};
+use task_proto::error_chain::chain;
+use task_proto::time::millis;
 
 use crate::logs::capture;
 use crate::process::cgroup::Cgroup;
@@ -28,7 +30,7 @@ const KILL_TIMEOUT: Duration = Duration::from_secs(10);
 /// Number of attempts to write the exit record to a full disk, and the pause between two attempts:
 /// an hour in all.
 const MAX_WRITES: u32 = 720;
-const ROOM_PAUSE: Duration = Duration::from_secs(5);
+const DISK_FULL_PAUSE: Duration = Duration::from_secs(5);
 /// Maximum time for the rest of the output once no process is left to write any.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -82,9 +84,9 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     let begun = program::become_shim().map_err(ShimError::Io).and_then(|()| begin(&dir));
     let answer = match &begun {
         Ok(task) => Answer::Started(task.started.clone()),
-        Err(error) => Answer::Failed(with_causes(error)),
+        Err(error) => Answer::Failed(chain(error)),
     };
-    tell(&answer);
+    send_answer(&answer);
     program::close_standard_streams()?;
     let task = begun?;
     let status = wait_for_task(task.started.task.pid)?;
@@ -93,7 +95,7 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
     let _ = end_leftovers(&task.containment);
     // Output that is still unread after this belongs to a process that hangs in the kernel.
     let _ = task.drained.recv_timeout(DRAIN_TIMEOUT);
-    let at_uptime_ms = u64::try_from(clock::uptime()?.as_millis()).unwrap_or(u64::MAX);
+    let at_uptime_ms = millis(clock::uptime()?);
     let out_of_memory_bytes = task.memory_bytes.filter(|_| task.containment.is_out_of_memory());
     if task.has_outputs {
         // The agent uploads the files once it reads that the run ended, also after a power cut. The
@@ -101,7 +103,7 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
         let _ = durable::sync_file_system(dir.path());
     }
     let ended = Ended { status, at_uptime_ms, out_of_memory_bytes };
-    once_there_is_room(ROOM_PAUSE, || dir.write_ended(&ended))?;
+    retry_while_disk_is_full(DISK_FULL_PAUSE, || dir.write_ended(&ended))?;
     // The next stop of this run or the next boot removes a group that stays here.
     let _ = task.containment.remove();
     Ok(())
@@ -109,7 +111,7 @@ pub fn run(path: &Path) -> Result<(), ShimError> {
 
 /// Retries while the disk is full: the task may have filled the disk itself, and its exit status
 /// must not be lost for that reason.
-fn once_there_is_room(
+fn retry_while_disk_is_full(
     pause: Duration,
     mut write: impl FnMut() -> Result<(), RunDirError>,
 ) -> Result<(), RunDirError> {
@@ -135,9 +137,9 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
         Ok(pid) => pid,
         Err(source) => {
             // If the file stays, the run counts as lost: a lost job is not run again.
-            let _ = dir.forget_begun();
-            let (script, directory) =
-                (spec.script.display().to_string(), spec.directory.display().to_string());
+            let _ = dir.remove_begun();
+            let script = spec.script.display().to_string();
+            let directory = spec.directory.display().to_string();
             return Err(ShimError::Start { script, directory, source });
         }
     };
@@ -153,7 +155,8 @@ fn begin(dir: &RunDir) -> Result<Task, ShimError> {
     });
     match written {
         Ok(started) => {
-            let (memory_bytes, has_outputs) = (spec.limits.memory_bytes, spec.has_outputs);
+            let memory_bytes = spec.limits.memory_bytes;
+            let has_outputs = spec.has_outputs;
             Ok(Task { started, containment, memory_bytes, has_outputs, drained })
         }
         Err(error) => {
@@ -175,8 +178,8 @@ fn start(spec: &RunSpec, output: PipeWriter, errors: PipeWriter) -> io::Result<u
         Confinement::new(&spec.script, cgroup.as_ref(), &spec.limits, spec.user.as_ref())?;
     if let Some(user) = &spec.user {
         // A task may open its output by name, as `/dev/stdout`.
-        user.own(&output)?;
-        user.own(&errors)?;
+        user.chown(&output)?;
+        user.chown(&errors)?;
     }
     program::spawn_task(
         &spec.script,
@@ -193,7 +196,7 @@ fn identity(pid: u32) -> Result<ProcessIdentity, ShimError> {
 }
 
 /// Ignores errors: the supervisor may be gone, and the task runs on all the same.
-fn tell(answer: &Answer) {
+fn send_answer(answer: &Answer) {
     if let Ok(mut line) = serde_json::to_vec(answer) {
         line.push(b'\n');
         let mut output = io::stdout();
@@ -206,7 +209,9 @@ fn wait_for_task(task: u32) -> io::Result<ExitStatus> {
         match program::next_child(None)? {
             ChildEvent::Ended(pid, status) if pid == task => return Ok(status),
             ChildEvent::NoChildren => {
-                return Err(io::Error::other("the task was collected by someone else"));
+                return Err(io::Error::other(
+                    "another process collected the exit status of the task",
+                ));
             }
             ChildEvent::Ended(..) | ChildEvent::TimedOut => {}
         }
@@ -245,23 +250,12 @@ fn collect_until_empty(containment: &Containment, timeout: Duration) -> io::Resu
     }
 }
 
-fn with_causes(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        text.push_str(": ");
-        text.push_str(&inner.to_string());
-        cause = inner.source();
-    }
-    text
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn how_a_task_ended_is_written_once_the_disk_has_room_again() {
+    fn exit_status_is_written_once_the_disk_has_space() {
         let refused =
             |kind: io::ErrorKind| RunDirError::Io { path: "exit.json".into(), source: kind.into() };
         let mut answers = vec![
@@ -269,11 +263,11 @@ mod tests {
             Err(refused(io::ErrorKind::StorageFull)),
             Err(refused(io::ErrorKind::QuotaExceeded)),
         ];
-        once_there_is_room(Duration::ZERO, || answers.pop().expect("asked three times"))
+        retry_while_disk_is_full(Duration::ZERO, || answers.pop().expect("asked three times"))
             .expect("written");
         assert!(answers.is_empty());
         let mut count = 0;
-        let never = once_there_is_room(Duration::ZERO, || {
+        let never = retry_while_disk_is_full(Duration::ZERO, || {
             count += 1;
             Err(refused(if count == 2 {
                 io::ErrorKind::PermissionDenied

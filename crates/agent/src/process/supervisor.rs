@@ -46,7 +46,7 @@ pub struct Supervisor {
 
 /// State of a run, from its run directory and the process table.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Observed {
+pub enum RunState {
     /// No run was ever started in the directory.
     NeverStarted,
     /// The run's shim lives.
@@ -66,11 +66,11 @@ pub enum Observed {
 }
 
 /// Progress of a start.
-enum Begun {
+enum StartProgress {
     /// The run was started before.
-    Runs(Started),
+    AlreadyRunning(Started),
     /// The shim writes the result of the start to this pipe.
-    Asked(PipeReader),
+    ShimStarted(PipeReader),
 }
 
 /// Errors of starting, observing or ending a run.
@@ -89,7 +89,7 @@ pub enum SupervisorError {
     #[error("the task's shim did not answer within {} s", START_TIMEOUT.as_secs())]
     NoAnswer,
     /// The result of the start is not known yet.
-    #[error("a start of the task is in progress, or hangs")]
+    #[error("a start of the task is in progress or hangs")]
     Starting,
     /// Processes could not be found or ended.
     #[error(transparent)]
@@ -133,17 +133,21 @@ impl Supervisor {
     }
 
     async fn start_shim(&self, path: &Path, spec: &RunSpec) -> Result<Started, SupervisorError> {
-        let (program, cgroups) = (self.program.clone(), self.cgroups.clone());
-        let (path, mut spec) = (path.to_owned(), spec.clone());
-        let (dir, lock) = once_locked(&path, START_TIMEOUT, |dir| Ok(dir.try_lock()?)).await?;
+        let program = self.program.clone();
+        let cgroups = self.cgroups.clone();
+        let path = path.to_owned();
+        let mut spec = spec.clone();
+        let (dir, lock) = with_lock(&path, START_TIMEOUT, |dir| Ok(dir.try_lock()?)).await?;
         let given_up = CancellationToken::new();
         let _when_dropped = given_up.clone().drop_guard();
-        let begun = in_background("start the shim", move || {
+        let progress = in_background("start the shim", move || {
             let started = dir.started()?;
             if started.is_some() || dir.has_begun() {
                 let runs = dir.ended()?.is_none();
                 let running = started.filter(|started| runs && started.shim.is_alive());
-                return running.map(Begun::Runs).ok_or(SupervisorError::Used(path));
+                return running
+                    .map(StartProgress::AlreadyRunning)
+                    .ok_or(SupervisorError::Used(path));
             }
             spec.environment.insert(ASSIGNMENT_VARIABLE.to_owned(), spec.assignment.to_string());
             spec.environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.path().display().to_string());
@@ -161,12 +165,12 @@ impl Supervisor {
                 return Err(SupervisorError::NoAnswer);
             }
             program::spawn_shim(&program, dir.path(), lock)
-                .map(Begun::Asked)
+                .map(StartProgress::ShimStarted)
                 .map_err(failed("start the shim"))
         });
-        let answer = match begun.await? {
-            Begun::Runs(started) => return Ok(started),
-            Begun::Asked(answer) => answer,
+        let answer = match progress.await? {
+            StartProgress::AlreadyRunning(started) => return Ok(started),
+            StartProgress::ShimStarted(answer) => answer,
         };
         let unread = failed("read the shim's answer");
         let answer = pipe::Receiver::from_owned_fd(answer.into()).map_err(&unread)?;
@@ -175,14 +179,14 @@ impl Supervisor {
         match serde_json::from_slice(&line) {
             Ok(Answer::Started(started)) => Ok(started),
             Ok(Answer::Failed(reason)) => Err(SupervisorError::Refused(reason)),
-            Err(_) => Err(SupervisorError::Refused("its shim ended without a word".to_owned())),
+            Err(_) => Err(SupervisorError::Refused("its shim ended without an answer".to_owned())),
         }
     }
 
     /// The state of the run at `path`. Waits for a start in progress. When the shim was killed,
     /// this call ends the processes that are left: their output is no longer read and their exit
     /// status could not be determined.
-    pub async fn observe(&self, path: &Path) -> Result<Observed, SupervisorError> {
+    pub async fn observe(&self, path: &Path) -> Result<RunState, SupervisorError> {
         self.observe_within(path, START_TIMEOUT).await
     }
 
@@ -190,39 +194,39 @@ impl Supervisor {
     pub async fn observe_within(
         &self,
         path: &Path,
-        patience: Duration,
-    ) -> Result<Observed, SupervisorError> {
+        time_limit: Duration,
+    ) -> Result<RunState, SupervisorError> {
         if !path.join("spec.json").exists() {
-            return Ok(Observed::NeverStarted);
+            return Ok(RunState::NeverStarted);
         }
-        let (dir, started, cgroup) = read_within(path, patience).await?;
+        let (dir, started, cgroup) = read_within(path, time_limit).await?;
         let Some(started) = started else {
             // The shim died, or the machine went down, before the processes of the run were
             // recorded.
             Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
-            return Ok(if dir.has_begun() { Observed::Gone } else { Observed::NeverStarted });
+            return Ok(if dir.has_begun() { RunState::Gone } else { RunState::NeverStarted });
         };
         // The order matters: before it ends, a shim writes `exit.json` if it can.
         let shim_lives = started.shim.is_alive();
         if let Some(ended) = dir.ended()? {
             let killed =
-                ended.out_of_memory_bytes.map(|limit_bytes| Observed::OutOfMemory { limit_bytes });
-            return Ok(killed.unwrap_or(Observed::Exited(ended.status)));
+                ended.out_of_memory_bytes.map(|limit_bytes| RunState::OutOfMemory { limit_bytes });
+            return Ok(killed.unwrap_or(RunState::Exited(ended.status)));
         }
         if shim_lives {
             let age = started.task.age().map_err(failed("read the machine's uptime"))?;
-            return Ok(Observed::Running { pid: started.task.pid, age });
+            return Ok(RunState::Running { pid: started.task.pid, age });
         }
         Containment::new(dir.path(), None, cgroup).end(KILL_TIMEOUT).await?;
-        Ok(Observed::Gone)
+        Ok(RunState::Gone)
     }
 
     /// Resolves when the run at `path` does not run any more, at once if it does not run now. This
     /// call does not poll. Cancel-safe.
-    pub async fn wait(&self, path: &Path) -> Result<Observed, SupervisorError> {
+    pub async fn wait(&self, path: &Path) -> Result<RunState, SupervisorError> {
         loop {
             let observed = self.observe(path).await?;
-            if !matches!(observed, Observed::Running { .. }) {
+            if !matches!(observed, RunState::Running { .. }) {
                 return Ok(observed);
             }
             let Some(started) = read(path).await?.1 else { continue };
@@ -246,7 +250,7 @@ impl Supervisor {
     /// Afterwards none of the run's processes is left, wherever they had hidden. Dropping the
     /// future leaves a run that may still be ending. Another call begins with SIGINT again; on a
     /// run that has ended, it only verifies that no process is left.
-    pub async fn stop(&self, path: &Path, grace: Duration) -> Result<Observed, SupervisorError> {
+    pub async fn stop(&self, path: &Path, grace: Duration) -> Result<RunState, SupervisorError> {
         let mut observed = match self.observe(path).await {
             Err(SupervisorError::Starting) => {
                 self.end_start(path).await?;
@@ -254,7 +258,7 @@ impl Supervisor {
             }
             observed => observed?,
         };
-        if observed == Observed::NeverStarted && !path.exists() {
+        if observed == RunState::NeverStarted && !path.exists() {
             return Ok(observed);
         }
         let (dir, started, cgroup) = read(path).await?;
@@ -263,7 +267,7 @@ impl Supervisor {
             started.as_ref().map(|started| started.shim.clone()),
             cgroup,
         );
-        if let (Observed::Running { .. }, Some(started)) = (&observed, &started) {
+        if let (RunState::Running { .. }, Some(started)) = (&observed, &started) {
             observed = self.end_run(&dir, &containment, &started.task, grace).await?;
         }
         containment.end(KILL_TIMEOUT).await?;
@@ -289,8 +293,9 @@ impl Supervisor {
         containment: &Containment,
         task: &ProcessIdentity,
         grace: Duration,
-    ) -> Result<Observed, SupervisorError> {
-        let (path, signalled) = (dir.path(), failed("signal the task"));
+    ) -> Result<RunState, SupervisorError> {
+        let path = dir.path();
+        let signalled = failed("signal the task");
         match dir.spec()?.map(|spec| spec.interrupt).unwrap_or_default() {
             // The task's first process leads its group.
             Interrupt::Group => {
@@ -313,7 +318,7 @@ impl Supervisor {
         containment.end(KILL_TIMEOUT).await?;
         // The shim needs a moment to record the end. If the shim hangs, the run is over all the
         // same.
-        tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(Observed::Gone))
+        tokio::time::timeout(KILL_TIMEOUT, self.wait(path)).await.unwrap_or(Ok(RunState::Gone))
     }
 }
 
@@ -325,9 +330,9 @@ async fn read(path: &Path) -> Result<(RunDir, Option<Started>, Option<PathBuf>),
 
 async fn read_within(
     path: &Path,
-    patience: Duration,
+    time_limit: Duration,
 ) -> Result<(RunDir, Option<Started>, Option<PathBuf>), SupervisorError> {
-    let (dir, (started, spec)) = once_locked(path, patience, |dir| {
+    let (dir, (started, spec)) = with_lock(path, time_limit, |dir| {
         let Some(_no_start_in_progress) = dir.try_lock_shared()? else { return Ok(None) };
         Ok(Some((dir.started()?, dir.spec()?)))
     })
@@ -337,12 +342,12 @@ async fn read_within(
 
 /// Runs `attempt` on the run directory once its lock is held. The lock is tried repeatedly, because
 /// a thread that blocked on the lock of a hanging start would be lost forever.
-async fn once_locked<T: Send + 'static>(
+async fn with_lock<T: Send + 'static>(
     path: &Path,
-    patience: Duration,
+    time_limit: Duration,
     attempt: impl Fn(&RunDir) -> Result<Option<T>, SupervisorError> + Copy + Send + 'static,
 ) -> Result<(RunDir, T), SupervisorError> {
-    let deadline = Instant::now() + patience;
+    let deadline = Instant::now() + time_limit;
     loop {
         let path = path.to_owned();
         let tried = in_background("read the run directory", move || {

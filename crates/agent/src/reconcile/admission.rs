@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 
 use task_proto::RobotId;
 use task_proto::desired::DesiredState;
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, EnvelopeError, PublicKey};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, EnvelopeError, PublicKey};
 use task_proto::{Generation, TaskName};
 
 use crate::system::clock::PROGRAM_EXISTS_SINCE_MS;
@@ -16,12 +16,12 @@ const MAX_TASKS: usize = 1024;
 
 /// Why a desired state is refused.
 #[derive(Debug, thiserror::Error)]
-pub enum Refused {
+pub enum AdmissionError {
     /// The state is not signed by the server at which this robot registered.
-    #[error("it is not signed by the server this robot registered at")]
+    #[error("it is not signed by the server that this robot registered with")]
     Signature(#[source] EnvelopeError),
     /// The payload is signed but is not a desired state.
-    #[error("it is signed, but no desired state")]
+    #[error("it is signed, but is not a desired state")]
     Malformed(#[source] serde_json::Error),
     /// The state is for another robot.
     #[error("it is for robot {0}")]
@@ -54,23 +54,24 @@ pub fn admit(
     robot: &RobotId,
     accepted: Option<&DesiredState>,
     wall_ms: u64,
-) -> Result<DesiredState, Refused> {
+) -> Result<DesiredState, AdmissionError> {
     let state = open(envelope, key, robot)?;
     if let Some(accepted) = accepted {
-        let (offered, accepted_generation) = (state.generation, accepted.generation);
+        let offered = state.generation;
+        let accepted_generation = accepted.generation;
         if offered < accepted_generation {
-            return Err(Refused::Stale { offered, accepted: accepted_generation });
+            return Err(AdmissionError::Stale { offered, accepted: accepted_generation });
         }
         // The server signs a state anew before it expires; the content must be the same.
         if offered == accepted_generation && state.tasks != accepted.tasks {
-            return Err(Refused::Contradicts(offered));
+            return Err(AdmissionError::Contradicts(offered));
         }
         if offered == accepted_generation && state.issued_at_ms < accepted.issued_at_ms {
             return Ok(accepted.clone());
         }
     }
     if is_expired(&state, wall_ms) {
-        return Err(Refused::Expired(state.expires_at_ms));
+        return Err(AdmissionError::Expired(state.expires_at_ms));
     }
     Ok(state)
 }
@@ -80,16 +81,17 @@ pub fn open(
     envelope: &Envelope,
     key: &PublicKey,
     robot: &RobotId,
-) -> Result<DesiredState, Refused> {
-    let payload = envelope.open(DESIRED_STATE_TYPE, key).map_err(Refused::Signature)?;
-    let state: DesiredState = serde_json::from_slice(&payload).map_err(Refused::Malformed)?;
+) -> Result<DesiredState, AdmissionError> {
+    let payload = envelope.open(DESIRED_STATE_TYPE, key).map_err(AdmissionError::Signature)?;
+    let state: DesiredState =
+        serde_json::from_slice(&payload).map_err(AdmissionError::Malformed)?;
     if state.robot_id != *robot {
-        return Err(Refused::OtherRobot(state.robot_id));
+        return Err(AdmissionError::OtherRobot(state.robot_id));
     }
     let mut names = BTreeSet::new();
     for (count, task) in state.tasks.iter().enumerate() {
         if count >= MAX_TASKS || task.package.name != task.task || !names.insert(&task.task) {
-            return Err(Refused::Tasks(task.task.clone()));
+            return Err(AdmissionError::Tasks(task.task.clone()));
         }
     }
     Ok(state)
@@ -104,7 +106,7 @@ pub fn is_expired(state: &DesiredState, wall_ms: u64) -> bool {
 #[cfg(test)]
 mod tests {
     use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
-    use task_proto::envelope::SigningKey;
+    use task_proto::trust::envelope::SigningKey;
     use task_proto::{DeploymentId, Digest};
 
     use super::*;
@@ -143,35 +145,43 @@ mod tests {
     }
 
     #[test]
-    fn only_a_signed_newer_state_of_this_robot_is_obeyed() {
-        let (key, robot) = (SigningKey::random(), RobotId::random());
+    fn admission_requires_a_signed_newer_state_for_this_robot() {
+        let key = SigningKey::random();
+        let robot = RobotId::random();
         let accepted = state(&robot, 5);
-        let ask = |state: &DesiredState, key_used: &SigningKey| {
+        let admit_sealed = |state: &DesiredState, key_used: &SigningKey| {
             admit(&seal(state, key_used), &key.public_key(), &robot, Some(&accepted), NOW_MS)
         };
-        assert_eq!(ask(&state(&robot, 6), &key).expect("newer").generation, Generation(6));
+        assert_eq!(admit_sealed(&state(&robot, 6), &key).expect("newer").generation, Generation(6));
         assert!(matches!(
-            ask(&state(&robot, 6), &SigningKey::random()),
-            Err(Refused::Signature(_))
+            admit_sealed(&state(&robot, 6), &SigningKey::random()),
+            Err(AdmissionError::Signature(_))
         ));
-        assert!(matches!(ask(&state(&RobotId::random(), 6), &key), Err(Refused::OtherRobot(_))));
-        assert!(matches!(ask(&state(&robot, 4), &key), Err(Refused::Stale { .. })));
-        assert!(matches!(ask(&state(&robot, 5), &key), Err(Refused::Contradicts(_))));
+        assert!(matches!(
+            admit_sealed(&state(&RobotId::random(), 6), &key),
+            Err(AdmissionError::OtherRobot(_))
+        ));
+        assert!(matches!(admit_sealed(&state(&robot, 4), &key), Err(AdmissionError::Stale { .. })));
+        assert!(matches!(
+            admit_sealed(&state(&robot, 5), &key),
+            Err(AdmissionError::Contradicts(_))
+        ));
         let resigned = DesiredState {
             issued_at_ms: NOW_MS + 9,
             expires_at_ms: NOW_MS + 99,
             ..accepted.clone()
         };
-        assert_eq!(ask(&resigned, &key).expect("signed anew"), resigned);
+        assert_eq!(admit_sealed(&resigned, &key).expect("signed anew"), resigned);
         let expired = DesiredState { expires_at_ms: NOW_MS, ..state(&robot, 6) };
-        assert!(matches!(ask(&expired, &key), Err(Refused::Expired(_))));
+        assert!(matches!(admit_sealed(&expired, &key), Err(AdmissionError::Expired(_))));
         let doubled = DesiredState { tasks: vec![task("a"), task("a")], ..state(&robot, 6) };
-        assert!(matches!(ask(&doubled, &key), Err(Refused::Tasks(_))));
+        assert!(matches!(admit_sealed(&doubled, &key), Err(AdmissionError::Tasks(_))));
     }
 
     #[test]
-    fn a_clock_that_is_plainly_wrong_locks_nobody_out() {
-        let (key, robot) = (SigningKey::random(), RobotId::random());
+    fn impossible_clock_does_not_expire_a_state() {
+        let key = SigningKey::random();
+        let robot = RobotId::random();
         let old = DesiredState { expires_at_ms: 1, ..state(&robot, 1) };
         assert!(admit(&seal(&old, &key), &key.public_key(), &robot, None, 0).is_ok());
     }

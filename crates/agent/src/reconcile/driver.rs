@@ -11,52 +11,45 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::desired::{DesiredState, DesiredTask, Wanted};
-use task_proto::envelope::PublicKey;
-use task_proto::id::Labels;
-use task_proto::report::{Condition, Progress};
+use task_proto::error_chain::chain;
+use task_proto::ids::Labels;
+use task_proto::messages::report::{Condition, Progress};
+use task_proto::trust::envelope::PublicKey;
 use task_proto::{Digest, Generation, InstanceId, RobotId, RobotName, TaskName};
 use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use crate::link::state::{Heard, Shared};
+use crate::link::state::{LinkState, ServerMessage};
 use crate::reconcile::admission;
-use crate::system::error_chain::chain;
-use crate::task::effects::{Effects, Now};
+use crate::task::effects::Effects;
 use crate::task::ledger::{Ledger, TaskRecord};
-use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched};
-use crate::task::plan::{self, Done, Lane, Next, Situation, Step, StepFailure};
-use crate::transfer::parts::Asks;
+use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts};
+use crate::task::plan::{self, Lane, Next, Outcome, Permissions, PlanInput, Step};
+use crate::task::run::ActiveRun;
+use crate::task::timing::Moment;
+use crate::transfer::parts::PartRequest;
 
-mod hearing;
+mod messages;
 mod reporting;
 mod steps;
-mod watching;
+mod watchers;
 
 /// Interval between polls of the hold flag while idle, and between progress reports.
 const TICK: Duration = Duration::from_secs(1);
 /// Delay before the next attempt after the ledger could not be written.
 const LEDGER_RETRY: Duration = Duration::from_secs(5);
 /// Interval between observations of a process while its state cannot be determined.
-const LOOK_AGAIN: Duration = Duration::from_millis(plan::LOOK_AGAIN_MS);
+const OBSERVE_AGAIN: Duration = Duration::from_millis(plan::OBSERVE_AGAIN_MS);
 /// More planning rounds than this for one task mean that the plan is in a cycle.
-const MAX_TURNS: u32 = 64;
+const MAX_PLANNING_ROUNDS: u32 = 64;
 /// The maximum number of watcher observations waiting for the driver; beyond it the watchers wait.
-const MAX_SIGHTS: usize = 16;
-
-/// The assumed contents of a disk that has not been inspected.
-static NOTHING_PREPARED: Prepared = Prepared {
-    manifest: None,
-    content: false,
-    built: false,
-    versions: Vec::new(),
-    vouched: Vouched::No,
-};
+const QUEUED_OBSERVATIONS: usize = 16;
 
 /// The robot and the agent that the driver reports for.
 #[derive(Debug, Clone)]
-pub struct Speaker {
+pub struct AgentIdentity {
     pub robot_id: RobotId,
     /// The server's public key, which verifies the desired states.
     pub server_key: PublicKey,
@@ -75,15 +68,15 @@ pub struct Speaker {
 /// The driver's observations of one task; lost at a restart.
 #[derive(Default)]
 struct View {
-    /// The files of the ordered version on the disk; `None` when the disk must be inspected.
+    /// The files of the version to prepare on the disk; `None` when the disk must be inspected.
     prepared: Option<Prepared>,
     /// The state of the active run's process; `None` when the process must be observed.
     process: Option<ProcessState>,
     /// When to observe the process again if its state could not be determined. An observation may
     /// take long, and all tasks wait for it.
-    look_again: Option<Instant>,
+    observe_again_at: Option<Instant>,
     /// The watchers of the process.
-    watched: Option<Watched>,
+    process_watch: Option<ProcessWatch>,
     /// The health of the process on the ROS graph.
     health: Health,
     /// The progress of the transfers under way, by lane.
@@ -91,27 +84,27 @@ struct View {
     /// The progress as reported, by lane.
     progress: BTreeMap<Lane, Progress>,
     /// The missing parts, as announced by the step that gathers parts.
-    asked: Option<watch::Receiver<Asks>>,
+    requested_parts: Option<watch::Receiver<PartRequest>>,
     /// The last stop or deletion that failed, and the reason. The step is tried again.
-    undone: Option<String>,
+    failed_step: Option<String>,
 }
 
 /// The watchers of one process. Dropping this ends the watcher of the ROS graph.
-struct Watched {
+struct ProcessWatch {
     /// The run directory's name.
     dir: String,
     _until_dropped: DropGuard,
 }
 
 /// A watcher's observation of the process of a run directory.
-struct Seen {
+struct WatcherEvent {
     task: TaskName,
     dir: String,
-    what: Sight,
+    observation: Observation,
 }
 
 /// An observation of a process.
-enum Sight {
+enum Observation {
     /// The process has ended, or is no longer watched.
     Over,
     /// The current health on the ROS graph.
@@ -119,7 +112,7 @@ enum Sight {
 }
 
 /// A step under way.
-struct UnderWay {
+struct RunningStep {
     step: Step,
     handle: AbortHandle,
     cancel: CancellationToken,
@@ -127,13 +120,11 @@ struct UnderWay {
     drop_at: Option<Instant>,
 }
 
-type Outcome = Result<Done, StepFailure>;
-
 /// The driver of one robot.
 pub struct Driver<E> {
     effects: Arc<E>,
-    speaker: Speaker,
-    shared: Shared,
+    agent_identity: AgentIdentity,
+    link_state: LinkState,
     ledger: Ledger,
     /// Whether the ledger has changes that are not on the disk.
     dirty: bool,
@@ -142,11 +133,11 @@ pub struct Driver<E> {
     observed: Generation,
     desired: Option<DesiredState>,
     views: BTreeMap<TaskName, View>,
-    under_way: HashMap<(TaskName, Lane), UnderWay>,
+    under_way: HashMap<(TaskName, Lane), RunningStep>,
     steps: JoinSet<(TaskName, Lane, Outcome)>,
     /// The channel on which watchers send their observations.
-    sights: mpsc::Sender<Seen>,
-    seen: mpsc::Receiver<Seen>,
+    observation_sender: mpsc::Sender<WatcherEvent>,
+    observations: mpsc::Receiver<WatcherEvent>,
     robot: RobotFacts,
     /// The trust facts at the last check of the packages' signers.
     trust: TrustFacts,
@@ -154,13 +145,13 @@ pub struct Driver<E> {
     /// Conditions by code, except those that follow from other fields.
     conditions: BTreeMap<&'static str, String>,
     /// Why the server withholds a desired state, in the server's words.
-    withheld: Option<Condition>,
+    state_unavailable: Option<Condition>,
     /// The contents whose gathered bytes were kept at the last cleanup; `None`: a cleanup is due.
     kept_parts: Option<Vec<Digest>>,
     /// Notified when missing parts are to be requested.
-    asks: Arc<Notify>,
+    part_requests: Arc<Notify>,
     /// Whether missing parts are to be requested, even if the last report may have said the same.
-    asks_again: bool,
+    report_parts_again: bool,
     seq: u64,
     started: Instant,
 }
@@ -170,14 +161,14 @@ impl<E: Effects> Driver<E> {
     /// `lost` says that an earlier ledger was moved aside, and where.
     pub async fn new(
         effects: Arc<E>,
-        speaker: Speaker,
-        shared: Shared,
+        agent_identity: AgentIdentity,
+        link_state: LinkState,
         mut ledger: Ledger,
         lost: Option<String>,
     ) -> Self {
         let now = effects.now();
         ledger.start += 1;
-        ledger.enter_boot(&speaker.boot_id, now.boot_ms);
+        ledger.enter_boot(&agent_identity.boot_id, now.boot_ms);
         let mut conditions = BTreeMap::new();
         if let Some(text) = lost {
             for (task, run) in effects.survivors().await {
@@ -187,26 +178,30 @@ impl<E: Effects> Driver<E> {
         }
         let mut desired = None;
         if let Some(accepted) = &ledger.accepted {
-            match admission::open(&accepted.envelope, &speaker.server_key, &speaker.robot_id) {
+            match admission::open(
+                &accepted.envelope,
+                &agent_identity.server_key,
+                &agent_identity.robot_id,
+            ) {
                 Ok(state) => desired = Some(state),
                 // The robot was registered anew. The tasks continue unchanged until the new server
                 // has sent a state.
                 Err(error) => {
-                    tracing::warn!(error = %chain(&error), "the state in the ledger is not this server's");
+                    tracing::warn!(error = %chain(&error), "the state in the ledger was signed by another server");
                     ledger.accepted = None;
                 }
             }
         }
         // The ROS installations are inspected when they are needed.
         let robot = RobotFacts { installations: None, ..effects.robot_facts() };
-        let (sights, seen) = mpsc::channel(MAX_SIGHTS);
+        let (observation_sender, observations) = mpsc::channel(QUEUED_OBSERVATIONS);
         let held = effects.is_held();
-        desired.iter().for_each(|state| effects.heed(state));
+        desired.iter().for_each(|state| effects.apply_state(state));
         let trust = effects.trust_facts();
         Self {
             effects,
-            speaker,
-            shared,
+            agent_identity,
+            link_state,
             ledger,
             dirty: true,
             observed: Generation(0),
@@ -214,16 +209,16 @@ impl<E: Effects> Driver<E> {
             views: BTreeMap::new(),
             under_way: HashMap::new(),
             steps: JoinSet::new(),
-            sights,
-            seen,
+            observation_sender,
+            observations,
             robot,
             trust,
             held,
             conditions,
-            withheld: None,
+            state_unavailable: None,
             kept_parts: None,
-            asks: Arc::default(),
-            asks_again: false,
+            part_requests: Arc::default(),
+            report_parts_again: false,
             seq: 0,
             started: Instant::now(),
         }
@@ -231,25 +226,25 @@ impl<E: Effects> Driver<E> {
 
     /// Drives the tasks until the agent ends. Steps under way are dropped then; the tasks keep
     /// running.
-    pub async fn run(mut self, mut heard: mpsc::Receiver<Heard>) {
+    pub async fn run(mut self, mut server_messages: mpsc::Receiver<ServerMessage>) {
         let mut tick = tokio::time::interval(TICK);
         loop {
-            let wake = self.turn().await;
+            let wake = self.plan_all().await;
             tokio::select! {
                 // Cancel-safe: a step that has ended stays in the set until it is taken.
                 Some(ended) = self.steps.join_next_with_id() => self.step_ended(ended),
                 // Cancel-safe: a message stays in its channel until it is received.
-                Some(seen) = self.seen.recv() => self.see(seen),
+                Some(event) = self.observations.recv() => self.handle_observation(event),
                 // Cancel-safe: a message stays in its channel until it is received.
-                Some(message) = heard.recv() => self.hear(message),
+                Some(message) = server_messages.recv() => self.handle_message(message),
                 // Cancel-safe: a permit that was not taken stays.
-                () = self.asks.notified() => self.asks_again = true,
+                () = self.part_requests.notified() => self.report_parts_again = true,
                 // Cancel-safe: an interval keeps its own time.
                 _ = tick.tick() => self.tick(),
                 // Cancel-safe: the timer is created anew in each turn.
                 () = tokio::time::sleep_until(wake) => {}
                 // Cancel-safe: a token can be awaited again.
-                () = self.shared.shutdown.cancelled() => break,
+                () = self.link_state.shutdown.cancelled() => break,
             }
         }
         self.save();
@@ -257,7 +252,7 @@ impl<E: Effects> Driver<E> {
 
     /// Plans every task until all rest, begins the planned steps, reports. Returns the time of the
     /// next turn.
-    async fn turn(&mut self) -> Instant {
+    async fn plan_all(&mut self) -> Instant {
         // Polled before each turn: after `hold` nothing may be started any more.
         self.held = self.effects.is_held();
         self.interrupt_unwanted();
@@ -273,12 +268,12 @@ impl<E: Effects> Driver<E> {
         // Written before any step begins. If the write fails, the plan sees steps that never began.
         let saved = self.save();
         if saved {
-            self.keep_ordered_parts();
+            self.retain_ordered_parts();
         } else {
             wake = wake.min(Instant::now() + LEDGER_RETRY);
         }
         for (task, step) in begin {
-            if saved || self.only_takes_away(&task, &step) {
+            if saved || self.is_removal(&task, &step) {
                 self.begin(task, step);
             }
         }
@@ -293,7 +288,7 @@ impl<E: Effects> Driver<E> {
     /// Whether the step ends something without a replacement. Such a step runs even when the ledger
     /// cannot be written: it may free the disk space, and an agent that has forgotten the step
     /// repeats it.
-    fn only_takes_away(&self, task: &TaskName, step: &Step) -> bool {
+    fn is_removal(&self, task: &TaskName, step: &Step) -> bool {
         let is_wanted =
             self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
         matches!(step, Step::Stop(_) | Step::Remove) && !is_wanted
@@ -306,7 +301,9 @@ impl<E: Effects> Driver<E> {
         let known =
             self.ledger.tasks.iter().map(|(task, record)| (task.clone(), record.order.priority));
         let is_desired = |task: &TaskName| desired.clone().any(|(other, _)| other == *task);
-        plan::in_turn(known.filter(|(task, _)| !is_desired(task)).chain(desired.clone()).collect())
+        plan::by_priority(
+            known.filter(|(task, _)| !is_desired(task)).chain(desired.clone()).collect(),
+        )
     }
 
     /// The desired state of a task. Before any desired state is known, this is the order in the
@@ -319,9 +316,10 @@ impl<E: Effects> Driver<E> {
     }
 
     /// Whether new work may be begun.
-    fn may_begin(&self, now: Now) -> bool {
+    fn may_begin(&self) -> bool {
+        let wall_ms = self.effects.now().wall_ms;
         let in_force =
-            self.desired.as_ref().is_none_or(|state| !admission::is_expired(state, now.wall_ms));
+            self.desired.as_ref().is_none_or(|state| !admission::is_expired(state, wall_ms));
         in_force && !self.ledger.removed
     }
 
@@ -337,7 +335,7 @@ impl<E: Effects> Driver<E> {
             self.dirty = true;
         }
         let mut until_ms: Option<u64> = None;
-        for _ in 0..MAX_TURNS {
+        for _ in 0..MAX_PLANNING_ROUNDS {
             let mut changed = false;
             until_ms = None;
             for lane in Lane::ALL {
@@ -347,31 +345,30 @@ impl<E: Effects> Driver<E> {
                     continue;
                 }
                 self.observe(task).await;
-                match self.ask(task, lane, desired.as_ref(), begin) {
+                match self.next_step(task, lane, desired.as_ref(), begin) {
                     Next::Rest { until_ms: rest } => {
                         until_ms = [until_ms, rest].into_iter().flatten().min()
                     }
                     Next::Record(record) => {
-                        self.put(task, *record);
+                        self.store_record(task, *record);
                         changed = true;
                     }
-                    Next::Act(step) if lane == Lane::Prepare && !self.has_room(begin) => {
+                    Next::Act(step) if lane == Lane::Prepare && !self.has_free_slot(begin) => {
                         tracing::debug!(
                             step = plan::describe(task, &step),
-                            "waits for another task's step"
+                            "waiting for another task's step"
                         );
                     }
                     Next::Act(step) => {
                         let record = self.ledger.tasks.get(task)?;
-                        let (boot_id, start) = (&self.speaker.boot_id, self.ledger.start);
                         let record =
-                            plan::begun(record, &step, boot_id, start, self.effects.now().boot_ms);
+                            plan::begin_step(record, &step, self.ledger.start, &self.moment());
                         // A start follows the record that was written before it.
                         let step = match (step, &record.active) {
                             (Step::Start(_), Some(active)) => Step::Start(Box::new(active.clone())),
                             (step, _) => step,
                         };
-                        self.put(task, record);
+                        self.store_record(task, record);
                         begin.push((task.clone(), step));
                         changed = true;
                     }
@@ -381,11 +378,11 @@ impl<E: Effects> Driver<E> {
                 return until_ms;
             }
         }
-        tracing::error!(%task, "the plan goes in circles");
+        tracing::error!(%task, "the plan does not converge");
         until_ms
     }
 
-    fn ask(
+    fn next_step(
         &self,
         task: &TaskName,
         lane: Lane,
@@ -396,47 +393,42 @@ impl<E: Effects> Driver<E> {
         let under_way = self.under_way.iter().filter(|((other, _), _)| other == task);
         let steps: Vec<&Step> =
             planned.chain(under_way.map(|(_, under_way)| &under_way.step)).collect();
-        let rest = Next::Rest { until_ms: None };
-        let Some(view) =
-            self.views.get(task).filter(|view| view.prepared.is_some() && view.process.is_some())
-        else {
-            return rest;
+        let (Some(record), Some(view)) = (self.ledger.tasks.get(task), self.views.get(task)) else {
+            return Next::Rest { until_ms: None };
         };
-        self.situation(task, view, desired, &steps).map_or(rest, |situation| match lane {
-            Lane::Run => plan::supervise(&situation),
-            Lane::Prepare => plan::prepare(&situation),
-            Lane::Gate => plan::consult(&situation),
-            Lane::Collect => plan::collect(&situation),
-        })
+        let (Some(prepared), Some(process)) = (&view.prepared, &view.process) else {
+            return Next::Rest { until_ms: None };
+        };
+        let plan_input = PlanInput {
+            desired,
+            record,
+            prepared,
+            process,
+            health: &view.health,
+            under_way: &steps,
+            robot: &self.robot,
+            permissions: Permissions {
+                may_begin: self.may_begin(),
+                held: self.held,
+                gated: self.effects.is_gated(),
+            },
+            at: self.moment(),
+        };
+        match lane {
+            Lane::Run => plan::supervise(&plan_input),
+            Lane::Prepare => plan::prepare(&plan_input),
+            Lane::Gate => plan::check_gate(&plan_input),
+            Lane::Upload => plan::upload(&plan_input),
+        }
     }
 
-    /// The plan's inputs for `task`, while `steps` are under way.
-    fn situation<'a>(
-        &'a self,
-        task: &TaskName,
-        view: &'a View,
-        desired: Option<&'a DesiredTask>,
-        steps: &[&Step],
-    ) -> Option<Situation<'a>> {
-        let now = self.effects.now();
-        Some(Situation {
-            desired,
-            record: self.ledger.tasks.get(task)?,
-            prepared: view.prepared.as_ref().unwrap_or(&NOTHING_PREPARED),
-            process: view.process.as_ref().unwrap_or(&ProcessState::None),
-            health: &view.health,
-            preparing: steps.iter().any(|step| step.lane() == Lane::Prepare),
-            acting: steps.iter().any(|step| step.lane() == Lane::Run),
-            collecting: steps.iter().any(|step| step.lane() == Lane::Collect),
-            deleting: steps.iter().any(|step| step.deletes()),
-            robot: &self.robot,
-            may_begin: self.may_begin(now),
-            held: self.held,
-            gated: self.effects.is_gated(),
-            boot_id: &self.speaker.boot_id,
-            now_ms: now.boot_ms,
+    /// The moment of a decision.
+    fn moment(&self) -> Moment<'_> {
+        Moment {
+            boot_id: &self.agent_identity.boot_id,
+            now_ms: self.effects.now().boot_ms,
             jitter: rand::random(),
-        })
+        }
     }
 
     /// Observes the disk and the process again where the last observation may be stale.
@@ -444,42 +436,41 @@ impl<E: Effects> Driver<E> {
         let Some(record) = self.ledger.tasks.get(task) else { return };
         let view = self.views.entry(task.clone()).or_default();
         if view.prepared.is_none() {
-            let prepared = self.effects.prepared(&record.order.package).await;
+            let prepared = self.effects.prepared(record.to_prepare().0).await;
             if self.robot.labels.is_none() && requires_labels(&prepared) {
-                self.shared.post.notify_one();
+                self.link_state.post.notify_one();
             }
             view.prepared = Some(prepared);
         }
         let is_due = match view.process {
             None => true,
-            Some(ProcessState::Unknown) => view.look_again.is_none_or(|at| at <= Instant::now()),
+            Some(ProcessState::Unknown) => {
+                view.observe_again_at.is_none_or(|at| at <= Instant::now())
+            }
             Some(_) => false,
         };
         if is_due {
-            view.process =
-                Some(match record.active.as_ref().and_then(|active| active.process.as_ref()) {
-                    Some(process) => self.effects.process(task, process).await,
-                    None => ProcessState::None,
-                });
-            view.look_again = Some(Instant::now() + LOOK_AGAIN);
+            view.process = Some(match record.active.as_ref().and_then(ActiveRun::process) {
+                Some(process) => self.effects.process(task, process).await,
+                None => ProcessState::None,
+            });
+            view.observe_again_at = Some(Instant::now() + OBSERVE_AGAIN);
         }
         if let Some(ProcessState::Alive { pid }) = view.process {
             // An agent that died during the start did not record the process id.
-            let record = self
-                .ledger
-                .tasks
-                .get_mut(task)
-                .and_then(|record| record.active.as_mut()?.process.as_mut());
-            if let Some(process) = record.filter(|process| process.pid != Some(pid)) {
-                process.pid = Some(pid);
+            let known = record.active.as_ref().and_then(|active| active.process()?.pid);
+            if known != Some(pid)
+                && let Some(record) = self.ledger.tasks.get_mut(task)
+            {
+                record.change_active(|active| active.seen(pid));
                 self.dirty = true;
             }
         }
     }
 
-    /// Deletes the gathered parts of contents that are no longer ordered or are already unpacked. A
+    /// Deletes the gathered parts of contents that are no longer needed or are already unpacked. A
     /// power cut may have brought such parts back.
-    fn keep_ordered_parts(&mut self) {
+    fn retain_ordered_parts(&mut self) {
         let is_there = |task| {
             self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content)
         };
@@ -488,32 +479,30 @@ impl<E: Effects> Driver<E> {
                 record.order.wanted == Wanted::Running && !is_there(*task)
             });
         let wanted: Vec<Digest> =
-            ordered.map(|(_, record)| record.order.package.content.digest).collect();
+            ordered.map(|(_, record)| record.to_prepare().0.content.digest).collect();
         if self.kept_parts.as_ref() != Some(&wanted) {
-            self.effects.keep_parts(&wanted);
+            self.effects.retain_parts(&wanted);
             self.kept_parts = Some(wanted);
         }
     }
 
-    fn has_room(&self, begin: &[(TaskName, Step)]) -> bool {
+    fn has_free_slot(&self, begin: &[(TaskName, Step)]) -> bool {
         let under_way = self.under_way.keys().filter(|(_, lane)| *lane == Lane::Prepare).count();
         let planned = begin.iter().filter(|(_, step)| step.lane() == Lane::Prepare).count();
         under_way + planned < self.effects.parallel_tasks()
     }
 
     /// Stores a changed record, and drops observations that belong to an earlier order or process.
-    fn put(&mut self, task: &TaskName, record: TaskRecord) {
+    fn store_record(&mut self, task: &TaskName, record: TaskRecord) {
         let view = self.views.entry(task.clone()).or_default();
         let before = self.ledger.tasks.get(task);
-        let package = |record: &TaskRecord| record.order.package.clone();
-        if before.map(package).as_ref() != Some(&record.order.package) {
+        if before.map(|before| before.to_prepare().0) != Some(record.to_prepare().0) {
             view.prepared = None;
             view.progress.remove(&Lane::Prepare);
         }
-        let process =
-            |record: &TaskRecord| Some(record.active.as_ref()?.process.as_ref()?.dir.clone());
+        let process = |record: &TaskRecord| Some(record.active.as_ref()?.process()?.dir.clone());
         if before.and_then(process) != process(&record) {
-            (view.process, view.watched, view.health) = (None, None, Health::Unknown);
+            (view.process, view.process_watch, view.health) = (None, None, Health::Unknown);
         }
         self.ledger.tasks.insert(task.clone(), record);
         self.dirty = true;
@@ -550,7 +539,7 @@ impl<E: Effects> Driver<E> {
                 let text = chain(&error);
                 if self.conditions.get("ledger_unwritable") != Some(&text) {
                     tracing::error!(
-                        "nothing but what was ordered to end is done until the ledger can be written: {text}"
+                        "cannot write the ledger; only stops and removals run until it can be written: {text}"
                     );
                 }
                 self.conditions.insert("ledger_unwritable", text);

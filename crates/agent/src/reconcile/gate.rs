@@ -9,7 +9,8 @@ use std::io::{self, PipeReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use task_proto::report::{Failure, FailureCode};
+use task_proto::error_chain::chain;
+use task_proto::messages::report::{Failure, FailureCode};
 use task_proto::{RobotId, TaskName};
 
 use crate::config::{GateConfig, GateDefault};
@@ -67,7 +68,7 @@ impl Gate {
 
     /// Asks the gate, run with `environment`. An error is the reason of the refusal. A setting
     /// decides how a missing answer counts.
-    pub async fn ask(
+    pub async fn query(
         &self,
         task: &TaskName,
         question: &GateQuestion,
@@ -79,10 +80,10 @@ impl Gate {
             }
             Err(error) => error,
         };
-        let text = crate::system::error_chain::chain(&error);
+        let text = chain(&error);
         match self.config.default {
             GateDefault::Allow => {
-                tracing::warn!(%task, "{text}: by the robot's setting that means yes");
+                tracing::warn!(%task, "{text}: allowed by gate.default");
                 Ok(())
             }
             GateDefault::Deny => Err(Failure::new(FailureCode::GATE_FAILED, text)),
@@ -104,7 +105,7 @@ impl Gate {
         processes.end(KILL_TIMEOUT).await?;
         let (reader, writer) = io::pipe().map_err(failed)?;
         let mut environment = environment.clone();
-        environment.extend(self.asked(task, question, &mark));
+        environment.extend(self.question_environment(task, question, &mark));
         let mut child =
             program::spawn_gate(&self.config.command, &self.directory, &environment, writer)
                 .map_err(failed)?;
@@ -126,7 +127,7 @@ impl Gate {
         match status {
             ExitStatus::Code(0) => Ok(Ok(())),
             ExitStatus::Code(code) if reason.is_empty() => {
-                Ok(Err(format!("the gate said no and gave no reason (exit code {code})")))
+                Ok(Err(format!("the gate refused without a reason (exit code {code})")))
             }
             ExitStatus::Code(_) => Ok(Err(reason)),
             ExitStatus::Signal(_) => Err(GateError::Crashed { program: program(), status }),
@@ -134,7 +135,7 @@ impl Gate {
     }
 
     /// The question, as environment variables.
-    fn asked(
+    fn question_environment(
         &self,
         task: &TaskName,
         question: &GateQuestion,

@@ -2,9 +2,9 @@
 //! requests. It leaves each decision to `task`.
 
 pub mod admission;
-pub mod answers;
 pub mod driver;
 pub mod gate;
-pub mod graph_answers;
-pub mod orders;
+pub mod graph_requests;
+pub mod request_verifier;
+pub mod requests;
 pub mod robot;

@@ -8,22 +8,28 @@ use std::sync::{Arc, RwLock};
 use std::time::Duration;
 
 use bytes::Bytes;
+use task_proto::desired::settings::RobotSettings;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
-use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts, Isolation, Progress, TaskAccounts};
-use task_proto::settings::RobotSettings;
+use task_proto::error_chain::chain;
+use task_proto::messages::report::{
+    Failure, FailureCode, HostFacts, Isolation, Progress, TaskAccounts,
+};
+use task_proto::packages::manifest::TaskManifest;
+use task_proto::time::millis;
 use task_proto::{Digest, MacAddress, RobotId, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use self::held::Held;
-use self::outcomes::{build_failure, fetch_failure, later, millis, on_disk, outputs_code, pulled};
+use self::outcomes::{
+    blocking_io, build_failure, fetch_failure, outputs_code, pull_outcome, retryable_failure,
+};
+use self::resolved::ResolvedSettings;
 use self::trees::Purpose;
 use crate::config::Config;
-use crate::config::trust::{Trust, Use};
-use crate::install::builder::{self, BuildLimits, BuildOrder};
+use crate::config::trust::{PackageUse, Trust};
+use crate::install::builder::{self, BuildLimits, BuildSpec};
 use crate::install::fetch::{self, FetchError, Fetcher};
-use crate::install::signature_policy::Vouching;
+use crate::install::signature_policy::SignaturePolicy;
 use crate::logs;
 use crate::logs::LogSpec;
 use crate::logs::forwarder::ForwardSettings;
@@ -31,12 +37,12 @@ use crate::process::call_filter;
 use crate::process::cgroup::{Cgroups, RunLimits};
 use crate::process::program::ExitStatus;
 use crate::process::run_dir::RunSpec;
-use crate::process::supervisor::{Observed, Supervisor, SupervisorError};
+use crate::process::supervisor::{RunState, Supervisor, SupervisorError};
 use crate::reconcile::gate::Gate;
 use crate::ros::graph::GraphProgram;
 use crate::ros::graph_access::GraphAccess;
 use crate::ros::readiness::Promise;
-use crate::ros::watcher::{Watched, Watcher};
+use crate::ros::watcher::{WatchedRun, Watcher};
 use crate::setup::environment;
 use crate::setup::installation;
 use crate::setup::installation::Installation;
@@ -48,24 +54,22 @@ use crate::system::clock;
 use crate::system::disk;
 use crate::system::disk::Need;
 use crate::system::durable;
-use crate::system::error_chain::chain;
 use crate::system::layout::{DataDir, VersionDir};
 use crate::system::task_user::{TaskUser, TaskUserError};
 use crate::task::effects::{Effects, Now};
-use crate::task::ledger::{
-    ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord,
-};
+use crate::task::ledger::{GateQuestion, Ledger, LedgerError, OutputUpload};
 use crate::task::observed::{
-    Exit, Health, Prepared, ProcessState, RobotFacts, TrustFacts, Vouched,
+    Exit, Health, Prepared, ProcessState, RobotFacts, SignatureVerdict, TrustFacts,
 };
 use crate::task::plan::{Done, StepFailure};
-use crate::telemetry::outputs::{self, OutputOrder, Registry};
-use crate::transfer::parts::Asks;
-use crate::transfer::parts::Listening;
+use crate::task::run::{ActiveRun, ProcessRecord};
+use crate::telemetry::outputs::{self, OutputSpec, Registry};
+use crate::transfer::parts::PartRequest;
+use crate::transfer::parts::PartSubscriptions;
 
 mod graph;
-mod held;
 mod outcomes;
+mod resolved;
 mod ros;
 mod runs;
 mod signers;
@@ -83,8 +87,8 @@ pub struct Robot {
     data: DataDir,
     fetcher: Arc<Fetcher>,
     /// The signature policy of a robot that requires more than its server's word.
-    vouching: Option<Arc<Vouching>>,
-    listening: Listening,
+    signature_policy: Option<Arc<SignaturePolicy>>,
+    part_subscriptions: PartSubscriptions,
     gate: Option<Gate>,
     registry: Registry,
     robot: RobotId,
@@ -96,7 +100,7 @@ pub struct Robot {
     /// The robot's own settings.
     own: Config,
     /// The effective settings: the robot's own combined with the server's.
-    held: RwLock<Arc<Held>>,
+    resolved: RwLock<Arc<ResolvedSettings>>,
     forward: watch::Sender<ForwardSettings>,
     cgroups: Option<Cgroups>,
     task_user: Result<Option<TaskUser>, TaskUserError>,
@@ -110,13 +114,13 @@ impl Robot {
     /// The robot with its data in `data`.
     pub fn new(
         data: DataDir,
-        (fetcher, listening): (Fetcher, Listening),
+        (fetcher, part_subscriptions): (Fetcher, PartSubscriptions),
         registry: Registry,
         config: &Config,
         robot: &RobotId,
         mac: MacAddress,
     ) -> Self {
-        let held = Held::of(config, RobotSettings::default());
+        let resolved = ResolvedSettings::of(config, RobotSettings::default());
         let cgroups = Cgroups::find();
         let task_user = TaskUser::find(config.task_user.as_deref());
         let user = task_user.as_ref().ok().and_then(Option::as_ref);
@@ -124,22 +128,22 @@ impl Robot {
         let graph = GraphAccess::of_robot(mac, data.clone(), program);
         graph.limit(config.limits.log_bytes);
         let fetcher = Arc::new(fetcher);
-        let vouching = config.trust.clone().map(|settings| {
+        let signature_policy = config.trust.clone().map(|settings| {
             let trust = Trust::open(settings, data.publishers());
-            Arc::new(Vouching::new(trust, fetcher.clone(), data.clone()))
+            Arc::new(SignaturePolicy::new(trust, fetcher.clone(), data.clone()))
         });
         let task_user = TaskUser::find(config.task_user.as_deref())
-            .and_then(|user| user.map(|user| user.admitted_to(data.root())).transpose());
+            .and_then(|user| user.map(|user| user.check_access(data.root())).transpose());
         if let Err(error) = &task_user {
-            tracing::warn!(%error, "nothing can be run");
+            tracing::warn!(%error, "tasks can't run");
         }
         let accounts_data = data.clone();
         let gate = config.gate.clone().map(|gate| Gate::new(gate, robot.clone(), data.root()));
         Self {
             data,
             fetcher,
-            vouching,
-            listening,
+            signature_policy,
+            part_subscriptions,
             gate,
             registry,
             robot: robot.clone(),
@@ -150,10 +154,10 @@ impl Robot {
             filter_calls: call_filter::is_wanted(config.seccomp, matches!(&task_user, Ok(Some(_)))),
             task_user,
             accounts: Accounts::new(accounts_data, config.task_uids.clone()),
-            ros: RwLock::new(held.installations()),
+            ros: RwLock::new(resolved.installations()),
             own: config.clone(),
             forward: watch::Sender::new(config.forward),
-            held: RwLock::new(held),
+            resolved: RwLock::new(resolved),
             mac,
         }
     }
@@ -173,7 +177,7 @@ impl Robot {
 
     fn log(&self, task: &TaskName) -> LogSpec {
         let mut log = LogSpec::at(self.data.task(task).output_log());
-        log.max_bytes = self.held().config.limits.log_bytes.unwrap_or(log.max_bytes);
+        log.max_bytes = self.resolved().config.limits.log_bytes.unwrap_or(log.max_bytes);
         log
     }
 
@@ -191,11 +195,12 @@ impl Robot {
         user: Option<&TaskUser>,
         home: &Path,
     ) -> Result<BTreeMap<String, String>, StepFailure> {
-        let mut environment = self.held().environment.clone();
+        let mut environment = self.resolved().environment.clone();
         if let Some(user) = user {
-            let opened =
-                user.make_home(home).and_then(|()| user.let_through(&self.data.way_to(task)));
-            opened.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
+            let opened = user
+                .make_home(home)
+                .and_then(|()| user.allow_traversal(&self.data.path_dirs(task)));
+            opened.map_err(|error| retryable_failure(FailureCode::IO_ERROR, &error, 0))?;
             environment.insert("HOME".to_owned(), home.display().to_string());
             environment
                 .extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
@@ -205,7 +210,8 @@ impl Robot {
 
     /// The resource limits of the task: from its package, else from this robot's settings.
     fn limits(&self, manifest: &TaskManifest) -> RunLimits {
-        let (limits, settings) = (&manifest.limits, self.held().task_limits);
+        let limits = &manifest.limits;
+        let settings = self.resolved().task_limits;
         RunLimits {
             memory_bytes: limits
                 .memory_mb
@@ -246,12 +252,13 @@ impl Effects for Robot {
         }
     }
 
-    async fn look_for_ros(&self) {
-        self.survey().await;
+    async fn probe_ros(&self) {
+        self.probe_installations().await;
     }
 
     fn host_facts(&self) -> HostFacts {
-        let (installations, held) = (self.installations(), self.held());
+        let installations = self.installations();
+        let resolved = self.resolved();
         let isolates = self.cgroups.as_ref().is_some_and(Cgroups::isolates);
         HostFacts {
             agent_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -262,8 +269,8 @@ impl Effects for Robot {
             arch: std::env::consts::ARCH.to_owned(),
             mac: Some(self.mac),
             ros_distros: installation::all_distros(&installations),
-            disk_free_bytes: disk::room(self.data.root()).map_or(0, |room| room.free),
-            ros: environment::ros_facts(&installations, &held.environment),
+            disk_free_bytes: disk::space(self.data.root()).map_or(0, |room| room.free),
+            ros: environment::ros_facts(&installations, &resolved.environment),
             battery_percent: battery::percent(Path::new(battery::SUPPLIES)),
             isolation: if isolates { Isolation::Cgroup } else { Isolation::None },
             accounts: self.task_user.as_ref().ok().map(|user| match user {
@@ -271,8 +278,11 @@ impl Effects for Robot {
                 Some(_) => TaskAccounts::Shared,
                 None => TaskAccounts::Agent,
             }),
-            publishers: self.vouching.as_ref().map(|vouching| vouching.version()),
-            settings: held.effective.clone(),
+            publishers: self
+                .signature_policy
+                .as_ref()
+                .map(|signature_policy| signature_policy.version()),
+            settings: resolved.effective.clone(),
         }
     }
 
@@ -290,8 +300,8 @@ impl Effects for Robot {
                     continue;
                 };
                 match self.supervisor.observe(&entry.path()).await {
-                    Ok(Observed::Running { .. }) => last = Some((true, run)),
-                    Ok(Observed::Exited(_) | Observed::OutOfMemory { .. } | Observed::Gone)
+                    Ok(RunState::Running { .. }) => last = Some((true, run)),
+                    Ok(RunState::Exited(_) | RunState::OutOfMemory { .. } | RunState::Gone)
                         if !matches!(last, Some((true, _))) =>
                     {
                         last = Some((false, run));
@@ -308,15 +318,19 @@ impl Effects for Robot {
         let task = self.data.task(&package.name);
         let version = self.version(package);
         let manifest = fetch::stored_manifest(&self.data, package);
-        let content = version.src().is_dir();
-        let needs_build =
-            manifest.as_ref().is_none_or(|manifest| manifest.build.tool != BuildTool::None);
         Prepared {
-            content,
-            built: content && (!needs_build || version.root().join(BUILT_MARKER).exists()),
+            content: version.src().is_dir(),
+            built: manifest
+                .as_ref()
+                .is_some_and(|manifest| trees::is_built(&version, manifest.build.tool)),
             manifest,
             versions: task.versions().unwrap_or_default(),
-            vouched: self.vouching.as_ref().map_or(Vouched::Yes, |vouching| vouching.look(package)),
+            signatures: self
+                .signature_policy
+                .as_ref()
+                .map_or(SignatureVerdict::Sufficient, |signature_policy| {
+                    signature_policy.verdict(package)
+                }),
         }
     }
 
@@ -327,18 +341,18 @@ impl Effects for Robot {
         };
         // A start that hangs must not keep the caller waiting: the caller asks again.
         match self.supervisor.observe_within(&self.run_dir(task, process), Duration::ZERO).await {
-            Ok(Observed::NeverStarted) => ProcessState::NeverStarted,
-            Ok(Observed::Running { pid, .. }) => ProcessState::Alive { pid },
-            Ok(Observed::Exited(status)) => exit(Some(status), None),
-            Ok(Observed::OutOfMemory { limit_bytes }) => {
+            Ok(RunState::NeverStarted) => ProcessState::NeverStarted,
+            Ok(RunState::Running { pid, .. }) => ProcessState::Alive { pid },
+            Ok(RunState::Exited(status)) => exit(Some(status), None),
+            Ok(RunState::OutOfMemory { limit_bytes }) => {
                 exit(Some(ExitStatus::Signal(9)), Some(limit_bytes))
             }
-            Ok(Observed::Gone) => exit(None, None),
-            Err(error) if error.is_malformed() && runs::went_down_with_its_boot(process) => {
+            Ok(RunState::Gone) => exit(None, None),
+            Err(error) if error.is_malformed() && runs::is_from_earlier_boot(process) => {
                 exit(None, None)
             }
             Err(error) => {
-                tracing::error!(%task, error = %chain(&error), "cannot tell what became of the process");
+                tracing::error!(%task, error = %chain(&error), "cannot determine the state of the process");
                 ProcessState::Unknown
             }
         }
@@ -351,28 +365,33 @@ impl Effects for Robot {
     }
 
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health> {
-        let watched = run.process.as_ref().map(|process| Watched {
+        let watched = run.process().map(|process| WatchedRun {
             dir: self.run_dir(task, process),
             started_ms: process.started_ms,
-            was_ready: process.ready,
+            was_ready: run.is_ready(),
         });
         let watched = watched.unwrap_or_default();
         let facts = self.ros_facts_of(&watched.dir);
-        self.listen_to(&run.package, facts.as_ref());
+        self.open_graph(&run.package, facts.as_ref());
         self.watcher.watch(watched, self.promise(&run.package), facts)
     }
 
     fn parallel_tasks(&self) -> usize {
-        self.held().config.parallel_tasks
+        self.resolved().config.parallel_tasks
     }
 
-    fn heed(&self, state: &DesiredState) {
+    fn apply_state(&self, state: &DesiredState) {
         self.adopt(&state.settings);
-        self.vouching.iter().for_each(|vouching| vouching.heed(state));
+        self.signature_policy
+            .iter()
+            .for_each(|signature_policy| signature_policy.follow_evidence(state));
     }
 
     fn trust_facts(&self) -> TrustFacts {
-        self.vouching.as_ref().map(|vouching| vouching.facts()).unwrap_or_default()
+        self.signature_policy
+            .as_ref()
+            .map(|signature_policy| signature_policy.facts())
+            .unwrap_or_default()
     }
 
     async fn check_signers(
@@ -380,12 +399,12 @@ impl Effects for Robot {
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
-        self.vouched(package, Use::Begin, cancel).await
+        self.check_signatures(package, PackageUse::New, cancel).await
     }
 
-    fn keep_parts(&self, wanted: &[Digest]) {
+    fn retain_parts(&self, wanted: &[Digest]) {
         if let Err(error) = self.data.clean_parts(wanted) {
-            tracing::warn!(%error, "bytes of packages that are no longer ordered can't be removed");
+            tracing::warn!(%error, "cannot remove the parts of packages that are no longer ordered");
         }
     }
 
@@ -394,12 +413,12 @@ impl Effects for Robot {
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
-        self.still_vouched(package)?;
-        pulled(self.fetcher.manifest(package, cancel).await.map(drop))
+        self.recheck_signatures(package)?;
+        pull_outcome(self.fetcher.manifest(package, cancel).await.map(drop))
     }
 
     fn offer(&self, blobs: Vec<(BlobRef, Bytes)>) {
-        self.fetcher.offer(blobs);
+        self.fetcher.add_inline_blobs(blobs);
     }
 
     async fn pull_content(
@@ -408,12 +427,12 @@ impl Effects for Robot {
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
-        self.still_vouched(package)?;
+        self.recheck_signatures(package)?;
         let manifest = match self.fetcher.manifest(package, cancel).await {
             Ok(manifest) => manifest,
-            Err(error) => return pulled(Err(error)),
+            Err(error) => return pull_outcome(Err(error)),
         };
-        let done = pulled(self.fetcher.content(package, &manifest, progress, cancel).await)?;
+        let done = pull_outcome(self.fetcher.content(package, &manifest, progress, cancel).await)?;
         self.seal_pulled(package, &manifest, done).await
     }
 
@@ -421,17 +440,19 @@ impl Effects for Robot {
         &self,
         package: &PackageRef,
         progress: &watch::Sender<Progress>,
-        asks: &watch::Sender<Asks>,
+        part_requests: &watch::Sender<PartRequest>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
-        self.still_vouched(package)?;
+        self.recheck_signatures(package)?;
         let manifest = match self.fetcher.manifest(package, cancel).await {
             Ok(manifest) => manifest,
-            Err(error) => return pulled(Err(error)),
+            Err(error) => return pull_outcome(Err(error)),
         };
-        let told = (progress, asks);
-        let done = pulled(
-            self.fetcher.pushed_content(package, &manifest, &self.listening, told, cancel).await,
+        let told = (progress, part_requests);
+        let done = pull_outcome(
+            self.fetcher
+                .pushed_content(package, &manifest, &self.part_subscriptions, told, cancel)
+                .await,
         )?;
         self.seal_pulled(package, &manifest, done).await
     }
@@ -441,51 +462,57 @@ impl Effects for Robot {
         package: &PackageRef,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
-        self.still_vouched(package)?;
+        self.recheck_signatures(package)?;
         let manifest = self.manifest(package).await?;
-        let (version, tool) = (self.version(package), manifest.build.tool);
+        let version = self.version(package);
+        let tool = manifest.build.tool;
         self.verify(package, tool, Purpose::Build).await?;
         let user = self.accounts_of(&package.name)?.map(|pair| pair.build);
         let home = self.data.task(&package.name).build_home();
         let environment = self.environment_of(&package.name, user.as_ref(), &home)?;
-        let order = BuildOrder {
+        let spec = BuildSpec {
             tool,
             underlays: self.setup_files(&manifest)?,
             environment,
             log: self.data.task(&package.name).build_log(),
-            limits: BuildLimits { filter_calls: self.filter_calls, ..self.held().build_limits },
+            limits: BuildLimits { filter_calls: self.filter_calls, ..self.resolved().build_limits },
             version: version.clone(),
             user,
             cgroups: self.cgroups.clone(),
         };
-        builder::build(&order, cancel)
+        builder::build(&spec, cancel)
             .await
             .map_err(|error| build_failure(error, self.data.root()))?;
         self.seal(package, tool).await?;
         let marker = version.root().join(BUILT_MARKER);
         durable::write(&marker, b"", 0o600).map_err(|source| {
             let error = FetchError::disk(&marker, source);
-            fetch_failure(error.for_want_of_room(self.data.root(), Need::of_file(0)))
+            fetch_failure(error.or_disk_full(self.data.root(), Need::of_file(0)))
         })
     }
 
-    async fn ask_gate(&self, task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
+    async fn query_gate(
+        &self,
+        task: &TaskName,
+        question: &GateQuestion,
+    ) -> Result<(), StepFailure> {
         let Some(gate) = &self.gate else { return Ok(()) };
-        let answer = gate.ask(task, question, &self.held().environment).await;
+        let answer = gate.query(task, question, &self.resolved().environment).await;
         answer.map_err(|failure| StepFailure { failure, retry_after_ms: Some(0) })
     }
 
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
-        let failed = |error: &dyn Error| later(FailureCode::START_FAILED, error, 0);
-        let Some(process) = &run.process else {
+        let failed = |error: &dyn Error| retryable_failure(FailureCode::START_FAILED, error, 0);
+        let Some(process) = run.process() else {
             return Err(failed(&std::io::Error::other("the ledger names no process to start")));
         };
         // A version that was staged long ago may have waited for a person or the gate until its
         // publishers' list expired.
-        let purpose = if run.has_started() { Use::GoOn } else { Use::Begin };
-        self.vouched(&run.package, purpose, &CancellationToken::new()).await?;
+        let purpose = if run.has_started() { PackageUse::Restart } else { PackageUse::New };
+        self.check_signatures(&run.package, purpose, &CancellationToken::new()).await?;
         let manifest = self.manifest(&run.package).await?;
-        let (version, tool) = (self.version(&run.package), manifest.build.tool);
+        let version = self.version(&run.package);
+        let tool = manifest.build.tool;
         let text = script::run_script(&manifest, &version, &self.setup_files_of(run, &manifest)?);
         let task_dir = self.data.task(task);
         let run_dir = self.run_dir(task, process);
@@ -518,12 +545,13 @@ impl Effects for Robot {
         durable::create_dir_all(&run_dir).map_err(|error| failed(&error))?;
         durable::write(&run_dir.join(RUN_RECORD), &record, 0o600)
             .map_err(|error| failed(&error))?;
-        let (facts, promise) = (self.ros_facts_in(&spec.environment), Promise::of(&manifest));
+        let facts = self.ros_facts_in(&spec.environment);
+        let promise = Promise::of(&manifest);
         if let Some(what) =
-            environment::unheard_of(&spec.environment).filter(|_| !promise.is_empty())
+            environment::unsupported_discovery(&spec.environment).filter(|_| !promise.is_empty())
         {
             let text = format!(
-                "nodes here meet by {what}, which the agent does not speak: [ready] can't be watched"
+                "nodes on this robot use {what}, which the agent does not support: [ready] can't be checked"
             );
             let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, text);
             return Err(StepFailure { failure, retry_after_ms: None });
@@ -531,7 +559,7 @@ impl Effects for Robot {
         self.watcher.before_start(&promise, facts.as_ref()).await.map_err(|failure| {
             // The owner of a conflicting name may go away, so a run that was ready before waits for
             // that. An obstacle to the graph may also pass.
-            let may_pass = run.ever_ready
+            let may_pass = run.was_ever_ready()
                 || (failure.code == FailureCode::GRAPH_UNAVAILABLE && facts.is_some());
             StepFailure { failure, retry_after_ms: may_pass.then_some(0) }
         })?;
@@ -540,37 +568,41 @@ impl Effects for Robot {
             && let Err(error) = self.supervisor.stop(&run_dir, Duration::ZERO).await
         {
             // The process stays in the ledger until it is seen to be gone.
-            tracing::warn!(%task, error = %chain(&error), "cannot end what may have been started");
+            tracing::warn!(%task, error = %chain(&error), "cannot end a process that may have been started");
         }
         let pid = started.map_err(|error| failed(&error))?.task.pid;
         // Leftovers of earlier runs have no further use. If they cannot be deleted, the task still
         // runs.
-        if let Err(error) = self.forget_runs(&task_dir.run(), Some(&run_dir)).await {
-            tracing::warn!(%task, failure = %error.failure, "cannot delete what ended runs left");
+        if let Err(error) = self.delete_runs(&task_dir.run(), Some(&run_dir)).await {
+            tracing::warn!(%task, failure = %error.failure, "cannot delete the leftovers of ended runs");
         }
         Ok(pid)
     }
 
     async fn stop(&self, task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
-        let Some(process) = &run.process else { return Ok(()) };
+        let Some(process) = run.process() else { return Ok(()) };
         let grace = Duration::from_secs(u64::from(run.rules.stop_timeout_s));
         let dir = self.run_dir(task, process);
         let facts = self.ros_facts_of(&dir);
-        self.watcher.wind_down(&dir, &self.promise(&run.package), facts.as_ref(), grace / 2).await;
+        self.watcher
+            .shut_down_nodes(&dir, &self.promise(&run.package), facts.as_ref(), grace / 2)
+            .await;
         let stopped = self.supervisor.stop(&dir, grace).await;
-        stopped.map(drop).map_err(|error: SupervisorError| later(FailureCode::IO_ERROR, &error, 0))
+        stopped
+            .map(drop)
+            .map_err(|error: SupervisorError| retryable_failure(FailureCode::IO_ERROR, &error, 0))
     }
 
-    async fn collect(
+    async fn upload_outputs(
         &self,
         task: &TaskName,
-        files: &Collection,
+        files: &OutputUpload,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
         let manifest = self.manifest(&files.package).await?;
-        let (directory, user) = self.written_in(&files.package, manifest.build.tool)?;
-        let order = OutputOrder {
+        let (directory, user) = self.output_directory(&files.package, manifest.build.tool)?;
+        let spec = OutputSpec {
             robot_id: self.robot.clone(),
             task: task.clone(),
             version: files.package.version.clone(),
@@ -580,11 +612,11 @@ impl Effects for Robot {
             user,
             notes: self.data.task(task).uploads(),
             patterns: manifest.outputs.paths,
-            max_bytes: self.held().output_bytes,
+            max_bytes: self.resolved().output_bytes,
         };
-        match outputs::bring_back(&self.registry, &order, progress, cancel).await {
+        match outputs::upload(&self.registry, &spec, progress, cancel).await {
             Ok(count) => {
-                tracing::info!(%task, run = files.run, count, "its files are at the server");
+                tracing::info!(%task, run = files.run, count, "uploaded the output files");
                 Ok(())
             }
             Err(error) => Err(StepFailure {
@@ -600,18 +632,21 @@ impl Effects for Robot {
         kept: &[Digest],
         running: Option<&ProcessRecord>,
     ) -> Result<(), StepFailure> {
-        let (task, kept) = (self.data.task(task), kept.to_vec());
+        let task = self.data.task(task);
+        let kept = kept.to_vec();
         let running = running.map(|process| task.run().join(&process.dir));
-        self.forget_runs(&task.run(), running.as_deref()).await?;
-        on_disk(move || task.prune(&kept)).await
+        self.delete_runs(&task.run(), running.as_deref()).await?;
+        blocking_io(move || task.prune(&kept)).await
     }
 
     async fn remove(&self, task: &TaskName) -> Result<(), StepFailure> {
         let dir = self.data.task(task);
         let ended = self.end_other_runs(&dir.run(), None).await;
-        ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
-        on_disk(move || dir.remove()).await?;
-        self.accounts.release(task).map_err(|error| later(FailureCode::IO_ERROR, &error, 0))
+        ended.map_err(|error| retryable_failure(FailureCode::IO_ERROR, &error, 0))?;
+        blocking_io(move || dir.remove()).await?;
+        self.accounts
+            .release(task)
+            .map_err(|error| retryable_failure(FailureCode::IO_ERROR, &error, 0))
     }
 }
 
@@ -644,7 +679,7 @@ mod tests {
         let mac = "02:00:00:00:00:01".parse().expect("an address");
         Robot::new(
             data,
-            (fetcher, Listening::default()),
+            (fetcher, PartSubscriptions::default()),
             registry,
             &config,
             &RobotId::random(),

@@ -3,9 +3,8 @@
 //!
 //! Every host on the network may send to a participant of a ROS graph, and a large library reads
 //! the bytes. So the agent, which may be root, does not take part itself. It starts a program that
-//! has no rights and little memory ([`program`]), and communicates with this program over pipes
-//! ([`protocol`], [`connection`]). The program is the agent's own executable ([`serve`]) with a DDS
-//! participant ([`participant`]).
+//! has no rights and little memory, and communicates with this program over pipes ([`process`]).
+//! The program is the agent's own executable with a DDS participant.
 //!
 //! Only these modules name `ros2-client`. The graph uses its message types and the DDS library
 //! below it (RustDDS), but not its `Node`, `Spinner` and `Client`. Those fix the length of a gid at
@@ -16,44 +15,32 @@
 //! No C library is needed. Two kinds of participants stay invisible: those that speak neither UDP
 //! nor RTPS (Zenoh), and those that use DDS Security.
 
-pub mod entities;
+pub mod calls;
+pub mod dds;
 pub mod feeds;
-pub mod names;
 pub mod owners;
-pub mod parameters;
-pub mod program;
-pub mod protocol;
+pub mod process;
 pub mod rate;
-pub mod serve;
-pub mod snapshot;
-
-mod connection;
-mod endpoint;
-mod lifecycle;
-mod observer;
-mod own;
-mod participant;
-mod services;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use task_proto::ros::{GraphName, LifecycleState, Transition};
+use task_proto::telemetry::ros::{GraphName, LifecycleState, Transition};
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
-use self::connection::Connection;
+pub use self::calls::parameters::{ParameterValue, SetResult};
+use self::dds::names::{self, Role};
+pub use self::dds::snapshot::{EndpointId, Node, Participant, ParticipantId, Snapshot};
 pub use self::feeds::{DiagnosticLevel, DiagnosticStatus, RosoutLine};
-use self::names::Role;
 pub use self::owners::Owners;
-pub use self::parameters::{ParameterValue, SetResult};
-pub use self::program::GraphProgram;
-use self::protocol::{Answer, Call, Feed, Request};
+use self::process::connection::Connection;
+pub use self::process::program::GraphProgram;
+use self::process::protocol::{Answer, Call, Feed, Request};
 pub use self::rate::{Rate, RateMeter};
-pub use self::snapshot::{EndpointId, Node, Participant, ParticipantId, Snapshot};
 
 /// The highest domain id with valid ports.
 pub const MAX_DOMAIN_ID: u16 = 232;
@@ -216,9 +203,9 @@ impl Graph {
             unknown: snapshot.participants.keys().copied().collect(),
             ..Owners::default()
         };
-        let asked =
+        let owners =
             tokio::task::spawn_blocking(move || Owners::of(&snapshot.participants, &pids)).await;
-        asked.unwrap_or(unknown)
+        owners.unwrap_or(unknown)
     }
 
     /// The process on this host that contains the participant, if it can be determined.
@@ -324,14 +311,14 @@ impl Graph {
     /// because nodes keep them. A receiver that is too slow is told how many lines it missed.
     pub fn rosout(&self) -> Result<broadcast::Receiver<Arc<RosoutLine>>, GraphError> {
         let listener = self.shared.connection.rosout()?;
-        self.shared.connection.say(Request::Listen(Feed::Rosout))?;
+        self.shared.connection.send(Request::Listen(Feed::Rosout))?;
         Ok(listener)
     }
 
     /// Diagnostics that nodes publish about the robot's parts, from now on.
     pub fn diagnostics(&self) -> Result<broadcast::Receiver<Arc<DiagnosticStatus>>, GraphError> {
         let listener = self.shared.connection.diagnostics()?;
-        self.shared.connection.say(Request::Listen(Feed::Diagnostics))?;
+        self.shared.connection.send(Request::Listen(Feed::Diagnostics))?;
         Ok(listener)
     }
 
@@ -374,9 +361,10 @@ mod milliseconds {
     use std::time::Duration;
 
     use serde::{Deserialize as _, Deserializer, Serializer};
+    use task_proto::time::millis;
 
     pub fn serialize<S: Serializer>(duration: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_u64(u64::try_from(duration.as_millis()).unwrap_or(u64::MAX))
+        serializer.serialize_u64(millis(*duration))
     }
 
     pub fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Duration, D::Error> {

@@ -11,8 +11,8 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use rand::RngExt as _;
 use task_proto::MacAddress;
-use task_proto::id::InvalidId;
-use task_proto::report::{Failure, FailureCode, RosFacts};
+use task_proto::ids::InvalidId;
+use task_proto::messages::report::{Failure, FailureCode, RosFacts};
 use tokio::sync::{Mutex, watch};
 use tokio::time::Instant;
 use tokio_util::sync::{CancellationToken, DropGuard};
@@ -29,7 +29,7 @@ const DISCOVERY: Duration = Duration::from_millis(3500);
 const FIRST_RETRY: Duration = Duration::from_millis(500);
 const LAST_RETRY: Duration = Duration::from_secs(30);
 /// A graph that was open for this long resets the failure count.
-const WELL: Duration = Duration::from_secs(60);
+const STABLE: Duration = Duration::from_secs(60);
 
 /// Access to the robot's graph; clones share it.
 #[derive(Clone)]
@@ -62,7 +62,7 @@ enum GraphState {
         domain_id: u16,
         /// Messages of nodes are recorded while the graph is open. Only this recorder may write the
         /// files, and it does not hold the graph open.
-        _keeping: DropGuard,
+        _recording: DropGuard,
     },
     Failed {
         failure: Failure,
@@ -75,7 +75,8 @@ impl GraphAccess {
     /// robot, because two agents on one host, or in one domain, need two names. Messages of nodes
     /// are recorded in `data` while the graph is open.
     pub fn of_robot(mac: MacAddress, data: DataDir, program: GraphProgram) -> Self {
-        let (log_bytes, state) = (watch::Sender::new(None), Mutex::default());
+        let log_bytes = watch::Sender::new(None);
+        let state = Mutex::default();
         Self { inner: Arc::new(Inner { mac, data, program, log_bytes, state }) }
     }
 
@@ -86,24 +87,24 @@ impl GraphAccess {
 
     /// The graph, opened now if it was not open yet. `facts` describe the robot as last seen.
     pub async fn open(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
-        self.inner.opened(facts).await.map(|(graph, _)| graph)
+        self.inner.open_shared(facts).await.map(|(graph, _)| graph)
     }
 
     /// Like `open`, but waits until the graph can show the nodes that existed when it was opened.
-    pub async fn settled(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
-        let (graph, since) = self.inner.opened(facts).await?;
+    pub async fn open_after_discovery(&self, facts: Option<&RosFacts>) -> Result<Graph, Failure> {
+        let (graph, since) = self.inner.open_shared(facts).await?;
         tokio::time::sleep_until(since + DISCOVERY).await;
         Ok(graph)
     }
 }
 
 impl Inner {
-    async fn opened(
+    async fn open_shared(
         self: &Arc<Self>,
         facts: Option<&RosFacts>,
     ) -> Result<(Graph, Instant), Failure> {
         let mut state = self.state.lock().await;
-        state.notice_loss();
+        state.detect_loss();
         match &state.graph {
             // Watches of tasks in the domain that was left go on with the graph that they have.
             GraphState::Open { graph, since, domain_id, .. }
@@ -126,16 +127,21 @@ impl Inner {
                 );
                 let since = Instant::now();
                 let over = CancellationToken::new();
-                let keep =
-                    node_logs::keep(graph.clone(), self.data.clone(), *self.log_bytes.borrow());
-                tokio::spawn(over.clone().run_until_cancelled_owned(keep));
+                let recording = node_logs::record_messages(
+                    graph.clone(),
+                    self.data.clone(),
+                    *self.log_bytes.borrow(),
+                );
+                tokio::spawn(over.clone().run_until_cancelled_owned(recording));
                 tokio::spawn(reopen_when_lost(
                     Arc::downgrade(self),
                     graph.changes(),
                     facts.cloned(),
                 ));
-                let (domain_id, _keeping) = (settings.domain_id, over.drop_guard());
-                state.graph = GraphState::Open { graph: graph.clone(), since, domain_id, _keeping };
+                let domain_id = settings.domain_id;
+                let _recording = over.drop_guard();
+                state.graph =
+                    GraphState::Open { graph: graph.clone(), since, domain_id, _recording };
                 Ok((graph, since))
             }
             Err(error) => {
@@ -150,7 +156,7 @@ impl Inner {
         let none = || {
             Failure::new(
                 FailureCode::GRAPH_UNAVAILABLE,
-                "this robot has no ROS 2, whose graph could be watched",
+                "this robot has no ROS 2 installation, so it has no ROS graph to watch",
             )
         };
         let (facts, domain_id) = found.ok_or_else(none)?;
@@ -169,13 +175,13 @@ impl Inner {
 impl State {
     /// Notices that the graph has closed by itself, because its program was killed or its listening
     /// ended.
-    fn notice_loss(&mut self) {
+    fn detect_loss(&mut self) {
         let GraphState::Open { graph, since, .. } = &self.graph else { return };
         if graph.is_closed() {
-            if since.elapsed() >= WELL {
+            if since.elapsed() >= STABLE {
                 self.failures = 0;
             }
-            self.fail("the ROS graph was lost; it is opened again".to_owned());
+            self.fail("the ROS graph was lost; opening it again".to_owned());
         }
     }
 
@@ -207,7 +213,7 @@ fn reopen_when_lost(
             let retry_at = {
                 let Some(access) = access.upgrade() else { return };
                 let mut state = access.state.lock().await;
-                state.notice_loss();
+                state.detect_loss();
                 match &state.graph {
                     // Another graph is open by now, or the graph is no longer needed.
                     GraphState::Open { .. } | GraphState::Closed => return,
@@ -216,7 +222,7 @@ fn reopen_when_lost(
             };
             tokio::time::sleep_until(retry_at).await;
             let Some(access) = access.upgrade() else { return };
-            if access.opened(facts.as_ref()).await.is_ok() {
+            if access.open_shared(facts.as_ref()).await.is_ok() {
                 return;
             }
         }
@@ -229,7 +235,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn retries_come_later_each_time_and_never_at_one_time() {
+    fn retry_pause_grows_and_is_jittered() {
         for (failures, most_ms) in [(0, 500), (1, 1000), (4, 8000), (6, 30_000), (u32::MAX, 30_000)]
         {
             let most = Duration::from_millis(most_ms);

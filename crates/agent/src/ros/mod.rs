@@ -1,4 +1,4 @@
-//! The ROS graph: the process that takes part in it, the readiness of tasks, and the survey of
+//! The ROS graph: the process that takes part in it, the readiness of tasks, and the examination of
 //! installations. It starts and stops no task.
 
 pub mod graph;

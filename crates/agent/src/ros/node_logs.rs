@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use task_proto::TaskName;
-use task_proto::log::{LogLevel, LogSource};
+use task_proto::telemetry::log::{LogLevel, LogSource};
 use task_proto::time::timestamp;
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::mpsc;
@@ -27,9 +27,9 @@ const QUEUED_MESSAGES: usize = 1024;
 /// Maximum number of statuses of which the last value is remembered.
 const MAX_STATUSES: usize = 4096;
 /// Interval until the owner of a participant without a task is looked up again.
-const LOOK_AGAIN: Duration = Duration::from_secs(2);
+const REFRESH_INTERVAL: Duration = Duration::from_secs(2);
 /// Minimum interval between two look-ups of participants.
-const LOOK_PAUSE: Duration = Duration::from_millis(200);
+const LOOKUP_PAUSE: Duration = Duration::from_millis(200);
 /// Maximum time for discovery to show a participant after its first message.
 const DISCOVERY: Duration = Duration::from_secs(1);
 /// Number of files of each log.
@@ -43,26 +43,27 @@ enum Message {
 }
 
 /// Records the messages on `graph` until it is closed.
-pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
+pub async fn record_messages(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
     let (mut rosout, mut diagnostics) = match (graph.rosout(), graph.diagnostics()) {
         (Ok(rosout), Ok(diagnostics)) => (rosout, diagnostics),
         (Err(error), _) | (_, Err(error)) => {
-            tracing::warn!(%error, "what nodes say on ROS topics is not kept");
+            tracing::warn!(%error, "messages of ROS nodes are not recorded");
             return;
         }
     };
     let (messages, waiting) = mpsc::channel(QUEUED_MESSAGES);
     let recorder = Recorder::new(data.clone(), log_bytes);
     tokio::task::spawn_blocking(move || recorder.run(waiting));
-    let mut owners = Owners { data, known: HashMap::new(), looked_at: None };
-    let (mut missed, mut changes) = (0, graph.changes());
+    let mut tasks = TaskLookup { data, known: HashMap::new(), looked_up_at: None };
+    let mut missed = 0;
+    let mut changes = graph.changes();
     let mut missed_before = 0;
     loop {
         let message = tokio::select! {
             // Cancel-safe: a message stays in the channel until it is received.
             line = rosout.recv() => match line {
                 Ok(line) => {
-                    let task = owners.task_of(&graph, line.participant).await;
+                    let task = tasks.task_of(&graph, line.participant).await;
                     Message::Line(line, task)
                 }
                 Err(RecvError::Lagged(count)) => Message::Missed(count),
@@ -71,7 +72,7 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
             // Cancel-safe, for the same reason.
             status = diagnostics.recv() => match status {
                 Ok(status) => {
-                    let task = owners.task_of(&graph, status.participant).await;
+                    let task = tasks.task_of(&graph, status.participant).await;
                     Message::Status(status, task)
                 }
                 Err(RecvError::Lagged(count)) => Message::Missed(count),
@@ -96,20 +97,20 @@ pub async fn keep(graph: Graph, data: DataDir, log_bytes: Option<u64>) {
 }
 
 /// The tasks whose processes take part in the graph.
-struct Owners {
+struct TaskLookup {
     data: DataDir,
     known: HashMap<ParticipantId, Option<TaskName>>,
-    looked_at: Option<Instant>,
+    looked_up_at: Option<Instant>,
 }
 
-impl Owners {
+impl TaskLookup {
     async fn task_of(&mut self, graph: &Graph, participant: ParticipantId) -> Option<TaskName> {
         let pause = match self.known.get(&participant) {
             Some(Some(task)) => return Some(task.clone()),
-            Some(None) => LOOK_AGAIN,
-            None => LOOK_PAUSE,
+            Some(None) => REFRESH_INTERVAL,
+            None => LOOKUP_PAUSE,
         };
-        if self.looked_at.is_some_and(|at| at.elapsed() < pause) {
+        if self.looked_up_at.is_some_and(|at| at.elapsed() < pause) {
             return None;
         }
         let mut changes = graph.changes();
@@ -117,7 +118,7 @@ impl Owners {
         // A participant that discovery does not show has no known owner.
         let _ = tokio::time::timeout(DISCOVERY, shown).await;
         let snapshot = graph.snapshot();
-        self.looked_at = Some(Instant::now());
+        self.looked_up_at = Some(Instant::now());
         self.known.retain(|participant, _| snapshot.participants.contains_key(participant));
         let data = self.data.clone();
         let pids =
@@ -136,7 +137,7 @@ impl Owners {
 fn pids_by_task(data: &DataDir) -> Vec<(TaskName, Vec<u32>)> {
     let tasks = data.task_names().unwrap_or_default();
     let mut found: BTreeMap<TaskName, Vec<u32>> = BTreeMap::new();
-    let run_dirs = environments::look(ProcessEntry::all().unwrap_or_default(), |process| {
+    let run_dirs = environments::read_all(ProcessEntry::all().unwrap_or_default(), |process| {
         process.variable(RUN_DIR_VARIABLE)
     });
     for (process, run_dir) in run_dirs {
@@ -169,7 +170,8 @@ impl Recorder {
         while let Some(message) = messages.blocking_recv() {
             match message {
                 Message::Line(line, task) => {
-                    let (stamp, level) = (seconds(line.at_ms), console_level(line.level));
+                    let stamp = seconds(line.at_ms);
+                    let level = console_level(line.level);
                     let text = format!("[{level}] [{stamp}] [{}]: {}", line.logger, line.text);
                     self.write(task, LogSource::Rosout, &text);
                     if line.lost > 0 {
@@ -185,7 +187,9 @@ impl Recorder {
                     self.write(
                         None,
                         LogSource::Agent,
-                        &format!("[WARN] {count} messages of nodes came too fast to be kept"),
+                        &format!(
+                            "[WARN] {count} messages of nodes were dropped: they came too fast"
+                        ),
                     );
                 }
             }
@@ -206,24 +210,25 @@ impl Recorder {
             DiagnosticLevel::Warn | DiagnosticLevel::Stale => LogLevel::Warn,
             DiagnosticLevel::Error => LogLevel::Error,
         };
-        let (stamp, level) = (seconds(status.at_ms), console_level(level));
+        let stamp = seconds(status.at_ms);
+        let level = console_level(level);
         let text = format!("[{level}] [{stamp}]: {}: {}", status.name, status.message);
         self.write(task, LogSource::Diagnostics, &text);
     }
 
     fn write(&mut self, task: Option<TaskName>, source: LogSource, text: &str) {
-        let path = path_in(&self.data, task.as_ref());
+        let path = log_path(&self.data, task.as_ref());
         // A task that was removed has no directory any more, and this must not create one.
         let parent = path.parent().filter(|_| task.is_none());
         if let Some(Err(error)) = parent.map(std::fs::create_dir_all) {
-            tracing::debug!(%error, "what nodes say can't be kept");
+            tracing::debug!(%error, "a message of a ROS node can't be recorded");
         }
         if !path.exists() {
             // The file was never created, or was removed with its task: a file that was open then
             // does not belong to the next task. Other removed files are closed too, because they
             // would keep their bytes on the disk.
             let data = &self.data;
-            self.logs.retain(|task, _| path_in(data, task.as_ref()).exists());
+            self.logs.retain(|task, _| log_path(data, task.as_ref()).exists());
         }
         let log = self.logs.entry(task).or_insert_with(|| {
             let mut spec = LogSpec::at(path);
@@ -240,7 +245,7 @@ impl Recorder {
 }
 
 /// Path of the log for the messages of a task's nodes, or of nodes without a task.
-fn path_in(data: &DataDir, task: Option<&TaskName>) -> PathBuf {
+fn log_path(data: &DataDir, task: Option<&TaskName>) -> PathBuf {
     task.map_or_else(|| data.ros_log(), |task| data.task(task).ros_log())
 }
 
@@ -264,7 +269,7 @@ mod tests {
     use crate::system::durable;
 
     #[test]
-    fn a_task_that_comes_back_has_a_log_of_its_own() {
+    fn task_installed_again_starts_a_new_log() {
         let temp = tempfile::tempdir().expect("temp dir");
         let data = DataDir::new(temp.path()).expect("data dir");
         let name: TaskName = "talker".parse().expect("valid");

@@ -21,7 +21,7 @@ use crate::system::task_user::{self, TaskUser};
 const NICE: i32 = 10;
 /// Maximum time for setup files; those of a large workspace on a slow card take seconds.
 const SOURCING_TIMEOUT: Duration = Duration::from_secs(30);
-/// Maximum time for the survey's processes to be gone.
+/// Maximum time for the probe's processes to be gone.
 const KILL_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of installations that are examined.
 const MAX_INSTALLATIONS: usize = 16;
@@ -43,8 +43,8 @@ const VARIABLES: [&str; 7] = [
     "RMW_IMPLEMENTATION",
 ];
 
-/// `installations` with the packages that `user` can see in them. `dir` is for the survey alone.
-pub async fn survey(
+/// `installations` with the packages that `user` can see in them. `dir` is for the probe alone.
+pub async fn probe_installations(
     installations: Vec<Installation>,
     environment: &BTreeMap<String, String>,
     dir: &Path,
@@ -54,9 +54,9 @@ pub async fn survey(
     for (number, mut installation) in installations.into_iter().enumerate() {
         if number < MAX_INSTALLATIONS {
             match source(&installation.setups, environment, dir, user).await {
-                Ok(answer) => look_into(&mut installation, answer, user).await,
+                Ok(answer) => apply_answer(&mut installation, answer, user).await,
                 Err(error) => {
-                    tracing::warn!(setups = ?installation.setups, %error, "cannot look into this ROS installation");
+                    tracing::warn!(setups = ?installation.setups, %error, "cannot examine this ROS installation");
                 }
             }
         }
@@ -75,18 +75,18 @@ async fn source(
     durable::create_dir_all(dir)?;
     let dir = dir.canonicalize()?;
     let path = dir.join("survey.sh");
-    durable::write(&path, script::survey_script(setups, &VARIABLES).as_bytes(), 0o755)?;
+    durable::write(&path, script::probe_script(setups, &VARIABLES).as_bytes(), 0o755)?;
     let mut environment = environment.clone();
     environment.insert(RUN_DIR_VARIABLE.to_owned(), dir.display().to_string());
     if let Some(user) = user {
-        let way: Vec<PathBuf> =
+        let dirs: Vec<PathBuf> =
             dir.parent().into_iter().chain([dir.as_path()]).map(Path::to_owned).collect();
-        user.let_through(&way)?;
+        user.allow_traversal(&dirs)?;
         environment.insert("HOME".to_owned(), dir.display().to_string());
         environment.extend(["USER", "LOGNAME"].map(|name| (name.to_owned(), user.name.clone())));
     }
     let containment = Containment::new(&dir, None, None);
-    // An agent that was killed may have left a survey running.
+    // An agent that was killed may have left a probe running.
     containment.end(KILL_TIMEOUT).await.map_err(io::Error::other)?;
     let (reader, writer) = io::pipe()?;
     let confinement = Confinement::new(&path, None, &RunLimits::default(), user)?;
@@ -117,7 +117,11 @@ fn read_answer(answer: PipeReader) -> io::Result<Vec<String>> {
     }
 }
 
-async fn look_into(installation: &mut Installation, answer: Vec<String>, user: Option<&TaskUser>) {
+async fn apply_answer(
+    installation: &mut Installation,
+    answer: Vec<String>,
+    user: Option<&TaskUser>,
+) {
     let value = |name: &str| {
         let at = VARIABLES.iter().position(|variable| *variable == name);
         at.and_then(|at| answer.get(at)).filter(|value| !value.is_empty()).cloned()
@@ -135,33 +139,34 @@ async fn look_into(installation: &mut Installation, answer: Vec<String>, user: O
         });
     }
     installation.rmw = value("RMW_IMPLEMENTATION");
-    let mut places = Places { prefixes: paths("AMENT_PREFIX_PATH"), ..Places::default() };
-    places.prefixes.extend(paths("CMAKE_PREFIX_PATH"));
-    places.sources = paths("ROS_PACKAGE_PATH");
+    let mut search_paths =
+        SearchPaths { prefixes: paths("AMENT_PREFIX_PATH"), ..SearchPaths::default() };
+    search_paths.prefixes.extend(paths("CMAKE_PREFIX_PATH"));
+    search_paths.sources = paths("ROS_PACKAGE_PATH");
     if let Some(venv) = value("VIRTUAL_ENV").map(PathBuf::from) {
-        places
+        search_paths
             .pythons
             .extend(children(&venv.join("lib")).map(|python| python.join("site-packages")));
-        places.prefixes.push(venv);
+        search_paths.prefixes.push(venv);
     }
     if installation.versions.contains(&RosVersion::Ros1) {
         // ROS 1 of the operating system, also below another installation.
-        places.prefixes.push("/usr".into());
-        places.pythons.push("/usr/lib/python3/dist-packages".into());
+        search_paths.prefixes.push("/usr".into());
+        search_paths.pythons.push("/usr/lib/python3/dist-packages".into());
     }
     // A thread that panicked returns no packages.
-    installation.packages = task_user::do_as(user, move || places.packages()).await.ok();
+    installation.packages = task_user::do_as(user, move || search_paths.packages()).await.ok();
 }
 
 /// Directories that contain packages.
 #[derive(Default)]
-struct Places {
+struct SearchPaths {
     prefixes: Vec<PathBuf>,
     sources: Vec<PathBuf>,
     pythons: Vec<PathBuf>,
 }
 
-impl Places {
+impl SearchPaths {
     /// All names that could refer to a package. The list is rather too long than too short: a
     /// missing name causes a refusal.
     fn packages(&self) -> BTreeSet<String> {
@@ -232,7 +237,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_sourcing_makes_findable_is_listed() {
+    async fn packages_found_after_sourcing_are_listed() {
         let temp = tempfile::tempdir().expect("a directory");
         let root = temp.path();
         write(root.join("a/share/ament_index/resource_index/packages/nav_msgs"), "");
@@ -249,7 +254,8 @@ mod tests {
         write(root.join("my setup.bash"), &text);
         let given =
             Installation { setups: vec![root.join("my setup.bash")], ..Installation::default() };
-        let seen = survey(vec![given], &system(), &root.join("survey"), None).await.remove(0);
+        let seen =
+            probe_installations(vec![given], &system(), &root.join("survey"), None).await.remove(0);
         assert_eq!(
             (seen.distros, seen.versions),
             (vec!["jazzy".to_owned()], vec![RosVersion::Ros2])
@@ -263,14 +269,19 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_cannot_be_sourced_stays_unknown() {
+    async fn installation_that_fails_to_source_stays_unknown() {
         let temp = tempfile::tempdir().expect("a directory");
         write(temp.path().join("exits.bash"), "exit 3\n");
         for setup in ["exits.bash", "absent.bash"] {
             let given =
                 Installation { setups: vec![temp.path().join(setup)], ..Installation::default() };
-            let seen =
-                survey(vec![given.clone()], &system(), &temp.path().join("survey"), None).await;
+            let seen = probe_installations(
+                vec![given.clone()],
+                &system(),
+                &temp.path().join("survey"),
+                None,
+            )
+            .await;
             assert_eq!(seen, [given]);
         }
     }

@@ -1,14 +1,14 @@
 //! Decides when a run of a task counts as running. It compares the promises in `[ready]` and
 //! `[parameters]` with the part of the robot's ROS graph that belongs to the run's own processes.
-//! Pure: its inputs are observations and answers, its outputs are the next questions and the run's
+//! Pure: its inputs are observations and answers, its outputs are the next requests and the run's
 //! health. It touches neither ROS nor clocks.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::Value;
-use task_proto::manifest::TaskManifest;
-use task_proto::report::{Failure, FailureCode};
-use task_proto::ros::{GraphName, LifecycleState};
+use task_proto::messages::report::{Failure, FailureCode};
+use task_proto::packages::manifest::TaskManifest;
+use task_proto::telemetry::ros::{GraphName, LifecycleState};
 
 use crate::ros::graph::{Node, ParticipantId, Snapshot};
 use crate::task::observed::{Health, Missing};
@@ -19,7 +19,7 @@ mod rate;
 mod tests;
 
 use bring_up::BringUp;
-pub use bring_up::{Answer, Ask, Question};
+pub use bring_up::{Answer, NodeRequest, RequestKind};
 use rate::Rate;
 
 /// Grace period for an entity that goes missing from a graph that was complete: discovery has short
@@ -27,7 +27,7 @@ use rate::Rate;
 const GRACE_MS: u64 = 2000;
 /// Time for which a node of another owner must exist before it counts: determining the owner of a
 /// new participant takes a moment.
-const FOREIGN_MS: u64 = 1000;
+const CONFLICT_MS: u64 = 1000;
 /// Time without any answer after which a node that is up counts as inactive.
 const SILENCE_MS: u64 = 10_000;
 /// Maximum number of graph names that a text lists.
@@ -53,7 +53,7 @@ pub struct Promise {
 /// The graph and the ownership of its participants. A participant that is in none of the three sets
 /// does not count: discovery's data about it may be long outdated.
 #[derive(Debug, Clone, Copy)]
-pub struct Look<'a> {
+pub struct Observation<'a> {
     /// The graph.
     pub snapshot: &'a Snapshot,
     /// The participants of the run's processes.
@@ -74,7 +74,7 @@ enum Item {
     Lifecycle(GraphName),
     Service(GraphName),
     Topic(GraphName),
-    Alone(GraphName),
+    UniqueName(GraphName),
 }
 
 /// A promise that does not hold.
@@ -87,16 +87,16 @@ struct Shortfall {
     what: String,
     /// The state found instead, or empty.
     seen: String,
-    /// The shortfall needs no confirmation by a second look.
+    /// The shortfall needs no confirmation by a second observation.
     certain: bool,
 }
 
 /// Duration of a shortfall.
 #[derive(Debug, Clone)]
-struct Lasting {
+struct OngoingShortfall {
     since_ms: u64,
     /// The shortfall in its first wording, so that a text does not change with every figure.
-    said: Option<Shortfall>,
+    reported: Option<Shortfall>,
 }
 
 /// The health of one run on the graph.
@@ -109,7 +109,7 @@ pub struct Readiness {
     was_ready: bool,
     nodes: BTreeMap<GraphName, BringUp>,
     rates: BTreeMap<GraphName, Rate>,
-    lasting: BTreeMap<Item, Lasting>,
+    lasting: BTreeMap<Item, OngoingShortfall>,
     health: Health,
 }
 
@@ -148,18 +148,20 @@ impl Promise {
     }
 
     /// The reason why the run can't be started: a living process already has one of its names.
-    pub fn taken(
+    pub fn name_conflict(
         &self,
         snapshot: &Snapshot,
         others: &BTreeMap<ParticipantId, String>,
     ) -> Option<Failure> {
-        let texts: Vec<String> =
-            self.foreign(snapshot, others).map(|(name, whose)| taken(name, &whose)).collect();
+        let texts: Vec<String> = self
+            .name_conflicts(snapshot, others)
+            .map(|(name, owner)| describe_conflict(name, &owner))
+            .collect();
         (!texts.is_empty()).then(|| Failure::new(FailureCode::NODE_NAME_TAKEN, texts.join("; ")))
     }
 
     /// The participants of other owners that have a promised name.
-    pub fn takers(
+    pub fn conflicting_participants(
         &self,
         snapshot: &Snapshot,
         others: &BTreeMap<ParticipantId, String>,
@@ -174,19 +176,19 @@ impl Promise {
     }
 
     /// Promised names that other owners have, with those owners.
-    fn foreign<'a>(
+    fn name_conflicts<'a>(
         &'a self,
         snapshot: &'a Snapshot,
         others: &'a BTreeMap<ParticipantId, String>,
     ) -> impl Iterator<Item = (&'a GraphName, String)> {
         let nodes = self.nodes.iter().filter_map(|name| {
-            let whose = snapshot.named(name).find_map(|node| others.get(&node.participant))?;
-            Some((name, format!("{whose} has a node of that name")))
+            let owner = snapshot.named(name).find_map(|node| others.get(&node.participant))?;
+            Some((name, format!("{owner} has a node of that name")))
         });
         let services = self.services.iter().filter_map(|name| {
             let offered = |node: &Node| Some((node.name.clone(), others.get(&node.participant)?));
-            let (node, whose) = snapshot.servers_of(name).find_map(offered)?;
-            Some((name, format!("`{node}` of {whose} offers that service")))
+            let (node, owner) = snapshot.servers_of(name).find_map(offered)?;
+            Some((name, format!("`{node}` of {owner} offers that service")))
         });
         nodes.chain(services)
     }
@@ -215,48 +217,55 @@ impl Readiness {
         &self.promise
     }
 
-    /// The run's health, as of the last look.
+    /// The run's health, as of the last observation.
     pub fn health(&self) -> &Health {
         &self.health
     }
 
-    /// The questions to ask now; each is asked once, until its answer has come.
-    pub fn questions(&mut self, now_ms: u64) -> Vec<Question> {
-        self.nodes.values_mut().filter_map(|node| node.question(now_ms)).collect()
+    /// The requests to send now; each is sent once, until its answer has come.
+    pub fn requests(&mut self, now_ms: u64) -> Vec<NodeRequest> {
+        self.nodes.values_mut().filter_map(|node| node.next_request(now_ms)).collect()
     }
 
     /// Records an answer; the next look takes it into account.
-    pub fn answered(&mut self, question: &Question, answer: Answer, now_ms: u64) {
-        if let Some(node) = self.nodes.get_mut(&question.node) {
-            node.answered(question, answer, now_ms);
+    pub fn record_answer(&mut self, request: &NodeRequest, answer: Answer, now_ms: u64) {
+        if let Some(node) = self.nodes.get_mut(&request.node) {
+            node.record_answer(request, answer, now_ms);
         }
     }
 
     /// Records an observation of the graph.
-    pub fn see(&mut self, look: &Look<'_>, now_ms: u64) {
+    pub fn observe(&mut self, observation: &Observation<'_>, now_ms: u64) {
         // Until this look all that was promised has held.
         self.was_ready |= self.has_held(now_ms);
-        self.meet(look);
+        self.track_nodes(observation);
         for (topic, rate) in &mut self.rates {
-            if let Some(count) = look.counts.get(topic) {
-                rate.counted(*count, now_ms);
+            if let Some(count) = observation.counts.get(topic) {
+                rate.record(*count, now_ms);
             }
         }
-        let shortfalls = self.shortfalls(look, now_ms);
-        self.judge(shortfalls, now_ms);
+        let shortfalls = self.shortfalls(observation, now_ms);
+        self.update_health(shortfalls, now_ms);
     }
 
     /// Notices nodes that are new, or that have returned in another process.
-    fn meet(&mut self, look: &Look<'_>) {
-        let offer =
-            self.promise.services.iter().flat_map(|service| look.snapshot.servers_of(service));
+    fn track_nodes(&mut self, observation: &Observation<'_>) {
+        let offer = self
+            .promise
+            .services
+            .iter()
+            .flat_map(|service| observation.snapshot.servers_of(service));
         let offering: BTreeSet<&GraphName> = offer
-            .filter(|node| look.ours.contains(&node.participant))
+            .filter(|node| observation.ours.contains(&node.participant))
             .map(|node| &node.name)
             .collect();
         for name in self.promise.nodes.iter().chain(offering.iter().copied()) {
-            let here =
-                || look.snapshot.named(name).filter(|node| look.ours.contains(&node.participant));
+            let here = || {
+                observation
+                    .snapshot
+                    .named(name)
+                    .filter(|node| observation.ours.contains(&node.participant))
+            };
             let known = self.nodes.get(name).map(BringUp::instance);
             let Some(first) = here().next() else { continue };
             if !here().any(|node| Some(node.participant) == known) {
@@ -267,50 +276,58 @@ impl Readiness {
                     BringUp::new(name.clone(), first.participant, lifecycle, parameters, is_up);
                 self.nodes.insert(name.clone(), node);
             }
-            let answers = format!("{name}/get_parameters");
-            let can_answer = here()
-                .any(|node| node.services.iter().any(|service| service.name.as_str() == answers));
+            let answer_service = format!("{name}/get_parameters");
+            let can_answer = here().any(|node| {
+                node.services.iter().any(|service| service.name.as_str() == answer_service)
+            });
             if let Some(node) =
                 self.nodes.get_mut(name).filter(|_| offering.contains(name) && can_answer)
             {
-                node.must_answer();
+                node.require_answer();
             }
         }
     }
 
-    fn shortfalls(&self, look: &Look<'_>, now_ms: u64) -> Vec<Shortfall> {
-        let foreign =
-            self.promise.foreign(look.snapshot, look.others).map(|(name, seen)| Shortfall {
-                item: Item::Alone(name.clone()),
+    fn shortfalls(&self, observation: &Observation<'_>, now_ms: u64) -> Vec<Shortfall> {
+        let conflicts = self.promise.name_conflicts(observation.snapshot, observation.others).map(
+            |(name, seen)| Shortfall {
+                item: Item::UniqueName(name.clone()),
                 code: FailureCode::NODE_NAME_TAKEN,
                 what: format!("`{name}` was not free"),
                 seen,
                 certain: false,
-            });
-        let mut shortfalls: Vec<Shortfall> = foreign.collect();
+            },
+        );
+        let mut shortfalls: Vec<Shortfall> = conflicts.collect();
         for name in &self.promise.nodes {
-            let here = look.snapshot.named(name).any(|node| look.ours.contains(&node.participant));
+            let here = observation
+                .snapshot
+                .named(name)
+                .any(|node| observation.ours.contains(&node.participant));
             shortfalls.extend(if here {
                 self.unprepared(name, now_ms)
             } else {
-                Some(self.absent(name, look))
+                Some(self.absent(name, observation))
             });
         }
-        shortfalls
-            .extend(self.promise.services.iter().filter_map(|name| self.unanswered(name, look)));
-        shortfalls
-            .extend(self.promise.topics.keys().filter_map(|name| self.unpublished(name, look)));
+        shortfalls.extend(
+            self.promise.services.iter().filter_map(|name| self.unanswered(name, observation)),
+        );
+        shortfalls.extend(
+            self.promise.topics.keys().filter_map(|name| self.unpublished(name, observation)),
+        );
         shortfalls
     }
 
-    fn absent(&self, name: &GraphName, look: &Look<'_>) -> Shortfall {
-        let gone = self.nodes.get(name).is_some_and(|node| look.gone.contains(&node.instance()));
+    fn absent(&self, name: &GraphName, observation: &Observation<'_>) -> Shortfall {
+        let gone =
+            self.nodes.get(name).is_some_and(|node| observation.gone.contains(&node.instance()));
         let (what, seen) = match self.was_ready {
             true => (
                 format!("`{name}` left the graph"),
                 if gone { "its process is gone" } else { "" }.to_owned(),
             ),
-            false => (format!("`{name}` did not appear"), on_the_graph(look.snapshot)),
+            false => (format!("`{name}` did not appear"), list_graph(observation.snapshot)),
         };
         Shortfall {
             item: Item::Node(name.clone()),
@@ -354,18 +371,22 @@ impl Readiness {
                 );
             }
         }
-        if node.has_its_parameters() {
+        if node.has_all_parameters() {
             return None;
         }
         let seen = if silent_ms.is_some() { "its parameter services do not answer" } else { "" };
-        let what = format!("`{name}` did not take its parameters");
+        let what = format!("`{name}` did not accept its parameters");
         shortfall(Item::Parameters(name.clone()), FailureCode::PARAMETER_REJECTED, what, seen)
     }
 
-    fn unanswered(&self, name: &GraphName, look: &Look<'_>) -> Option<Shortfall> {
-        let offering =
-            || look.snapshot.servers_of(name).filter(|node| look.ours.contains(&node.participant));
-        let answers = |node: &Node| self.nodes.get(&node.name).is_none_or(BringUp::answers);
+    fn unanswered(&self, name: &GraphName, observation: &Observation<'_>) -> Option<Shortfall> {
+        let offering = || {
+            observation
+                .snapshot
+                .servers_of(name)
+                .filter(|node| observation.ours.contains(&node.participant))
+        };
+        let answers = |node: &Node| self.nodes.get(&node.name).is_none_or(BringUp::has_answered);
         let (what, seen) = match offering().next() {
             None if self.was_ready => {
                 (format!("the service `{name}` is not offered any more"), String::new())
@@ -374,87 +395,100 @@ impl Readiness {
             Some(_) if self.was_ready || offering().any(answers) => return None,
             Some(node) => (
                 format!("the service `{name}` did not answer"),
-                format!("`{}` answers nothing", node.name),
+                format!("`{}` does not answer", node.name),
             ),
         };
-        let (item, code) = (Item::Service(name.clone()), FailureCode::SERVICE_LOST);
+        let item = Item::Service(name.clone());
+        let code = FailureCode::SERVICE_LOST;
         Some(Shortfall { item, code, what, seen, certain: false })
     }
 
-    fn unpublished(&self, name: &GraphName, look: &Look<'_>) -> Option<Shortfall> {
-        let published =
-            look.snapshot.publishers_of(name).any(|node| look.ours.contains(&node.participant));
+    fn unpublished(&self, name: &GraphName, observation: &Observation<'_>) -> Option<Shortfall> {
+        let published = observation
+            .snapshot
+            .publishers_of(name)
+            .any(|node| observation.ours.contains(&node.participant));
         let (what, seen) = match (published, self.rates.get(name)) {
-            (false, _) if self.was_ready => {
-                (format!("nobody publishes `{name}` any more"), String::new())
-            }
-            (false, _) => (format!("nobody published `{name}`"), String::new()),
+            (false, _) if self.was_ready => (format!("`{name}` lost its publisher"), String::new()),
+            (false, _) => (format!("`{name}` had no publisher"), String::new()),
             (true, None) => return None,
             (true, Some(rate)) => match rate.suffices() {
                 Some(true) => return None,
                 // Right after a restart of the agent nothing was counted yet; that is no reason to
                 // doubt the topic.
                 None if self.was_ready => return None,
-                None => (format!("`{name}` was not heard for long enough"), String::new()),
+                None => (format!("`{name}` was not measured for long enough"), String::new()),
                 Some(false) => {
                     let what = match self.was_ready {
-                        true => format!("`{name}` does not come at {} Hz any more", rate.min_hz()),
-                        false => format!("`{name}` did not come at {} Hz", rate.min_hz()),
+                        true => format!("`{name}` is no longer published at {} Hz", rate.min_hz()),
+                        false => format!("`{name}` was not published at {} Hz", rate.min_hz()),
                     };
                     (
                         what,
-                        rate.hz().map_or_else(String::new, |hz| format!("it came at {hz:.1} Hz")),
+                        rate.hz().map_or_else(String::new, |hz| {
+                            format!("it was published at {hz:.1} Hz")
+                        }),
                     )
                 }
             },
         };
-        let (item, code) = (Item::Topic(name.clone()), FailureCode::TOPIC_SILENT);
+        let item = Item::Topic(name.clone());
+        let code = FailureCode::TOPIC_SILENT;
         Some(Shortfall { item, code, what, seen, certain: false })
     }
 
-    fn judge(&mut self, shortfalls: Vec<Shortfall>, now_ms: u64) {
+    fn update_health(&mut self, shortfalls: Vec<Shortfall>, now_ms: u64) {
         let before = std::mem::take(&mut self.lasting);
         let mut counted = Vec::new();
         for shortfall in shortfalls {
             let item = shortfall.item.clone();
-            let mut lasting =
-                before.get(&item).cloned().unwrap_or(Lasting { since_ms: now_ms, said: None });
+            let mut lasting = before
+                .get(&item)
+                .cloned()
+                .unwrap_or(OngoingShortfall { since_ms: now_ms, reported: None });
             let needed_ms = match item {
                 // Nothing becomes ready while anything is in doubt.
                 _ if !self.was_ready || shortfall.certain => 0,
-                Item::Alone(_) => FOREIGN_MS,
+                Item::UniqueName(_) => CONFLICT_MS,
                 _ => GRACE_MS,
             };
             if now_ms.saturating_sub(lasting.since_ms) >= needed_ms {
-                let said = lasting.said.take().filter(|_| self.was_ready).unwrap_or(shortfall);
-                counted.push(said.clone());
-                lasting.said = Some(said);
+                let reported =
+                    lasting.reported.take().filter(|_| self.was_ready).unwrap_or(shortfall);
+                counted.push(reported.clone());
+                lasting.reported = Some(reported);
             }
             self.lasting.insert(item, lasting);
         }
-        let stumbled = self.nodes.values().find_map(|node| node.refused().cloned());
-        let refused = self.taken(now_ms).or(stumbled);
+        let node_refusal = self.nodes.values().find_map(|node| node.refused().cloned());
+        let refused = self.lasting_name_conflict(now_ms).or(node_refusal);
         if matches!(self.health, Health::Refused(_)) {
             return;
         }
-        let lacking = match refused {
+        let problem = match refused {
             Some(refused) if !self.was_ready => {
                 self.health = Health::Refused(refused);
                 return;
             }
             // A refusal by one node that returned is no reason to take down the others.
             Some(refused) => Some((refused.code, refused.text, String::new())),
-            None => in_words(&counted),
+            None => summarize(&counted),
         };
-        let is_strangers =
-            !counted.is_empty() && counted.iter().all(|lacks| matches!(lacks.item, Item::Alone(_)));
-        self.health = match (lacking, &self.health) {
+        let only_conflicts = !counted.is_empty()
+            && counted.iter().all(|shortfall| matches!(shortfall.item, Item::UniqueName(_)));
+        self.health = match (problem, &self.health) {
             (None, Health::Holds { since_ms }) => Health::Holds { since_ms: *since_ms },
             (None, _) => Health::Holds { since_ms: now_ms },
             (Some((code, what, seen)), before) => {
                 let since_ms =
                     if let Health::Missing(missing) = before { missing.since_ms } else { now_ms };
-                Health::Missing(Missing { since_ms, code, what, seen, is_its_own: !is_strangers })
+                Health::Missing(Missing {
+                    since_ms,
+                    code,
+                    what,
+                    seen,
+                    is_own_fault: !only_conflicts,
+                })
             }
         };
         self.was_ready |= self.has_held(now_ms);
@@ -467,12 +501,12 @@ impl Readiness {
     }
 
     /// A name that another owner has had for long enough.
-    fn taken(&self, now_ms: u64) -> Option<Failure> {
-        self.lasting.iter().find_map(|(item, lasting)| match (item, &lasting.said) {
-            (Item::Alone(name), Some(said))
-                if now_ms.saturating_sub(lasting.since_ms) >= FOREIGN_MS =>
+    fn lasting_name_conflict(&self, now_ms: u64) -> Option<Failure> {
+        self.lasting.iter().find_map(|(item, lasting)| match (item, &lasting.reported) {
+            (Item::UniqueName(name), Some(reported))
+                if now_ms.saturating_sub(lasting.since_ms) >= CONFLICT_MS =>
             {
-                Some(Failure::new(said.code.clone(), taken(name, &said.seen)))
+                Some(Failure::new(reported.code.clone(), describe_conflict(name, &reported.seen)))
             }
             _ => None,
         })
@@ -480,7 +514,7 @@ impl Readiness {
 }
 
 /// The shortfalls in words, with the code of the first and the state found instead; each text once.
-fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
+fn summarize(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
     let code = counted.first()?.code.clone();
     let what =
         counted.iter().map(|shortfall| shortfall.what.as_str()).collect::<Vec<_>>().join(", ");
@@ -494,12 +528,12 @@ fn in_words(counted: &[Shortfall]) -> Option<(FailureCode, String, String)> {
 }
 
 /// States that another owner has a name, in words that stand alone.
-fn taken(name: &GraphName, whose: &str) -> String {
-    format!("`{name}` is already on the graph: {whose}")
+fn describe_conflict(name: &GraphName, owner: &str) -> String {
+    format!("`{name}` is already on the graph: {owner}")
 }
 
 /// The names on the graph.
-fn on_the_graph(snapshot: &Snapshot) -> String {
+fn list_graph(snapshot: &Snapshot) -> String {
     let names: BTreeSet<&str> = snapshot.nodes.iter().map(|node| node.name.as_str()).collect();
     if names.is_empty() {
         return "the graph is empty".to_owned();

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use task_proto::report::{Failure, FailureCode, RosFacts};
-use task_proto::ros::{GraphName, LifecycleState, Transition};
+use task_proto::messages::report::{Failure, FailureCode, RosFacts};
+use task_proto::telemetry::ros::{GraphName, LifecycleState, Transition};
 use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, timeout};
@@ -17,18 +17,18 @@ use tokio_util::sync::CancellationToken;
 use crate::process::supervisor::Supervisor;
 use crate::ros::graph::{Graph, GraphError, ParameterValue, RateMeter, Snapshot};
 use crate::ros::graph_access::GraphAccess;
-use crate::ros::readiness::{Answer, Ask, Look, Promise, Question, Readiness};
+use crate::ros::readiness::{Answer, NodeRequest, Observation, Promise, Readiness, RequestKind};
 use crate::system::clock;
 use crate::task::observed::{Health, Missing};
 
-mod whose;
+mod ownership;
 
-use whose::Whose;
+use ownership::Ownership;
 
 /// Interval between looks at a run that is not ready, when the graph reports no change.
-const LOOK_STARTING: Duration = Duration::from_millis(250);
+const POLL_STARTING: Duration = Duration::from_millis(250);
 /// Interval between looks at a run that is ready: this detects a process that ended without notice.
-const LOOK_RUNNING: Duration = Duration::from_secs(1);
+const POLL_RUNNING: Duration = Duration::from_secs(1);
 /// Maximum time for a node to answer a cheap question.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Maximum time for a node to set parameters or make a transition, before its state is queried.
@@ -39,11 +39,11 @@ const LEAVE_TIMEOUT: Duration = Duration::from_secs(2);
 /// often opening is attempted.
 const RETRY: Duration = Duration::from_secs(2);
 /// A parameter that every node has.
-const EVERYWHERE: &str = "use_sim_time";
+const COMMON_PARAMETER: &str = "use_sim_time";
 
 /// A run to be watched.
 #[derive(Debug, Clone, Default)]
-pub struct Watched {
+pub struct WatchedRun {
     pub dir: PathBuf,
     /// Start time of the run's process, in milliseconds since boot.
     pub started_ms: u64,
@@ -75,7 +75,7 @@ impl Watcher {
         if promise.is_empty() {
             return Ok(());
         }
-        let graph = self.access.settled(facts).await?;
+        let graph = self.access.open_after_discovery(facts).await?;
         for node in promise.lifecycle.iter().chain(promise.parameters.keys()) {
             // A node that finds the agent's clients answers sooner; a failure costs only that.
             if let Err(error) = graph.prepare(node).await {
@@ -86,21 +86,24 @@ impl Watcher {
         let deadline = Instant::now() + LEAVE_TIMEOUT;
         loop {
             let snapshot = changes.borrow_and_update().clone();
-            let whose = Whose::look(snapshot.clone(), Vec::new(), &BTreeSet::new(), None).await;
-            let Some(failure) = promise.taken(&snapshot, &whose.others) else { return Ok(()) };
+            let ownership =
+                Ownership::determine(snapshot.clone(), Vec::new(), &BTreeSet::new(), None).await;
+            let Some(failure) = promise.name_conflict(&snapshot, &ownership.others) else {
+                return Ok(());
+            };
             // Nodes of a run that was just stopped may still be leaving.
             let changed = tokio::time::timeout_at(deadline, changes.changed()).await;
             if !matches!(changed, Ok(Ok(()))) {
-                let named = whose.naming_takers(promise, &snapshot).await;
-                return Err(promise.taken(&snapshot, &named.others).unwrap_or(failure));
+                let named = ownership.with_process_names(promise, &snapshot).await;
+                return Err(promise.name_conflict(&snapshot, &named.others).unwrap_or(failure));
             }
         }
     }
 
-    /// Watches a run until the receiver is dropped, or until [`Self::wind_down`].
+    /// Watches a run until the receiver is dropped, or until [`Self::shut_down_nodes`].
     pub fn watch(
         &self,
-        run: Watched,
+        run: WatchedRun,
         promise: Promise,
         facts: Option<RosFacts>,
     ) -> watch::Receiver<Health> {
@@ -113,7 +116,8 @@ impl Watcher {
         let over = Arc::new(CancellationToken::new());
         let watches = self.watches.clone();
         lock(&watches).insert(run.dir.clone(), over.clone());
-        let (access, supervisor) = (self.access.clone(), self.supervisor.clone());
+        let access = self.access.clone();
+        let supervisor = self.supervisor.clone();
         tokio::spawn(async move {
             let watching = watch_run(run, promise, facts, &access, supervisor, &health);
             tokio::select! {
@@ -131,7 +135,7 @@ impl Watcher {
 
     /// Ends the watch of a run and, within `time`, shuts its lifecycle nodes down cleanly. Failures
     /// are logged: the signals that follow end the nodes anyway.
-    pub async fn wind_down(
+    pub async fn shut_down_nodes(
         &self,
         dir: &Path,
         promise: &Promise,
@@ -145,15 +149,21 @@ impl Watcher {
             return;
         }
         let winding_down = async {
-            let graph = self.access.settled(facts).await.map_err(|failure| failure.to_string())?;
+            let graph = self
+                .access
+                .open_after_discovery(facts)
+                .await
+                .map_err(|failure| failure.to_string())?;
             let pids = self.supervisor.pids(dir).await.map_err(|error| error.to_string())?;
             let snapshot = graph.snapshot();
-            let whose = Whose::look(snapshot.clone(), pids, &BTreeSet::new(), None).await;
+            let ownership =
+                Ownership::determine(snapshot.clone(), pids, &BTreeSet::new(), None).await;
             let mut nodes = JoinSet::new();
             for name in &promise.lifecycle {
-                if snapshot.named(name).any(|node| whose.ours.contains(&node.participant)) {
-                    let (graph, name) = (graph.clone(), name.clone());
-                    nodes.spawn(async move { take_down(&graph, &name, time).await });
+                if snapshot.named(name).any(|node| ownership.ours.contains(&node.participant)) {
+                    let graph = graph.clone();
+                    let name = name.clone();
+                    nodes.spawn(async move { shut_down_node(&graph, &name, time).await });
                 }
             }
             nodes.join_all().await;
@@ -177,7 +187,7 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
 }
 
 /// Deactivates one node and shuts it down.
-async fn take_down(graph: &Graph, node: &GraphName, time: Duration) {
+async fn shut_down_node(graph: &Graph, node: &GraphName, time: Duration) {
     let state = graph.lifecycle_state(node, ANSWER_TIMEOUT.min(time)).await;
     let active = matches!(state, Ok(LifecycleState::Active));
     let steps = [active.then_some(Transition::Deactivate), Some(Transition::Shutdown)];
@@ -188,14 +198,14 @@ async fn take_down(graph: &Graph, node: &GraphName, time: Duration) {
                 tracing::warn!(%node, transition = transition.as_str(), "a node refused a transition")
             }
             Err(error) => {
-                tracing::warn!(%node, transition = transition.as_str(), %error, "a node made no transition")
+                tracing::warn!(%node, transition = transition.as_str(), %error, "a lifecycle transition failed")
             }
         }
     }
 }
 
 async fn watch_run(
-    run: Watched,
+    run: WatchedRun,
     promise: Promise,
     facts: Option<RosFacts>,
     access: &GraphAccess,
@@ -203,38 +213,39 @@ async fn watch_run(
     health: &watch::Sender<Health>,
 ) {
     let graph = loop {
-        let failure = match access.settled(facts.as_ref()).await {
+        let failure = match access.open_after_discovery(facts.as_ref()).await {
             Ok(graph) => break graph,
             Err(failure) => failure,
         };
-        health.send_replace(Health::Missing(blind(failure)));
+        health.send_replace(Health::Missing(graph_unavailable(failure)));
         tokio::time::sleep(RETRY).await;
     };
     let readiness = Readiness::new(promise.clone(), run.was_ready);
     let age = Duration::from_millis(clock::boot_ms().saturating_sub(run.started_ms));
-    let eyes = Eyes {
+    let observer = RunObserver {
         graph,
         supervisor,
         dir: run.dir,
         started: std::time::Instant::now().checked_sub(age),
         pids: Vec::new(),
         pids_at: None,
-        whose: Whose::default(),
+        ownership: Ownership::default(),
         topics: promise.topics,
         meters: BTreeMap::new(),
     };
-    eyes.watch(readiness, health).await;
+    observer.watch(readiness, health).await;
 }
 
 /// The consequence for a run when the graph can't be observed.
-fn blind(failure: Failure) -> Missing {
+fn graph_unavailable(failure: Failure) -> Missing {
     let what = "the ROS graph could not be watched".to_owned();
-    let (since_ms, code) = (clock::boot_ms(), FailureCode::GRAPH_UNAVAILABLE);
-    Missing { since_ms, code, what, seen: failure.text, is_its_own: false }
+    let since_ms = clock::boot_ms();
+    let code = FailureCode::GRAPH_UNAVAILABLE;
+    Missing { since_ms, code, what, seen: failure.text, is_own_fault: false }
 }
 
 /// The data for observing one run.
-struct Eyes {
+struct RunObserver {
     graph: Graph,
     supervisor: Supervisor,
     dir: PathBuf,
@@ -242,7 +253,7 @@ struct Eyes {
     started: Option<std::time::Instant>,
     pids: Vec<u32>,
     pids_at: Option<Instant>,
-    whose: Whose,
+    ownership: Ownership,
     topics: BTreeMap<GraphName, Option<f64>>,
     meters: BTreeMap<GraphName, RateMeter>,
 }
@@ -250,78 +261,83 @@ struct Eyes {
 /// Maximum age of the list of a run's processes.
 const PIDS_AGE: Duration = Duration::from_secs(10);
 
-impl Eyes {
+impl RunObserver {
     async fn watch(mut self, mut readiness: Readiness, health: &watch::Sender<Health>) {
         let mut changes = self.graph.changes();
-        let mut asking = JoinSet::new();
+        let mut pending = JoinSet::new();
         loop {
             let snapshot = changes.borrow_and_update().clone();
-            self.see(&snapshot, &mut readiness).await;
+            self.observe(&snapshot, &mut readiness).await;
             let seen = readiness.health().clone();
             health.send_if_modified(|known| {
                 let news = *known != seen;
                 known.clone_from(&seen);
                 news
             });
-            for question in readiness.questions(clock::boot_ms()) {
+            for request in readiness.requests(clock::boot_ms()) {
                 let graph = self.graph.clone();
-                asking.spawn(async move {
-                    let answer = ask(&graph, &question).await;
-                    (question, answer)
+                pending.spawn(async move {
+                    let answer = send_request(&graph, &request).await;
+                    (request, answer)
                 });
             }
             let holds = matches!(seen, Health::Holds { .. });
-            let look_again = if holds { LOOK_RUNNING } else { LOOK_STARTING };
+            let poll_interval = if holds { POLL_RUNNING } else { POLL_STARTING };
             tokio::select! {
                 // Cancel-safe: an answer stays in the set until it is taken.
-                Some(answered) = asking.join_next() => {
-                    if let Ok((question, answer)) = answered {
-                        readiness.answered(&question, answer, clock::boot_ms());
+                Some(answered) = pending.join_next() => {
+                    if let Ok((request, answer)) = answered {
+                        readiness.record_answer(&request, answer, clock::boot_ms());
                     }
                 }
                 // Cancel-safe: a change is only marked as seen when the snapshot is taken.
                 changed = changes.changed() => {
                     if changed.is_err() {
                         let failure = Failure::new(FailureCode::GRAPH_UNAVAILABLE, GraphError::Closed.to_string());
-                        health.send_replace(Health::Missing(blind(failure)));
+                        health.send_replace(Health::Missing(graph_unavailable(failure)));
                         return;
                     }
                 }
                 // Cancel-safe: a timer that is made anew each time.
-                () = tokio::time::sleep(look_again) => {}
+                () = tokio::time::sleep(poll_interval) => {}
             }
         }
     }
 
-    async fn see(&mut self, snapshot: &Arc<Snapshot>, readiness: &mut Readiness) {
-        let strangers = snapshot.participants.keys().any(|id| !self.whose.knows(id));
-        if strangers || self.pids_at.is_none_or(|at| at.elapsed() >= PIDS_AGE) {
+    async fn observe(&mut self, snapshot: &Arc<Snapshot>, readiness: &mut Readiness) {
+        let has_unknown = snapshot.participants.keys().any(|id| !self.ownership.knows(id));
+        if has_unknown || self.pids_at.is_none_or(|at| at.elapsed() >= PIDS_AGE) {
             match self.supervisor.pids(&self.dir).await {
                 Ok(pids) => (self.pids, self.pids_at) = (pids, Some(Instant::now())),
-                Err(error) => tracing::warn!(%error, "cannot tell which processes a run has"),
+                Err(error) => tracing::warn!(%error, "cannot list the processes of a run"),
             }
         }
-        let ours = std::mem::take(&mut self.whose).ever_ours;
-        let whose = Whose::look(snapshot.clone(), self.pids.clone(), &ours, self.started).await;
-        self.whose = whose.naming_takers(readiness.promise(), snapshot).await;
-        self.meter(snapshot);
+        let ours = std::mem::take(&mut self.ownership).ever_ours;
+        let ownership =
+            Ownership::determine(snapshot.clone(), self.pids.clone(), &ours, self.started).await;
+        self.ownership = ownership.with_process_names(readiness.promise(), snapshot).await;
+        self.count_messages(snapshot);
         let counts = self
             .meters
             .iter()
             .map(|(topic, meter)| (topic.clone(), meter.rate().samples))
             .collect();
-        let Whose { ours, others, gone, .. } = &self.whose;
-        readiness.see(&Look { snapshot, ours, others, gone, counts: &counts }, clock::boot_ms());
+        let Ownership { ours, others, gone, .. } = &self.ownership;
+        readiness.observe(
+            &Observation { snapshot, ours, others, gone, counts: &counts },
+            clock::boot_ms(),
+        );
     }
 
     /// Counts the messages of topics with a minimum rate, once their type is known.
-    fn meter(&mut self, snapshot: &Snapshot) {
+    fn count_messages(&mut self, snapshot: &Snapshot) {
         for (topic, _) in self.topics.iter().filter(|(_, min_hz)| min_hz.is_some()) {
             if self.meters.contains_key(topic) {
                 continue;
             }
             let mut publishers = snapshot.publishers_of(topic);
-            let Some(node) = publishers.find(|node| self.whose.ours.contains(&node.participant))
+            let Some(node) =
+                publishers.find(|node| self.ownership.ours.contains(&node.participant))
             else {
                 continue;
             };
@@ -339,18 +355,18 @@ impl Eyes {
     }
 }
 
-async fn ask(graph: &Graph, question: &Question) -> Answer {
-    let node = &question.node;
-    let answer = match &question.ask {
-        Ask::Anything => {
-            graph.parameter(node, EVERYWHERE, ANSWER_TIMEOUT).await.map(|_| Answer::Something)
+async fn send_request(graph: &Graph, request: &NodeRequest) -> Answer {
+    let node = &request.node;
+    let answer = match &request.kind {
+        RequestKind::Ping => {
+            graph.parameter(node, COMMON_PARAMETER, ANSWER_TIMEOUT).await.map(|_| Answer::Pong)
         }
-        Ask::State => graph.lifecycle_state(node, ANSWER_TIMEOUT).await.map(Answer::State),
-        Ask::Transition(transition) => {
-            tracing::info!(%node, transition = transition.as_str(), "asks for a lifecycle transition");
+        RequestKind::State => graph.lifecycle_state(node, ANSWER_TIMEOUT).await.map(Answer::State),
+        RequestKind::Transition(transition) => {
+            tracing::info!(%node, transition = transition.as_str(), "requesting a lifecycle transition");
             graph.change_state(node, *transition, WORK_TIMEOUT).await.map(Answer::Transition)
         }
-        Ask::Set(parameters) => set(graph, node, parameters).await.map(Answer::Set),
+        RequestKind::Set(parameters) => set(graph, node, parameters).await.map(Answer::Set),
     };
     answer.unwrap_or_else(|error| {
         tracing::debug!(%node, %error, "no answer");
@@ -380,7 +396,7 @@ async fn set(
         results.push(match answers.next_if(|answer| answer.name == *name) {
             Some(answer) if answer.successful => Ok(()),
             Some(answer) => Err(answer.reason),
-            None => Err("no ROS parameter can have this value".to_owned()),
+            None => Err("not a value of a ROS parameter".to_owned()),
         });
     }
     Ok(results)

@@ -4,12 +4,12 @@
 
 use std::collections::BTreeMap;
 
-use task_proto::report::RosFacts;
+use task_proto::messages::report::RosFacts;
 
 use crate::setup::installation::{Installation, RosVersion};
 
 /// Variables passed on from the agent, with a default where the agent has none.
-const PASSED_ON: [(&str, Option<&str>); 6] = [
+const INHERITED: [(&str, Option<&str>); 6] = [
     ("PATH", Some("/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin")),
     ("HOME", Some("/")),
     ("LANG", Some("C.UTF-8")),
@@ -45,7 +45,7 @@ pub const ROS_VARIABLES: [&str; 20] = [
 ];
 
 /// The discovery method of nodes with this environment, if the agent can't take part in it.
-pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str> {
+pub fn unsupported_discovery(environment: &BTreeMap<String, String>) -> Option<&'static str> {
     let value = |name| environment.get(name).map(String::as_str).filter(|value| !value.is_empty());
     match (value("RMW_IMPLEMENTATION"), value("ROS_DISCOVERY_SERVER")) {
         (Some("rmw_zenoh_cpp"), _) => Some("Zenoh"),
@@ -56,16 +56,16 @@ pub fn unheard_of(environment: &BTreeMap<String, String>) -> Option<&'static str
 
 /// The environment from the robot's settings (`ROS_DOMAIN_ID` and the like, which take precedence)
 /// and from the values in `inherited` of the few variables that every program expects.
-pub fn explicit(
+pub fn task_environment(
     settings: &BTreeMap<String, String>,
     inherited: impl Fn(&str) -> Option<String>,
 ) -> BTreeMap<String, String> {
-    let passed_on = PASSED_ON.into_iter().filter_map(|(name, default)| {
+    let inherited_values = INHERITED.into_iter().filter_map(|(name, default)| {
         let value =
             inherited(name).filter(|value| !value.is_empty()).or(default.map(str::to_owned))?;
         Some((name.to_owned(), value))
     });
-    let mut environment: BTreeMap<_, _> = passed_on.collect();
+    let mut environment: BTreeMap<_, _> = inherited_values.collect();
     // Otherwise Python holds a task's lines back until a buffer is full, and the log of a killed
     // task misses its end.
     environment.insert("PYTHONUNBUFFERED".to_owned(), "1".to_owned());
@@ -73,9 +73,9 @@ pub fn explicit(
     environment
 }
 
-/// [`explicit`] with this process's own variables.
-pub fn of_this_robot(settings: &BTreeMap<String, String>) -> BTreeMap<String, String> {
-    explicit(settings, |name| std::env::var(name).ok())
+/// [`task_environment`] with this process's own variables.
+pub fn robot_environment(settings: &BTreeMap<String, String>) -> BTreeMap<String, String> {
+    task_environment(settings, |name| std::env::var(name).ok())
 }
 
 /// The ROS setup of tasks without special needs: the best of `installations` under their
@@ -107,7 +107,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_robot_says_how_its_tasks_meet_ros() {
+    fn ros_facts_follow_the_installations_and_the_environment() {
         let environment = |pairs: &[(&str, &str)]| {
             pairs
                 .iter()
@@ -116,17 +116,20 @@ mod tests {
         };
         assert_eq!(ros_facts(&[], &environment(&[])), None);
         assert_eq!(
-            unheard_of(&environment(&[
+            unsupported_discovery(&environment(&[
                 ("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"),
                 ("ROS_DISCOVERY_SERVER", "")
             ])),
             None
         );
         assert_eq!(
-            unheard_of(&environment(&[("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")])),
+            unsupported_discovery(&environment(&[("RMW_IMPLEMENTATION", "rmw_zenoh_cpp")])),
             Some("Zenoh")
         );
-        assert!(unheard_of(&environment(&[("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")])).is_some());
+        assert!(
+            unsupported_discovery(&environment(&[("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")]))
+                .is_some()
+        );
         let installation = |distro: &str, version| Installation {
             distros: vec![distro.to_owned()],
             versions: vec![version],
@@ -160,12 +163,12 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_listed_passes_and_settings_win() {
+    fn only_listed_variables_are_inherited_and_settings_win() {
         let settings = BTreeMap::from([
             ("ROS_DOMAIN_ID".to_owned(), "7".to_owned()),
             ("TZ".to_owned(), "UTC".to_owned()),
         ]);
-        let environment = explicit(&settings, |name| match name {
+        let environment = task_environment(&settings, |name| match name {
             "HOME" => Some("/home/robot".to_owned()),
             "LANG" => Some(String::new()),
             "TZ" => Some("CET".to_owned()),

@@ -36,10 +36,10 @@ pub struct Installation {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NoInstallation {
     /// There is no installation of this version.
-    #[error("{0} (no {0} found{found})", found = also(.1))]
+    #[error("{0} (no {0} found{found})", found = alternatives(.1))]
     Version(RosVersion, Vec<String>),
     /// None of the distributions the task accepts is installed.
-    #[error("ros_distro {} (it has {})", wanted.join(" or "), if found.is_empty() { "none".to_owned() } else { found.join(", ") })]
+    #[error("ros_distro {} (it has {})", wanted.join(" or "), or_none(found))]
     Distro {
         /// The distributions that the task accepts.
         wanted: Vec<String>,
@@ -62,7 +62,10 @@ impl Installation {
     /// The packages of `needed` that are certainly missing. Only names that must be ROS packages
     /// are judged: other names are keys of `rosdep` for packages of the operating system or pip,
     /// which no index of ROS lists.
-    pub fn lacks<'a>(&self, needed: impl IntoIterator<Item = &'a str>) -> BTreeSet<&'a str> {
+    pub fn missing_packages<'a>(
+        &self,
+        needed: impl IntoIterator<Item = &'a str>,
+    ) -> BTreeSet<&'a str> {
         let Some(packages) = &self.packages else { return BTreeSet::new() };
         needed
             .into_iter()
@@ -110,7 +113,11 @@ pub fn all_distros(installations: &[Installation]) -> Vec<String> {
     distros.into_iter().cloned().collect()
 }
 
-fn also(found: &[String]) -> String {
+fn or_none(found: &[String]) -> String {
+    if found.is_empty() { "none".to_owned() } else { found.join(", ") }
+}
+
+fn alternatives(found: &[String]) -> String {
     if found.is_empty() { String::new() } else { format!(", only {}", found.join(", ")) }
 }
 
@@ -136,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_task_gets_its_version_of_ros_whatever_else_is_there() {
+    fn task_gets_its_ros_version_among_several() {
         let all =
             [installation("noetic", RosVersion::Ros1), installation("humble", RosVersion::Ros2)];
         let distro = |version, wanted: &[&str]| {
@@ -159,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_is_certainly_absent_is_lacking() {
+    fn only_certainly_absent_packages_are_missing() {
         let needed = [
             "nav2_bringup",
             "rclpy",
@@ -171,8 +178,8 @@ mod tests {
             "libFoo_x",
         ];
         let mut found = installation("jazzy", RosVersion::Ros2);
-        assert!(found.lacks(needed).is_empty(), "nobody has looked");
+        assert!(found.missing_packages(needed).is_empty(), "nobody has looked");
         found.packages = Some(["std_msgs".to_owned()].into());
-        assert_eq!(found.lacks(needed), ["nav2_bringup", "rclpy"].into());
+        assert_eq!(found.missing_packages(needed), ["nav2_bringup", "rclpy"].into());
     }
 }

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
-use task_proto::manifest::{BuildTool, TaskManifest};
+use task_proto::packages::manifest::{BuildTool, TaskManifest};
 
 use crate::setup::installation::RosVersion;
 
@@ -36,7 +36,8 @@ pub enum Interrupt {
 
 /// The launcher of a manifest.
 pub fn of(manifest: &TaskManifest) -> Launch {
-    let (run, tool) = (&manifest.run, manifest.build.tool);
+    let run = &manifest.run;
+    let tool = manifest.build.tool;
     let mut launch = match (&run.launch, &run.exec) {
         (Some(file), _) if tool == BuildTool::Catkin => roslaunch(file, &run.args),
         (Some(file), _) => ros2_launch(file, &run.args),
@@ -104,13 +105,16 @@ mod tests {
     }
 
     #[test]
-    fn each_launcher_says_what_it_runs_and_who_is_interrupted() {
-        let run = serde_json::json!({"launch": ["base", "base.launch"], "args": {"frame": "a b", "map": "x:=y"}});
+    fn each_launcher_has_its_command_and_interrupt_target() {
+        let run = serde_json::json!({
+            "launch": ["base", "base.launch"], "args": {"frame": "a b", "map": "x:=y"},
+        });
         let of = |tool, run: &serde_json::Value| {
             let launch = super::of(&manifest(tool, run.clone()));
             (launch.command.join("|"), launch.interrupt, launch.ros)
         };
-        let (leader, group) = (Interrupt::Leader, Interrupt::Group);
+        let leader = Interrupt::Leader;
+        let group = Interrupt::Group;
         let arguments = "base|base.launch|frame:=a b|map:=x:=y";
         assert_eq!(
             of("colcon", &run),

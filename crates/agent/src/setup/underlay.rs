@@ -14,7 +14,7 @@ const SYSTEM_DISTRO: &str = "debian";
 
 /// Directories that are searched for installations.
 #[derive(Debug, Clone)]
-pub struct Places {
+pub struct SearchPaths {
     /// Installation directory of ROS, with a subdirectory for each distribution.
     pub distros: PathBuf,
     /// Directory of the operating system's programs.
@@ -25,14 +25,14 @@ pub struct Places {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum UnderlayError {
     /// A configured file does not exist.
-    #[error("underlays, workspace: {} is not there", .0.display())]
+    #[error("underlays, workspace: {} does not exist", .0.display())]
     Missing(PathBuf),
     /// The robot lacks the required ROS.
-    #[error("this robot lacks what the task needs: {0}")]
+    #[error("this robot does not meet the requirements of the task: {0}")]
     NotInstalled(NoInstallation),
 }
 
-impl Places {
+impl SearchPaths {
     /// The directories of this machine.
     pub fn of_this_machine() -> Self {
         Self { distros: "/opt/ros".into(), system: "/usr".into() }
@@ -42,11 +42,11 @@ impl Places {
 /// The installations that tasks can use, the best last: the `configured` setup files, which are
 /// sourced all together, or else every installation found, ROS 2 after ROS 1 and newer after older
 /// (the names of distributions rise with the alphabet).
-pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
+pub fn find(configured: &[PathBuf], paths: &SearchPaths) -> Vec<Installation> {
     let mut found: Vec<Installation> = Vec::new();
     if ["catkin", "roslaunch"]
         .iter()
-        .any(|name| places.system.join("share").join(name).join("package.xml").is_file())
+        .any(|name| paths.system.join("share").join(name).join("package.xml").is_file())
     {
         let distros = vec![SYSTEM_DISTRO.to_owned()];
         found.push(Installation {
@@ -56,11 +56,11 @@ pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
         });
     }
     if !configured.is_empty() {
-        found.push(together(configured));
+        found.push(combine(configured));
         return found;
     }
-    let setups = children(&places.distros).into_iter().map(|dir| dir.join("setup.bash"));
-    found.extend(setups.filter(|setup| setup.is_file()).map(|setup| together(&[setup])));
+    let setups = children(&paths.distros).into_iter().map(|dir| dir.join("setup.bash"));
+    found.extend(setups.filter(|setup| setup.is_file()).map(|setup| combine(&[setup])));
     // Stable: installations of one version stay in the order of their names, the system's first.
     found.sort_by(|one, other| one.versions.cmp(&other.versions));
     found
@@ -68,7 +68,7 @@ pub fn find(configured: &[PathBuf], places: &Places) -> Vec<Installation> {
 
 /// The installations that tasks can use on this machine, by the effective settings.
 pub fn by_settings(underlays: &[PathBuf], workspace: Option<&Path>) -> Vec<Installation> {
-    let found = find(underlays, &Places::of_this_machine());
+    let found = find(underlays, &SearchPaths::of_this_machine());
     match workspace {
         Some(workspace) => with_workspace(found, workspace),
         None => found,
@@ -114,7 +114,7 @@ pub fn setup_files(
     }
 }
 
-fn together(setups: &[PathBuf]) -> Installation {
+fn combine(setups: &[PathBuf]) -> Installation {
     let mut versions: Vec<_> = setups.iter().filter_map(|setup| version_of(setup)).collect();
     versions.sort();
     versions.dedup();
@@ -142,10 +142,10 @@ fn version_of(setup: &Path) -> Option<RosVersion> {
 /// environment (which may well be called `ros`), else the directory's name below `ros`.
 fn distro_of(setup: &Path) -> Option<String> {
     let dir = setup.parent()?;
-    let said =
+    let declared =
         fs::read_to_string(dir.join("share/ros_environment/environment/1.ros_distro.dsv")).ok();
     if let Some(distro) =
-        said.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;"))
+        declared.as_deref().and_then(|text| text.trim().strip_prefix("set;ROS_DISTRO;"))
     {
         return Some(distro.to_owned());
     }
@@ -189,21 +189,21 @@ mod tests {
         path
     }
 
-    fn places(root: &Path) -> Places {
-        Places { distros: root.join("opt/ros"), system: root.join("usr") }
+    fn paths(root: &Path) -> SearchPaths {
+        SearchPaths { distros: root.join("opt/ros"), system: root.join("usr") }
     }
 
     #[test]
-    fn the_newest_installed_distribution_is_used_unless_the_task_says_which() {
+    fn newest_distribution_is_used_unless_the_task_names_one() {
         let temp = tempfile::tempdir().unwrap();
-        let places = places(temp.path());
+        let paths = paths(temp.path());
         let [humble, jazzy] =
-            ["humble", "jazzy"].map(|distro| touch(places.distros.join(distro).join("setup.bash")));
+            ["humble", "jazzy"].map(|distro| touch(paths.distros.join(distro).join("setup.bash")));
         // This name comes last in the alphabet, but the distribution is ROS 1.
-        let noetic = touch(places.distros.join("noetic/setup.bash"));
-        touch(places.distros.join("noetic/.catkin"));
-        fs::create_dir(places.distros.join("removed")).unwrap();
-        let found = find(&[], &places);
+        let noetic = touch(paths.distros.join("noetic/setup.bash"));
+        touch(paths.distros.join("noetic/.catkin"));
+        fs::create_dir(paths.distros.join("removed")).unwrap();
+        let found = find(&[], &paths);
         assert_eq!(all_distros(&found), ["humble", "jazzy", "noetic"]);
         assert_eq!(setup_files(&found, None, &[]), Ok(vec![jazzy.clone()]));
         assert_eq!(setup_files(&found, Some(RosVersion::Ros2), &[]), Ok(vec![jazzy]));
@@ -220,35 +220,35 @@ mod tests {
         let venv = temp.path().join("ros");
         let activate = touch(venv.join("bin/activate"));
         touch(venv.join("lib/python3.11/site-packages/ros_kilted_rclpy-9.1.2.dist-info/METADATA"));
-        let found = find(std::slice::from_ref(&activate), &places(temp.path()));
+        let found = find(std::slice::from_ref(&activate), &paths(temp.path()));
         assert_eq!(
             (all_distros(&found), &found[0].versions),
             (vec!["kilted".to_owned()], &vec![RosVersion::Ros2])
         );
         assert_eq!(setup_files(&found, None, &[]), Ok(vec![activate]));
         let gone = temp.path().join("gone/setup.bash");
-        let found = find(std::slice::from_ref(&gone), &places(temp.path()));
+        let found = find(std::slice::from_ref(&gone), &paths(temp.path()));
         assert_eq!(setup_files(&found, None, &[]), Err(UnderlayError::Missing(gone)));
     }
 
     #[test]
     fn the_ros_1_of_the_operating_system_needs_no_setup_file() {
         let temp = tempfile::tempdir().unwrap();
-        let places = places(temp.path());
-        assert_eq!(setup_files(&find(&[], &places), None, &[]), Ok(vec![]));
-        touch(places.system.join("share/roslaunch/package.xml"));
-        let found = find(&[], &places);
+        let paths = paths(temp.path());
+        assert_eq!(setup_files(&find(&[], &paths), None, &[]), Ok(vec![]));
+        touch(paths.system.join("share/roslaunch/package.xml"));
+        let found = find(&[], &paths);
         assert_eq!((all_distros(&found), found.len()), (vec!["debian".to_owned()], 1));
         assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &["debian".to_owned()]), Ok(vec![]));
         // It stays usable beside a configured ROS 2.
-        let jazzy = touch(places.distros.join("jazzy/setup.bash"));
-        let found = find(std::slice::from_ref(&jazzy), &places);
+        let jazzy = touch(paths.distros.join("jazzy/setup.bash"));
+        let found = find(std::slice::from_ref(&jazzy), &paths);
         assert_eq!(setup_files(&found, Some(RosVersion::Ros1), &[]), Ok(vec![]));
         assert_eq!(setup_files(&found, Some(RosVersion::Ros2), &[]), Ok(vec![jazzy]));
     }
 
     #[test]
-    fn a_workspace_lies_on_top_of_the_ros_it_was_made_with() {
+    fn workspace_overlays_the_ros_version_it_was_built_with() {
         let dir = tempfile::tempdir().unwrap();
         let installed = |setup: &str, version| Installation {
             versions: vec![version],
@@ -270,7 +270,7 @@ mod tests {
         assert_eq!(
             setup_files(&on_ros_2, Some(RosVersion::Ros2), &[]),
             Err(UnderlayError::Missing("/j".into())),
-            "what is not there is named"
+            "the missing file is named"
         );
         assert_eq!(setups(&with_workspace(Vec::new(), dir.path())), [[install]]);
         let devel = dir.path().join("devel/setup.bash");

@@ -31,7 +31,7 @@ pub struct Accounts {
     /// The available user ids; `None`: all tasks share one account.
     range: Option<RangeInclusive<u32>>,
     /// Loaded when the first task asks for its accounts.
-    book: Mutex<Option<Book>>,
+    table: Mutex<Option<AccountTable>>,
 }
 
 /// The accounts of a task and its builds.
@@ -45,7 +45,7 @@ pub struct AccountPair {
 
 /// Content of the file on disk: the first of each task's ids.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
-struct Book {
+struct AccountTable {
     tasks: BTreeMap<TaskName, u32>,
     /// First ids of tasks that were removed, the earliest removal first.
     #[serde(default)]
@@ -55,7 +55,7 @@ struct Book {
 impl Accounts {
     /// The accounts of the tasks in `data`, with ids of `range`.
     pub fn new(data: DataDir, range: Option<RangeInclusive<u32>>) -> Self {
-        Self { data, range, book: Mutex::new(None) }
+        Self { data, range, table: Mutex::new(None) }
     }
 
     /// Whether each task has its own accounts.
@@ -69,10 +69,10 @@ impl Accounts {
         let Some(range) = &self.range else {
             return Ok(AccountPair { run: base.clone(), build: base.clone() });
         };
-        let mut book = self.book.lock().unwrap_or_else(PoisonError::into_inner);
-        let known = match &mut *book {
+        let mut table = self.table.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = match &mut *table {
             Some(known) => known,
-            None => book.insert(self.read(range)?),
+            None => table.insert(self.read(range)?),
         };
         let id = match known.tasks.get(task).filter(|id| has_pair(range, **id)) {
             Some(id) => *id,
@@ -94,11 +94,11 @@ impl Accounts {
 
     /// Records that `task` has no files left in the agent's directory.
     pub fn release(&self, task: &TaskName) -> io::Result<()> {
-        let mut book = self.book.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut table = self.table.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(range) = &self.range else { return Ok(()) };
-        let known = match &mut *book {
+        let known = match &mut *table {
             Some(known) => known,
-            None => book.insert(self.read(range)?),
+            None => table.insert(self.read(range)?),
         };
         let mut next = known.clone();
         let Some(id) = next.tasks.remove(task) else { return Ok(()) };
@@ -110,29 +110,29 @@ impl Accounts {
 
     /// The recorded ids. If the record is lost, they are recovered from the owners of home
     /// directories.
-    fn read(&self, range: &RangeInclusive<u32>) -> io::Result<Book> {
+    fn read(&self, range: &RangeInclusive<u32>) -> io::Result<AccountTable> {
         let path = self.data.accounts();
-        let mut book = match fs::read(&path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Book::default(),
+        let mut table = match fs::read(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => AccountTable::default(),
             read => serde_json::from_slice(&read?).unwrap_or_else(|error| {
-                tracing::error!(path = %path.display(), %error, "it is made anew from the owners of home directories");
-                Book::default()
+                tracing::error!(path = %path.display(), %error, "the account table is damaged; rebuilding it from the owners of home directories");
+                AccountTable::default()
             }),
         };
         for task in self.data.task_names()? {
             let Ok(home) = fs::symlink_metadata(self.data.task(&task).home()) else { continue };
             let id = home.uid();
             let is_first = has_pair(range, id) && (id - range.start()).is_multiple_of(PER_TASK);
-            let is_taken = book.tasks.values().any(|other| *other == id);
+            let is_taken = table.tasks.values().any(|other| *other == id);
             if is_first && !is_taken {
-                book.tasks.entry(task).or_insert(id);
+                table.tasks.entry(task).or_insert(id);
             }
         }
-        Ok(book)
+        Ok(table)
     }
 
-    fn write(&self, book: &Book) -> io::Result<()> {
-        durable::write(&self.data.accounts(), &serde_json::to_vec_pretty(book)?, 0o600)
+    fn write(&self, table: &AccountTable) -> io::Result<()> {
+        durable::write(&self.data.accounts(), &serde_json::to_vec_pretty(table)?, 0o600)
     }
 
     /// Whether this id is unused: it has no account on the system, and owns no file in a public
@@ -148,7 +148,7 @@ impl Accounts {
     }
 }
 
-impl Book {
+impl AccountTable {
     /// Gives `task` the first id of a pair: the id that the task had before, else one that no task
     /// had, else the one that was released first.
     fn assign(
@@ -219,7 +219,7 @@ mod tests {
     const RANGE: RangeInclusive<u32> = 3_000_000..=3_000_005;
 
     #[test]
-    fn ids_are_a_tasks_own_over_restarts_and_come_with_the_groups_of_the_task_user() {
+    fn task_keeps_its_ids_over_restarts_with_the_groups_of_the_task_user() {
         let temp = tempfile::tempdir().expect("a directory");
         let first = accounts(temp.path(), RANGE).of(&name("a"), &base()).expect("assigned");
         let expected = TaskUser {
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn id_of_a_removed_task_is_the_last_to_be_given_to_another() {
+    fn ids_of_removed_tasks_are_reused_last() {
         let temp = tempfile::tempdir().expect("a directory");
         let accounts = accounts(temp.path(), RANGE);
         let id =
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn lost_book_is_made_anew_from_home_directories() {
+    fn lost_table_is_rebuilt_from_home_directories() {
         if !nix::unistd::geteuid().is_root() {
             return eprintln!("unavailable: only root can make another's directory");
         }
@@ -289,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn shared_account_is_everybodys() {
+    fn without_a_range_all_tasks_share_one_account() {
         let temp = tempfile::tempdir().expect("a directory");
         let accounts = Accounts::new(DataDir::new(temp.path()).expect("a directory"), None);
         let pair = accounts.of(&name("a"), &base()).expect("given");

@@ -26,7 +26,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_battery_that_says_how_full_it_is_counts() {
+    fn first_battery_with_a_charge_level_counts() {
         let dir = tempfile::tempdir().unwrap();
         let supply = |name: &str, files: &[(&str, &str)]| {
             fs::create_dir(dir.path().join(name)).unwrap();

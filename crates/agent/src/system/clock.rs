@@ -5,6 +5,8 @@
 use std::io;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use task_proto::time::millis;
+
 /// Milliseconds since the kernel booted; comparable between processes of one boot.
 pub fn boot_ms() -> u64 {
     // Without /proc no process could be supervised either, and the agent has reported this at its
@@ -39,8 +41,4 @@ pub const PROGRAM_EXISTS_SINCE_MS: u64 = task_transport::BUILT_MS;
 /// The wall clock for checking certificates.
 pub fn for_certificates() -> task_transport::Clock {
     task_transport::Clock::new(wall_ms)
-}
-
-fn millis(duration: Duration) -> u64 {
-    u64::try_from(duration.as_millis()).unwrap_or(u64::MAX)
 }

@@ -6,17 +6,17 @@ use std::path::Path;
 use std::time::Duration;
 
 use task_proto::desired::PackageRef;
-use task_proto::manifest::{BuildTool, TaskManifest};
+use task_proto::packages::manifest::{BuildTool, TaskManifest};
 
 /// Disk cost of a file beyond its bytes: a block that is only partly used, and an inode.
 const BYTES_PER_ENTRY: u64 = 4096 + 256;
 /// A build and its install tree together take about this many times the sources.
 const BUILD_FACTOR: u64 = 2;
 
-/// Pause before a full disk is checked again: a person has to make room.
+/// Pause before a full disk is checked again: a person has to make space.
 pub const FULL_PAUSE: Duration = Duration::from_secs(5 * 60);
-/// With less than this free, a failure may be due to lack of room.
-const NO_ROOM_BYTES: u64 = 16 * 1024 * 1024;
+/// With less than this free, a failure may be due to lack of space.
+const FULL_BYTES: u64 = 16 * 1024 * 1024;
 
 /// The bytes that one package needs, by purpose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -30,7 +30,7 @@ pub struct Need {
     pub reserve: u64,
 }
 
-/// There is not enough room. The error's text is the failure's text and has all the figures.
+/// There is not enough space. The error's text is the failure's text and has all the figures.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{free} of {total} bytes are free, {} are needed: {} for the package, {} for its tree, {} for the build, {} in reserve",
@@ -45,9 +45,9 @@ pub struct DiskFull {
     pub need: Need,
 }
 
-/// Room on a file system.
+/// Space on a file system.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Room {
+pub struct DiskSpace {
     /// Bytes that an ordinary user may still write.
     pub free: u64,
     pub total: u64,
@@ -75,27 +75,27 @@ impl Need {
         [self.tree, self.build, self.reserve].into_iter().fold(self.blob, u64::saturating_add)
     }
 
-    /// Checks whether the need fits into `room`.
-    pub fn check(self, room: Room) -> Result<(), DiskFull> {
-        if self.total() <= room.free {
+    /// Checks whether the need fits into `space`.
+    pub fn check(self, space: DiskSpace) -> Result<(), DiskFull> {
+        if self.total() <= space.free {
             return Ok(());
         }
-        Err(DiskFull { free: room.free, total: room.total, need: self })
+        Err(DiskFull { free: space.free, total: space.total, need: self })
     }
 }
 
-impl Room {
+impl DiskSpace {
     /// Whether the disk is nearly full, so that hardly anything can be written.
-    pub fn is_used_up(self) -> bool {
-        self.free < NO_ROOM_BYTES
+    pub fn is_full(self) -> bool {
+        self.free < FULL_BYTES
     }
 }
 
 /// The room on the file system that holds `path`.
-pub fn room(path: &Path) -> io::Result<Room> {
+pub fn space(path: &Path) -> io::Result<DiskSpace> {
     let stat = nix::sys::statvfs::statvfs(path)?;
     let block = stat.fragment_size();
-    Ok(Room {
+    Ok(DiskSpace {
         free: stat.blocks_available().saturating_mul(block),
         total: stat.blocks().saturating_mul(block),
     })
@@ -108,9 +108,9 @@ mod tests {
     const NEED: Need = Need { blob: 10, tree: 20, build: 40, reserve: 30 };
 
     #[test]
-    fn the_refusal_has_the_figures() {
-        assert_eq!(NEED.check(Room { free: 100, total: 500 }), Ok(()));
-        let full = NEED.check(Room { free: 99, total: 500 }).unwrap_err();
+    fn refusal_text_has_all_figures() {
+        assert_eq!(NEED.check(DiskSpace { free: 100, total: 500 }), Ok(()));
+        let full = NEED.check(DiskSpace { free: 99, total: 500 }).unwrap_err();
         assert_eq!(
             full.to_string(),
             "99 of 500 bytes are free, 100 are needed: 10 for the package, 20 for its tree, 40 for the build, 30 in reserve"
@@ -118,20 +118,20 @@ mod tests {
     }
 
     #[test]
-    fn a_disk_with_hardly_any_room_is_used_up() {
-        assert!(Room { free: NO_ROOM_BYTES - 1, total: u64::MAX }.is_used_up());
-        assert!(!Room { free: NO_ROOM_BYTES, total: u64::MAX }.is_used_up());
+    fn nearly_full_disk_counts_as_full() {
+        assert!(DiskSpace { free: FULL_BYTES - 1, total: u64::MAX }.is_full());
+        assert!(!DiskSpace { free: FULL_BYTES, total: u64::MAX }.is_full());
     }
 
     #[test]
-    fn absurd_sizes_never_wrap() {
+    fn huge_sizes_do_not_wrap() {
         let need = Need { blob: u64::MAX, tree: u64::MAX, ..NEED };
-        assert!(need.check(Room { free: u64::MAX - 1, total: u64::MAX }).is_err());
+        assert!(need.check(DiskSpace { free: u64::MAX - 1, total: u64::MAX }).is_err());
     }
 
     #[test]
-    fn a_real_file_system_has_room() {
-        let room = room(Path::new("/")).unwrap();
-        assert!(room.free <= room.total && room.total > 0);
+    fn real_file_system_reports_its_space() {
+        let space = space(Path::new("/")).unwrap();
+        assert!(space.free <= space.total && space.total > 0);
     }
 }

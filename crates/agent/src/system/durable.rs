@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_write_replaces_content_and_mode_whatever_a_crash_left() {
+    fn write_replaces_content_and_mode_after_any_crash() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("identity.json");
         fs::write(&path, "old").unwrap();
@@ -126,7 +126,8 @@ mod tests {
     #[test]
     fn a_link_is_swapped_and_its_old_target_stays() {
         let dir = tempfile::tempdir().unwrap();
-        let (current, old) = (dir.path().join("current"), dir.path().join("old"));
+        let current = dir.path().join("current");
+        let old = dir.path().join("old");
         fs::create_dir(&old).unwrap();
         write_link(&current, Path::new("old")).unwrap();
         write_link(&current, Path::new("new")).unwrap();
@@ -137,7 +138,8 @@ mod tests {
     #[test]
     fn removing_unlocks_directories_and_follows_no_link() {
         let dir = tempfile::tempdir().unwrap();
-        let (tree, outside) = (dir.path().join("tree"), dir.path().join("outside"));
+        let tree = dir.path().join("tree");
+        let outside = dir.path().join("outside");
         create_dir_all(&tree.join("locked/inner")).unwrap();
         fs::write(&outside, "kept").unwrap();
         std::os::unix::fs::symlink(&outside, tree.join("locked/link")).unwrap();

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use task_proto::api::MqttEndpoint;
-use task_proto::envelope::PublicKey;
+use task_proto::trust::envelope::PublicKey;
 use task_proto::{CaPin, MacAddress, RobotId};
 use task_transport::ClientKey;
 
@@ -73,12 +73,12 @@ pub enum MacError {
         "no physical network interface with an address was found: give the robot's MAC with --mac"
     )]
     NoneFound,
-    /// All interfaces have made-up addresses.
+    /// All interfaces have addresses other than the permanent one of the hardware.
     #[error(
-        "the addresses of this robot's network interfaces are made up, not the hardware's own ({0}): \
-         give the MAC it shall be known by with --mac"
+        "the addresses of this robot's network interfaces are not those of the hardware ({0}): \
+         give the robot's MAC with --mac"
     )]
-    MadeUp(String),
+    NotPermanent(String),
 }
 
 impl Identity {
@@ -125,7 +125,7 @@ pub fn find_mac(
         .map(|entry| entry.path())
         .collect();
     dirs.sort();
-    let mut made_up = Vec::new();
+    let mut not_permanent = Vec::new();
     for dir in dirs {
         // A bridge, a tunnel or a container's interface has no device behind it.
         let is_physical = dir.join("device").exists();
@@ -142,12 +142,12 @@ pub fn find_mac(
         if let Some(own) = own.filter(|own| !own.is_locally_administered()) {
             return Ok(own);
         }
-        made_up.push(format!("{name} {mac}"));
+        not_permanent.push(format!("{name} {mac}"));
     }
-    if made_up.is_empty() {
+    if not_permanent.is_empty() {
         Err(MacError::NoneFound)
     } else {
-        Err(MacError::MadeUp(made_up.join(", ")))
+        Err(MacError::NotPermanent(not_permanent.join(", ")))
     }
 }
 
@@ -208,7 +208,7 @@ mod tests {
             next_token: None,
             token_since_ms: 0,
             server: "http://server".to_owned(),
-            server_key: task_proto::envelope::SigningKey::random().public_key(),
+            server_key: task_proto::trust::envelope::SigningKey::random().public_key(),
             ca_pin: None,
             client_key: None,
             mqtt: MqttEndpoint {

@@ -9,8 +9,8 @@
 //! blobs/sha256/<hex>.parts-note     which of its parts are on the disk
 //! accounts.json                     which account each task runs under
 //! staging/                          trees being unpacked; emptied at every start
-//! survey/                           what was last asked about the ROS installations
-//! logs/                             what nodes say that are of no task
+//! survey/                           script of the last probe of the ROS installations
+//! logs/                             messages of nodes that belong to no task
 //! tasks/<name>/current              link to the active version
 //! tasks/<name>/run/                 the shim's files: pid, exit status
 //! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
@@ -127,7 +127,7 @@ impl DataDir {
     }
 
     /// The directories that lead to a task's files.
-    pub fn way_to(&self, name: &TaskName) -> [PathBuf; 3] {
+    pub fn path_dirs(&self, name: &TaskName) -> [PathBuf; 3] {
         [self.root.clone(), self.tasks(), self.task(name).root]
     }
 
@@ -256,7 +256,7 @@ impl TaskDir {
         let current = self.current();
         for digest in self.versions()? {
             if !kept.contains(&digest) && current != Some(digest) {
-                remove_whole(self.version(&digest).root())?;
+                remove_tree(self.version(&digest).root())?;
             }
         }
         for path in entries(&self.root)? {
@@ -275,7 +275,7 @@ impl TaskDir {
 
     /// Removes the task's directory with all its contents.
     pub fn remove(&self) -> io::Result<()> {
-        remove_whole(&self.root)
+        remove_tree(&self.root)
     }
 
     fn current_link(&self) -> PathBuf {
@@ -327,7 +327,7 @@ impl VersionDir {
 
 /// Removes a directory atomically: at any moment it is either complete or absent. The call fails
 /// while any part of it is left, also from an earlier attempt.
-fn remove_whole(dir: &Path) -> io::Result<()> {
+fn remove_tree(dir: &Path) -> io::Result<()> {
     let Some(name) = file_name(dir) else { return Ok(()) };
     let removed = dir.with_file_name(format!("{REMOVED}{name}"));
     durable::remove_dir_all(&removed)?;
@@ -404,7 +404,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_half_removed_is_never_taken_for_whole() {
+    fn half_removed_tree_never_counts_as_complete() {
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
         data.clean_leftovers().unwrap();
@@ -429,7 +429,7 @@ mod tests {
     }
 
     #[test]
-    fn a_removal_that_fails_is_not_done_and_keeps_no_other_from_being_cleaned_up() {
+    fn failed_removal_does_not_stop_the_cleaning_of_others() {
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
         let task = data.task(&"talker".parse().unwrap());
@@ -456,7 +456,8 @@ mod tests {
     fn cleaning_keeps_wanted_parts_only() {
         let dir = tempfile::tempdir().unwrap();
         let data = DataDir::new(dir.path()).unwrap();
-        let (wanted, other) = (Digest::of(b"wanted"), Digest::of(b"other"));
+        let wanted = Digest::of(b"wanted");
+        let other = Digest::of(b"other");
         data.clean_parts(&[]).unwrap();
         durable::create_dir_all(&data.blobs()).unwrap();
         for digest in [wanted, other] {

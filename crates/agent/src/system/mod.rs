@@ -6,7 +6,6 @@ pub mod battery;
 pub mod clock;
 pub mod disk;
 pub mod durable;
-pub mod error_chain;
 pub mod identity;
 pub mod layout;
 pub mod permanent_address;

@@ -17,7 +17,7 @@ const MAX_ADDRESS: usize = 32;
 const MAC: usize = 6;
 
 #[repr(C)]
-struct Answer {
+struct PermanentAddress {
     command: u32,
     size: u32,
     address: [u8; MAX_ADDRESS],
@@ -25,29 +25,32 @@ struct Answer {
 
 /// `struct ifreq`, whose second part is as large as its largest member.
 #[repr(C)]
-struct Question {
+struct InterfaceRequest {
     name: [u8; libc::IFNAMSIZ],
-    answer: *mut Answer,
+    answer: *mut PermanentAddress,
     rest: [u8; 16],
 }
 
 /// The permanent address of `interface`; `None` where the kernel knows none, as for interfaces
 /// without hardware.
 pub fn of(interface: &str) -> io::Result<Option<MacAddress>> {
-    let mut question =
-        Question { name: [0; libc::IFNAMSIZ], answer: std::ptr::null_mut(), rest: [0; 16] };
+    let mut request =
+        InterfaceRequest { name: [0; libc::IFNAMSIZ], answer: std::ptr::null_mut(), rest: [0; 16] };
     if interface.len() >= libc::IFNAMSIZ {
         return Err(io::Error::from(io::ErrorKind::InvalidInput));
     }
-    question.name[..interface.len()].copy_from_slice(interface.as_bytes());
-    let mut answer =
-        Answer { command: ETHTOOL_GPERMADDR, size: MAX_ADDRESS as u32, address: [0; MAX_ADDRESS] };
-    question.answer = &raw mut answer;
+    request.name[..interface.len()].copy_from_slice(interface.as_bytes());
+    let mut answer = PermanentAddress {
+        command: ETHTOOL_GPERMADDR,
+        size: MAX_ADDRESS as u32,
+        address: [0; MAX_ADDRESS],
+    };
+    request.answer = &raw mut answer;
     // Any socket gives access to the network's interfaces; no data is sent over this one.
     let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     // SAFETY: both structures are laid out as the kernel's, outlive the call, and `size` is the
     // room in `answer`.
-    let result = unsafe { libc::ioctl(socket.as_raw_fd(), SIOCETHTOOL as _, &raw mut question) };
+    let result = unsafe { libc::ioctl(socket.as_raw_fd(), SIOCETHTOOL as _, &raw mut request) };
     match Errno::result(result) {
         Ok(_) => Ok(parse(&answer)),
         Err(Errno::EOPNOTSUPP) => Ok(None),
@@ -55,7 +58,7 @@ pub fn of(interface: &str) -> io::Result<Option<MacAddress>> {
     }
 }
 
-fn parse(answer: &Answer) -> Option<MacAddress> {
+fn parse(answer: &PermanentAddress) -> Option<MacAddress> {
     let address = &answer.address[..MAC];
     // Zeros mean that there is no permanent address.
     if answer.size as usize != MAC || address.iter().all(|byte| *byte == 0) {
@@ -72,7 +75,7 @@ mod tests {
 
     #[test]
     fn an_answer_is_six_bytes_that_are_not_zero() {
-        let mut answer = Answer { command: 0, size: 6, address: [0; MAX_ADDRESS] };
+        let mut answer = PermanentAddress { command: 0, size: 6, address: [0; MAX_ADDRESS] };
         assert_eq!(parse(&answer), None);
         answer.address[..MAC].copy_from_slice(&[0, 0x11, 0x22, 0x33, 0x44, 0xff]);
         assert_eq!(parse(&answer).expect("an address").to_string(), "00:11:22:33:44:ff");

@@ -33,9 +33,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn place_is_that_of_the_file_and_not_of_a_copy() {
+    fn copy_of_the_lock_file_has_another_place() {
         let dir = tempfile::tempdir().expect("a directory");
-        let (path, copy) = (dir.path().join("lock"), dir.path().join("copy"));
+        let path = dir.path().join("lock");
+        let copy = dir.path().join("copy");
         File::create(&path).expect("made");
         std::fs::copy(&path, &copy).expect("copied");
         let place = |path| of(&File::open(path).expect("opened")).expect("found out");

@@ -41,17 +41,17 @@ pub struct TaskUser {
 pub enum TaskUserError {
     /// There is no such account.
     #[error(
-        "the agent runs as root, and there is no user {name:?} that tasks could run as: make one (`useradd --system \
-         {DEFAULT_NAME}`), or name another by `task_user` in agent.toml (\"root\" if tasks are to have the whole \
+        "the agent runs as root, and the user {name:?} that tasks run as does not exist: create it (`useradd --system \
+         {DEFAULT_NAME}`), or name another user by `task_user` in agent.toml (\"root\" gives tasks the whole \
          machine), and restart the agent"
     )]
     Missing { name: String },
     /// The account can't enter a directory above the agent's data directory.
     #[error(
-        "tasks run as {user:?}, which may not enter {}, where the data directory {} lies: let it pass \
+        "tasks run as {user:?}, which may not enter {}, where the data directory {} lies: allow it to pass \
          (`chmod o+x {}`) or move the data directory, and restart the agent", dir.display(), data.display(), dir.display()
     )]
-    ShutOut {
+    NoAccess {
         user: String,
         /// The first directory that the account can't enter.
         dir: PathBuf,
@@ -71,8 +71,8 @@ impl TaskUser {
     pub fn find(setting: Option<&str>) -> Result<Option<Self>, TaskUserError> {
         let text =
             |path: &str| fs::read(path).map(|bytes| String::from_utf8_lossy(&bytes).into_owned());
-        let (passwd, group) =
-            (text("/etc/passwd").unwrap_or_default(), text("/etc/group").unwrap_or_default());
+        let passwd = text("/etc/passwd").unwrap_or_default();
+        let group = text("/etc/group").unwrap_or_default();
         Self::choose(setting, nix::unistd::geteuid().as_raw(), &passwd, &group)
     }
 
@@ -111,7 +111,8 @@ impl TaskUser {
         let is_member = |members: &str| members.split(',').any(|member| member == name);
         let in_groups = group.lines().filter_map(|line| {
             let mut fields = line.split(':').skip(2);
-            let (gid, members) = (fields.next()?.parse().ok()?, fields.next()?);
+            let gid = fields.next()?.parse().ok()?;
+            let members = fields.next()?;
             is_member(members).then_some(gid)
         });
         let groups = in_groups.filter(|other| *other != gid).collect();
@@ -121,14 +122,14 @@ impl TaskUser {
     /// The account, if it can reach the data directory `data`. The agent opens that directory and
     /// its contents to its tasks. The directories above belong to the machine's administrator, so
     /// the agent does not open them.
-    pub fn admitted_to(self, data: &Path) -> Result<Self, TaskUserError> {
+    pub fn check_access(self, data: &Path) -> Result<Self, TaskUserError> {
         let data = std::path::absolute(data).unwrap_or_else(|_| data.to_owned());
         // An error that does not show here shows at the first start.
-        let shut = self.with_its_rights(|| {
-            data.ancestors().skip(1).filter(|dir| is_shut(dir)).last().map(Path::to_owned)
+        let inaccessible = self.run_with_file_rights(|| {
+            data.ancestors().skip(1).filter(|dir| is_inaccessible(dir)).last().map(Path::to_owned)
         });
-        match shut {
-            Ok(Some(dir)) => Err(TaskUserError::ShutOut { user: self.name, dir, data }),
+        match inaccessible {
+            Ok(Some(dir)) => Err(TaskUserError::NoAccess { user: self.name, dir, data }),
             Ok(None) | Err(_) => Ok(self),
         }
     }
@@ -142,7 +143,7 @@ impl TaskUser {
 
     /// Lets the account into a directory that stays root's. Apart from root, no other account may
     /// enter.
-    pub fn admit(&self, dir: &Path) -> io::Result<()> {
+    pub fn grant_entry(&self, dir: &Path) -> io::Result<()> {
         let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         let opened = nix::fcntl::open(dir, flags, Mode::empty())?;
         fchown(&opened, Some(nix::unistd::geteuid()), Some(self.group()))?;
@@ -150,7 +151,7 @@ impl TaskUser {
     }
 
     /// Lets the account pass through `dirs` without listing them.
-    pub fn let_through(&self, dirs: &[PathBuf]) -> io::Result<()> {
+    pub fn allow_traversal(&self, dirs: &[PathBuf]) -> io::Result<()> {
         for dir in dirs {
             let mode = fs::metadata(dir)?.permissions().mode();
             if mode & 0o001 == 0 {
@@ -161,7 +162,7 @@ impl TaskUser {
     }
 
     /// Makes the account the owner of an open file.
-    pub fn own(&self, file: impl AsFd) -> io::Result<()> {
+    pub fn chown(&self, file: impl AsFd) -> io::Result<()> {
         Ok(fchown(file, Some(self.user()), Some(self.group()))?)
     }
 
@@ -184,7 +185,7 @@ impl TaskUser {
         each_below(&opened, 0, &mut |entry, stat| {
             // A file with a second name may belong to another account; packages have no such files.
             let is_sure = !is_kind(stat, SFlag::S_IFREG) || stat.st_nlink == 1;
-            if is_sure { self.own_entry(entry) } else { Ok(()) }
+            if is_sure { self.chown_entry(entry) } else { Ok(()) }
         })?;
         nix::sys::stat::fchmod(&opened, Mode::S_IRWXU)?;
         Ok(fchown(&opened, Some(self.user()), Some(self.group()))?)
@@ -193,10 +194,10 @@ impl TaskUser {
     /// Runs `work` with the account's rights to files and no others. `work` must not touch data
     /// that only the agent may see. A task may replace any file or directory by a link, so the
     /// agent must not read anything for the task that the task itself can't read.
-    pub fn with_its_rights<T: Send>(&self, work: impl FnOnce() -> T + Send) -> io::Result<T> {
+    pub fn run_with_file_rights<T: Send>(&self, work: impl FnOnce() -> T + Send) -> io::Result<T> {
         // The thread ends with the work, so no rights need to be restored.
         std::thread::scope(|scope| {
-            let working = scope.spawn(|| self.take_file_rights().map(|()| work()));
+            let working = scope.spawn(|| self.reduce_to_file_rights().map(|()| work()));
             working.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
         })
     }
@@ -204,7 +205,7 @@ impl TaskUser {
     /// Reduces the calling thread, and no other, to the account's rights to files and no
     /// capability. The thread's user id stays root's: otherwise every process of the account could
     /// end the agent by a signal to this thread.
-    fn take_file_rights(&self) -> io::Result<()> {
+    fn reduce_to_file_rights(&self) -> io::Result<()> {
         let groups: Vec<libc::gid_t> =
             std::iter::once(self.gid).chain(self.groups.iter().copied()).collect();
         // SAFETY: the list outlives the call. The C library's own call would change all threads.
@@ -212,14 +213,15 @@ impl TaskUser {
         // These calls return the previous id and report no failure; an invalid id changes nothing.
         setfsgid(self.group());
         setfsuid(self.user());
-        let (none, now) = (u32::MAX, (self.user(), self.group()));
+        let none = u32::MAX;
+        let now = (self.user(), self.group());
         if (setfsuid(Uid::from_raw(none)), setfsgid(Gid::from_raw(none))) != now {
             return Err(io::Error::from(io::ErrorKind::PermissionDenied));
         }
-        give_up_capabilities()
+        drop_capabilities()
     }
 
-    fn own_entry(&self, entry: &OwnedFd) -> io::Result<()> {
+    fn chown_entry(&self, entry: &OwnedFd) -> io::Result<()> {
         Ok(fchownat(entry, "", Some(self.user()), Some(self.group()), AtFlags::AT_EMPTY_PATH)?)
     }
 
@@ -233,20 +235,20 @@ impl TaskUser {
 }
 
 /// Whether the calling thread may not pass through the directory.
-fn is_shut(dir: &Path) -> bool {
+fn is_inaccessible(dir: &Path) -> bool {
     fs::metadata(dir.join(".")).is_err_and(|error| error.kind() == io::ErrorKind::PermissionDenied)
 }
 
 /// Returns the files that the account `uid` owns in the tree at `dir` to root: readable for
 /// everybody, as they were for the account, and writable for none. Files of other accounts stay as
 /// they are, and no link is followed. No process of the account may be left.
-pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
+pub fn return_to_root(dir: &Path, uid: u32) -> io::Result<()> {
     let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
     let opened = match nix::fcntl::open(dir, flags, Mode::empty()) {
         Err(Errno::ENOENT) => return Ok(()),
         opened => opened?,
     };
-    let take = |entry: &OwnedFd, stat: &FileStat| {
+    let return_entry = |entry: &OwnedFd, stat: &FileStat| {
         if stat.st_uid != uid {
             return Ok(());
         }
@@ -259,8 +261,8 @@ pub fn take_back(dir: &Path, uid: u32) -> io::Result<()> {
         let root = (Some(nix::unistd::geteuid()), Some(nix::unistd::getegid()));
         Ok(fchownat(entry, "", root.0, root.1, AtFlags::AT_EMPTY_PATH)?)
     };
-    each_below(&opened, 0, &mut |entry, stat| take(entry, stat))?;
-    take(&opened, &fstat(&opened)?)
+    each_below(&opened, 0, &mut |entry, stat| return_entry(entry, stat))?;
+    return_entry(&opened, &fstat(&opened)?)
 }
 
 /// Runs `work` on each entry below `dir`, directories after their contents. `work` acts on the
@@ -300,7 +302,7 @@ pub async fn do_as<T: Send + 'static>(
 ) -> io::Result<T> {
     let user = user.cloned();
     let working = tokio::task::spawn_blocking(move || match user {
-        Some(user) => user.with_its_rights(work),
+        Some(user) => user.run_with_file_rights(work),
         None => Ok(work()),
     });
     working.await.map_err(io::Error::other).flatten()
@@ -309,7 +311,7 @@ pub async fn do_as<T: Send + 'static>(
 /// Drops all capabilities of the calling thread, and of no other. Another user id for files removes
 /// only the capabilities for file modes: the rest would still allow reading the `/proc` entries of
 /// other processes.
-fn give_up_capabilities() -> io::Result<()> {
+fn drop_capabilities() -> io::Result<()> {
     /// The kernel's `_LINUX_CAPABILITY_VERSION_3`: two words for each set.
     const VERSION: u32 = 0x2008_0522;
     let header: [u32; 2] = [VERSION, 0];
@@ -348,7 +350,7 @@ mod tests {
     }
 
     #[test]
-    fn root_must_be_said_and_a_missing_account_is_never_replaced_by_it() {
+    fn root_must_be_explicit_and_a_missing_account_is_an_error() {
         assert_eq!(choose(Some("root"), 0), Ok(None));
         assert_eq!(choose(Some("0"), 0), Ok(None));
         let missing = TaskUser::choose(None, 0, "root:x:0:0::/:/bin/sh\n", "")
@@ -362,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn work_with_the_accounts_rights_reads_what_the_account_can_and_leaves_this_thread_as_it_was() {
+    fn work_with_file_rights_reads_only_the_files_of_the_account() {
         let temp = tempfile::tempdir().expect("temp dir");
         let own = temp.path().join("own");
         fs::write(&own, "text").expect("written");
@@ -370,7 +372,8 @@ mod tests {
         let user = TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
         let kind = |path: &Path| fs::read(path).map(drop).map_err(|error| error.kind());
         let status = || fs::read_to_string("/proc/thread-self/status").expect("read");
-        let read = user.with_its_rights(|| ([&own, Path::new("/etc/passwd")].map(kind), status()));
+        let read =
+            user.run_with_file_rights(|| ([&own, Path::new("/etc/passwd")].map(kind), status()));
         if nix::unistd::geteuid().is_root() {
             let (kinds, status) = read.expect("the rights");
             assert_eq!(kinds, [Err(io::ErrorKind::PermissionDenied), Ok(())]);
@@ -384,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn account_that_can_not_enter_a_directory_above_the_data_is_told_which() {
+    fn inaccessible_directory_above_the_data_is_named() {
         if !nix::unistd::geteuid().is_root() {
             return eprintln!("unavailable: only root may take another's rights");
         }
@@ -399,16 +402,16 @@ mod tests {
         let_all(&data, 0o700);
         let user =
             || TaskUser { name: "4711".to_owned(), uid: 4711, gid: 4711, groups: Vec::new() };
-        let refused = user().admitted_to(&data).expect_err("shut out");
+        let refused = user().check_access(&data).expect_err("no access");
         assert!(
-            matches!(&refused, TaskUserError::ShutOut { dir, .. } if *dir == home),
+            matches!(&refused, TaskUserError::NoAccess { dir, .. } if *dir == home),
             "{refused}"
         );
         let chmod = format!("chmod o+x {}`", home.display());
         assert!(refused.to_string().contains(&chmod), "{refused}");
         let_all(&home, 0o711);
         assert_eq!(
-            user().admitted_to(&data),
+            user().check_access(&data),
             Ok(user()),
             "the data directory itself is the agent's to open"
         );

@@ -81,7 +81,7 @@ pub fn read(path: &Path, max_bytes: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(max_bytes.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > max_bytes {
-        return Err(io::Error::other(format!("it has more than {max_bytes} bytes")));
+        return Err(io::Error::other(format!("more than {max_bytes} bytes")));
     }
     Ok(bytes)
 }
@@ -98,7 +98,7 @@ fn open_found(found: &OwnedFd) -> io::Result<File> {
     match kind(&fstat(found)?) {
         SFlag::S_IFREG => File::open(by_descriptor(found)),
         SFlag::S_IFLNK => Err(Errno::ELOOP.into()),
-        _ => Err(io::Error::new(io::ErrorKind::InvalidData, "it is not a regular file")),
+        _ => Err(io::Error::new(io::ErrorKind::InvalidData, "not a regular file")),
     }
 }
 

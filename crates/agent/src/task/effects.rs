@@ -6,17 +6,16 @@ use std::future::Future;
 
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
-use task_proto::report::{HostFacts, Progress};
+use task_proto::messages::report::{HostFacts, Progress};
 use task_proto::{Digest, TaskName};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::task::ledger::{
-    ActiveRun, Collection, GateQuestion, Ledger, LedgerError, ProcessRecord,
-};
+use crate::task::ledger::{GateQuestion, Ledger, LedgerError, OutputUpload};
 use crate::task::observed::{Health, Prepared, ProcessState, RobotFacts, TrustFacts};
 use crate::task::plan::{Done, StepFailure};
-use crate::transfer::parts::Asks;
+use crate::task::run::{ActiveRun, ProcessRecord};
+use crate::transfer::parts::PartRequest;
 
 /// Readings of the agent's two clocks, in milliseconds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -47,7 +46,7 @@ pub trait Effects: Send + Sync + 'static {
 
     /// Inspects the installed ROS distributions again: a person may have installed a missing
     /// dependency.
-    fn look_for_ros(&self) -> impl Future<Output = ()> + Send;
+    fn probe_ros(&self) -> impl Future<Output = ()> + Send;
 
     /// The facts about the machine that reports contain.
     fn host_facts(&self) -> HostFacts;
@@ -75,7 +74,7 @@ pub trait Effects: Send + Sync + 'static {
 
     /// Begins to compare the ROS graph with the promises of the package of this run. The run's
     /// process must be alive. Also brings the run's lifecycle nodes to active and sets its
-    /// parameters, unless `process.ready` says that this was done. Watching continues until the
+    /// parameters, unless the run says that its process is ready. Watching continues until the
     /// receiver is dropped. A package without promises is healthy from the start of its process.
     fn watch(&self, task: &TaskName, run: &ActiveRun) -> watch::Receiver<Health>;
 
@@ -84,7 +83,7 @@ pub trait Effects: Send + Sync + 'static {
 
     /// Records the signature evidence of a desired state, begins to fetch the evidence, and adopts
     /// the settings in the state.
-    fn heed(&self, state: &DesiredState);
+    fn apply_state(&self, state: &DesiredState);
 
     /// The facts by which the robot decides whether a package is trusted.
     fn trust_facts(&self) -> TrustFacts;
@@ -98,7 +97,7 @@ pub trait Effects: Send + Sync + 'static {
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Deletes the gathered bytes of all contents that are not in `wanted`.
-    fn keep_parts(&self, wanted: &[Digest]);
+    fn retain_parts(&self, wanted: &[Digest]);
 
     /// Pulls the manifest, unless the server tells this robot to come back later.
     fn pull_manifest(
@@ -125,7 +124,7 @@ pub trait Effects: Send + Sync + 'static {
         &self,
         package: &PackageRef,
         progress: &watch::Sender<Progress>,
-        asks: &watch::Sender<Asks>,
+        part_requests: &watch::Sender<PartRequest>,
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<Done, StepFailure>> + Send;
 
@@ -136,7 +135,7 @@ pub trait Effects: Send + Sync + 'static {
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Asks the robot's gate; a failure holds the reason of the refusal.
-    fn ask_gate(
+    fn query_gate(
         &self,
         task: &TaskName,
         question: &GateQuestion,
@@ -159,10 +158,10 @@ pub trait Effects: Send + Sync + 'static {
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;
 
     /// Uploads the output files of an ended run to the server.
-    fn collect(
+    fn upload_outputs(
         &self,
         task: &TaskName,
-        files: &Collection,
+        files: &OutputUpload,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> impl Future<Output = Result<(), StepFailure>> + Send;

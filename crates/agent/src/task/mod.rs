@@ -5,3 +5,5 @@ pub mod effects;
 pub mod ledger;
 pub mod observed;
 pub mod plan;
+pub mod run;
+pub mod timing;

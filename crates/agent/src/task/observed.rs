@@ -5,9 +5,10 @@
 use std::collections::BTreeSet;
 
 use task_proto::Digest;
-use task_proto::id::Labels;
-use task_proto::manifest::TaskManifest;
-use task_proto::report::{Failure, FailureCode};
+use task_proto::ids::Labels;
+use task_proto::messages::report::{Failure, FailureCode};
+use task_proto::packages::manifest::{TaskKind, TaskManifest};
+use task_proto::size::format_bytes;
 
 use crate::process::program::ExitStatus;
 use crate::setup::installation::{self, Installation};
@@ -25,19 +26,26 @@ pub struct Prepared {
     /// Every version of the task that has a directory.
     pub versions: Vec<Digest>,
     /// Whether this robot may run the version, by the signatures known so far.
-    pub vouched: Vouched,
+    pub signatures: SignatureVerdict,
+}
+
+impl Prepared {
+    /// Service or job, once the manifest is there.
+    pub fn kind(&self) -> Option<TaskKind> {
+        self.manifest.as_ref().map(|manifest| manifest.run.kind)
+    }
 }
 
 /// The verdict on the signatures on the disk.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Vouched {
+pub enum SignatureVerdict {
     /// There are no signatures, or not enough.
     #[default]
-    No,
+    Insufficient,
     /// The version may keep running; new work needs a newer list of publishers.
     Stale,
     /// The version may run. On a robot that trusts its server alone, every version may.
-    Yes,
+    Sufficient,
 }
 
 /// The facts by which a robot decides whether a package is trusted.
@@ -46,7 +54,7 @@ pub struct TrustFacts {
     /// Changes whenever the verdict on a package may have changed.
     pub epoch: u64,
     /// Whether the list of publishers has expired, so that no new work begins.
-    pub list_is_over: bool,
+    pub list_expired: bool,
     /// Why the newest list of publishers was rejected, if it was.
     pub refused_list: Option<String>,
 }
@@ -108,7 +116,7 @@ pub struct Missing {
     pub seen: String,
     /// Whether the run itself lacks something, so that a restart may help. False if a stranger on
     /// the graph is the cause, or if the agent sees nothing.
-    pub is_its_own: bool,
+    pub is_own_fault: bool,
 }
 
 /// Facts about the robot that a package may require.
@@ -125,7 +133,7 @@ pub struct RobotFacts {
 
 impl RobotFacts {
     /// Whether we must know this robot's ROS to decide if `manifest` can run here.
-    pub fn must_know_ros(manifest: &TaskManifest) -> bool {
+    pub fn needs_ros_facts(manifest: &TaskManifest) -> bool {
         launch::of(manifest).ros.is_some()
             || !manifest.requires.ros_distro.is_empty()
             || !manifest.exec_depends.is_empty()
@@ -150,7 +158,11 @@ impl RobotFacts {
         let launcher = launch::of(manifest);
         let lacks_of = |chosen: &Installation| -> Vec<String> {
             let needed = manifest.exec_depends.iter().map(String::as_str).chain(launcher.package);
-            chosen.lacks(needed).into_iter().map(|name| format!("ROS package {name}")).collect()
+            chosen
+                .missing_packages(needed)
+                .into_iter()
+                .map(|name| format!("ROS package {name}"))
+                .collect()
         };
         lacks.extend(
             match installation::choose(installations, launcher.ros, &requires.ros_distro) {
@@ -173,7 +185,7 @@ impl Missing {
     }
 
     /// The failure of a task that was not ready within its timeout.
-    pub fn not_within(&self, timeout_s: u32) -> Failure {
+    pub fn timeout_failure(&self, timeout_s: u32) -> Failure {
         Failure::new(FailureCode::NOT_READY, self.sentence(&format!(" within {timeout_s} s")))
     }
 
@@ -194,7 +206,7 @@ impl Exit {
         let (code, end) = match (self.out_of_memory_bytes, self.status) {
             (Some(limit), _) => {
                 let end =
-                    format!("killed: it used more than the {} MiB of memory it may", limit >> 20);
+                    format!("killed: it exceeded its memory limit of {}", format_bytes(limit));
                 (FailureCode::OUT_OF_MEMORY, end)
             }
             (None, Some(status)) => (FailureCode::PROCESS_EXITED, status.to_string()),
@@ -205,7 +217,7 @@ impl Exit {
 
     fn text(&self, end: &str) -> String {
         if self.last_lines.trim().is_empty() {
-            format!("the process ended ({end}) and wrote nothing")
+            format!("the process ended ({end}) without output")
         } else {
             format!("the process ended ({end}); its last lines:\n{}", self.last_lines.trim_end())
         }
@@ -214,7 +226,7 @@ impl Exit {
 
 #[cfg(test)]
 mod tests {
-    use task_proto::manifest::Requires;
+    use task_proto::packages::manifest::Requires;
 
     use super::*;
     use crate::setup::installation::RosVersion;
@@ -248,15 +260,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_said_with_what_is_there() {
+    fn missing_failure_names_present_nodes() {
         let mut missing = Missing {
-            is_its_own: true,
+            is_own_fault: true,
             since_ms: 0,
             code: FailureCode::NODE_VANISHED,
             what: "`/mapper` did not appear".to_owned(),
             seen: "on the graph: `/lidar`, `/odom`".to_owned(),
         };
-        let failure = missing.not_within(30);
+        let failure = missing.timeout_failure(30);
         assert_eq!(
             failure.to_string(),
             "not_ready: `/mapper` did not appear within 30 s; on the graph: `/lidar`, `/odom`"
@@ -266,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_lacking_is_listed_by_the_packages_keys() {
+    fn unmet_requirements_are_listed_by_manifest_key() {
         let mut robot = robot(vec![jazzy()]);
         robot.labels =
             Some([("base".parse().expect("valid"), "husky".parse().expect("valid"))].into());
@@ -304,7 +316,7 @@ mod tests {
             ["ROS package nav_msgs"]
         );
         assert!(robot.lacks(&manifest("none", &["ffmpeg"])).is_empty());
-        assert!(!RobotFacts::must_know_ros(&manifest("none", &[])));
-        assert!(RobotFacts::must_know_ros(&manifest("colcon", &[])));
+        assert!(!RobotFacts::needs_ros_facts(&manifest("none", &[])));
+        assert!(RobotFacts::needs_ros_facts(&manifest("colcon", &[])));
     }
 }

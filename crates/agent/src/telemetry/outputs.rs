@@ -10,8 +10,8 @@ use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use task_proto::output::{MAX_FILES, OutputSet};
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
+use task_proto::packages::output::{MAX_FILES, OutputSet};
 use task_proto::{DeploymentId, RobotId, TaskName, Version};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
@@ -22,7 +22,7 @@ pub use push::Registry;
 
 /// The files to upload, and the run that they belong to.
 #[derive(Debug, Clone)]
-pub struct OutputOrder {
+pub struct OutputSpec {
     pub robot_id: RobotId,
     pub task: TaskName,
     /// Version of the task.
@@ -74,14 +74,14 @@ pub enum OutputError {
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
     /// The answer does not come from a registry, but from a captive portal or a proxy.
-    #[error("something else answers in the server's place: {status} {text}")]
+    #[error("another program answers at the server's address: {status} {text}")]
     NotTheServer {
         status: u16,
         /// Text of the answer.
         text: String,
     },
     /// The server is overloaded, restarting or broken.
-    #[error("the server answers {status} {text}")]
+    #[error("the server answered {status} {text}")]
     Busy {
         status: u16,
         /// Text of the answer.
@@ -101,13 +101,13 @@ pub enum OutputError {
         text: String,
     },
     /// The server repeatedly receives other bytes than we send.
-    #[error("the server receives other bytes than are sent: {text}")]
-    Garbled {
+    #[error("the server receives other bytes than we send: {text}")]
+    Corrupted {
         /// Text of the answer.
         text: String,
     },
     /// The upload was cancelled.
-    #[error("it was interrupted")]
+    #[error("the upload was cancelled")]
     Cancelled,
 }
 
@@ -117,7 +117,7 @@ impl OutputError {
         match self {
             Self::Unreachable(_) | Self::Note { .. } | Self::Cancelled => Some(Duration::ZERO),
             // An unreadable file may become readable once its file system is back.
-            Self::Read { .. } | Self::User(_) | Self::Garbled { .. } => {
+            Self::Read { .. } | Self::User(_) | Self::Corrupted { .. } => {
                 Some(Duration::from_secs(30))
             }
             Self::Busy { retry_after, .. } => Some(retry_after.unwrap_or_default()),
@@ -132,15 +132,15 @@ impl OutputError {
 
 /// Uploads the files and returns their number. Zero is not an error: the run may have produced no
 /// output.
-pub async fn bring_back(
+pub async fn upload(
     registry: &Registry,
-    order: &OutputOrder,
+    spec: &OutputSpec,
     progress: &watch::Sender<Progress>,
     cancel: &CancellationToken,
 ) -> Result<usize, OutputError> {
     let work = async {
-        let found = order.clone();
-        let searched = task_user::do_as(order.user.as_ref(), move || {
+        let found = spec.clone();
+        let searched = task_user::do_as(spec.user.as_ref(), move || {
             find::files(&found.directory, &found.patterns, found.max_bytes)
         });
         let files = searched.await.map_err(OutputError::User)??;
@@ -148,14 +148,14 @@ pub async fn bring_back(
             return Ok(0);
         }
         let output = OutputSet {
-            robot_id: order.robot_id.clone(),
-            task: order.task.clone(),
-            version: order.version.clone(),
-            deployment: order.deployment.clone(),
-            run: order.run,
+            robot_id: spec.robot_id.clone(),
+            task: spec.task.clone(),
+            version: spec.version.clone(),
+            deployment: spec.deployment.clone(),
+            run: spec.run,
             files,
         };
-        push::push(registry, order, &output, progress).await?;
+        push::push(registry, spec, &output, progress).await?;
         Ok(output.files.len())
     };
     tokio::select! {
@@ -165,6 +165,6 @@ pub async fn bring_back(
 }
 
 /// Error for a file beyond [`MAX_FILES`].
-fn too_many() -> OutputError {
+fn too_many_files() -> OutputError {
     OutputError::TooMuch(format!("more than {MAX_FILES} files match"))
 }

@@ -1,4 +1,4 @@
-//! Vitals of the machine, read from the kernel's /proc and /sys. A [`Gauge`] reads them. A
+//! Vitals of the machine, read from the kernel's /proc and /sys. A [`VitalsReader`] reads them. A
 //! [`Sender`] sends them once a minute over the MQTT session, or over HTTP while no session is up.
 //! No decision depends on vitals, and lost ones are not sent again.
 
@@ -10,20 +10,20 @@ use std::time::Duration;
 
 use task_proto::RobotId;
 use task_proto::api::AWAITS_APPROVAL;
-use task_proto::topic::RobotTopic;
-use task_proto::vitals::{Telemetry, Vitals};
+use task_proto::error_chain::chain;
+use task_proto::messages::topic::RobotTopic;
+use task_proto::telemetry::vitals::{Telemetry, Vitals};
 use tokio::sync::{Mutex, mpsc};
 use tokio::time::Instant;
 
-use crate::link::state::{Message, REFUSED_POLL, Shared, spread};
+use crate::link::state::{LinkState, Message, REFUSED_POLL, spread};
 use crate::system::battery;
 use crate::system::clock;
 use crate::system::disk;
-use crate::system::error_chain::chain;
 use crate::transfer::server::{Server, ServerError};
 
 /// Shortest time span for meaningful percentages and rates.
-const LEAST_SPAN: Duration = Duration::from_millis(250);
+const MIN_SPAN: Duration = Duration::from_millis(250);
 /// The first vitals are sent within this time, so that a fleet that starts at once spreads over it.
 const FIRST_WITHIN: Duration = Duration::from_secs(10);
 /// Pause after the server answers that it does not know telemetry: the server is older than this
@@ -32,14 +32,14 @@ const UNKNOWN_PAUSE: Duration = Duration::from_secs(3600);
 
 /// Paths that vitals are read from.
 #[derive(Debug, Clone)]
-pub struct Places {
+pub struct VitalsPaths {
     pub proc: PathBuf,
     pub sys: PathBuf,
     /// A path on the reported file system.
     pub data: PathBuf,
 }
 
-impl Places {
+impl VitalsPaths {
     /// The paths of this machine, with the agent's data directory.
     pub fn of_this_machine(data: &Path) -> Self {
         Self { proc: "/proc".into(), sys: "/sys".into(), data: data.to_owned() }
@@ -56,22 +56,22 @@ struct Counters {
 }
 
 /// Reads the machine's vitals repeatedly.
-pub struct Gauge {
-    places: Places,
+pub struct VitalsReader {
+    paths: VitalsPaths,
     before: Option<(Instant, Counters)>,
     last: Vitals,
 }
 
-impl Gauge {
+impl VitalsReader {
     /// A gauge without a first reading.
-    pub fn new(places: Places) -> Self {
-        Self { places, before: None, last: Vitals::default() }
+    pub fn new(paths: VitalsPaths) -> Self {
+        Self { paths, before: None, last: Vitals::default() }
     }
 
     /// Reads the vitals at `now`. The first reading has no percentages and rates. A reading too
     /// soon after the last one returns that one again.
-    pub fn look(&mut self, now: Instant) -> Vitals {
-        if self.before.is_some_and(|(at, _)| now.duration_since(at) < LEAST_SPAN) {
+    pub fn read(&mut self, now: Instant) -> Vitals {
+        if self.before.is_some_and(|(at, _)| now.duration_since(at) < MIN_SPAN) {
             return self.last;
         }
         let counters = Counters { cpu: self.cpu(), network: self.network() };
@@ -81,7 +81,7 @@ impl Gauge {
         let network = counters.network.zip(before.network).filter(|_| seconds > 0.0);
         let rate = |now: u64, before: u64| (now.saturating_sub(before) as f64 / seconds) as u64;
         let (memory_total_bytes, memory_used_bytes) = self.memory().unzip();
-        let room = disk::room(&self.places.data).ok();
+        let room = disk::space(&self.paths.data).ok();
         self.last = Vitals {
             at_ms: clock::wall_ms(),
             cpu_percent: counters
@@ -97,14 +97,14 @@ impl Gauge {
             load_1m: self
                 .proc("loadavg")
                 .and_then(|text| text.split_whitespace().next()?.parse().ok()),
-            battery_percent: battery::percent(&self.places.sys.join("class/power_supply")),
+            battery_percent: battery::percent(&self.paths.sys.join("class/power_supply")),
             temperature_c: self.temperature(),
         };
         self.last
     }
 
     fn proc(&self, name: &str) -> Option<String> {
-        fs::read_to_string(self.places.proc.join(name)).ok()
+        fs::read_to_string(self.paths.proc.join(name)).ok()
     }
 
     fn cpu(&self) -> Option<(u64, u64)> {
@@ -152,11 +152,11 @@ impl Gauge {
     }
 
     fn is_device(&self, interface: &str) -> bool {
-        self.places.sys.join("class/net").join(interface).join("device").exists()
+        self.paths.sys.join("class/net").join(interface).join("device").exists()
     }
 
     fn temperature(&self) -> Option<f32> {
-        let zones = fs::read_dir(self.places.sys.join("class/thermal")).ok()?.flatten();
+        let zones = fs::read_dir(self.paths.sys.join("class/thermal")).ok()?.flatten();
         let zones =
             zones.filter(|zone| zone.file_name().to_string_lossy().starts_with("thermal_zone"));
         let read = |zone: fs::DirEntry| {
@@ -181,39 +181,39 @@ fn tenths(value: f64) -> f32 {
 
 /// A source of vitals: the machine, or a simulation of one.
 pub trait Source: Send + 'static {
-    fn look(&mut self) -> Vitals;
+    fn read(&mut self) -> Vitals;
 }
 
-impl Source for Gauge {
-    fn look(&mut self) -> Vitals {
-        self.look(Instant::now())
+impl Source for VitalsReader {
+    fn read(&mut self) -> Vitals {
+        self.read(Instant::now())
     }
 }
 
 /// Vitals on request. Frequent requests get percentages and rates over the time since the last one.
 #[derive(Clone)]
-pub struct Asked {
-    gauge: Arc<Mutex<Gauge>>,
+pub struct OnDemandVitals {
+    reader: Arc<Mutex<VitalsReader>>,
 }
 
-impl Asked {
-    /// A source for the machine at `places`.
-    pub fn new(places: Places) -> Self {
-        Self { gauge: Arc::new(Mutex::new(Gauge::new(places))) }
+impl OnDemandVitals {
+    /// A source for the machine at `paths`.
+    pub fn new(paths: VitalsPaths) -> Self {
+        Self { reader: Arc::new(Mutex::new(VitalsReader::new(paths))) }
     }
 
     /// The current vitals. After a longer pause this takes two readings, because percentages and
     /// rates would otherwise cover the whole pause.
     pub async fn now(&self) -> Vitals {
         const FRESH: Duration = Duration::from_secs(10);
-        let mut gauge = self.gauge.lock().await;
-        let is_fresh = gauge.before.is_some_and(|(at, _)| at.elapsed() < FRESH);
+        let mut reader = self.reader.lock().await;
+        let is_fresh = reader.before.is_some_and(|(at, _)| at.elapsed() < FRESH);
         if !is_fresh {
-            gauge.before = None;
-            gauge.look(Instant::now());
-            tokio::time::sleep(LEAST_SPAN).await;
+            reader.before = None;
+            reader.read(Instant::now());
+            tokio::time::sleep(MIN_SPAN).await;
         }
-        gauge.look(Instant::now())
+        reader.read(Instant::now())
     }
 }
 
@@ -230,20 +230,17 @@ pub struct Sender<S> {
 
 impl<S: Source> Sender<S> {
     /// Sends until the agent ends, through `messages` while a session is up.
-    pub async fn run(mut self, shared: Shared, messages: mpsc::Sender<Message>) {
+    pub async fn run(mut self, link_state: LinkState, messages: mpsc::Sender<Message>) {
         if self.interval.is_zero() {
             return;
         }
         // A session carries the same data at less cost, above all when a whole fleet starts at
         // once.
-        let mut tried = shared.mqtt_tried.subscribe();
-        tokio::select! {
-            // Cancel-safe: a watch remembers its value, and a token can be awaited again.
-            _ = tried.wait_for(|tried| *tried) => {}
-            () = shared.shutdown.cancelled() => return,
+        if !link_state.first_attempt_ended().await {
+            return;
         }
         // This reading is the start of the first message's percentages and rates.
-        self.source.look();
+        self.source.read();
         let first = FIRST_WITHIN.min(self.interval).mul_f64(0.1 + 0.9 * rand::random::<f64>());
         let mut ticks = tokio::time::interval_at(Instant::now() + first, self.interval);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -253,12 +250,12 @@ impl<S: Source> Sender<S> {
                 // Cancel-safe: an interval keeps its own time.
                 _ = ticks.tick() => {}
                 // Cancel-safe: a token can be awaited again.
-                () = shared.shutdown.cancelled() => return,
+                () = link_state.shutdown.cancelled() => return,
             }
             let telemetry =
-                Telemetry { robot_id: self.robot_id.clone(), vitals: self.source.look() };
-            if *shared.mqtt_up.borrow() {
-                say(&messages, &telemetry);
+                Telemetry { robot_id: self.robot_id.clone(), vitals: self.source.read() };
+            if link_state.mqtt_now().is_up() {
+                publish(&messages, &telemetry);
             } else if Instant::now() >= not_before
                 && let Err(error) = self.server.telemetry(&telemetry).await
             {
@@ -285,7 +282,7 @@ fn pause(error: &ServerError) -> Duration {
     }
 }
 
-fn say(messages: &mpsc::Sender<Message>, telemetry: &Telemetry) {
+fn publish(messages: &mpsc::Sender<Message>, telemetry: &Telemetry) {
     match serde_json::to_vec(telemetry) {
         // Drop the message if the session is too slow: the next vitals are more useful.
         Ok(payload) => drop(messages.try_send(Message { topic: RobotTopic::Telemetry, payload })),
@@ -296,6 +293,7 @@ fn say(messages: &mpsc::Sender<Message>, telemetry: &Telemetry) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::link::state::MqttState;
 
     struct Machine {
         dir: tempfile::TempDir,
@@ -312,9 +310,9 @@ mod tests {
             fs::write(path, text).expect("written");
         }
 
-        fn gauge(&self) -> Gauge {
+        fn reader(&self) -> VitalsReader {
             let root = self.dir.path();
-            Gauge::new(Places {
+            VitalsReader::new(VitalsPaths {
                 proc: root.join("proc"),
                 sys: root.join("sys"),
                 data: root.to_owned(),
@@ -329,24 +327,24 @@ mod tests {
     }
 
     #[test]
-    fn shares_and_rates_are_over_the_time_between_two_looks() {
+    fn vitals_rates_cover_the_time_between_readings() {
         let machine = Machine::new();
         machine.write("proc/stat", "cpu  100 0 100 700 100 0 0 0 50 0\ncpu0 1 2 3\n");
         machine.write(
             "proc/net/dev",
             &format!("{NET_HEAD}{}{}", interface("lo", 9, 9), interface("eth0", 1000, 100)),
         );
-        let mut gauge = machine.gauge();
+        let mut reader = machine.reader();
         let begun = Instant::now();
-        let first = gauge.look(begun);
+        let first = reader.read(begun);
         assert_eq!((first.cpu_percent, first.network_in_bytes_per_s), (None, None));
         machine.write("proc/stat", "cpu  150 0 125 900 125 0 0 0 60 0\n");
         machine.write(
             "proc/net/dev",
             &format!("{NET_HEAD}{}{}", interface("lo", 99, 99), interface("eth0", 3000, 400)),
         );
-        assert_eq!(gauge.look(begun + LEAST_SPAN / 2), first, "too soon");
-        let second = gauge.look(begun + Duration::from_secs(2));
+        assert_eq!(reader.read(begun + MIN_SPAN / 2), first, "too soon");
+        let second = reader.read(begun + Duration::from_secs(2));
         assert_eq!(second.cpu_percent, Some(25.0));
         assert_eq!(
             (second.network_in_bytes_per_s, second.network_out_bytes_per_s),
@@ -355,27 +353,27 @@ mod tests {
         // An interface was removed, and the counters were reset.
         machine.write("proc/net/dev", NET_HEAD);
         machine.write("proc/stat", "cpu  1 0 1 1 1 0 0 0 0 0\n");
-        let third = gauge.look(begun + Duration::from_secs(4));
+        let third = reader.read(begun + Duration::from_secs(4));
         assert_eq!((third.cpu_percent, third.network_in_bytes_per_s), (None, Some(0)));
     }
 
     #[test]
-    fn bridges_do_not_count_where_there_are_devices() {
+    fn network_traffic_of_bridges_is_ignored() {
         let machine = Machine::new();
         let net = |eth, bridge| {
             format!("{NET_HEAD}{}{}", interface("eth0", eth, 0), interface("docker0", bridge, 0))
         };
         machine.write("proc/net/dev", &net(0, 0));
         machine.write("sys/class/net/eth0/device/uevent", "");
-        let mut gauge = machine.gauge();
+        let mut reader = machine.reader();
         let begun = Instant::now();
-        gauge.look(begun);
+        reader.read(begun);
         machine.write("proc/net/dev", &net(500, 70_000));
-        assert_eq!(gauge.look(begun + Duration::from_secs(1)).network_in_bytes_per_s, Some(500));
+        assert_eq!(reader.read(begun + Duration::from_secs(1)).network_in_bytes_per_s, Some(500));
     }
 
     #[test]
-    fn what_the_kernel_shows_of_memory_heat_and_load() {
+    fn memory_temperature_and_load_are_read() {
         let machine = Machine::new();
         machine.write(
             "proc/meminfo",
@@ -387,7 +385,7 @@ mod tests {
         machine.write("sys/class/thermal/cooling_device0/temp", "99000\n");
         machine.write("sys/class/power_supply/BAT0/type", "Battery\n");
         machine.write("sys/class/power_supply/BAT0/capacity", "80\n");
-        let seen = machine.gauge().look(Instant::now());
+        let seen = machine.reader().read(Instant::now());
         assert_eq!(
             (seen.memory_total_bytes, seen.memory_used_bytes),
             (Some(4_096_000), Some(3_072_000))
@@ -400,15 +398,15 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_is_not_said() {
+    fn missing_vitals_are_omitted() {
         let machine = Machine::new();
         machine.write("proc/stat", "intr 1\n");
         machine.write("proc/meminfo", "MemTotal: many kB\n");
         machine.write("proc/loadavg", "");
-        let mut gauge = machine.gauge();
+        let mut reader = machine.reader();
         let begun = Instant::now();
-        gauge.look(begun);
-        let seen = gauge.look(begun + Duration::from_secs(1));
+        reader.read(begun);
+        let seen = reader.read(begun + Duration::from_secs(1));
         let disk = (seen.disk_used_bytes, seen.disk_total_bytes);
         let nothing = Vitals {
             at_ms: seen.at_ms,
@@ -420,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn a_server_that_says_no_is_left_alone() {
+    fn refused_telemetry_pauses_sending() {
         let refused =
             |code: &str| ServerError::Refused { code: code.to_owned(), message: String::new() };
         let busy = |retry_after| ServerError::Busy { status: 503, retry_after };
@@ -436,18 +434,18 @@ mod tests {
     }
 
     /// Records for each reading whether a session had been tried before.
-    struct Looks(Shared, mpsc::UnboundedSender<bool>);
+    struct Looks(LinkState, mpsc::UnboundedSender<bool>);
 
     impl Source for Looks {
-        fn look(&mut self) -> Vitals {
-            self.1.send(*self.0.mqtt_tried.borrow()).expect("heard");
+        fn read(&mut self) -> Vitals {
+            self.1.send(self.0.mqtt_now().was_tried()).expect("heard");
             Vitals::default()
         }
     }
 
     #[tokio::test]
-    async fn nothing_is_said_before_a_session_was_tried() {
-        let shared = Shared::new(tokio_util::sync::CancellationToken::new());
+    async fn vitals_wait_for_the_first_session_attempt() {
+        let link_state = LinkState::new(tokio_util::sync::CancellationToken::new());
         let (looks, mut looked) = mpsc::unbounded_channel();
         let (messages, _said) = mpsc::channel(1);
         let tls = task_transport::Trust::by(None).client_config(clock::for_certificates());
@@ -455,19 +453,19 @@ mod tests {
         let robot_id = RobotId::random();
         let base = "http://127.0.0.1:9/".parse().expect("a URL");
         let server = Server::new(client, base, robot_id.clone(), "tskr_x".to_owned());
-        let source = Looks(shared.clone(), looks);
+        let source = Looks(link_state.clone(), looks);
         let sender = Sender { robot_id, interval: Duration::from_secs(60), source, server };
-        let sending = tokio::spawn(sender.run(shared.clone(), messages));
+        let sending = tokio::spawn(sender.run(link_state.clone(), messages));
         tokio::task::yield_now().await;
-        shared.mqtt_tried.send_replace(true);
+        link_state.mqtt.send_replace(MqttState::Down);
         assert_eq!(looked.recv().await, Some(true));
-        shared.shutdown.cancel();
+        link_state.shutdown.cancel();
         sending.await.expect("ends");
     }
 
     #[tokio::test]
-    async fn this_machine_answers_whoever_asks() {
-        let asked = Asked::new(Places::of_this_machine(Path::new("/")));
+    async fn on_demand_vitals_read_this_machine() {
+        let asked = OnDemandVitals::new(VitalsPaths::of_this_machine(Path::new("/")));
         let seen = asked.now().await;
         assert!(
             seen.cpu_percent.is_some_and(|percent| (0.0..=100.0).contains(&percent)),

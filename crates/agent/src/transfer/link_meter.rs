@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use task_proto::report::LinkFacts;
+use task_proto::messages::report::LinkFacts;
 use tokio::time::Instant;
 
 /// Shorter transfers are ignored: they measure the start of the connection more than its speed.
@@ -113,7 +113,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn short_transfers_say_nothing_and_one_alone_does_not_decide() {
+    fn throughput_ignores_short_transfers_and_is_averaged() {
         let meter = LinkMeter::default();
         let now = Instant::now();
         meter.transferred(MEASURED_BYTES - 1, Duration::from_secs(100));
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn what_broke_is_forgotten_after_an_hour_and_never_grows() {
+    fn interruptions_expire_after_an_hour_and_are_bounded() {
         let meter = LinkMeter::default();
         let start = Instant::now();
         for second in 0..4000 {
@@ -146,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_differs_much_is_news() {
+    fn small_link_changes_are_not_reported() {
         let facts = |rate, rtt, losses| LinkFacts {
             throughput_bytes_per_s: rate,
             rtt_ms: rtt,

@@ -14,14 +14,14 @@ pub(crate) const CONTENT_DIGEST: HeaderName = HeaderName::from_static("docker-co
 const MAX_BYTES: usize = 4096;
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct RegistryWords {
+pub(crate) struct RegistryError {
     /// Error code of the specification; empty if the body is not a registry's error.
     pub(crate) code: String,
     /// The message, or the whole body, on one line.
     pub(crate) text: String,
 }
 
-impl RegistryWords {
+impl RegistryError {
     /// Reads the error from an answer. A truncated body counts as complete.
     pub(crate) async fn read(response: &mut Response) -> Self {
         let mut body = Vec::new();
@@ -45,7 +45,7 @@ impl RegistryWords {
     }
 
     /// Whether the error comes from a registry.
-    pub(crate) fn are_a_registrys(&self) -> bool {
+    pub(crate) fn is_from_registry(&self) -> bool {
         !self.code.is_empty()
     }
 }
@@ -55,19 +55,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refusal_is_told_in_the_servers_words() {
+    fn registry_error_keeps_the_servers_message() {
         let error = br#"{"errors":[{"code":"SIZE_INVALID","message":"the output\nhas 9 bytes","detail":{}}]}"#;
-        let words = RegistryWords {
+        let registry_error = RegistryError {
             code: "SIZE_INVALID".to_owned(),
             text: "the output has 9 bytes".to_owned(),
         };
-        assert_eq!(RegistryWords::of(error), words);
+        assert_eq!(RegistryError::of(error), registry_error);
         for other in
             ["<h1>Forbidden</h1>", r#"{"errors":[]}"#, r#"{"error":{"code":"x"}}"#, "[]", ""]
         {
-            let words = RegistryWords::of(other.as_bytes());
-            assert_eq!((words.are_a_registrys(), words.text.as_str()), (false, other));
+            let registry_error = RegistryError::of(other.as_bytes());
+            assert_eq!(
+                (registry_error.is_from_registry(), registry_error.text.as_str()),
+                (false, other)
+            );
         }
-        assert_eq!(RegistryWords::of(b"\xff\x1b[2J").text, "\u{fffd} [2J");
+        assert_eq!(RegistryError::of(b"\xff\x1b[2J").text, "\u{fffd} [2J");
     }
 }

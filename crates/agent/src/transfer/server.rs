@@ -13,9 +13,9 @@ use task_proto::api::{
     EnrollRequest, EnrollResponse, ErrorBody, INSTANCE_HEADER, MqttEndpoint, PLACE_HEADER,
     ReportReply, RobotToken,
 };
-use task_proto::envelope::Envelope;
-use task_proto::report::Report;
-use task_proto::vitals::Telemetry;
+use task_proto::messages::report::Report;
+use task_proto::telemetry::vitals::Telemetry;
+use task_proto::trust::envelope::Envelope;
 use task_proto::{Digest, InstanceId, RobotId};
 
 use crate::transfer::credential::Credential;
@@ -29,7 +29,7 @@ const REQUEST_TIMEOUT: Duration = Duration::from_secs(30);
 /// How long an idle connection is kept for the next request. A pull makes several requests in a row
 /// and then none for minutes. A fleet's idle connections would cost the server more than its
 /// sessions.
-pub const KEPT_CONNECTION: Duration = Duration::from_secs(3);
+pub const IDLE_CONNECTION_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// Reasons for a missing or unusable answer.
 #[derive(Debug, thiserror::Error)]
@@ -38,20 +38,20 @@ pub enum ServerError {
     #[error("the server can't be reached")]
     Unreachable(#[source] reqwest::Error),
     /// The answer does not come from taskd.
-    #[error("something else answers in the server's place: {0}")]
+    #[error("another program answers at the server's address: {0}")]
     NotTheServer(String),
     /// The token is not accepted.
     #[error("the server does not accept the token: {0}")]
     TokenRefused(String),
     /// The server is overloaded, restarting or broken.
-    #[error("the server answers {status}")]
+    #[error("the server answered {status}")]
     Busy {
         status: u16,
         /// Wait that the server requests.
         retry_after: Option<Duration>,
     },
     /// The server refused the request.
-    #[error("the server refuses: {message} ({code})")]
+    #[error("the server refused: {message} ({code})")]
     Refused { code: String, message: String },
 }
 
@@ -63,12 +63,12 @@ pub struct Server {
     robot: RobotId,
     token: Credential,
     /// Headers of every request that identify the agent.
-    said: HeaderMap,
+    identity_headers: HeaderMap,
 }
 
 /// A desired state as the server sent it.
 #[derive(Debug)]
-pub struct Sent {
+pub struct DesiredResponse {
     pub envelope: Envelope,
     /// The server's entity tag for exactly these bytes, opaque to the agent.
     pub tag: Option<HeaderValue>,
@@ -80,7 +80,7 @@ pub fn client(tls: ClientConfig) -> Result<reqwest::Client, reqwest::Error> {
         .tls_backend_preconfigured(tls)
         .connect_timeout(CONNECT_TIMEOUT)
         .timeout(REQUEST_TIMEOUT)
-        .pool_idle_timeout(KEPT_CONNECTION)
+        .pool_idle_timeout(IDLE_CONNECTION_TIMEOUT)
         .redirect(reqwest::redirect::Policy::none())
         .user_agent(concat!("task-agent/", env!("CARGO_PKG_VERSION")))
         .build()
@@ -106,19 +106,19 @@ impl Server {
         robot: RobotId,
         token: impl Into<Credential>,
     ) -> Self {
-        Self { client, base, robot, token: token.into(), said: HeaderMap::new() }
+        Self { client, base, robot, token: token.into(), identity_headers: HeaderMap::new() }
     }
 
     /// Identifies this client as the agent `instance` that runs at `place`. For a while the server
     /// gives nothing to another agent.
-    pub fn speaking_as(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
-        let said = [
+    pub fn with_instance(mut self, instance: &InstanceId, place: Option<Digest>) -> Self {
+        let identity_headers = [
             (INSTANCE_HEADER, Some(instance.to_string())),
             (PLACE_HEADER, place.map(|place| place.to_string())),
         ];
-        for (name, value) in said {
+        for (name, value) in identity_headers {
             if let Some(value) = value.and_then(|value| HeaderValue::try_from(value).ok()) {
-                self.said.insert(name, value);
+                self.identity_headers.insert(name, value);
             }
         }
         self
@@ -131,45 +131,51 @@ impl Server {
 
     /// Returns the signed desired state; `None` if it has not changed since the answer with the tag
     /// `known`.
-    pub async fn desired(&self, known: Option<&HeaderValue>) -> Result<Option<Sent>, ServerError> {
+    pub async fn desired(
+        &self,
+        known: Option<&HeaderValue>,
+    ) -> Result<Option<DesiredResponse>, ServerError> {
         let url = at(&self.base, &format!("robots/{}/desired", self.robot));
-        let answer = self.ask::<()>(Method::GET, url, None, known).await?;
+        let answer = self.send_authorized::<()>(Method::GET, url, None, known).await?;
         if answer.status == StatusCode::NOT_MODIFIED {
             return Ok(None);
         }
-        Ok(Some(Sent { envelope: parse(&answer.body)?, tag: answer.headers.get(ETAG).cloned() }))
+        Ok(Some(DesiredResponse {
+            envelope: parse(&answer.body)?,
+            tag: answer.headers.get(ETAG).cloned(),
+        }))
     }
 
     /// Delivers a report. On return the server has stored the report.
     pub async fn report(&self, report: &Report) -> Result<ReportReply, ServerError> {
         let url = at(&self.base, &format!("robots/{}/report", self.robot));
-        let answer = self.ask(Method::POST, url, Some(report), None).await?;
+        let answer = self.send_authorized(Method::POST, url, Some(report), None).await?;
         parse(&answer.body)
     }
 
     /// Sends the vitals of the robot's machine.
     pub async fn telemetry(&self, telemetry: &Telemetry) -> Result<(), ServerError> {
         let url = at(&self.base, &format!("robots/{}/telemetry", self.robot));
-        self.ask(Method::POST, url, Some(telemetry), None).await.map(drop)
+        self.send_authorized(Method::POST, url, Some(telemetry), None).await.map(drop)
     }
 
     /// Requests the endpoint of the robot's MQTT session.
     pub async fn mqtt_endpoint(&self) -> Result<MqttEndpoint, ServerError> {
         let url = at(&self.base, &format!("robots/{}/mqtt", self.robot));
-        let answer = self.ask::<()>(Method::GET, url, None, None).await?;
+        let answer = self.send_authorized::<()>(Method::GET, url, None, None).await?;
         parse(&answer.body)
     }
 
     /// Requests the next token. Its first use invalidates the current one.
     pub async fn next_token(&self) -> Result<String, ServerError> {
         let url = at(&self.base, &format!("robots/{}/token", self.robot));
-        let answer = self.ask::<()>(Method::POST, url, None, None).await?;
+        let answer = self.send_authorized::<()>(Method::POST, url, None, None).await?;
         let RobotToken { token } = parse(&answer.body)?;
         Ok(token)
     }
 
     /// Sends a request, and repeats it once if the token was replaced meanwhile.
-    async fn ask<B: Serialize>(
+    async fn send_authorized<B: Serialize>(
         &self,
         method: Method,
         url: Url,
@@ -177,7 +183,7 @@ impl Server {
         known: Option<&HeaderValue>,
     ) -> Result<Answer, ServerError> {
         let token = self.token.current();
-        let mut headers = self.said.clone();
+        let mut headers = self.identity_headers.clone();
         headers.extend(known.map(|tag| (IF_NONE_MATCH, tag.clone())));
         match send(&self.client, method.clone(), url.clone(), &token, body, headers.clone()).await {
             Err(ServerError::TokenRefused(_)) if self.token.current() != token => {
@@ -213,7 +219,8 @@ async fn send<B: Serialize>(
         request = request.json(body);
     }
     let mut response = request.send().await.map_err(ServerError::Unreachable)?;
-    let (status, headers) = (response.status(), response.headers().clone());
+    let status = response.status();
+    let headers = response.headers().clone();
     let mut bytes = Vec::new();
     while let Some(chunk) = response.chunk().await.map_err(ServerError::Unreachable)? {
         if bytes.len() + chunk.len() > MAX_ANSWER_BYTES {

@@ -10,14 +10,14 @@ use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use task_agent::link::rotation::Rotation;
-use task_agent::link::state::{self, Heard, Intervals, Shared};
-use task_agent::reconcile::admission::{self, Refused};
+use task_agent::link::state::{self, LinkState, MqttState, PollIntervals, ServerMessage};
+use task_agent::reconcile::admission::{self, AdmissionError};
 use task_agent::system::identity::Identity;
 use task_agent::transfer::credential::Credential;
 use task_agent::transfer::server::{self, Server, ServerError};
 use task_proto::desired::DesiredState;
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
-use task_proto::report::{HostFacts, Report};
+use task_proto::messages::report::{HostFacts, Report};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{Generation, InstanceId, RobotId};
 use task_transport::Trust;
 use tokio::sync::mpsc;
@@ -93,7 +93,7 @@ fn sealed(state: &DesiredState, key: &SigningKey) -> Canned {
 }
 
 #[tokio::test]
-async fn only_the_servers_own_no_is_a_refusal() {
+async fn only_the_servers_error_body_is_a_refusal() {
     let (fake, url) = Fake::start((401, "application/json", REFUSAL.to_owned())).await;
     let server = server(&url, &RobotId::random());
     assert!(matches!(server.desired(None).await, Err(ServerError::TokenRefused(_))));
@@ -108,19 +108,21 @@ async fn only_the_servers_own_no_is_a_refusal() {
     }
     fake.set((503, "text/html", "<html>".to_owned()));
     let busy = server.desired(None).await.unwrap_err();
-    assert!(
-        matches!(busy, ServerError::Busy { status: 503, retry_after: Some(wait) } if wait.as_secs() == 7)
-    );
+    assert!(matches!(
+        busy,
+        ServerError::Busy { status: 503, retry_after: Some(wait) } if wait.as_secs() == 7
+    ));
     fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
-    assert!(
-        matches!(server.desired(None).await, Err(ServerError::Refused { code, .. }) if code == "diverged")
-    );
+    assert!(matches!(
+        server.desired(None).await,
+        Err(ServerError::Refused { code, .. }) if code == "diverged"
+    ));
     fake.set((304, "application/json", String::new()));
     assert!(server.desired(None).await.unwrap().is_none());
 }
 
 #[tokio::test]
-async fn a_new_token_is_on_the_disk_before_it_is_used_and_the_old_one_until_it_worked() {
+async fn new_token_is_stored_before_use_and_the_old_one_kept_until_it_works() {
     let robot = RobotId::random();
     let (fake, url) = Fake::start((201, "application/json", r#"{"token":"new"}"#.to_owned())).await;
     let dir = tempfile::tempdir().unwrap();
@@ -199,22 +201,22 @@ async fn altered_foreign_and_old_states_are_refused() {
     let other = if &body[at..=at] == "A" { "B" } else { "A" };
     fake.set((status, kind, format!("{}{other}{}", &body[..at], &body[at + 1..])));
     let altered = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
-    assert!(matches!(altered, Err(Refused::Signature(_))), "{altered:?}");
+    assert!(matches!(altered, Err(AdmissionError::Signature(_))), "{altered:?}");
 
     fake.set(sealed(&state(&RobotId::random(), 4), &key));
     let foreign = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
-    assert!(matches!(foreign, Err(Refused::OtherRobot(_))));
+    assert!(matches!(foreign, Err(AdmissionError::OtherRobot(_))));
 
     fake.set(sealed(&state(&robot, 2), &key));
     let old = admit(&server.desired(None).await.unwrap().unwrap().envelope, Some(&accepted));
-    assert!(matches!(old, Err(Refused::Stale { .. })));
+    assert!(matches!(old, Err(AdmissionError::Stale { .. })));
 }
 
 #[tokio::test]
 async fn a_report_is_sent_again_until_it_is_stored() {
     let robot = RobotId::random();
     let (fake, url) = Fake::start((503, "text/plain", String::new())).await;
-    let shared = Shared::new(CancellationToken::new());
+    let link_state = LinkState::new(CancellationToken::new());
     let report = Report {
         robot_id: robot.clone(),
         start: 1,
@@ -229,9 +231,10 @@ async fn a_report_is_sent_again_until_it_is_stored() {
         link: None,
         tasks: Vec::new(),
     };
-    shared.reports.send_replace(Some(Arc::new(report)));
-    let (heard, mut messages) = mpsc::channel(4);
-    let posting = tokio::spawn(state::post(server(&url, &robot), shared.clone(), heard));
+    link_state.reports.send_replace(Some(Arc::new(report)));
+    let (server_messages, mut messages) = mpsc::channel(4);
+    let posting =
+        tokio::spawn(state::post(server(&url, &robot), link_state.clone(), server_messages));
     let asked = async {
         while fake.asked_with.lock().unwrap().is_empty() {
             tokio::task::yield_now().await;
@@ -244,58 +247,71 @@ async fn a_report_is_sent_again_until_it_is_stored() {
         r#"{"generation":0,"name":"atlas","labels":{}}"#.to_owned(),
     ));
     let confirmed = tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(
-        matches!(confirmed, Heard::Confirmed { seq: 1, reply: Some(reply) } if reply.name.as_str() == "atlas")
-    );
-    shared.shutdown.cancel();
+    assert!(matches!(
+        confirmed,
+        ServerMessage::Confirmed { seq: 1, reply: Some(reply) } if reply.name.as_str() == "atlas"
+    ));
+    link_state.shutdown.cancel();
     posting.await.unwrap();
 }
 
 #[tokio::test]
-async fn polling_goes_on_after_every_kind_of_answer() {
+async fn polling_continues_after_every_kind_of_answer() {
     let (key, robot) = (SigningKey::random(), RobotId::random());
     let (fake, url) = Fake::start((401, "application/json", REFUSAL.to_owned())).await;
-    let shared = Shared::new(CancellationToken::new());
-    let (heard, mut messages) = mpsc::channel(1);
-    let intervals = Intervals { slow: Duration::from_millis(20), fast: Duration::from_millis(10) };
-    let polling = tokio::spawn(state::poll(server(&url, &robot), shared.clone(), intervals, heard));
+    let link_state = LinkState::new(CancellationToken::new());
+    let (server_messages, mut messages) = mpsc::channel(1);
+    let intervals =
+        PollIntervals { slow: Duration::from_millis(20), fast: Duration::from_millis(10) };
+    let polling = tokio::spawn(state::poll(
+        server(&url, &robot),
+        link_state.clone(),
+        intervals,
+        server_messages,
+    ));
     let answers = [(200, "text/html", "<html>".to_owned()), sealed(&state(&robot, 1), &key)];
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(next().await, Heard::TokenRefused(_)));
+    assert!(matches!(next().await, ServerMessage::TokenRefused(_)));
     for (answer, is_state) in answers.into_iter().zip([false, true]) {
         fake.set(answer);
         loop {
             match next().await {
-                Heard::Withheld { code, .. } if !is_state => {
+                ServerMessage::StateUnavailable { code, .. } if !is_state => {
                     break assert_eq!(code, "server_unreachable");
                 }
-                Heard::Desired { .. } if is_state => break,
+                ServerMessage::Desired { .. } if is_state => break,
                 _ => {}
             }
         }
     }
-    shared.shutdown.cancel();
+    link_state.shutdown.cancel();
     drop(messages);
     polling.await.unwrap();
 }
 
 #[tokio::test]
-async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_up() {
+async fn unannounced_order_is_found_by_polling_while_mqtt_is_up() {
     let (key, robot) = (SigningKey::random(), RobotId::random());
     let (fake, url) = Fake::start(sealed(&state(&robot, 1), &key)).await;
-    let shared = Shared::new(CancellationToken::new());
-    shared.mqtt_up.send_replace(true);
-    shared.settled.send_replace(true);
-    let (heard, mut messages) = mpsc::channel(1);
-    let intervals = Intervals { slow: Duration::from_millis(50), fast: Duration::from_secs(3600) };
-    let polling = tokio::spawn(state::poll(server(&url, &robot), shared.clone(), intervals, heard));
+    let link_state = LinkState::new(CancellationToken::new());
+    link_state.mqtt.send_replace(MqttState::UpAtExternalBroker);
+    link_state.settled.send_replace(true);
+    let (server_messages, mut messages) = mpsc::channel(1);
+    let intervals =
+        PollIntervals { slow: Duration::from_millis(50), fast: Duration::from_secs(3600) };
+    let polling = tokio::spawn(state::poll(
+        server(&url, &robot),
+        link_state.clone(),
+        intervals,
+        server_messages,
+    ));
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(next().await, Heard::Desired { .. }));
+    assert!(matches!(next().await, ServerMessage::Desired { .. }));
     fake.set((304, "application/json", String::new()));
-    while !matches!(next().await, Heard::Unchanged) {}
+    while !matches!(next().await, ServerMessage::Unchanged) {}
     fake.set(sealed(&state(&robot, 2), &key));
-    let is_found = |heard| match heard {
-        Heard::Desired { envelope, .. } => {
+    let is_found = |server_messages| match server_messages {
+        ServerMessage::Desired { envelope, .. } => {
             admission::open(&envelope, &key.public_key(), &robot).unwrap().generation
                 == Generation(2)
         }
@@ -304,10 +320,10 @@ async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_
     while !is_found(next().await) {}
     // A session measures the distance to the server better; without a session the answers' times
     // are used.
-    let facts = || shared.meter.facts(tokio::time::Instant::now());
+    let facts = || link_state.meter.facts(tokio::time::Instant::now());
     assert_eq!(facts(), None);
-    shared.mqtt_up.send_replace(false);
-    shared.poll.notify_one();
+    link_state.mqtt.send_replace(MqttState::Down);
+    link_state.poll.notify_one();
     let measured = async {
         while facts().is_none() {
             next().await;
@@ -315,38 +331,38 @@ async fn an_order_that_nobody_announces_is_found_by_the_poll_also_while_mqtt_is_
     };
     tokio::time::timeout(PATIENCE, measured).await.unwrap();
     assert!(facts().unwrap().rtt_ms.is_some());
-    shared.shutdown.cancel();
+    link_state.shutdown.cancel();
     drop(messages);
     polling.await.unwrap();
 }
 
 #[tokio::test]
-async fn a_state_is_sent_once_and_again_only_to_a_robot_that_does_not_keep_to_it() {
+async fn unchanged_state_is_sent_again_only_to_an_unsettled_robot() {
     let (key, robot) = (SigningKey::random(), RobotId::random());
     let (fake, url) = Fake::start(sealed(&state(&robot, 1), &key)).await;
-    let shared = Shared::new(CancellationToken::new());
-    let (heard, mut messages) = mpsc::channel(1);
+    let link_state = LinkState::new(CancellationToken::new());
+    let (server_messages, mut messages) = mpsc::channel(1);
     let never = Duration::from_secs(3600);
     let polling = tokio::spawn(state::poll(
         server(&url, &robot),
-        shared.clone(),
-        Intervals { slow: never, fast: never },
-        heard,
+        link_state.clone(),
+        PollIntervals { slow: never, fast: never },
+        server_messages,
     ));
     let mut next = async || tokio::time::timeout(PATIENCE, messages.recv()).await.unwrap().unwrap();
-    assert!(matches!(next().await, Heard::Desired { .. }));
+    assert!(matches!(next().await, ServerMessage::Desired { .. }));
 
-    shared.settled.send_replace(true);
+    link_state.settled.send_replace(true);
     fake.set((304, "application/json", String::new()));
-    shared.poll.notify_one();
-    assert!(matches!(next().await, Heard::Unchanged));
+    link_state.poll.notify_one();
+    assert!(matches!(next().await, ServerMessage::Unchanged));
 
     // As when half of its lifetime is over.
-    shared.settled.send_replace(false);
+    link_state.settled.send_replace(false);
     fake.set(sealed(&state(&robot, 1), &key));
-    shared.poll.notify_one();
-    assert!(matches!(next().await, Heard::Desired { .. }));
+    link_state.poll.notify_one();
+    assert!(matches!(next().await, ServerMessage::Desired { .. }));
     assert_eq!(*fake.asked_with.lock().unwrap(), [None, Some(TAG.to_owned()), None]);
-    shared.shutdown.cancel();
+    link_state.shutdown.cancel();
     polling.await.unwrap();
 }

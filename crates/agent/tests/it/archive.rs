@@ -1,7 +1,7 @@
 //! Archives written byte by byte, also those that no decent writer would produce.
 
 use task_proto::Digest;
-use task_proto::manifest::ContentFacts;
+use task_proto::packages::manifest::ContentFacts;
 
 /// A tar archive that grows.
 #[derive(Clone, Default)]

@@ -5,23 +5,23 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use task_agent::install::builder::{self, BuildError, BuildLimits, BuildOrder};
+use task_agent::install::builder::{self, BuildError, BuildLimits, BuildSpec};
 use task_agent::install::work_dir;
 use task_agent::logs::LogSpec;
 use task_agent::process::cgroup::{Cgroups, RunLimits};
 use task_agent::process::program;
 use task_agent::process::program::ExitStatus;
 use task_agent::process::run_dir::RunSpec;
-use task_agent::process::supervisor::Observed;
+use task_agent::process::supervisor::RunState;
 use task_agent::setup::environment;
 use task_agent::setup::installation::RosVersion;
 use task_agent::setup::launch::Interrupt;
 use task_agent::setup::script;
-use task_agent::setup::underlay::{self, Places};
+use task_agent::setup::underlay::{self, SearchPaths};
 use task_agent::system::layout::DataDir;
 use task_proto::Digest;
-use task_proto::manifest::{BuildTool, TaskManifest};
-use task_proto::report::FailureCode;
+use task_proto::messages::report::FailureCode;
+use task_proto::packages::manifest::{BuildTool, TaskManifest};
 use tokio_util::sync::CancellationToken;
 
 use crate::harness::{eventually, lives, other_user, supervisor, within, write};
@@ -29,7 +29,7 @@ use crate::harness::{eventually, lives, other_user, supervisor, within, write};
 /// A version directory with an order to build the version.
 struct TestBuild {
     dir: tempfile::TempDir,
-    order: BuildOrder,
+    spec: BuildSpec,
 }
 
 impl TestBuild {
@@ -38,17 +38,17 @@ impl TestBuild {
         let data = DataDir::new(dir.path()).expect("data dir");
         let version = data.task(&"talker".parse().expect("name")).version(&Digest::of(b"manifest"));
         std::fs::create_dir_all(version.src()).expect("src");
-        let order = BuildOrder {
+        let spec = BuildSpec {
             tool: BuildTool::Colcon,
             version,
             underlays,
-            environment: environment::of_this_robot(&BTreeMap::new()),
+            environment: environment::robot_environment(&BTreeMap::new()),
             log: dir.path().join("build.log"),
             limits: BuildLimits::of_this_machine(),
             user: None,
             cgroups: None,
         };
-        Self { dir, order }
+        Self { dir, spec }
     }
 
     /// A build with this script as colcon, among the system's other tools.
@@ -59,27 +59,27 @@ impl TestBuild {
         std::fs::set_permissions(bin.join("colcon"), std::fs::Permissions::from_mode(0o755))
             .expect("executable");
         build
-            .order
+            .spec
             .environment
             .insert("PATH".to_owned(), format!("{}:/usr/bin:/bin", bin.display()));
         build
     }
 
     async fn run(&self) -> Result<(), BuildError> {
-        within("the build", builder::build(&self.order, &CancellationToken::new())).await
+        within("the build", builder::build(&self.spec, &CancellationToken::new())).await
     }
 
     fn log(&self) -> String {
-        std::fs::read_to_string(&self.order.log).unwrap_or_default()
+        std::fs::read_to_string(&self.spec.log).unwrap_or_default()
     }
 
     fn src(&self, name: &str) -> PathBuf {
-        self.order.version.src().join(name)
+        self.spec.version.src().join(name)
     }
 
     /// The processes that were started for this build.
     fn processes(&self) -> usize {
-        let marker = format!("TASKD_RUN_DIR={}", self.order.version.root().display());
+        let marker = format!("TASKD_RUN_DIR={}", self.spec.version.root().display());
         let table = program::ProcessEntry::all().expect("process table");
         table.iter().filter(|entry| !entry.is_zombie && entry.was_started_with(&marker)).count()
     }
@@ -89,7 +89,8 @@ impl TestBuild {
 fn ros() -> PathBuf {
     let root = std::env::var_os("TASKD_TEST_ROS").map(PathBuf::from);
     root.expect(
-        "TASKD_TEST_ROS names no virtual environment with ROS 2 and colcon: run ./scripts/test, which makes one",
+        "TASKD_TEST_ROS names no virtual environment with ROS 2 and colcon: \
+         run ./scripts/test, which makes one",
     )
     .join("bin/activate")
 }
@@ -110,8 +111,10 @@ fn write_ament_package(build: &TestBuild) {
         &build.src("setup.py"),
         r#"from setuptools import setup
 setup(name="talker", version="1.0.0", packages=["talker"],
-      data_files=[("share/ament_index/resource_index/packages", ["resource/talker"]), ("share/talker", ["package.xml"])],
-      install_requires=["setuptools"], entry_points={"console_scripts": ["talker = talker.node:main"]})
+      data_files=[("share/ament_index/resource_index/packages", ["resource/talker"]),
+                  ("share/talker", ["package.xml"])],
+      install_requires=["setuptools"],
+      entry_points={"console_scripts": ["talker = talker.node:main"]})
 "#,
     );
     write(
@@ -127,7 +130,8 @@ import rclpy
 def main():
     rclpy.init()
     node = rclpy.create_node("talker")
-    print("hello from", node.get_fully_qualified_name(), sys.argv[1:], os.environ["ROS_DOMAIN_ID"], flush=True)
+    domain = os.environ["ROS_DOMAIN_ID"]
+    print("hello from", node.get_fully_qualified_name(), sys.argv[1:], domain, flush=True)
     node.destroy_node()
     rclpy.shutdown()
 "#,
@@ -136,10 +140,10 @@ def main():
 
 #[tokio::test]
 async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
-    let found = underlay::find(&[ros()], &Places::of_this_machine());
+    let found = underlay::find(&[ros()], &SearchPaths::of_this_machine());
     let setups = underlay::setup_files(&found, Some(RosVersion::Ros2), &["kilted".to_owned()]);
     let mut build = TestBuild::new(setups.expect("kilted is there"));
-    build.order.environment.insert("ROS_DOMAIN_ID".to_owned(), "47".to_owned());
+    build.spec.environment.insert("ROS_DOMAIN_ID".to_owned(), "47".to_owned());
     write_ament_package(&build);
     build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
     // An interrupted build is done again.
@@ -151,10 +155,10 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
         "content": {"tar_digest": Digest::of(b""), "tar_size": 0, "entries": 0},
     }))
     .expect("manifest");
-    let version = &build.order.version;
+    let version = &build.spec.version;
     std::fs::write(
         version.run_script(),
-        script::run_script(&manifest, version, &build.order.underlays),
+        script::run_script(&manifest, version, &build.spec.underlays),
     )
     .expect("script");
     work_dir::refresh(BuildTool::Colcon, version, None).expect("made");
@@ -163,7 +167,7 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
         assignment: task_proto::DeploymentId::random(),
         script: version.run_script(),
         directory: version.work(),
-        environment: build.order.environment.clone(),
+        environment: build.spec.environment.clone(),
         interrupt: Interrupt::Group,
         log: LogSpec::at(build.dir.path().join("task.log")),
         limits: RunLimits::default(),
@@ -174,14 +178,14 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
     supervisor().start(&run_dir, &spec).await.expect("started");
     let ended = within("the node", supervisor().wait(&run_dir)).await.expect("observed");
     let log = std::fs::read_to_string(&spec.log.path).unwrap_or_default();
-    assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)), "{log}");
+    assert_eq!(ended, RunState::Exited(ExitStatus::Code(0)), "{log}");
     assert!(log.contains(r#"hello from /talker ["it's", '$HOME'] 47"#), "{log}");
 }
 
 #[tokio::test]
 async fn a_catkin_package_is_built_and_installed() {
     let mut build = TestBuild::new(Vec::new());
-    build.order.tool = BuildTool::Catkin;
+    build.spec.tool = BuildTool::Catkin;
     write(
         &build.src("package.xml"),
         r#"<?xml version="1.0"?>
@@ -194,7 +198,8 @@ async fn a_catkin_package_is_built_and_installed() {
     );
     write(
         &build.src("CMakeLists.txt"),
-        "cmake_minimum_required(VERSION 3.5)\nproject(mapper NONE)\nfind_package(catkin REQUIRED)\ncatkin_package()\n\
+        "cmake_minimum_required(VERSION 3.5)\nproject(mapper NONE)\n\
+         find_package(catkin REQUIRED)\ncatkin_package()\n\
          install(PROGRAMS mapper.sh DESTINATION ${CATKIN_PACKAGE_BIN_DESTINATION})\n",
     );
     write(&build.src("mapper.sh"), "#!/bin/sh\n");
@@ -202,7 +207,7 @@ async fn a_catkin_package_is_built_and_installed() {
         .run()
         .await
         .unwrap_or_else(|error| panic!("{error}: ./scripts/test installs what this needs"));
-    let install = build.order.version.install();
+    let install = build.spec.version.install();
     assert!(
         install.join("lib/mapper/mapper.sh").is_file()
             && install.join("local_setup.bash").is_file()
@@ -210,7 +215,7 @@ async fn a_catkin_package_is_built_and_installed() {
 }
 
 #[tokio::test]
-async fn a_package_that_does_not_build_fails_with_the_tools_own_words() {
+async fn failed_build_reports_the_tools_output() {
     let build = TestBuild::new(vec![ros()]);
     write_ament_package(&build);
     std::fs::remove_file(build.src("resource/talker")).expect("removed");
@@ -220,12 +225,15 @@ async fn a_package_that_does_not_build_fails_with_the_tools_own_words() {
 }
 
 #[tokio::test]
-async fn a_package_that_colcon_passes_over_is_no_success() {
+async fn package_skipped_by_colcon_fails() {
     let build = TestBuild::new(vec![ros()]);
     write(&build.src("readme.txt"), "no package here");
     let error = build.run().await.expect_err("failed");
     assert!(
-        matches!(&error, BuildError::NotInstalled { missing, .. } if missing.contains("package.xml")),
+        matches!(
+            &error,
+            BuildError::NotInstalled { missing, .. } if missing.contains("package.xml")
+        ),
         "{error}"
     );
 }
@@ -233,30 +241,33 @@ async fn a_package_that_colcon_passes_over_is_no_success() {
 #[tokio::test]
 async fn a_missing_tool_and_a_missing_underlay_are_named() {
     let mut build = TestBuild::new(Vec::new());
-    build.order.environment.insert("PATH".to_owned(), "/nonexistent".to_owned());
+    build.spec.environment.insert("PATH".to_owned(), "/nonexistent".to_owned());
     let error = build.run().await.expect_err("failed").to_string();
     assert!(error.contains("colcon is not installed"), "{error}");
-    build.order.underlays = vec!["/nonexistent/setup.bash".into()];
+    build.spec.underlays = vec!["/nonexistent/setup.bash".into()];
     let error = build.run().await.expect_err("failed").to_string();
-    assert!(error.contains("the underlay /nonexistent/setup.bash is not there"), "{error}");
+    assert!(error.contains("the underlay /nonexistent/setup.bash does not exist"), "{error}");
 }
 
 #[tokio::test]
-async fn a_build_is_optimised_and_leaves_tests_out() {
+async fn build_is_optimized_and_skips_tests() {
     let build = TestBuild::new(vec![ros()]);
     write(
         &build.src("package.xml"),
-        "<package format=\"3\"><!-- was <name>tested</name> --><name>plain</name><version>1.0.0</version><description>p</description><maintainer email=\"a@b.co\">a</maintainer><license>MIT</license><export><build_type>cmake</build_type></export></package>",
+        "<package format=\"3\"><!-- was <name>tested</name> --><name>plain</name>\
+         <version>1.0.0</version><description>p</description>\
+         <maintainer email=\"a@b.co\">a</maintainer><license>MIT</license>\
+         <export><build_type>cmake</build_type></export></package>",
     );
-    let cmake = "cmake_minimum_required(VERSION 3.10)\nproject(plain NONE)\noption(BUILD_TESTING \"\" ON)\n\
+    let cmake = "cmake_minimum_required(VERSION 3.10)\nproject(plain NONE)\n\
+                 option(BUILD_TESTING \"\" ON)\n\
                  if(BUILD_TESTING)\nfind_package(nobody_has_this REQUIRED)\nendif()\n\
                  file(WRITE ${CMAKE_BINARY_DIR}/kind \"${CMAKE_BUILD_TYPE}\")\n\
                  install(FILES package.xml ${CMAKE_BINARY_DIR}/kind DESTINATION share/plain)\n";
     write(&build.src("CMakeLists.txt"), cmake);
     build.run().await.unwrap_or_else(|error| panic!("{error}\n{}", build.log()));
-    let kind =
-        std::fs::read_to_string(build.order.version.install().join("plain/share/plain/kind"))
-            .expect("installed");
+    let kind = std::fs::read_to_string(build.spec.version.install().join("plain/share/plain/kind"))
+        .expect("installed");
     assert_eq!(kind, "Release");
     // A colcon that does not know cmake is given no cmake arguments.
     let bare = TestBuild::with_colcon("echo \"asked: $*\"; mkdir -p install/talker");
@@ -269,11 +280,11 @@ async fn a_build_is_nice_and_limited() {
     let mut build = TestBuild::with_colcon(
         "echo nice $(nice), memory $(ulimit -d); mkdir -p install/talker; exit 0",
     );
-    build.order.limits.memory_bytes = Some(1 << 30);
+    build.spec.limits.memory_bytes = Some(1 << 30);
     build.run().await.expect("built");
     assert!(build.log().contains("nice 10, memory 1048576"), "{}", build.log());
     let big = TestBuild::with_colcon("tail /dev/zero");
-    let mut limited = big.order.clone();
+    let mut limited = big.spec.clone();
     limited.limits.memory_bytes = Some(100 << 20);
     let error = within("the build", builder::build(&limited, &CancellationToken::new()))
         .await
@@ -285,71 +296,74 @@ const ENDLESS: &str =
     "trap '' INT TERM; (setsid sleep 1000 &); echo compiling; sleep 1000; sleep 1000";
 
 #[tokio::test]
-async fn a_cancelled_build_ends_with_everything_it_started() {
+async fn cancelled_build_ends_all_its_processes() {
     let build = TestBuild::with_colcon(ENDLESS);
     let cancel = CancellationToken::new();
     let cancelling = async {
         eventually("the build's start", || build.log().contains("compiling").then_some(())).await;
         cancel.cancel();
     };
-    let building = futures_util::future::join(builder::build(&build.order, &cancel), cancelling);
+    let building = futures_util::future::join(builder::build(&build.spec, &cancel), cancelling);
     let (built, ()) = within("the cancelled build", building).await;
     assert!(matches!(built, Err(BuildError::Cancelled)), "{built:?}");
     assert_eq!(build.processes(), 0);
 }
 
 #[tokio::test]
-async fn a_build_that_is_dropped_or_takes_too_long_leaves_nothing() {
+async fn dropped_or_timed_out_build_leaves_no_processes() {
     let mut build = TestBuild::with_colcon(ENDLESS);
     {
         let cancel = CancellationToken::new();
-        let mut building = std::pin::pin!(builder::build(&build.order, &cancel));
+        let mut building = std::pin::pin!(builder::build(&build.spec, &cancel));
+        let compiles = || build.log().contains("compiling").then_some(());
         tokio::select! {
             built = &mut building => panic!("{built:?}"),
-            () = eventually("the build's start", || build.log().contains("compiling").then_some(())) => {}
+            () = eventually("the build's start", compiles) => {}
         }
     }
     eventually("the end of the dropped build", || (build.processes() == 0).then_some(())).await;
-    build.order.limits.timeout = Duration::from_millis(200);
+    build.spec.limits.timeout = Duration::from_millis(200);
     let error = build.run().await.expect_err("failed");
     assert_eq!(error.code(), Some(FailureCode::DEADLINE_EXCEEDED));
     assert_eq!(build.processes(), 0);
 }
 
 /// Starts a process that leaves the build's session and environment.
-const ESCAPE: &str = "env -i setsid bash -c 'echo $$ > escaped.tmp; mv escaped.tmp escaped; exec sleep 1000' & \
+const ESCAPE: &str = "env -i setsid bash -c \
+                      'echo $$ > escaped.tmp; mv escaped.tmp escaped; exec sleep 1000' & \
                       until [ -e escaped ]; do :; done; exit 3";
 
 #[tokio::test]
-async fn nothing_gets_away_from_a_build_in_a_control_group() {
+async fn build_in_a_cgroup_leaves_no_processes() {
     let mut build = TestBuild::with_colcon(ESCAPE);
-    build.order.cgroups = Cgroups::find();
-    let Some(cgroups) = &build.order.cgroups else {
+    build.spec.cgroups = Cgroups::find();
+    let Some(cgroups) = &build.spec.cgroups else {
         eprintln!("unavailable: this machine has no control groups that may be written to");
         return;
     };
     let error = build.run().await.expect_err("colcon failed");
     assert!(matches!(error, BuildError::Failed { status: ExitStatus::Code(3), .. }), "{error:?}");
-    let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
+    let pid = std::fs::read_to_string(build.spec.version.root().join("escaped")).expect("its pid");
     assert!(!lives(pid.trim().parse().expect("a pid")));
-    assert!(!cgroups.group(build.order.version.root()).path().exists());
+    assert!(!cgroups.group(build.spec.version.root()).path().exists());
 }
 
 #[tokio::test]
-async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
+async fn build_writes_only_its_tree_and_has_no_privileges() {
     let Some(user) = other_user() else { return };
     let mut build = TestBuild::with_colcon(
-        "mkdir -m 700 install/talker; touch install/talker/mine build/mine log/mine; chmod 4755 install/talker/mine
+        "mkdir -m 700 install/talker; touch install/talker/mine build/mine log/mine
+         chmod 4755 install/talker/mine
          id -u; grep -E 'NoNewPrivs|CapBnd' /proc/self/status
          for place in src/new new build.sh; do if touch $place; then echo GOT $place; fi; done",
     );
-    user.let_through(&[
+    user.allow_traversal(&[
         build.dir.path().to_owned(),
         build.dir.path().join("tasks"),
         build.dir.path().join("tasks/talker"),
     ])
     .expect("let through");
-    build.order.user = Some(user.clone());
+    build.spec.user = Some(user.clone());
     build.run().await.unwrap_or_else(|error| panic!("{error}: {}", build.log()));
     let log = build.log().replace('\t', "");
     assert!(
@@ -359,7 +373,7 @@ async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
     assert!(!log.contains("GOT"), "{log}");
     // All of it is root's now: readable by every user who reaches it, and writable by none.
     let about = |name: &str| {
-        let about = std::fs::metadata(build.order.version.root().join(name)).expect("there");
+        let about = std::fs::metadata(build.spec.version.root().join(name)).expect("there");
         (about.uid(), about.mode() & 0o7777)
     };
     assert_eq!((about("install/talker"), about("install/talker/mine")), ((0, 0o755), (0, 0o755)));
@@ -367,10 +381,10 @@ async fn a_build_changes_nothing_but_what_it_builds_and_has_no_powers() {
 }
 
 #[tokio::test]
-async fn a_process_that_got_away_from_a_build_holds_nobody_up() {
+async fn escaped_build_process_does_not_block() {
     let build = TestBuild::with_colcon(ESCAPE);
     let error = build.run().await.expect_err("colcon failed");
-    let pid = std::fs::read_to_string(build.order.version.root().join("escaped")).expect("its pid");
+    let pid = std::fs::read_to_string(build.spec.version.root().join("escaped")).expect("its pid");
     let escaped =
         program::ProcessIdentity::of(pid.trim().parse().expect("a pid")).expect("process table");
     escaped.expect("it still lives").signal(nix::sys::signal::Signal::SIGKILL).expect("killed");

@@ -10,8 +10,8 @@ use task_agent::process::cgroup::{Cgroups, RunLimits};
 use task_agent::process::containment::RUN_DIR_VARIABLE;
 use task_agent::process::program::{ExitStatus, ProcessEntry};
 use task_agent::process::run_dir::RunDir;
-use task_agent::process::supervisor::Observed;
-use task_agent::system::task_user::{TaskUser, take_back};
+use task_agent::process::supervisor::RunState;
+use task_agent::system::task_user::{TaskUser, return_to_root};
 
 use crate::harness::{TestRun, eventually, lives, other_user, supervisor, within};
 
@@ -33,11 +33,11 @@ async fn start(run: &TestRun) -> u32 {
         .pid
 }
 
-async fn stop(run: &TestRun) -> Observed {
+async fn stop(run: &TestRun) -> RunState {
     within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE)).await.expect("stopped")
 }
 
-async fn run_to_end(run: &TestRun) -> Observed {
+async fn run_to_end(run: &TestRun) -> RunState {
     start(run).await;
     within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed")
 }
@@ -111,18 +111,19 @@ async fn a_start_that_hangs_is_ended_with_its_control_group() {
     // system that does not answer.
     let group = cgroups.create(dir.path(), &RunLimits::default()).expect("made");
     std::fs::write(group.path().join("cgroup.freeze"), "1").expect("frozen");
+    let hangs = || group.pids().is_ok_and(|pids| !pids.is_empty()).then_some(());
     tokio::select! {
         started = run.supervisor.start(dir.path(), &run.spec) => panic!("{started:?}"),
-        () = eventually("it hangs", || group.pids().is_ok_and(|pids| !pids.is_empty()).then_some(())) => {}
+        () = eventually("it hangs", hangs) => {}
     }
     let observed =
         within("the stop", run.supervisor.stop(dir.path(), Duration::ZERO)).await.expect("stopped");
     assert!(
-        matches!(observed, Observed::Running { .. } | Observed::Exited(ExitStatus::Signal(9))),
+        matches!(observed, RunState::Running { .. } | RunState::Exited(ExitStatus::Signal(9))),
         "{observed:?}"
     );
     let ended = within("its end", run.supervisor.wait(dir.path())).await.expect("observed");
-    assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
+    assert_eq!(ended, RunState::Exited(ExitStatus::Signal(9)));
     assert!(!run.log().contains("up") && !group.path().exists());
 }
 
@@ -137,7 +138,7 @@ async fn nothing_outlives_a_task_that_ends_by_itself() {
             task_agent::process::program::ProcessIdentity::of(task).expect("stat").expect("alive");
         task.signal(Signal::SIGKILL).expect("killed");
         let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
-        assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
+        assert_eq!(ended, RunState::Exited(ExitStatus::Signal(9)));
         assert_eq!(living(&pids), Vec::<u32>::new());
         eventually("the control group's end", || {
             run.cgroup().is_none_or(|cgroup| !cgroup.exists()).then_some(())
@@ -164,7 +165,7 @@ async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environm
     // Another supervisor, as after a restart of the agent; it learns of the group only from the run
     // directory.
     let observed = within("the notice", supervisor().wait(&run.run_dir())).await.expect("observed");
-    assert_eq!(observed, Observed::Gone);
+    assert_eq!(observed, RunState::Gone);
     assert_eq!(living(&pids), Vec::<u32>::new());
     assert!(!cgroup.exists());
 }
@@ -184,7 +185,7 @@ async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
     assert!((10..=72).contains(&most), "{most}");
     goes_on(&neighbour).await;
     let stopped = stop(&bomb).await;
-    assert!(matches!(stopped, Observed::Exited(_)), "{stopped:?}");
+    assert!(matches!(stopped, RunState::Exited(_)), "{stopped:?}");
     assert!(bomb.cgroup().is_none_or(|cgroup| !cgroup.exists()));
     goes_on(&neighbour).await;
     stop(&neighbour).await;
@@ -192,7 +193,7 @@ async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
 }
 
 #[tokio::test]
-async fn a_task_that_wants_eight_gigabytes_gets_its_limit_and_says_so() {
+async fn task_over_its_memory_limit_is_reported_out_of_memory() {
     let Some(user) = other_user() else { return };
     let neighbour = neighbour(&user).await;
     let mut greedy =
@@ -201,10 +202,10 @@ async fn a_task_that_wants_eight_gigabytes_gets_its_limit_and_says_so() {
     greedy.spec.limits.memory_bytes = Some(256 << 20);
     let ended = run_to_end(&greedy).await;
     if Cgroups::find().is_some_and(|cgroups| cgroups.isolates()) {
-        assert_eq!(ended, Observed::OutOfMemory { limit_bytes: 256 << 20 });
+        assert_eq!(ended, RunState::OutOfMemory { limit_bytes: 256 << 20 });
     } else {
         // Each process by itself: one that asks for too much is refused, and can report that.
-        assert_eq!(ended, Observed::Exited(ExitStatus::Code(1)));
+        assert_eq!(ended, RunState::Exited(ExitStatus::Code(1)));
         assert!(greedy.log().contains("memory exhausted"), "{}", greedy.log());
     }
     goes_on(&neighbour).await;
@@ -273,7 +274,7 @@ env | cut -d= -f1 | sort | tr '\n' ' '
 "#;
 
 #[tokio::test]
-async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
+async fn task_user_cannot_reach_agent_files_and_processes() {
     let Some(user) = other_user() else { return };
     let mut run = TestRun::grouped(BURGLAR);
     run.run_as(&user);
@@ -285,7 +286,7 @@ async fn a_task_of_the_task_user_can_reach_nothing_of_the_agents() {
         .expect("set-id");
     run.spec.environment.insert("DATA".to_owned(), run.path("").display().to_string());
     run.spec.environment.insert("AGENT".to_owned(), std::process::id().to_string());
-    assert_eq!(run_to_end(&run).await, Observed::Exited(ExitStatus::Code(0)), "{}", run.log());
+    assert_eq!(run_to_end(&run).await, RunState::Exited(ExitStatus::Code(0)), "{}", run.log());
     let log = run.log();
     assert!(!log.contains("GOT"), "{log}");
     assert!(log.contains(&format!("root again: {}\n", user.uid)), "{log}");
@@ -327,7 +328,7 @@ const EXCHANGES: [&str; 4] = [
 ];
 
 #[tokio::test]
-async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
+async fn shim_opens_nothing_in_an_exchanged_directory() {
     let Some(user) = other_user() else { return };
     for exchange in EXCHANGES {
         let mut run = TestRun::grouped(&format!(
@@ -350,7 +351,7 @@ async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
         eventually("the exchange", exchanged).await;
         assert_eq!(
             stop(&run).await,
-            Observed::Exited(ExitStatus::Code(0)),
+            RunState::Exited(ExitStatus::Code(0)),
             "{exchange}: {}",
             run.log()
         );
@@ -359,7 +360,7 @@ async fn shim_of_a_task_that_exchanged_its_directory_opens_nothing_and_ends() {
 }
 
 #[tokio::test]
-async fn a_start_in_a_place_the_task_user_cannot_reach_says_so() {
+async fn start_in_an_unreachable_directory_is_reported() {
     let Some(user) = other_user() else { return };
     let mut run = TestRun::grouped("true");
     run.run_as(&user);
@@ -371,7 +372,7 @@ async fn a_start_in_a_place_the_task_user_cannot_reach_says_so() {
 }
 
 #[test]
-fn handing_over_follows_no_link_and_leaves_what_was_handed_over_alone() {
+fn handing_over_skips_links_and_files_already_handed_over() {
     let Some(user) = other_user() else { return };
     let temp = tempfile::tempdir().expect("temp dir");
     let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
@@ -395,7 +396,7 @@ fn handing_over_follows_no_link_and_leaves_what_was_handed_over_alone() {
 }
 
 #[test]
-fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
+fn taking_back_skips_foreign_files_and_links() {
     let Some(user) = other_user() else { return };
     let temp = tempfile::tempdir().expect("temp dir");
     let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
@@ -408,14 +409,14 @@ fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
     std::fs::set_permissions(&outside, std::fs::Permissions::from_mode(0o600)).expect("closed");
     std::os::unix::fs::symlink(&outside, tree.join("link")).expect("link");
     std::fs::hard_link(&outside, tree.join("second-name")).expect("hard link");
-    take_back(&tree, user.uid).expect("taken back");
+    return_to_root(&tree, user.uid).expect("taken back");
     let about = |path: &str| {
         let about = std::fs::symlink_metadata(tree.join(path)).expect("there");
         (about.uid(), about.mode() & 0o7777)
     };
     assert_eq!([about(""), about("deep"), about("deep/file")], [(0, 0o755); 3]);
     assert_eq!(std::fs::metadata(&outside).expect("there").mode() & 0o7777, 0o600);
-    take_back(&temp.path().join("nothing"), user.uid).expect("nothing to do");
+    return_to_root(&temp.path().join("nothing"), user.uid).expect("nothing to do");
 }
 
 #[test]
@@ -423,7 +424,7 @@ fn taking_back_leaves_to_others_what_is_theirs_and_follows_no_link() {
     clippy::disallowed_methods,
     reason = "starts the shim as the agent does, with less rights"
 )]
-fn how_a_task_ended_is_said_though_a_process_stays_that_may_not_be_signalled() {
+fn exit_status_is_reported_despite_an_unsignallable_process() {
     let Some(user) = other_user() else { return };
     // As by `sudo`: the process that the task starts there is root's, and no other user may signal
     // it.

@@ -7,7 +7,7 @@ use std::process::Stdio;
 use serde_json::{Value, json};
 use task_agent::task::ledger::{Accepted, Ledger};
 use task_proto::desired::DesiredState;
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{CaPin, Generation, RobotId};
 
 struct Ran {
@@ -63,7 +63,7 @@ fn write_identity_with(data: &Path, server: &str, more: Value) {
 }
 
 #[test]
-fn a_robot_that_is_not_set_up_is_told_what_is_missing() {
+fn doctor_names_what_an_unconfigured_robot_lacks() {
     let dir = tempfile::tempdir().unwrap();
     let nowhere = dir.path().join("nowhere");
     assert_found(&doctor(&nowhere, &[]), "data", "bad", "nowhere");
@@ -76,14 +76,14 @@ fn a_robot_that_is_not_set_up_is_told_what_is_missing() {
     );
     let ran = agent(&["doctor", "--data", dir.path().to_str().unwrap()], &[]);
     assert!(
-        ran.stdout.contains("✗ identity ") && ran.stdout.contains("→ enrol: task-agent enroll"),
+        ran.stdout.contains("✗ identity ") && ran.stdout.contains("→ enroll: task-agent enroll"),
         "{}",
         ran.stdout
     );
 }
 
 #[test]
-fn data_that_the_tasks_account_can_not_get_to_is_named_with_the_directory_in_the_way() {
+fn doctor_names_the_directory_that_blocks_the_task_user() {
     if !nix::unistd::geteuid().is_root() {
         return eprintln!("unavailable: only root runs tasks under another account");
     }
@@ -107,13 +107,13 @@ fn data_that_the_tasks_account_can_not_get_to_is_named_with_the_directory_in_the
 }
 
 #[test]
-fn a_setting_that_is_wrong_is_named() {
+fn doctor_names_an_invalid_setting() {
     let dir = tempfile::tempdir().unwrap();
     std::fs::write(dir.path().join("agent.toml"), "poll_intervall_s = 3\n").unwrap();
     assert_found(&doctor(dir.path(), &[]), "settings", "bad", "poll_intervall_s");
     std::fs::remove_file(dir.path().join("agent.toml")).unwrap();
     let gone = [("TASK_AGENT_UNDERLAYS", "/nowhere/setup.bash")];
-    assert_found(&doctor(dir.path(), &gone), "ros", "bad", "/nowhere/setup.bash is not there");
+    assert_found(&doctor(dir.path(), &gone), "ros", "bad", "/nowhere/setup.bash does not exist");
     let nobody = [("TASK_AGENT_TASK_USER", "nobody-of-this-name")];
     assert_found(&doctor(dir.path(), &nobody), "task user", "bad", "nobody-of-this-name");
     let setup = dir.path().join("setup.bash");
@@ -127,7 +127,7 @@ fn a_setting_that_is_wrong_is_named() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_that_can_not_be_reached_is_told_apart_from_another_program() {
+async fn doctor_distinguishes_an_unreachable_server_from_another_program() {
     let dir = tempfile::tempdir().unwrap();
     // Bound and not listening: no other process gets the port either.
     let nobody = tokio::net::TcpSocket::new_v4().unwrap();
@@ -160,7 +160,7 @@ async fn a_server_that_can_not_be_reached_is_told_apart_from_another_program() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_for_a_server_that_encrypts_is_shown_to_no_other() {
+async fn pinned_token_is_never_sent_in_plain_text() {
     let dir = tempfile::tempdir().unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let pin = CaPin::of(b"an authority");
@@ -179,7 +179,7 @@ async fn a_token_for_a_server_that_encrypts_is_shown_to_no_other() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn mqtt_is_looked_for_where_the_server_says_and_by_the_ways_that_are_allowed() {
+async fn doctor_checks_the_mqtt_endpoint_over_allowed_routes() {
     let dir = tempfile::tempdir().unwrap();
     let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
@@ -197,10 +197,10 @@ async fn mqtt_is_looked_for_where_the_server_says_and_by_the_ways_that_are_allow
         let doctor = move || doctor(&data, &[("TASK_AGENT_MQTT_TRANSPORT", transport)]);
         tokio::task::spawn_blocking(doctor).await.unwrap()
     };
-    let silent = format!("{address} speaks no MQTT");
+    let silent = format!("{address} does not speak MQTT");
     let has = |checks: &[Value], check: &str| checks.iter().any(|found| found["check"] == check);
     let checks = with("auto").await;
-    assert_found(&checks, "token", "good", "accepts");
+    assert_found(&checks, "token", "good", "accepted");
     assert_found(&checks, "mqtt", "notice", &silent);
     assert_found(&checks, "websocket", "bad", "404");
     let checks = with("tcp").await;
@@ -212,7 +212,7 @@ async fn mqtt_is_looked_for_where_the_server_says_and_by_the_ways_that_are_allow
 }
 
 #[test]
-fn what_the_server_has_set_is_looked_at_too() {
+fn doctor_checks_settings_from_the_server() {
     let dir = tempfile::tempdir().unwrap();
     let (robot_id, key) = (RobotId::random(), SigningKey::random());
     let identity = json!({ "robot_id": robot_id, "server_key": key.public_key() });
@@ -234,14 +234,14 @@ fn what_the_server_has_set_is_looked_at_too() {
         &doctor(dir.path(), &[]),
         "ros",
         "bad",
-        "/nowhere/ws/install/setup.bash is not there",
+        "/nowhere/ws/install/setup.bash does not exist",
     );
     let own = [("TASK_AGENT_WORKSPACE", "/elsewhere/ws")];
     assert_found(
         &doctor(dir.path(), &own),
         "ros",
         "bad",
-        "/elsewhere/ws/install/setup.bash is not there",
+        "/elsewhere/ws/install/setup.bash does not exist",
     );
 }
 

@@ -8,8 +8,8 @@ use axum::body::Bytes;
 use task_agent::install::fetch::{FetchError, FetchSettings, Fetcher};
 use task_agent::transfer::link_meter::LinkMeter;
 use task_proto::Digest;
-use task_proto::manifest::ContentFacts;
-use task_proto::report::{FailureCode, Progress};
+use task_proto::messages::report::{FailureCode, Progress};
+use task_proto::packages::manifest::ContentFacts;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
@@ -78,7 +78,7 @@ async fn a_cut_is_continued_within_the_pull() {
 }
 
 #[tokio::test]
-async fn cuts_end_no_pull_that_gets_on() {
+async fn repeated_cuts_do_not_end_a_progressing_pull() {
     let often = 2 * 5;
     // The same over and over would compress to nothing.
     let noise = noise();
@@ -91,14 +91,15 @@ async fn cuts_end_no_pull_that_gets_on() {
 }
 
 #[tokio::test]
-async fn a_pull_that_was_dropped_goes_on_where_it_was() {
+async fn dropped_pull_resumes_at_its_offset() {
     let site = Site::new(&tar()).await;
     site.answers([Answer::Stall(2 << 20)]);
     let progress = watch::Sender::new(Progress { done: 0, total: 0 });
     let cancel = CancellationToken::new();
     let mut arrived = progress.subscribe();
+    let content = site.fetcher.content(&site.package, &site.manifest, &progress, &cancel);
     tokio::select! {
-        result = site.fetcher.content(&site.package, &site.manifest, &progress, &cancel) => panic!("{result:?}"),
+        result = content => panic!("{result:?}"),
         _ = arrived.wait_for(|progress| progress.done == 2 << 20) => {}
     }
     site.pull().await.unwrap();
@@ -127,7 +128,7 @@ async fn a_cancelled_pull_leaves_only_the_part() {
 }
 
 #[tokio::test]
-async fn a_part_is_replayed_whatever_the_server_makes_of_ranges() {
+async fn partial_file_is_replayed_with_any_range_support() {
     for (answers, asked) in [
         (vec![], vec![1 << 20]),
         (vec![Answer::IgnoreRange], vec![1 << 20]),
@@ -144,7 +145,7 @@ async fn a_part_is_replayed_whatever_the_server_makes_of_ranges() {
 }
 
 #[tokio::test]
-async fn a_whole_part_needs_no_server() {
+async fn complete_partial_file_needs_no_server() {
     let site = Site::new(&tar()).await;
     site.put_part(&site.content);
     site.pull().await.unwrap();
@@ -153,7 +154,7 @@ async fn a_whole_part_needs_no_server() {
 }
 
 #[tokio::test]
-async fn a_part_that_a_power_cut_spoiled_is_thrown_away() {
+async fn corrupt_partial_file_is_discarded() {
     let zeros = vec![0; 1 << 20];
     for spoiled in [zeros.clone(), [noise(), noise()].concat(), vec![0; tar().compressed().len()]] {
         let site = Site::new(&tar()).await;
@@ -165,7 +166,7 @@ async fn a_part_that_a_power_cut_spoiled_is_thrown_away() {
 }
 
 #[tokio::test]
-async fn wrong_bytes_are_never_used_nor_kept() {
+async fn wrong_bytes_are_discarded() {
     let size = tar().compressed().len() as u64;
     for answer in
         [Answer::OtherBytes, Answer::Endless, Answer::Length(size - 1), Answer::Length(size + 1)]
@@ -252,7 +253,7 @@ async fn manifest_heals_whose_first_transfers_have_a_flipped_byte() {
 }
 
 #[tokio::test]
-async fn blob_that_is_said_once_not_to_be_there_is_asked_for_again() {
+async fn blob_reported_missing_once_is_requested_again() {
     let site = Site::new(&tar()).await;
     site.answers([Answer::Refused(404)]);
     site.pull().await.unwrap();
@@ -260,7 +261,7 @@ async fn blob_that_is_said_once_not_to_be_there_is_asked_for_again() {
 }
 
 #[tokio::test]
-async fn what_is_not_the_server_counts_as_not_reached() {
+async fn answer_of_another_server_counts_as_unreachable() {
     let login = vec![("location", "/login")];
     let mut answers = vec![
         Answer::Html(200),
@@ -289,7 +290,7 @@ async fn what_is_not_the_server_counts_as_not_reached() {
 }
 
 #[tokio::test]
-async fn statuses_say_whether_to_come_back() {
+async fn http_status_decides_whether_to_retry() {
     let seconds = |seconds| Some(Duration::from_secs(seconds));
     for (status, retry_after, code, retryable, wait) in [
         (503, Some("7"), FailureCode::SERVER_UNREACHABLE, true, seconds(7)),
@@ -323,7 +324,7 @@ async fn statuses_say_whether_to_come_back() {
 }
 
 #[tokio::test]
-async fn a_server_without_room_is_obeyed_and_what_is_there_stays() {
+async fn busy_server_delays_the_pull_and_keeps_its_bytes() {
     for (answer, told) in [
         (Answer::Status(429, vec![("retry-after", "7")]), Some(7)),
         (Answer::Status(503, vec![("retry-after", "9")]), Some(9)),
@@ -336,7 +337,7 @@ async fn a_server_without_room_is_obeyed_and_what_is_there_stays() {
         let cancel = CancellationToken::new();
         let pull = site.fetcher.content(&site.package, &site.manifest, &progress, &cancel);
         let error = pull.await.unwrap_err();
-        assert_eq!(error.told_to_wait(), told.map(Duration::from_secs), "{answer:?}");
+        assert_eq!(error.retry_later(), told.map(Duration::from_secs), "{answer:?}");
         let there = fs::metadata(site.part()).unwrap().len();
         assert!(there > 0);
         assert_eq!(*progress.borrow(), Progress { done: there, total: site.content.len() as u64 });
@@ -346,7 +347,7 @@ async fn a_server_without_room_is_obeyed_and_what_is_there_stays() {
 }
 
 #[tokio::test]
-async fn what_came_with_the_order_is_not_pulled() {
+async fn inline_blob_is_not_pulled() {
     let site = Site::new(&tar()).await;
     let config = serde_json::to_vec(&site.manifest).unwrap();
     let (package, cancel) = (&site.package, CancellationToken::new());
@@ -357,11 +358,11 @@ async fn what_came_with_the_order_is_not_pulled() {
         ]
     };
     // Others than the state names are as good as none.
-    site.fetcher.offer(blobs(&config[1..], &site.content[1..]));
+    site.fetcher.add_inline_blobs(blobs(&config[1..], &site.content[1..]));
     site.answers([Answer::Status(404, vec![])]);
     assert!(site.fetcher.manifest(package, &cancel).await.is_err());
     assert_eq!(site.asked(), [0]);
-    site.fetcher.offer(blobs(&config, &site.content));
+    site.fetcher.add_inline_blobs(blobs(&config, &site.content));
     site.put_part(&site.content[..100]);
     assert_eq!(site.fetcher.manifest(package, &cancel).await.unwrap(), site.manifest);
     site.pull().await.unwrap();
@@ -370,7 +371,7 @@ async fn what_came_with_the_order_is_not_pulled() {
 }
 
 #[tokio::test]
-async fn transfers_teach_about_the_link() {
+async fn transfers_measure_the_link() {
     let mut site = Site::new(&tar()).await;
     let meter = LinkMeter::default();
     let fetcher = Fetcher::new(
@@ -380,7 +381,7 @@ async fn transfers_teach_about_the_link() {
         site.data.clone(),
         settings(),
     );
-    site.fetcher = fetcher.measured_by(meter.clone());
+    site.fetcher = fetcher.with_meter(meter.clone());
     site.answers([Answer::Cut(1 << 20)]);
     site.pull().await.unwrap();
     let facts = meter.facts(tokio::time::Instant::now()).unwrap();
@@ -401,7 +402,7 @@ async fn a_server_that_stalls_is_given_up() {
 }
 
 #[tokio::test]
-async fn slow_retrieval_is_cut_by_a_least_rate() {
+async fn transfer_below_the_minimum_rate_is_cut() {
     let site = Site::with(
         &tar(),
         FetchSettings { stall_timeout: Duration::from_millis(300), ..settings() },
@@ -425,7 +426,7 @@ async fn a_refused_archive_is_blamed_only_when_its_bytes_are_the_ordered_ones() 
 }
 
 #[tokio::test]
-async fn too_little_room_is_said_before_anything_travels() {
+async fn insufficient_disk_space_is_reported_before_the_transfer() {
     let site = Site::with(&tar(), FetchSettings { reserve_bytes: u64::MAX, ..settings() }).await;
     let error = site.pull().await.unwrap_err();
     assert_eq!((error.code(), error.is_retryable()), (Some(FailureCode::DISK_FULL), true));
@@ -449,7 +450,7 @@ async fn two_pulls_of_one_content_take_turns() {
 }
 
 #[tokio::test]
-async fn a_manifest_for_something_else_is_refused() {
+async fn manifest_of_another_package_is_refused() {
     let mut site = Site::new(&tar()).await;
     let cancel = CancellationToken::new();
     site.package.version = "2.0.0".parse().unwrap();

@@ -10,7 +10,7 @@ use task_agent::config::{GateConfig, GateDefault};
 use task_agent::process::containment::Containment;
 use task_agent::reconcile::gate::Gate;
 use task_agent::task::ledger::{GateQuestion, GateStep};
-use task_proto::report::Failure;
+use task_proto::messages::report::Failure;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
 use crate::harness::eventually;
@@ -44,7 +44,7 @@ async fn ask_program(
         run: 3,
         version: "1.1".parse().expect("valid"),
     };
-    gate.ask(&task(), &question, &environment).await
+    gate.query(&task(), &question, &environment).await
 }
 
 fn task() -> TaskName {
@@ -55,9 +55,10 @@ fn task() -> TaskName {
 const LONG: Duration = Duration::from_secs(60);
 
 #[tokio::test]
-async fn it_is_told_what_is_about_to_happen_and_says_why_not() {
+async fn gate_receives_the_question_and_its_reason_is_kept() {
     let dir = tempfile::tempdir().expect("a directory");
-    let asked = "[ \"$TASKD_GATE_STEP $TASKD_TASK $TASKD_VERSION $TASKD_RUN $1\" = 'switch talker 1.1 3 an argument' ] \
+    let asked = "[ \"$TASKD_GATE_STEP $TASKD_TASK $TASKD_VERSION $TASKD_RUN $1\" \
+                 = 'switch talker 1.1 3 an argument' ] \
                  && [ -n \"$TASKD_DEPLOYMENT\" ] && [ $TASKD_ROBOT = r0123456789abcdef ]";
     assert_eq!(ask(dir.path(), asked, LONG, GateDefault::Deny).await, Ok(()));
     let refusal = ask(
@@ -71,10 +72,7 @@ async fn it_is_told_what_is_about_to_happen_and_says_why_not() {
         "gate_refused: carries a load\nat dock 3"
     );
     let silent = ask(dir.path(), "exit 7", LONG, GateDefault::Allow).await.expect_err("no");
-    assert_eq!(
-        silent.to_string(),
-        "gate_refused: the gate said no and gave no reason (exit code 7)"
-    );
+    assert_eq!(silent.to_string(), "gate_refused: the gate refused without a reason (exit code 7)");
     let flood = ask(
         dir.path(),
         "head -c 10000000 /dev/zero | tr '\\0' x; exit 1",
@@ -85,7 +83,7 @@ async fn it_is_told_what_is_about_to_happen_and_says_why_not() {
 }
 
 #[tokio::test]
-async fn without_an_answer_the_setting_decides_and_nothing_is_left_of_it() {
+async fn gate_without_an_answer_uses_the_default_and_leaves_no_process() {
     let dir = tempfile::tempdir().expect("a directory");
     let hang = "setsid sleep 1000 & trap '' INT TERM; sleep 1000";
     let short = Duration::from_millis(300);
@@ -106,12 +104,13 @@ async fn without_an_answer_the_setting_decides_and_nothing_is_left_of_it() {
 }
 
 #[tokio::test]
-async fn one_that_is_no_longer_waited_for_is_ended() {
+async fn dropped_gate_query_ends_the_gate() {
     let dir = tempfile::tempdir().expect("a directory");
     let started = dir.path().join("started");
     let script = format!("touch {}; sleep 1000", started.display());
+    let gate = ask(dir.path(), &script, LONG, GateDefault::Deny);
     tokio::select! {
-        answer = ask(dir.path(), &script, LONG, GateDefault::Deny) => panic!("it answered: {answer:?}"),
+        answer = gate => panic!("it answered: {answer:?}"),
         () = eventually("it runs", || started.exists().then_some(())) => {}
     }
     let marked = Containment::new(&dir.path().join("gate/talker"), None, None);

@@ -4,8 +4,8 @@
 use task_agent::ros::graph::{
     DiagnosticLevel, Graph, GraphError, GraphSettings, Node, ParameterValue, Snapshot,
 };
-use task_proto::log::LogLevel;
-use task_proto::ros::{Endpoint, LifecycleState, Transition};
+use task_proto::telemetry::log::LogLevel;
+use task_proto::telemetry::ros::{Endpoint, LifecycleState, Transition};
 
 use crate::harness::{eventually, within};
 use crate::ros::{CALL, RosNode, name, open, open_as, program};
@@ -201,7 +201,7 @@ async fn rates_are_counted_of_reliable_and_of_best_effort_publishers() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn log_lines_are_heard_also_by_a_late_joiner() {
+async fn late_joiner_receives_log_lines() {
     let mut node = RosNode::start("talker.py", 88, &["--ros-args", "-r", "__ns:=/robot"]).await;
     node.order("log said before the agent came").await;
     let graph = open(88).await;
@@ -225,7 +225,7 @@ async fn log_lines_are_heard_also_by_a_late_joiner() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn diagnostics_are_heard() {
+async fn diagnostics_are_received() {
     let graph = open(89).await;
     let mut statuses = graph.diagnostics().unwrap();
     let mut node = RosNode::start("talker.py", 89, &[]).await;
@@ -281,7 +281,7 @@ async fn domains_do_not_mix_and_two_agents_on_one_host_do_not_confuse_each_other
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_domain_that_does_not_exist_is_refused_by_its_key() {
+async fn invalid_domain_id_is_refused_by_its_key() {
     let settings = GraphSettings {
         domain_id: 233,
         localhost_only: true,

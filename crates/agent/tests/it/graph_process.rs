@@ -7,11 +7,11 @@ use std::time::{Duration, Instant};
 use nix::fcntl::{FcntlArg, FdFlag, fcntl};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use task_agent::ros::graph::program::MEMORY_BYTES;
+use task_agent::ros::graph::process::program::MEMORY_BYTES;
 use task_agent::ros::graph::{Graph, GraphError, ParameterValue};
 use task_agent::ros::graph_access::GraphAccess;
 use task_agent::system::layout::DataDir;
-use task_proto::report::{FailureCode, RosFacts};
+use task_proto::messages::report::{FailureCode, RosFacts};
 
 use crate::harness::{eventually, lives, within};
 use crate::ros::{CALL, RosNode, name, open, program};
@@ -50,7 +50,7 @@ fn signal(pid: u32, signal: Signal) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_graph_has_a_process_without_rights_and_with_little_memory() {
+async fn graph_process_has_no_privileges_and_little_memory() {
     // A file that a library opens need not be closed by itself when a process is started.
     let kept = std::fs::File::open("/proc/self/status").unwrap();
     fcntl(&kept, FcntlArg::F_SETFD(FdFlag::empty())).unwrap();
@@ -155,7 +155,7 @@ fn is_matched(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn packets_about_all_numbers_there_are_take_neither_time_nor_memory() {
+async fn packets_with_full_sequence_ranges_cost_no_time_or_memory() {
     const DOMAIN: u16 = 100;
     let graph = open(DOMAIN).await;
     let node = RosNode::start("talker.py", DOMAIN, &[]).await;
@@ -199,7 +199,7 @@ async fn packets_about_all_numbers_there_are_take_neither_time_nor_memory() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
+async fn localhost_only_graph_binds_to_loopback() {
     const DOMAIN: u16 = 101;
     let graph = open(DOMAIN).await;
     let sockets = std::fs::read_to_string("/proc/net/udp").unwrap();
@@ -220,7 +220,7 @@ async fn the_graph_on_this_host_alone_is_bound_where_nobody_else_can_send_to() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
+async fn killed_graph_process_is_restarted_with_its_subscriptions() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
     let access =
@@ -233,6 +233,7 @@ async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
     signal(first.pid(), Signal::SIGKILL);
     let closed = async { while changes.changed().await.is_ok() {} };
     within("the loss to be noticed", closed).await;
+    assert!(first.is_closed(), "the changes ended before the graph was closed");
     assert!(matches!(
         first.parameter(&name("/talker"), "rate", CALL).await,
         Err(GraphError::Closed)
@@ -249,7 +250,7 @@ async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
             }
         }
     };
-    within("what nodes say to be kept again", kept).await;
+    within("messages of nodes to be recorded again", kept).await;
     let second = access.open(Some(&facts)).await.unwrap();
     assert_ne!(second.pid(), first.pid());
     answers(&second).await;
@@ -259,7 +260,7 @@ async fn a_killed_process_is_started_again_and_all_is_heard_as_before() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_process_that_hangs_is_ended() {
+async fn hanging_graph_process_is_ended() {
     let graph = open(103).await;
     let (pid, mut changes) = (graph.pid(), graph.changes());
     signal(pid, Signal::SIGSTOP);
@@ -270,7 +271,7 @@ async fn a_process_that_hangs_is_ended() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_domain_that_was_left_is_left_by_whoever_keeps_what_nodes_say() {
+async fn node_log_reader_leaves_a_closed_domain() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
     let access = GraphAccess::of_robot("02:00:00:00:00:01".parse().unwrap(), data, program());

@@ -61,7 +61,7 @@ impl TestRun {
             assignment: task_proto::DeploymentId::random(),
             script: path,
             directory: dir.path().to_owned(),
-            environment: environment::of_this_robot(&BTreeMap::new()),
+            environment: environment::robot_environment(&BTreeMap::new()),
             interrupt: Interrupt::Group,
             log: LogSpec::at(dir.path().join("task.log")),
             limits: RunLimits::default(),
@@ -86,7 +86,7 @@ impl TestRun {
         user.make_home(&self.spec.directory).expect("handed over");
         std::fs::set_permissions(self.path("."), std::fs::Permissions::from_mode(0o700))
             .expect("closed");
-        user.let_through(&[self.path(".")]).expect("let through");
+        user.allow_traversal(&[self.path(".")]).expect("let through");
         self.spec.user = Some(user.clone());
     }
 

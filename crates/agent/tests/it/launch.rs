@@ -7,12 +7,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use task_agent::process::program::ExitStatus;
-use task_agent::process::supervisor::Observed;
+use task_agent::process::supervisor::RunState;
 use task_agent::setup::launch;
 use task_agent::setup::script;
 use task_agent::system::layout::{DataDir, VersionDir};
 use task_proto::Digest;
-use task_proto::manifest::TaskManifest;
+use task_proto::packages::manifest::TaskManifest;
 
 use crate::harness::{TestRun, eventually, within, write};
 
@@ -63,7 +63,7 @@ impl Launched {
             .expect("started");
     }
 
-    async fn stop(&self) -> Observed {
+    async fn stop(&self) -> RunState {
         within("the stop", self.run.supervisor.stop(&self.run.run_dir(), LONG_GRACE))
             .await
             .expect("stopped")
@@ -87,14 +87,15 @@ async fn launch_arguments_reach_ros2_as_they_are() {
         ("f_assignment", "x:=y"),
         ("g_option", "--ros-args"),
     ];
-    let record = "#!/bin/bash\nprintf '%s\\0' \"$@\" > argv\nenv -0 > environment\ngrep SigIgn /proc/self/status\npwd -P\n";
+    let record = "#!/bin/bash\nprintf '%s\\0' \"$@\" > argv\nenv -0 > environment\n\
+                  grep SigIgn /proc/self/status\npwd -P\n";
     let launched = Launched::by(record, &arguments);
     launched.start().await;
     let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir()))
         .await
         .expect("observed");
     let log = launched.run.log();
-    assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)), "{log}");
+    assert_eq!(ended, RunState::Exited(ExitStatus::Code(0)), "{log}");
 
     let root = launched.version.work();
     let mut expected =
@@ -150,7 +151,8 @@ print("up", flush=True)
 sys.stdin.read()
 print("the node was interrupted", count, flush=True)
 '''
-node = subprocess.Popen([sys.executable, "-c", NODE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+pipe = subprocess.PIPE
+node = subprocess.Popen([sys.executable, "-c", NODE], stdin=pipe, stdout=pipe, text=True)
 assert node.stdout.readline() == "up\n"
 def interrupted(*_):
     node.send_signal(signal.SIGINT)
@@ -162,13 +164,13 @@ sys.exit(7)
 "#;
 
 #[tokio::test]
-async fn a_stop_asks_the_launcher_alone_which_asks_its_nodes() {
+async fn stop_signals_only_the_launcher() {
     let launched = Launched::by(LAUNCHER, &[]);
     launched.start().await;
     launched.run.wrote("launched").await;
     let stopped = launched.stop().await;
     let log = launched.run.log();
-    assert_eq!(stopped, Observed::Exited(ExitStatus::Code(7)), "{log}");
+    assert_eq!(stopped, RunState::Exited(ExitStatus::Code(7)), "{log}");
     assert!(log.contains("the node was interrupted 1\n"), "{log}");
     assert_eq!(launched.run.survivors(), Vec::<u32>::new());
 }
@@ -187,7 +189,7 @@ async fn a_launcher_that_dies_leaves_no_node() {
     let ended = within("the end", launched.run.supervisor.wait(&launched.run.run_dir()))
         .await
         .expect("observed");
-    assert_eq!(ended, Observed::Exited(ExitStatus::Signal(9)));
+    assert_eq!(ended, RunState::Exited(ExitStatus::Signal(9)));
     assert_eq!(launched.run.survivors(), Vec::<u32>::new());
 }
 
@@ -200,5 +202,5 @@ async fn a_stop_is_noticed_while_an_underlay_is_sourced() {
         launched.run.log().contains("sourcing").then_some(())
     })
     .await;
-    assert_eq!(launched.stop().await, Observed::Exited(ExitStatus::Code(130)));
+    assert_eq!(launched.stop().await, RunState::Exited(ExitStatus::Code(130)));
 }

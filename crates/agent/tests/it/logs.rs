@@ -1,12 +1,12 @@
 //! Real nodes' messages on ROS topics are kept with the task of the publishing process.
 
 use task_agent::logs::Logs;
-use task_agent::logs::archive::Wanted;
+use task_agent::logs::archive::LogQuery;
 use task_agent::ros::graph_access::GraphAccess;
 use task_agent::ros::node_logs;
 use task_agent::system::layout::DataDir;
-use task_proto::log::{LogLevel, LogLine, LogSource};
-use task_proto::report::RosFacts;
+use task_proto::messages::report::RosFacts;
+use task_proto::telemetry::log::{LogLevel, LogLine, LogSource};
 
 use crate::harness::within;
 use crate::ros::{RosNode, open, program};
@@ -15,14 +15,14 @@ use crate::ros::{RosNode, open, program};
 const PAUSE: std::time::Duration = std::time::Duration::from_millis(200);
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_nodes_say_is_kept_with_their_task() {
+async fn node_messages_are_kept_with_their_task() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
     let task = data.task(&"talker".parse().unwrap());
     std::fs::create_dir_all(task.logs()).unwrap();
     let run_dir = task.run().join("1");
     let graph = open(118).await;
-    let keeping = tokio::spawn(node_logs::keep(graph.clone(), data.clone(), None));
+    let keeping = tokio::spawn(node_logs::record_messages(graph.clone(), data.clone(), None));
     let in_namespace = |namespace| ["--ros-args", "-r", namespace];
     let environment = [("TASKD_RUN_DIR", run_dir.as_path())];
     let mut ours =
@@ -31,7 +31,7 @@ async fn what_nodes_say_is_kept_with_their_task() {
     let logs = Logs::new(data);
     let kept = async |task: Option<&str>| -> Vec<LogLine> {
         let task = task.map(|task| task.parse().unwrap());
-        logs.kept(Wanted { task, level: LogLevel::Warn, since_ms: None, max_lines: 1000 })
+        logs.query(LogQuery { task, level: LogLevel::Warn, since_ms: None, max_lines: 1000 })
             .await
             .unwrap()
     };
@@ -67,7 +67,7 @@ async fn what_nodes_say_is_kept_with_their_task() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_nodes_say_is_kept_in_files_of_the_size_that_is_set_when_the_graph_is_opened() {
+async fn node_message_files_keep_the_size_limit_set_when_the_graph_opens() {
     let temp = tempfile::tempdir().unwrap();
     let data = DataDir::new(temp.path()).unwrap();
     let access =

@@ -22,7 +22,7 @@ mod parts;
 mod peer;
 mod ros;
 mod rtps;
+mod signatures;
 mod site;
 mod supervise;
 mod unpack;
-mod vouching;

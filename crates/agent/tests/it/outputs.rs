@@ -10,9 +10,9 @@ use axum::body::{Body, to_bytes};
 use axum::extract::Request;
 use axum::response::Response;
 use http::Method;
-use task_agent::telemetry::outputs::{OutputError, OutputOrder, Registry, bring_back};
+use task_agent::telemetry::outputs::{OutputError, OutputSpec, Registry, upload};
 use task_proto::Digest;
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
 use tempfile::TempDir;
 use tokio::net::TcpListener;
 use tokio::sync::watch;
@@ -21,13 +21,13 @@ use tokio_util::sync::CancellationToken;
 /// A run that has left `map.pgm`.
 struct Left {
     dir: TempDir,
-    order: OutputOrder,
+    spec: OutputSpec,
 }
 
 impl Left {
     fn new() -> Self {
         let dir = tempfile::tempdir().unwrap();
-        let order = OutputOrder {
+        let spec = OutputSpec {
             robot_id: "r0123456789abcdef".parse().unwrap(),
             task: "mapper".parse().unwrap(),
             version: "1.0.0".parse().unwrap(),
@@ -39,8 +39,8 @@ impl Left {
             notes: dir.path().join("uploads.json"),
             max_bytes: 1 << 20,
         };
-        std::fs::create_dir(&order.directory).unwrap();
-        let left = Self { dir, order };
+        std::fs::create_dir(&spec.directory).unwrap();
+        let left = Self { dir, spec };
         std::fs::write(left.map(), "the whole map").unwrap();
         left
     }
@@ -58,7 +58,7 @@ impl Left {
             reqwest::Client::builder().no_proxy().redirect(reqwest::redirect::Policy::none());
         let registry = Registry::new(client.build().unwrap(), base, "token".to_owned());
         let progress = watch::Sender::new(Progress { done: 0, total: 0 });
-        bring_back(&registry, &self.order, &progress, &CancellationToken::new()).await
+        upload(&registry, &self.spec, &progress, &CancellationToken::new()).await
     }
 }
 
@@ -79,7 +79,7 @@ fn refusal(status: u16, code: &str) -> Response {
 }
 
 #[tokio::test]
-async fn what_is_not_the_server_takes_no_files_and_loses_none() {
+async fn answer_of_another_server_keeps_outputs_for_later() {
     let left = Left::new();
     for status in [200, 201, 202, 302, 403, 404, 405] {
         for kind in ["text/html", "text/plain"] {
@@ -99,7 +99,7 @@ async fn what_is_not_the_server_takes_no_files_and_loses_none() {
 }
 
 #[tokio::test]
-async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() {
+async fn output_received_as_other_bytes_is_sent_again_if_unchanged() {
     // A file in one piece or in parts, and the expected result.
     let bodies = [(1, "its own "), (MANY, "its own "), (1, "{"), (1, "{\"schemaVersion\"")];
     for ((times, garbled), faults) in bodies.into_iter().flat_map(|body| [(body, 2), (body, 1000)])
@@ -107,7 +107,7 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
         let is_brought = faults == 2;
         let left = Left::new();
         std::fs::write(left.map(), "its own ".repeat(times)).unwrap();
-        let left = Left { order: OutputOrder { max_bytes: 1 << 24, ..left.order.clone() }, ..left };
+        let left = Left { spec: OutputSpec { max_bytes: 1 << 24, ..left.spec.clone() }, ..left };
         let parts = Arc::<Mutex<Vec<u8>>>::default();
         let (faults, listed) = (Arc::new(AtomicU32::new(faults)), Arc::<AtomicU32>::default());
         let garbles =
@@ -158,7 +158,7 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
         match brought {
             Ok(count) => assert_eq!((count, is_brought), (1, true)),
             Err(error) => {
-                assert!(!is_brought && matches!(error, OutputError::Garbled { .. }), "{error:?}");
+                assert!(!is_brought && matches!(error, OutputError::Corrupted { .. }), "{error:?}");
                 assert!(error.retry_after().is_some(), "{error}");
             }
         }
@@ -166,7 +166,7 @@ async fn file_that_arrives_as_other_bytes_is_sent_again_while_it_is_unchanged() 
 }
 
 #[tokio::test]
-async fn a_file_that_changes_while_it_is_sent_is_brought_back_later() {
+async fn output_changed_during_upload_is_uploaded_later() {
     let left = Left::new();
     let map = left.map();
     // An empty registry; between the query of its content and the upload, the task writes once
@@ -216,12 +216,12 @@ async fn exchange_while_files_are_sent(times: usize) {
     // Both have the same size.
     std::fs::write(root.join("run/maps/key.pgm"), "its own ".repeat(times)).unwrap();
     std::fs::write(root.join("secrets/key.pgm"), "a secret".repeat(times)).unwrap();
-    let order = OutputOrder {
+    let spec = OutputSpec {
         patterns: vec!["maps/*.pgm".to_owned()],
         max_bytes: 1 << 24,
-        ..left.order.clone()
+        ..left.spec.clone()
     };
-    let left = Left { order, ..left };
+    let left = Left { spec, ..left };
     let (told, mut sent) = tokio::sync::mpsc::unbounded_channel();
     let registry = move |request: Request| {
         let (root, told) = (root.clone(), told.clone());

@@ -6,15 +6,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_agent::config::MqttTransport;
-use task_agent::install::fetch::{FetchError, FetchSettings, PartPatience};
-use task_agent::link::mqtt::{self, MqttAccess, Ways};
-use task_agent::link::state::{Shared, Talk};
+use task_agent::install::fetch::{FetchError, FetchSettings, PartTimeouts};
+use task_agent::link::mqtt::{self, MqttAccess, Routes};
+use task_agent::link::state::{LinkState, MqttChannels};
 use task_agent::system::clock;
 use task_agent::transfer::credential::Credential;
-use task_agent::transfer::parts::Asks;
-use task_proto::part::{Cut, Part, PartRange};
-use task_proto::report::{Progress, Status};
-use task_proto::topic::{Topic, TopicPrefix};
+use task_agent::transfer::parts::PartRequest;
+use task_proto::messages::part::{Part, PartLayout, PartRange};
+use task_proto::messages::report::{Progress, Status};
+use task_proto::messages::topic::{Topic, TopicPrefix};
 use task_proto::{InstanceId, RobotId};
 use task_transport::Trust;
 use tokio::sync::{mpsc, watch};
@@ -30,10 +30,13 @@ const LONG: Duration = Duration::from_secs(600);
 
 /// Nothing is asked for and nothing given up.
 fn patient() -> FetchSettings {
-    FetchSettings { parts: PartPatience { silence: LONG, deaf: LONG, starved: LONG }, ..settings() }
+    FetchSettings {
+        parts: PartTimeouts { silence: LONG, no_subscription: LONG, no_progress: LONG },
+        ..settings()
+    }
 }
 
-fn with(parts: PartPatience) -> FetchSettings {
+fn with(parts: PartTimeouts) -> FetchSettings {
     FetchSettings { parts, ..settings() }
 }
 
@@ -41,13 +44,13 @@ fn with(parts: PartPatience) -> FetchSettings {
 struct Rig {
     site: Arc<Site>,
     peer: Peer,
-    shared: Shared,
+    link_state: LinkState,
     progress: watch::Sender<Progress>,
-    asks: watch::Sender<Asks>,
-    cut: Cut,
+    part_requests: watch::Sender<PartRequest>,
+    cut: PartLayout,
 }
 
-type Gathering = tokio::task::JoinHandle<Result<(), FetchError>>;
+type Pull = tokio::task::JoinHandle<Result<(), FetchError>>;
 
 impl Rig {
     async fn new(settings: FetchSettings) -> Self {
@@ -55,7 +58,7 @@ impl Rig {
     }
 
     async fn of(site: Site) -> Self {
-        let (peer, shared) = (Peer::start().await, Shared::new(CancellationToken::new()));
+        let (peer, link_state) = (Peer::start().await, LinkState::new(CancellationToken::new()));
         let tls = Trust::System.client_config(clock::for_certificates());
         let access = MqttAccess {
             host: "127.0.0.1".to_owned(),
@@ -71,38 +74,53 @@ impl Rig {
                 place: None,
             },
             message_bytes: mqtt::MESSAGE_BYTES,
-            ways: Ways::new(
+            routes: Routes::new(
                 &"http://127.0.0.1".parse().unwrap(),
                 Arc::new(tls),
                 MqttTransport::Tcp,
             ),
         };
-        let (heard, _) = mpsc::channel(1);
+        let (server_messages, _) = mpsc::channel(1);
         let (requests, _) = mpsc::channel(1);
-        let talk = Talk { requests, messages: mpsc::channel(1).1, lines: mpsc::channel(1).1 };
-        tokio::spawn(mqtt::run(access, shared.clone(), heard, talk));
-        let cut = Cut::new(site.content.len() as u64, PART_BYTES).unwrap();
+        let channels =
+            MqttChannels { requests, messages: mpsc::channel(1).1, lines: mpsc::channel(1).1 };
+        tokio::spawn(mqtt::run(access, link_state.clone(), server_messages, channels));
+        let cut = PartLayout::new(site.content.len() as u64, PART_BYTES).unwrap();
         let progress = watch::Sender::new(Progress { done: 0, total: 0 });
-        Self { site: Arc::new(site), peer, shared, progress, asks: watch::Sender::default(), cut }
+        Self {
+            site: Arc::new(site),
+            peer,
+            link_state,
+            progress,
+            part_requests: watch::Sender::default(),
+            cut,
+        }
     }
 
-    fn gather(&self, cancel: &CancellationToken) -> Gathering {
-        let (site, shared, cancel) = (self.site.clone(), self.shared.clone(), cancel.clone());
-        let (progress, asks) = (self.progress.clone(), self.asks.clone());
+    fn start_pull(&self, cancel: &CancellationToken) -> Pull {
+        let (site, link_state, cancel) =
+            (self.site.clone(), self.link_state.clone(), cancel.clone());
+        let (progress, part_requests) = (self.progress.clone(), self.part_requests.clone());
         tokio::spawn(async move {
             let (package, manifest) = (&site.package, &site.manifest);
             site.fetcher
-                .pushed_content(package, manifest, &shared.listening, (&progress, &asks), &cancel)
+                .pushed_content(
+                    package,
+                    manifest,
+                    &link_state.part_subscriptions,
+                    (&progress, &part_requests),
+                    &cancel,
+                )
                 .await
         })
     }
 
     /// Gathers, and waits until it hears.
-    async fn listen(&self) -> Gathering {
-        let gathering = self.gather(&CancellationToken::new());
+    async fn listen(&self) -> Pull {
+        let pull = self.start_pull(&CancellationToken::new());
         self.peer.subscribed(&self.topic()).await;
         self.asked(&[]).await;
-        gathering
+        pull
     }
 
     fn topic(&self) -> String {
@@ -131,14 +149,17 @@ impl Rig {
     async fn asked(&self, ranges: &[(u32, u32)]) {
         let ranges: Vec<PartRange> =
             ranges.iter().map(|&(from, to)| PartRange { from, to }).collect();
-        let mut asks = self.asks.subscribe();
-        within("what is lacking", asks.wait_for(|asks| asks.missing.as_ref() == Some(&ranges)))
-            .await
-            .unwrap();
+        let mut part_requests = self.part_requests.subscribe();
+        within(
+            "what is lacking",
+            part_requests.wait_for(|part_requests| part_requests.missing.as_ref() == Some(&ranges)),
+        )
+        .await
+        .unwrap();
     }
 
-    async fn ends_well(&self, gathering: Gathering) {
-        within("the package", gathering).await.unwrap().unwrap();
+    async fn ends_well(&self, pull: Pull) {
+        within("the package", pull).await.unwrap().unwrap();
         self.site.assert_in_place();
         for path in [
             self.site.data.blob_parts(&self.digest()),
@@ -146,7 +167,7 @@ impl Rig {
         ] {
             assert!(!path.exists(), "{} is left", path.display());
         }
-        assert_eq!(self.asks.borrow().missing, None);
+        assert_eq!(self.part_requests.borrow().missing, None);
         let topic = self.topic();
         self.peer.until("the end of the subscription", |seen| !seen.topics.contains(&topic)).await;
     }
@@ -158,21 +179,21 @@ impl Rig {
 
 impl Drop for Rig {
     fn drop(&mut self) {
-        self.shared.shutdown.cancel();
+        self.link_state.shutdown.cancel();
     }
 }
 
 #[tokio::test]
-async fn what_is_pushed_gets_its_place_without_a_pull_at_every_quality_of_service() {
+async fn pushed_content_is_installed_without_a_pull_at_every_qos() {
     for qos in [0, 1, 2] {
         let rig = Rig::new(patient()).await;
-        let gathering = rig.listen().await;
+        let pull = rig.listen().await;
         let before = rig.peer.seen.borrow().acknowledged;
         // In any order.
         for index in (0..rig.cut.count()).rev() {
             rig.peer.publish(&rig.topic(), qos, &rig.message(index));
         }
-        rig.ends_well(gathering).await;
+        rig.ends_well(pull).await;
         assert_eq!(rig.site.asked(), [0; 0]);
         let size = rig.site.content.len() as u64;
         assert_eq!(*rig.progress.borrow(), Progress { done: size, total: size });
@@ -184,10 +205,14 @@ async fn what_is_pushed_gets_its_place_without_a_pull_at_every_quality_of_servic
 }
 
 #[tokio::test]
-async fn parts_that_are_lacking_are_asked_for() {
-    let patience = PartPatience { silence: Duration::from_millis(300), deaf: LONG, starved: LONG };
-    let rig = Rig::new(with(patience)).await;
-    let gathering = rig.listen().await;
+async fn missing_parts_are_requested() {
+    let timeouts = PartTimeouts {
+        silence: Duration::from_millis(300),
+        no_subscription: LONG,
+        no_progress: LONG,
+    };
+    let rig = Rig::new(with(timeouts)).await;
+    let pull = rig.listen().await;
     // The number of parts is still unknown.
     rig.asked(&[(0, u32::MAX)]).await;
     // The agent joined late: parts sent earlier are requested at once, a gap only after a quiet
@@ -196,21 +221,23 @@ async fn parts_that_are_lacking_are_asked_for() {
     rig.asked(&[(0, 9)]).await;
     rig.push((11..rig.cut.count()).filter(|&index| index != 20));
     rig.asked(&[(0, 9), (20, 20)]).await;
-    let times = rig.asks.borrow().times;
-    let mut asks = rig.asks.subscribe();
-    within("it asks again", asks.wait_for(|asks| asks.times > times)).await.unwrap();
-    assert_eq!(rig.asks.borrow().missing.as_ref().unwrap().len(), 2);
+    let times = rig.part_requests.borrow().times;
+    let mut part_requests = rig.part_requests.subscribe();
+    within("it asks again", part_requests.wait_for(|part_requests| part_requests.times > times))
+        .await
+        .unwrap();
+    assert_eq!(rig.part_requests.borrow().missing.as_ref().unwrap().len(), 2);
     rig.push(0..5);
     rig.asked(&[(5, 9), (20, 20)]).await;
     rig.push((5..10).chain([20]));
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 }
 
 #[tokio::test]
-async fn hostile_messages_are_passed_over() {
+async fn hostile_part_messages_are_ignored() {
     let rig = Rig::new(patient()).await;
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     let good = rig.message(3);
     let altered = |at: usize, bytes: &[u8]| {
         let mut message = good.clone();
@@ -218,7 +245,7 @@ async fn hostile_messages_are_passed_over() {
         message
     };
     let other_cut = {
-        let cut = Cut::new(rig.site.content.len() as u64, 4096).unwrap();
+        let cut = PartLayout::new(rig.site.content.len() as u64, 4096).unwrap();
         Part { index: 0, count: cut.count(), part_bytes: 4096, bytes: &[7; 4096] }.encode()
     };
     rig.push([0]);
@@ -252,7 +279,7 @@ async fn hostile_messages_are_passed_over() {
     };
     rig.peer.publish(&rig.topic(), 1, &double.encode());
     rig.push(0..rig.cut.count());
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
     assert_eq!(rig.peer.seen.borrow().sessions, 1);
 }
@@ -260,7 +287,7 @@ async fn hostile_messages_are_passed_over() {
 #[tokio::test]
 async fn wrong_bytes_are_found_by_the_digest_and_pulled() {
     let rig = Rig::new(patient()).await;
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     let wrong = Part {
         index: 5,
         count: rig.cut.count(),
@@ -269,67 +296,74 @@ async fn wrong_bytes_are_found_by_the_digest_and_pulled() {
     };
     rig.peer.publish(&rig.topic(), 1, &wrong.encode());
     rig.push(0..rig.cut.count());
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0]);
 }
 
 #[tokio::test]
-async fn what_does_not_come_is_pulled_from_the_first_gap_on() {
-    let starved = PartPatience { starved: Duration::from_millis(500), ..patient().parts };
-    let rig = Rig::new(with(starved)).await;
-    let gathering = rig.listen().await;
+async fn undelivered_parts_are_pulled_from_the_first_gap() {
+    let no_progress = PartTimeouts { no_progress: Duration::from_millis(500), ..patient().parts };
+    let rig = Rig::new(with(no_progress)).await;
+    let pull = rig.listen().await;
     rig.push((0..7).chain(9..20));
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [7 * u64::from(PART_BYTES)]);
-    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 0);
+    assert_eq!(rig.link_state.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 0);
 }
 
 #[tokio::test]
-async fn a_subscription_that_is_refused_is_tried_again_and_not_for_ever() {
-    let deaf = PartPatience { deaf: Duration::from_secs(4), ..patient().parts };
-    let rig = Rig::new(with(deaf)).await;
+async fn refused_subscription_is_retried_for_a_limited_time() {
+    let no_subscription =
+        PartTimeouts { no_subscription: Duration::from_secs(4), ..patient().parts };
+    let rig = Rig::new(with(no_subscription)).await;
     rig.peer.allows_parts.send_replace(false);
-    let gathering = rig.gather(&CancellationToken::new());
+    let pull = rig.start_pull(&CancellationToken::new());
     rig.peer.until("a refusal", |seen| seen.refused > 0).await;
     rig.peer.allows_parts.send_replace(true);
     rig.peer.subscribed(&rig.topic()).await;
     rig.push(0..rig.cut.count());
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 
-    let deaf = PartPatience { deaf: Duration::from_millis(100), ..patient().parts };
-    let rig = Rig::new(with(deaf)).await;
+    let no_subscription =
+        PartTimeouts { no_subscription: Duration::from_millis(100), ..patient().parts };
+    let rig = Rig::new(with(no_subscription)).await;
     rig.peer.allows_parts.send_replace(false);
-    within("the pull", rig.gather(&CancellationToken::new())).await.unwrap().unwrap();
+    within("the pull", rig.start_pull(&CancellationToken::new())).await.unwrap().unwrap();
     rig.site.assert_in_place();
     assert_eq!(rig.site.asked(), [0]);
 }
 
 #[tokio::test]
-async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out() {
+async fn missing_session_pulls_at_once_but_a_short_loss_waits() {
     let site = Site::with(&tar(), patient()).await;
-    let listening = task_agent::transfer::parts::Listening::default();
-    listening.session(false);
-    let (progress, asks) =
+    let part_subscriptions = task_agent::transfer::parts::PartSubscriptions::default();
+    part_subscriptions.set_session_up(false);
+    let (progress, part_requests) =
         (watch::Sender::new(Progress { done: 0, total: 0 }), watch::Sender::default());
     let cancel = CancellationToken::new();
-    let told = (&progress, &asks);
-    let pull =
-        site.fetcher.pushed_content(&site.package, &site.manifest, &listening, told, &cancel);
+    let senders = (&progress, &part_requests);
+    let pull = site.fetcher.pushed_content(
+        &site.package,
+        &site.manifest,
+        &part_subscriptions,
+        senders,
+        &cancel,
+    );
     within("the pull", pull).await.unwrap();
     site.assert_in_place();
 
     let rig = Rig::new(patient()).await;
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     rig.push(0..5);
     rig.has(5 * u64::from(PART_BYTES)).await;
     rig.peer.cut();
     rig.peer.until("another session", |seen| seen.sessions == 2).await;
     rig.peer.subscribed(&rig.topic()).await;
     rig.push(5..rig.cut.count());
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
-    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
+    assert_eq!(rig.link_state.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
 }
 
 /// Half of the parts are present when the agent ends; returns the state from which the next agent
@@ -337,12 +371,12 @@ async fn without_a_session_it_is_pulled_at_once_and_a_short_loss_is_waited_out()
 async fn ended_half_way() -> Rig {
     let mut rig = Rig::new(patient()).await;
     let cancel = CancellationToken::new();
-    let gathering = rig.gather(&cancel);
+    let pull = rig.start_pull(&cancel);
     rig.peer.subscribed(&rig.topic()).await;
     rig.push((0..20).filter(|&index| index != 4));
     rig.has(19 * u64::from(PART_BYTES)).await;
     cancel.cancel();
-    let ended = within("the end", gathering).await.unwrap();
+    let ended = within("the end", pull).await.unwrap();
     assert!(matches!(ended, Err(FetchError::Cancelled)), "{ended:?}");
     let topic = rig.topic();
     rig.peer.until("the end of the subscription", |seen| !seen.topics.contains(&topic)).await;
@@ -353,57 +387,57 @@ async fn ended_half_way() -> Rig {
 }
 
 #[tokio::test]
-async fn a_new_agent_goes_on_with_the_parts_that_are_there() {
+async fn restarted_agent_continues_with_stored_parts() {
     let rig = ended_half_way().await;
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     rig.has(19 * u64::from(PART_BYTES)).await;
     rig.push([20]);
     rig.asked(&[(4, 4)]).await;
     rig.push((21..rig.cut.count()).chain([4]));
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 }
 
 #[tokio::test]
-async fn what_a_power_cut_tore_is_found_and_pulled() {
+async fn parts_torn_by_a_power_cut_are_pulled() {
     let rig = ended_half_way().await;
     let path = rig.site.data.blob_parts(&rig.digest());
     let mut bytes = fs::read(&path).unwrap();
     bytes[100_000..104_096].fill(0);
     fs::write(&path, bytes).unwrap();
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     rig.push((20..rig.cut.count()).chain([4]));
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0]);
 }
 
 #[tokio::test]
-async fn an_agent_that_died_with_all_parts_on_the_disk_needs_no_other() {
+async fn restarted_agent_with_all_parts_needs_no_transfer() {
     let rig = ended_half_way().await;
     fs::write(rig.site.data.blob_parts(&rig.digest()), &rig.site.content).unwrap();
     let bits = vec![0xff; 8 * rig.cut.count().div_ceil(64) as usize];
     let note = [b"pt1\n", &PART_BYTES.to_be_bytes()[..], &bits].concat();
     fs::write(rig.site.data.blob_parts_note(&rig.digest()), note).unwrap();
     rig.peer.allows_parts.send_replace(false);
-    rig.ends_well(rig.gather(&CancellationToken::new())).await;
+    rig.ends_well(rig.start_pull(&CancellationToken::new())).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 }
 
 #[tokio::test]
-async fn a_note_that_is_wrong_is_no_note() {
+async fn invalid_part_note_is_ignored() {
     for spoil in [b"pt1\n".to_vec(), vec![0xff; 300], vec![0; 1 << 20]] {
         let rig = ended_half_way().await;
         fs::write(rig.site.data.blob_parts_note(&rig.digest()), spoil).unwrap();
-        let gathering = rig.listen().await;
+        let pull = rig.listen().await;
         assert_eq!(rig.progress.borrow().done, 0);
         rig.push(0..rig.cut.count());
-        rig.ends_well(gathering).await;
+        rig.ends_well(pull).await;
         assert_eq!(rig.site.asked(), [0; 0]);
     }
 }
 
 #[tokio::test]
-async fn a_pull_goes_on_from_the_parts_that_are_there() {
+async fn pull_continues_from_stored_parts() {
     let rig = ended_half_way().await;
     let (progress, cancel) =
         (watch::Sender::new(Progress { done: 0, total: 0 }), CancellationToken::new());
@@ -420,29 +454,34 @@ async fn a_pull_goes_on_from_the_parts_that_are_there() {
 }
 
 #[tokio::test]
-async fn too_little_room_is_said_before_anything_is_pushed() {
+async fn insufficient_disk_space_is_reported_before_a_push() {
     let rig = Rig::new(FetchSettings { reserve_bytes: u64::MAX, ..patient() }).await;
-    let error =
-        within("the refusal", rig.gather(&CancellationToken::new())).await.unwrap().unwrap_err();
+    let error = within("the refusal", rig.start_pull(&CancellationToken::new()))
+        .await
+        .unwrap()
+        .unwrap_err();
     assert!(matches!(error, FetchError::DiskFull(_)), "{error:?}");
     assert!(!rig.site.data.blob_parts(&rig.digest()).exists());
-    assert_eq!((rig.site.asked(), rig.asks.borrow().times), (Vec::new(), 0));
+    assert_eq!((rig.site.asked(), rig.part_requests.borrow().times), (Vec::new(), 0));
 }
 
 #[tokio::test]
-async fn who_does_not_write_gets_no_more() {
+async fn slow_writer_stops_part_delivery() {
     let rig = Rig::new(patient()).await;
-    let mut ear = rig.shared.listening.listen(rig.digest(), rig.site.content.len() as u64);
+    let mut part_receiver =
+        rig.link_state.part_subscriptions.subscribe(rig.digest(), rig.site.content.len() as u64);
     rig.peer.subscribed(&rig.topic()).await;
     let before = rig.peer.seen.borrow().acknowledged;
     rig.push(0..rig.cut.count());
-    let first = within("a part", ear.parts.recv()).await.unwrap();
-    eventually("the queue is full", || (ear.parts.len() == ear.parts.max_capacity()).then_some(()))
-        .await;
+    let first = within("a part", part_receiver.parts.recv()).await.unwrap();
+    eventually("the queue is full", || {
+        (part_receiver.parts.len() == part_receiver.parts.max_capacity()).then_some(())
+    })
+    .await;
     assert_eq!(rig.peer.seen.borrow().acknowledged, before, "nothing was written");
     drop(first);
     for _ in 1..rig.cut.count() {
-        drop(within("a part", ear.parts.recv()).await.unwrap());
+        drop(within("a part", part_receiver.parts.recv()).await.unwrap());
     }
     let all = before + rig.cut.count();
     rig.peer.until("every acknowledgement", |seen| seen.acknowledged == all).await;
@@ -451,7 +490,7 @@ async fn who_does_not_write_gets_no_more() {
 #[tokio::test]
 async fn a_package_may_come_as_one_message() {
     let rig = Rig::new(patient()).await;
-    let gathering = rig.listen().await;
+    let pull = rig.listen().await;
     let size = u32::try_from(rig.site.content.len()).unwrap();
     assert!(rig.site.content.len() > mqtt::MESSAGE_BYTES);
     let whole = Part { index: 0, count: 1, part_bytes: size, bytes: &rig.site.content }.encode();
@@ -460,15 +499,15 @@ async fn a_package_may_come_as_one_message() {
     rig.peer.until("another session", |seen| seen.sessions == 2).await;
     rig.peer.subscribed(&rig.topic()).await;
     rig.peer.publish(&rig.topic(), 1, &whole);
-    rig.ends_well(gathering).await;
+    rig.ends_well(pull).await;
     assert_eq!(rig.site.asked(), [0; 0]);
 }
 
 #[tokio::test]
-async fn a_message_that_nobody_wants_ends_the_session_when_it_is_too_large() {
+async fn oversized_unwanted_message_ends_the_session() {
     let rig = Rig::new(patient()).await;
     rig.peer.until("a session", |seen| seen.topics.len() == 2).await;
     rig.peer.publish(&rig.topic(), 1, &vec![0; 2 * mqtt::MESSAGE_BYTES]);
     rig.peer.until("another session", |seen| seen.sessions == 2 && seen.topics.len() == 2).await;
-    assert_eq!(rig.shared.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
+    assert_eq!(rig.link_state.meter.facts(tokio::time::Instant::now()).unwrap().reconnects, 1);
 }

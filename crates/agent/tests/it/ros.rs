@@ -6,7 +6,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use task_agent::ros::graph::{Graph, GraphProgram, GraphSettings};
-use task_proto::ros::GraphName;
+use task_proto::telemetry::ros::GraphName;
 use tokio::io::{AsyncBufReadExt, AsyncWriteExt, BufReader};
 use tokio::process::{Child, ChildStdin, ChildStdout, Command};
 
@@ -18,7 +18,10 @@ pub const CALL: Duration = Duration::from_secs(30);
 /// The virtual environment with ROS.
 pub fn ros() -> PathBuf {
     let root = std::env::var_os("TASKD_TEST_ROS").map(PathBuf::from);
-    root.expect("TASKD_TEST_ROS names no virtual environment with ROS 2: run ./scripts/test, which makes one")
+    root.expect(
+        "TASKD_TEST_ROS names no virtual environment with ROS 2: \
+         run ./scripts/test, which makes one",
+    )
 }
 
 /// A name on the graph.

@@ -16,8 +16,8 @@ use task_agent::install::fetch::{FetchError, FetchSettings, Fetcher};
 use task_agent::system::layout::{DataDir, VersionDir};
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{ContentFacts, TaskManifest};
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
+use task_proto::packages::manifest::{ContentFacts, TaskManifest};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 

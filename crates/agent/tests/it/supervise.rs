@@ -10,14 +10,14 @@ use nix::unistd::Pid;
 use task_agent::process::program::ExitStatus;
 use task_agent::process::program::ProcessIdentity;
 use task_agent::process::run_dir::{RunDir, RunSpec, Started};
-use task_agent::process::supervisor::{Observed, SupervisorError};
+use task_agent::process::supervisor::{RunState, SupervisorError};
 
 use crate::harness::{TestRun, eventually, lives, supervisor, within};
 
 const SHORT_GRACE: Duration = Duration::from_millis(300);
 const LONG_GRACE: Duration = Duration::from_secs(50);
 
-async fn run_to_end(script: &str) -> (TestRun, Observed) {
+async fn run_to_end(script: &str) -> (TestRun, RunState) {
     let run = TestRun::of(script);
     within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
     let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
@@ -26,15 +26,15 @@ async fn run_to_end(script: &str) -> (TestRun, Observed) {
 
 #[tokio::test]
 async fn the_exit_code_and_the_signal_are_kept() {
-    assert_eq!(run_to_end("exit 0").await.1, Observed::Exited(ExitStatus::Code(0)));
-    assert_eq!(run_to_end("exit 7").await.1, Observed::Exited(ExitStatus::Code(7)));
-    assert_eq!(run_to_end("kill -SEGV $$").await.1, Observed::Exited(ExitStatus::Signal(11)));
+    assert_eq!(run_to_end("exit 0").await.1, RunState::Exited(ExitStatus::Code(0)));
+    assert_eq!(run_to_end("exit 7").await.1, RunState::Exited(ExitStatus::Code(7)));
+    assert_eq!(run_to_end("kill -SEGV $$").await.1, RunState::Exited(ExitStatus::Signal(11)));
     let (run, _) = run_to_end("exit 3").await;
     let text = std::fs::read_to_string(run.run_dir().join("exit.json")).expect("exit file");
     assert!(text.starts_with(r#"{"code":3,"at_uptime_ms":"#), "{text}");
     assert_eq!(
         supervisor().observe(&run.run_dir()).await.expect("observed"),
-        Observed::Exited(ExitStatus::Code(3))
+        RunState::Exited(ExitStatus::Code(3))
     );
 }
 
@@ -66,7 +66,7 @@ async fn a_task_gets_the_environment_it_was_promised_and_nothing_else() {
 }
 
 #[tokio::test]
-async fn a_start_that_cannot_be_says_why_and_leaves_nothing() {
+async fn failed_start_is_reported_and_leaves_nothing() {
     let mut run = TestRun::of("true");
     run.spec.directory = PathBuf::from("/nonexistent/place");
     let error =
@@ -74,14 +74,14 @@ async fn a_start_that_cannot_be_says_why_and_leaves_nothing() {
     assert!(error.contains("/nonexistent/place") && error.contains("No such file"), "{error}");
     assert_eq!(
         run.supervisor.observe(&run.run_dir()).await.expect("observed"),
-        Observed::NeverStarted
+        RunState::NeverStarted
     );
     let never = run.supervisor.stop(&run.path("never"), SHORT_GRACE).await.expect("stopped");
-    assert_eq!(never, Observed::NeverStarted);
+    assert_eq!(never, RunState::NeverStarted);
 }
 
 #[tokio::test]
-async fn a_run_of_which_nobody_wrote_down_who_runs_it_is_gone_and_not_started_again() {
+async fn run_without_a_recorded_shim_is_gone_and_not_restarted() {
     let run = TestRun::of("echo up; sleep 1000");
     // In the way of the file that says it, as a power cut would be.
     std::fs::create_dir_all(run.run_dir().join("pid.json.tmp")).expect("made");
@@ -89,14 +89,14 @@ async fn a_run_of_which_nobody_wrote_down_who_runs_it_is_gone_and_not_started_ag
         run.supervisor.start(&run.run_dir(), &run.spec).await.expect_err("refused").to_string();
     assert!(error.contains("pid.json"), "{error}");
     std::fs::remove_dir(run.run_dir().join("pid.json.tmp")).expect("removed");
-    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), Observed::Gone);
+    assert_eq!(run.supervisor.observe(&run.run_dir()).await.expect("observed"), RunState::Gone);
     let again = run.supervisor.start(&run.run_dir(), &run.spec).await;
     assert!(matches!(again, Err(SupervisorError::Used(_))), "{again:?}");
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
 #[tokio::test]
-async fn a_run_is_started_once_however_often_it_is_asked_for() {
+async fn repeated_start_runs_the_task_once() {
     let run = TestRun::of("echo up; sleep 1000");
     let dir = run.run_dir();
     let starts = (0..8).map(|_| run.supervisor.start(&dir, &run.spec));
@@ -111,7 +111,7 @@ async fn a_run_is_started_once_however_often_it_is_asked_for() {
 }
 
 #[tokio::test]
-async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
+async fn start_abandoned_before_the_shim_starts_nothing() {
     let run = TestRun::of("sleep 1000");
     let dir = RunDir::create(&run.run_dir()).expect("dir");
     let stalled = dir.try_lock().expect("locked").expect("nobody has it");
@@ -126,12 +126,12 @@ async fn a_start_that_was_given_up_before_there_was_a_shim_starts_nothing() {
     assert_eq!(run.survivors(), Vec::<u32>::new());
     assert_eq!(
         run.supervisor.observe(&run.run_dir()).await.expect("observed"),
-        Observed::NeverStarted
+        RunState::NeverStarted
     );
 }
 
 #[test]
-fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
+fn waiting_for_a_hanging_start_blocks_no_thread() {
     // With one thread for all that blocks.
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build();
@@ -160,7 +160,7 @@ fn whoever_waits_for_a_start_that_hangs_takes_no_thread() {
             .expect("started");
         let ended =
             within("its end", other.supervisor.wait(&other.run_dir())).await.expect("observed");
-        assert_eq!(ended, Observed::Exited(ExitStatus::Code(3)));
+        assert_eq!(ended, RunState::Exited(ExitStatus::Code(3)));
         drop(hangs);
         within("the start", run.supervisor.start(path, &run.spec)).await.expect("started");
         within("its end", run.supervisor.wait(path)).await.expect("observed");
@@ -214,7 +214,7 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
         RunDir::create(&run.run_dir()).expect("dir").started().expect("read").expect("started");
     let observed = run.supervisor.observe(&run.run_dir()).await.expect("observed");
     assert!(
-        matches!(observed, Observed::Running { pid, .. } if pid == recorded.task.pid),
+        matches!(observed, RunState::Running { pid, .. } if pid == recorded.task.pid),
         "{observed:?}"
     );
     // The run was started by a process that ignored SIGINT; a trap on SIGINT works only where the
@@ -227,8 +227,8 @@ async fn a_task_outlives_the_agent_and_is_adopted() {
         ),
     )
     .await;
-    assert_eq!(waited.expect("waited"), Observed::Exited(ExitStatus::Code(4)));
-    assert_eq!(stopped.expect("stopped"), Observed::Exited(ExitStatus::Code(4)));
+    assert_eq!(waited.expect("waited"), RunState::Exited(ExitStatus::Code(4)));
+    assert_eq!(stopped.expect("stopped"), RunState::Exited(ExitStatus::Code(4)));
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
@@ -264,7 +264,7 @@ async fn a_stubborn_task_and_its_daemons_are_ended() {
     let stopped = within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
         .await
         .expect("stopped");
-    assert_eq!(stopped, Observed::Exited(ExitStatus::Signal(9)));
+    assert_eq!(stopped, RunState::Exited(ExitStatus::Signal(9)));
     assert_eq!(run.survivors(), Vec::<u32>::new());
     assert_eq!(pids.into_iter().filter(|pid| lives(*pid)).collect::<Vec<_>>(), Vec::<u32>::new());
     let again = within("the second stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
@@ -274,7 +274,7 @@ async fn a_stubborn_task_and_its_daemons_are_ended() {
 }
 
 #[tokio::test]
-async fn a_stop_that_is_dropped_can_be_asked_for_again() {
+async fn dropped_stop_can_be_repeated() {
     let (run, _, _) = start_stubborn(STUBBORN).await;
     let dropped = tokio::time::timeout(
         Duration::from_millis(50),
@@ -294,7 +294,7 @@ async fn a_task_that_ends_takes_its_daemons_with_it() {
         "setsid sleep 1000 & setsid bash -c 'trap \"\" TERM; sleep 1000' & echo $!; exit 5",
     )
     .await;
-    assert_eq!(ended, Observed::Exited(ExitStatus::Code(5)));
+    assert_eq!(ended, RunState::Exited(ExitStatus::Code(5)));
     assert_eq!(run.survivors(), Vec::<u32>::new());
 }
 
@@ -306,17 +306,17 @@ async fn without_its_shim_a_task_is_ended_and_gone() {
     let kill = async { started.shim.signal(Signal::SIGKILL).expect("killed") };
     let (observed, ()) =
         within("the notice", futures_util::future::join(run.supervisor.wait(&dir), kill)).await;
-    assert_eq!(observed.expect("observed"), Observed::Gone);
+    assert_eq!(observed.expect("observed"), RunState::Gone);
     assert_eq!(pids.into_iter().filter(|pid| lives(*pid)).collect::<Vec<_>>(), Vec::<u32>::new());
     assert_eq!(run.survivors(), Vec::<u32>::new());
     assert_eq!(
         run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"),
-        Observed::Gone
+        RunState::Gone
     );
 }
 
 #[tokio::test]
-async fn a_pid_that_was_used_again_is_not_mistaken() {
+async fn reused_pid_is_not_mistaken_for_the_task() {
     let run = TestRun::of("true");
     let dir = RunDir::create(&run.run_dir()).expect("dir");
     dir.write_spec(&run.spec).expect("spec");
@@ -329,7 +329,7 @@ async fn a_pid_that_was_used_again_is_not_mistaken() {
         // A stop by pid would end this very process.
         assert_eq!(
             run.supervisor.stop(&run.run_dir(), SHORT_GRACE).await.expect("stopped"),
-            Observed::Gone
+            RunState::Gone
         );
     }
 }
@@ -341,7 +341,7 @@ async fn a_flood_of_output_neither_blocks_the_task_nor_fills_the_disk() {
     run.spec.log.files = 3;
     within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
     let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
-    assert_eq!(ended, Observed::Exited(ExitStatus::Code(0)));
+    assert_eq!(ended, RunState::Exited(ExitStatus::Code(0)));
     let sizes: Vec<u64> = ["task.log", "task.log.1", "task.log.2", "task.log.3"]
         .iter()
         .filter_map(|name| Some(std::fs::metadata(run.path(name)).ok()?.len()))
@@ -375,5 +375,5 @@ async fn a_log_that_cannot_be_written_does_not_stop_the_task() {
     run.spec.log.path = PathBuf::from("/nonexistent/task.log");
     within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");
     let ended = within("the end", run.supervisor.wait(&run.run_dir())).await.expect("observed");
-    assert_eq!(ended, Observed::Exited(ExitStatus::Code(6)));
+    assert_eq!(ended, RunState::Exited(ExitStatus::Code(6)));
 }

@@ -9,7 +9,7 @@ use std::path::Path;
 
 use proptest::prelude::*;
 use task_archive::{Limits, Refusal, UnpackError, unpack};
-use task_proto::manifest::ContentFacts;
+use task_proto::packages::manifest::ContentFacts;
 
 use crate::archive::{Header, Tar, compress, seal};
 
@@ -110,7 +110,7 @@ fn refusal_of(content: &[u8], facts: &ContentFacts, limits: &Limits) -> String {
 }
 
 #[test]
-fn an_honest_archive_becomes_its_tree() {
+fn valid_archive_is_unpacked() {
     let long = format!("{}/{}", "d".repeat(120), "f".repeat(130));
     let big: Vec<u8> = (0..300_000u32).flat_map(u32::to_le_bytes).collect();
     let tar = Tar::default()
@@ -183,17 +183,17 @@ fn paths_that_leave_or_confuse_are_refused() {
 }
 
 #[test]
-fn names_that_are_there_twice_are_refused() {
+fn duplicate_names_are_refused() {
     let tar = Tar::default;
     assert_refused([
-        (tar().file("a", b"").file("a", b""), r#"entry "a": the name is there twice"#),
-        (tar().file("a", b"").file("./a", b""), "there twice"),
-        (tar().file("a/b", b"").file("a//b", b""), "there twice"),
-        (tar().file("a/b", b"").file("a", b""), "there twice"),
-        (tar().dir("a").dir("a/"), "there twice"),
-        (tar().dir("a").file("a", b""), "there twice"),
-        (tar().file("a", b"").dir("a"), "there twice"),
-        (tar().symlink("a", "b").file("a", b""), "there twice"),
+        (tar().file("a", b"").file("a", b""), r#"entry "a": duplicate name"#),
+        (tar().file("a", b"").file("./a", b""), "duplicate name"),
+        (tar().file("a/b", b"").file("a//b", b""), "duplicate name"),
+        (tar().file("a/b", b"").file("a", b""), "duplicate name"),
+        (tar().dir("a").dir("a/"), "duplicate name"),
+        (tar().dir("a").file("a", b""), "duplicate name"),
+        (tar().file("a", b"").dir("a"), "duplicate name"),
+        (tar().symlink("a", "b").file("a", b""), "duplicate name"),
         (tar().file("a", b"").file("a/b", b""), r#""a" above it is a file"#),
         (tar().symlink("a", ".").file("a/b", b""), r#""a" above it is a symbolic link"#),
         (tar().symlink("a", "../neighbour").file("a/secret", b"x"), "above it is a symbolic link"),
@@ -230,7 +230,7 @@ fn links_that_leave_the_package_are_refused() {
 }
 
 #[test]
-fn what_is_no_plain_file_directory_or_link_is_refused() {
+fn special_files_are_refused() {
     let tar = Tar::default;
     let moded = |mode| tar().header(Header { name: b"f", mode, ..Header::default() });
     assert_refused([
@@ -249,7 +249,7 @@ fn what_is_no_plain_file_directory_or_link_is_refused() {
 }
 
 #[test]
-fn headers_that_readers_would_disagree_about_are_refused() {
+fn ambiguous_headers_are_refused() {
     let tar = Tar::default;
     assert_refused([
         (tar().pax(&[("size", "0")]).file("a", b""), r#"PAX record "size" is not accepted"#),
@@ -265,12 +265,12 @@ fn headers_that_readers_would_disagree_about_are_refused() {
             tar().typed(b'x', "x", &[b'9'; 20_000]).file("a", b""),
             "PAX records are longer than 16384 bytes",
         ),
-        (tar().pax(&[("path", "a")]), "a long name belongs to no entry"),
+        (tar().pax(&[("path", "a")]), "a long name without an entry"),
     ]);
 }
 
 #[test]
-fn what_is_no_archive_is_refused() {
+fn invalid_archives_are_refused() {
     let honest = Tar::default().file("a", b"content").end();
     let facts = honest.facts();
     let with = |change: &dyn Fn(&mut [u8; 512])| {
@@ -287,12 +287,12 @@ fn what_is_no_archive_is_refused() {
             seal(block);
         })
     };
-    assert!(resized(b"77777777777").contains("longer than what is left"));
+    assert!(resized(b"77777777777").contains("longer than the rest of the archive"));
     assert!(
         resized(b"\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff\xff")
-            .contains("longer than what is left")
+            .contains("longer than the rest of the archive")
     );
-    assert!(resized(b"x").contains("an entry's size is no number"));
+    assert!(resized(b"x").contains("an entry's size is not a number"));
     let v7 = with(&|block| {
         block[257..265].fill(0);
         seal(block);
@@ -315,11 +315,11 @@ fn what_is_no_archive_is_refused() {
 
     let mut garbage = honest.clone();
     garbage.bytes.extend([1; 512]);
-    assert!(refusal(&garbage).contains("bytes after its end marker"));
+    assert!(refusal(&garbage).contains("bytes follow the end marker"));
 }
 
 #[test]
-fn the_task_manifest_is_held_to_the_byte() {
+fn manifest_facts_must_match_exactly() {
     let tar = Tar::default().file("a", b"1").file("b", b"2").end();
     let facts = tar.facts();
     let refused = |facts: ContentFacts| refusal_of(&tar.compressed(), &facts, &Limits::default());
@@ -366,7 +366,7 @@ fn a_bomb_writes_nothing_beyond_what_was_announced() {
     let bomb = encoder.finish().unwrap();
     let honest = ContentFacts { tar_size: zeros + 1536, entries: 1, ..Tar::default().facts() };
     let refused = refusal_of(&bomb, &honest, &Limits::default());
-    assert!(refused.starts_with("uncompressed bytes for so few compressed ones"), "{refused}");
+    assert!(refused.starts_with("uncompressed bytes for this compressed size"), "{refused}");
 
     let site = Site::new();
     let lying = ContentFacts { tar_size: 1 << 20, ..honest };
@@ -431,16 +431,19 @@ fn hostile_entry() -> impl Strategy<Value = (u8, String, String, u32)> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 256, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig {
+        cases: 256, failure_persistence: None, ..ProptestConfig::default()
+    })]
 
     #[test]
-    fn no_mix_of_entries_escapes(entries in prop::collection::vec(hostile_entry(), 0..12)) {
+    fn no_combination_of_entries_escapes(entries in prop::collection::vec(hostile_entry(), 0..12)) {
         let mut tar = Tar::default();
         for (kind, name, target, mode) in &entries {
             let (name, link) = (name.as_bytes(), target.as_bytes());
             let content: &[u8] = if matches!(kind, b'0' | b'L' | b'K' | b'x') { link } else { b"" };
             let size = content.len() as u64;
-            tar = tar.header(Header { name, kind: *kind, mode: *mode, link, size, ..Header::default() }).content(content);
+            let header = Header { name, kind: *kind, mode: *mode, link, size, ..Header::default() };
+            tar = tar.header(header).content(content);
         }
         let tar = tar.end();
         let _ = Site::new().unpack(&tar.compressed(), &tar.facts(), &Limits::default());
@@ -472,7 +475,8 @@ proptest! {
             }
         }
         if !compressed {
-            for block in tar.bytes.chunks_exact_mut(512).filter(|block| reseal && block[257..262] == *b"ustar") {
+            let headers = tar.bytes.chunks_exact_mut(512);
+            for block in headers.filter(|block| reseal && block[257..262] == *b"ustar") {
                 seal(block.try_into().unwrap());
             }
             content = tar.compressed();
@@ -481,9 +485,10 @@ proptest! {
     }
 
     #[test]
-    fn noise_is_refused(noise in prop::collection::vec(any::<u8>(), 0..4096)) {
+    fn random_bytes_are_refused(noise in prop::collection::vec(any::<u8>(), 0..4096)) {
         let facts = ContentFacts { tar_size: noise.len() as u64, ..Tar::default().facts() };
         prop_assert!(Site::new().unpack(&noise, &facts, &Limits::default()).is_err());
-        prop_assert!(Site::new().unpack(&compress(&noise), &facts, &Limits::default()).is_err() || noise.iter().all(|&b| b == 0));
+        let unpacked = Site::new().unpack(&compress(&noise), &facts, &Limits::default());
+        prop_assert!(unpacked.is_err() || noise.iter().all(|&b| b == 0));
     }
 }

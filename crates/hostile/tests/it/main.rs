@@ -1,8 +1,9 @@
-//! The short run: every kept input, then the same changes of them each time, through every target.
+//! The short run: every stored input, and then reproducible mutations of them, through every
+//! target.
 
 mod corpus;
 mod targets;
 
-/// Counts what the target for RTPS takes.
+/// Counts the memory that the RTPS target allocates.
 #[global_allocator]
 static MEMORY: task_hostile::Counting = task_hostile::Counting;

@@ -1,10 +1,10 @@
-//! Each target over its inputs, and that no target is without its test, its program or its inputs.
+//! Runs each target over its inputs, and checks that each target has a test, a program and inputs.
 
 use std::fs;
 
 use task_hostile::TARGETS;
 
-use crate::corpus::{directory, kept, run};
+use crate::corpus::{directory, inputs, run};
 
 #[test]
 fn no_archive_does_harm() {
@@ -57,6 +57,11 @@ fn no_part_does_harm() {
 }
 
 #[test]
+fn no_proxy_header_does_harm() {
+    run("proxy_header");
+}
+
+#[test]
 fn no_question_or_reply_does_harm() {
     run("reply");
 }
@@ -91,9 +96,9 @@ fn no_websocket_frame_does_harm() {
     run("websocket");
 }
 
-/// A stack runs out at some depth, and that ends the process: nobody can catch it.
+/// A stack overflow ends the process and cannot be caught.
 #[test]
-fn however_deep_it_is_nothing_does_harm() {
+fn deep_nesting_does_no_harm() {
     const DEPTH: usize = 200_000;
     let nested = |before: &str, open: &str, close: &str| {
         [
@@ -146,8 +151,8 @@ fn every_target_is_run_here_and_by_the_fuzzer() {
 }
 
 #[test]
-fn what_is_kept_stays_small() {
+fn corpus_stays_small() {
     let size: usize =
-        TARGETS.iter().flat_map(|target| kept(target.name)).map(|(_, bytes)| bytes.len()).sum();
+        TARGETS.iter().flat_map(|target| inputs(target.name)).map(|(_, bytes)| bytes.len()).sum();
     assert!(size <= 300 * 1024, "fuzz/corpus has {size} bytes: minimise it");
 }

@@ -16,7 +16,7 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use super::FetchError;
-use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryWords};
+use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryError};
 
 /// Fewest bytes that must arrive within each stall timeout.
 const MIN_PROGRESS_BYTES: u64 = 16 * 1024;
@@ -40,7 +40,7 @@ pub(super) struct Download {
     /// time. Only waiting counts: a slow disk is not the server's fault.
     waited: Duration,
     progressed: u64,
-    asked_at: Instant,
+    requested_at: Instant,
 }
 
 impl Download {
@@ -59,21 +59,21 @@ impl Download {
         } else if range.start > 0 {
             request = request.header(RANGE, format!("bytes={}-", range.start));
         }
-        let asked_at = Instant::now();
+        let requested_at = Instant::now();
         let answer = tokio::time::timeout(stall_timeout, request.send()).await;
         let mut response = answer
             .map_err(|_| FetchError::Stalled(stall_timeout))?
             .map_err(FetchError::Unreachable)?;
-        let skip = match judge(&response, repository, blob, &range) {
+        let skip = match check_response(&response, repository, blob, &range) {
             Err(FetchError::Unavailable { .. })
-                if !has_registrys_words(&mut response, stall_timeout).await =>
+                if !is_registry_error(&mut response, stall_timeout).await =>
             {
                 let status = response.status().as_u16();
                 return Err(FetchError::NotTheServer(format!(
                     "status {status} without a registry's error"
                 )));
             }
-            judged => judged?,
+            checked => checked?,
         };
         Ok(Self {
             response,
@@ -83,7 +83,7 @@ impl Download {
             stall_timeout,
             waited: Duration::ZERO,
             progressed: 0,
-            asked_at,
+            requested_at,
         })
     }
 
@@ -93,12 +93,12 @@ impl Download {
     }
 
     /// Time of the request.
-    pub(super) fn asked_at(&self) -> Instant {
-        self.asked_at
+    pub(super) fn requested_at(&self) -> Instant {
+        self.requested_at
     }
 
     /// Sends all received bytes to `sender`, until the range is complete or the receiver is gone.
-    pub(super) async fn pass_on(&mut self, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
+    pub(super) async fn forward(&mut self, sender: &mpsc::Sender<Bytes>) -> Result<(), FetchError> {
         while let Some(chunk) = self.next().await? {
             if sender.send(chunk).await.is_err() {
                 break;
@@ -149,14 +149,16 @@ impl Download {
 }
 
 /// Number of bytes of the answer to skip, or an error if the answer is not usable.
-fn judge(
+fn check_response(
     response: &reqwest::Response,
     repository: &RepositoryName,
     blob: BlobRef,
     range: &Range<u64>,
 ) -> Result<u64, FetchError> {
-    let (offset, is_range) = (range.start, range.start > 0 || range.end < blob.size);
-    let (status, headers) = (response.status(), response.headers());
+    let offset = range.start;
+    let is_range = range.start > 0 || range.end < blob.size;
+    let status = response.status();
+    let headers = response.headers();
     // A captive portal may answer with any status.
     if header(headers, &CONTENT_TYPE)
         .is_some_and(|kind| kind.trim_start().to_ascii_lowercase().starts_with("text/html"))
@@ -175,14 +177,17 @@ fn judge(
                 range.clone()
             }
             _ => {
-                return Err(other_bytes(
+                return Err(digest_mismatch(
                     blob,
-                    "its Content-Range is not the one asked for".to_owned(),
+                    "its Content-Range is not the requested one".to_owned(),
                 ));
             }
         },
         StatusCode::RANGE_NOT_SATISFIABLE if is_range => {
-            return Err(other_bytes(blob, format!("it has none from byte {offset} on")));
+            return Err(digest_mismatch(
+                blob,
+                format!("the server has none from byte {offset} on"),
+            ));
         }
         StatusCode::UNAUTHORIZED => return Err(FetchError::Unauthorized),
         StatusCode::TOO_MANY_REQUESTS | StatusCode::REQUEST_TIMEOUT | StatusCode::TOO_EARLY => {
@@ -190,7 +195,8 @@ fn judge(
         }
         status if status.is_server_error() => return Err(busy(status, headers)),
         status if status.is_client_error() => {
-            let (digest, repository) = (blob.digest, repository.clone());
+            let digest = blob.digest;
+            let repository = repository.clone();
             return Err(FetchError::Unavailable { status: status.as_u16(), digest, repository });
         }
         status => {
@@ -199,7 +205,7 @@ fn judge(
     };
     match header(headers, &CONTENT_DIGEST) {
         Some(found) if found != blob.digest.to_string() => {
-            return Err(other_bytes(blob, format!("they are {found:?}")));
+            return Err(digest_mismatch(blob, format!("they are {found:?}")));
         }
         None if !headers.contains_key(ETAG) => {
             return Err(FetchError::NotTheServer(
@@ -212,23 +218,23 @@ fn judge(
         response.content_length().filter(|&length| length != offered.end - offered.start)
     {
         let reason = format!(
-            "{length} bytes are offered from byte {} on, {} were ordered",
+            "{length} bytes are offered from byte {} on, expected {}",
             offered.start, blob.size
         );
-        return Err(other_bytes(blob, reason));
+        return Err(digest_mismatch(blob, reason));
     }
     Ok(offset - offered.start)
 }
 
 /// Whether the refusal comes from the server itself. A proxy in front of a restarting server also
 /// refuses, but only for a while.
-async fn has_registrys_words(response: &mut reqwest::Response, patience: Duration) -> bool {
-    tokio::time::timeout(patience, RegistryWords::read(response))
+async fn is_registry_error(response: &mut reqwest::Response, time_limit: Duration) -> bool {
+    tokio::time::timeout(time_limit, RegistryError::read(response))
         .await
-        .is_ok_and(|words| words.are_a_registrys())
+        .is_ok_and(|registry_error| registry_error.is_from_registry())
 }
 
-fn other_bytes(blob: BlobRef, reason: String) -> FetchError {
+fn digest_mismatch(blob: BlobRef, reason: String) -> FetchError {
     FetchError::DigestMismatch { digest: blob.digest, reason }
 }
 

@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use task_archive::Refusal;
-use task_proto::report::FailureCode;
+use task_proto::messages::report::FailureCode;
 use task_proto::{Digest, RepositoryName};
 
 use crate::system::disk::{self, DiskFull, Need};
 
 /// Pause before the next request to a server that repeatedly sends bytes with a wrong digest.
-const OTHER_BYTES_PAUSE: Duration = Duration::from_secs(60);
+const MISMATCH_PAUSE: Duration = Duration::from_secs(60);
 
 /// Reasons why a pull did not put the package in its place.
 #[derive(Debug, thiserror::Error)]
@@ -30,11 +30,11 @@ pub enum FetchError {
         size: u64,
     },
     /// Too few bytes arrived within the stall timeout.
-    #[error("the server sent next to nothing for {} s", .0.as_secs())]
+    #[error("the server sent almost nothing for {} s", .0.as_secs())]
     Stalled(Duration),
     /// The answer does not come from a taskd server or a registry, but from a captive portal or a
     /// proxy.
-    #[error("something else answers in the server's place: {0}")]
+    #[error("not a taskd server: {0}")]
     NotTheServer(String),
     /// The server is overloaded, restarting or broken.
     #[error("the server answers {status}")]
@@ -55,10 +55,10 @@ pub enum FetchError {
         repository: RepositoryName,
     },
     /// The announced size exceeds the limit for such a blob.
-    #[error("blob {digest} is said to have {size} bytes, {most} are possible")]
+    #[error("blob {digest} is announced with {size} bytes, the limit is {most}")]
     TooLarge { digest: Digest, size: u64, most: u64 },
     /// The bytes do not match the ordered digest, even when fetched again.
-    #[error("the server's bytes for {digest} are others: {reason}")]
+    #[error("the server's bytes do not match {digest}: {reason}")]
     DigestMismatch { digest: Digest, reason: String },
     /// The bytes match the digest, but are not a task manifest for this package.
     #[error("the package's task manifest can't be used: {0}")]
@@ -116,13 +116,13 @@ impl FetchError {
 
     /// Whether to delete the collected bytes: they are useless, or they take up the space that is
     /// missing.
-    pub(super) fn spoils_gathered(&self) -> bool {
+    pub(super) fn discards_content(&self) -> bool {
         matches!(self, Self::DiskFull(_) | Self::DigestMismatch { .. })
             || !self.is_retryable() && !matches!(self, Self::Cancelled)
     }
 
     /// Wait that the server requests, if its only problem is a lack of capacity for this robot now.
-    pub fn told_to_wait(&self) -> Option<Duration> {
+    pub fn retry_later(&self) -> Option<Duration> {
         match self {
             Self::Busy { status: 429 | 503, retry_after } => *retry_after,
             _ => None,
@@ -133,7 +133,7 @@ impl FetchError {
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Busy { retry_after, .. } => *retry_after,
-            Self::DigestMismatch { .. } => Some(OTHER_BYTES_PAUSE),
+            Self::DigestMismatch { .. } => Some(MISMATCH_PAUSE),
             Self::DiskFull(_) => Some(disk::FULL_PAUSE),
             _ => None,
         }
@@ -144,7 +144,7 @@ impl FetchError {
         matches!(self, Self::Unreachable(_) | Self::Interrupted { .. } | Self::Stalled(_))
     }
 
-    pub(super) fn other_bytes(digest: Digest, found: Digest) -> Self {
+    pub(super) fn digest_mismatch(digest: Digest, found: Digest) -> Self {
         Self::DigestMismatch { digest, reason: format!("they hash to {found}") }
     }
 
@@ -167,7 +167,7 @@ impl FetchError {
 
     /// Turns a write error on a full disk into one with the figures of the file system that holds
     /// `path`.
-    pub(crate) fn for_want_of_room(self, path: &Path, need: Need) -> Self {
+    pub(crate) fn or_disk_full(self, path: &Path, need: Need) -> Self {
         match self {
             Self::Disk { source, .. }
                 if matches!(
@@ -175,7 +175,7 @@ impl FetchError {
                     io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded
                 ) =>
             {
-                match disk::room(path) {
+                match disk::space(path) {
                     Ok(room) => DiskFull { free: room.free, total: room.total, need }.into(),
                     Err(source) => Self::disk(path, source),
                 }

@@ -12,8 +12,8 @@ use sha2::{Digest as _, Sha256};
 use task_archive::{Limits, UnpackError};
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::ContentFacts;
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
+use task_proto::packages::manifest::ContentFacts;
 use tokio::sync::{OwnedMutexGuard, mpsc, watch};
 use tokio_util::sync::CancellationToken;
 
@@ -34,7 +34,7 @@ pub(super) struct Intake {
     stop: CancellationToken,
     /// Lock on the content, held until all work of this attempt has ended, possibly after the pull
     /// was dropped.
-    _turn: Arc<OwnedMutexGuard<()>>,
+    _lock: Arc<OwnedMutexGuard<()>>,
 }
 
 impl Intake {
@@ -45,7 +45,7 @@ impl Intake {
         receiver: mpsc::Receiver<Bytes>,
         progress: watch::Sender<Progress>,
         stop: CancellationToken,
-        turn: Arc<OwnedMutexGuard<()>>,
+        lock: Arc<OwnedMutexGuard<()>>,
     ) -> Self {
         let blob = package.content;
         Self {
@@ -57,7 +57,7 @@ impl Intake {
             receiver,
             progress,
             stop,
-            _turn: turn,
+            _lock: lock,
         }
     }
 
@@ -68,7 +68,8 @@ impl Intake {
         src: &Path,
         need: Need,
     ) -> Result<(), FetchError> {
-        let (part, staging) = (self.part.clone(), self.staging.clone());
+        let part = self.part.clone();
+        let staging = self.staging.clone();
         let result = self.unpack(facts).and_then(|()| place(&staging, src));
         let cleaned = match &result {
             // The bytes are unpacked or useless. Bytes with another digest stay, because a repair
@@ -77,13 +78,15 @@ impl Intake {
             Err(_) => Ok(()),
         };
         if let Err(error) = cleaned.and_then(|()| durable::remove_dir_all(&staging)) {
-            tracing::warn!(%error, part = %part.display(), "what a pull left can't be removed");
+            tracing::warn!(%error, part = %part.display(), "cannot remove the leftovers of a pull");
         }
-        result.map_err(|error| error.for_want_of_room(part.parent().unwrap_or(&part), need))
+        result.map_err(|error| error.or_disk_full(part.parent().unwrap_or(&part), need))
     }
 
     fn unpack(self, facts: &ContentFacts) -> Result<(), FetchError> {
-        let (blob, limits, staging) = (self.blob, self.limits, self.staging.clone());
+        let blob = self.blob;
+        let limits = self.limits;
+        let staging = self.staging.clone();
         durable::remove_dir_all(&staging).map_err(|source| FetchError::disk(&staging, source))?;
         if let Some(parent) = staging.parent() {
             durable::create_dir_all(parent).map_err(|source| FetchError::disk(parent, source))?;
@@ -103,7 +106,7 @@ impl Intake {
         }
         let found = Digest::from_sha256(bytes.hasher.finalize().into());
         if found != blob.digest {
-            return Err(FetchError::other_bytes(blob.digest, found));
+            return Err(FetchError::digest_mismatch(blob.digest, found));
         }
         match unpacked {
             Ok(()) => Ok(()),

@@ -1,7 +1,7 @@
 //! Tracks which parts of a blob are present and which missing parts were requested. The memory is
 //! bounded by the number of parts that a blob may have. This module never sees a part's bytes.
 
-use task_proto::part::{Cut, PartRange};
+use task_proto::messages::part::{PartLayout, PartRange};
 
 /// Format marker at the start of a note.
 const NOTE_FORMAT: [u8; 4] = *b"pt1\n";
@@ -9,17 +9,21 @@ const NOTE_FORMAT: [u8; 4] = *b"pt1\n";
 /// The parts of one blob.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct PartMap {
-    cut: Cut,
-    there: Bits,
-    asked: Bits,
+    cut: PartLayout,
+    present: Bits,
+    requested: Bits,
     bytes: u64,
 }
 
 impl PartMap {
     /// A map of a blob whose first `prefix` bytes are present.
-    pub(super) fn new(cut: Cut, prefix: u64) -> Self {
-        let mut map =
-            Self { cut, there: Bits::new(cut.count()), asked: Bits::new(cut.count()), bytes: 0 };
+    pub(super) fn new(cut: PartLayout, prefix: u64) -> Self {
+        let mut map = Self {
+            cut,
+            present: Bits::new(cut.count()),
+            requested: Bits::new(cut.count()),
+            bytes: 0,
+        };
         for index in (0..cut.count()).take_while(|&index| cut.range(index).end <= prefix) {
             map.take(index);
         }
@@ -27,7 +31,7 @@ impl PartMap {
     }
 
     /// The blob's division into parts.
-    pub(super) fn cut(&self) -> Cut {
+    pub(super) fn cut(&self) -> PartLayout {
         self.cut
     }
 
@@ -38,12 +42,12 @@ impl PartMap {
 
     /// Whether the part is present.
     pub(super) fn has(&self, index: u32) -> bool {
-        self.there.has(index)
+        self.present.has(index)
     }
 
     /// Marks the part as present; false if the part was present before.
     pub(super) fn take(&mut self, index: u32) -> bool {
-        let is_new = index < self.cut.count() && self.there.set(index);
+        let is_new = index < self.cut.count() && self.present.set(index);
         if is_new {
             let range = self.cut.range(index);
             self.bytes += range.end - range.start;
@@ -53,58 +57,58 @@ impl PartMap {
 
     /// Whether all parts are present.
     pub(super) fn is_whole(&self) -> bool {
-        self.lacking().next().is_none()
+        self.missing().next().is_none()
     }
 
     /// Number of bytes before the first gap.
     pub(super) fn prefix(&self) -> u64 {
-        let first_gap = self.lacking().next().unwrap_or(self.cut.count());
+        let first_gap = self.missing().next().unwrap_or(self.cut.count());
         self.cut.range(first_gap).start
     }
 
     /// Requests all missing parts below `index`; true if there are any.
-    pub(super) fn ask_below(&mut self, index: u32) -> bool {
-        let lacking: Vec<u32> = self.lacking().take_while(|&lacking| lacking < index).collect();
-        lacking.iter().for_each(|&lacking| {
-            self.asked.set(lacking);
+    pub(super) fn request_below(&mut self, index: u32) -> bool {
+        let missing: Vec<u32> = self.missing().take_while(|&missing| missing < index).collect();
+        missing.iter().for_each(|&missing| {
+            self.requested.set(missing);
         });
-        !lacking.is_empty()
+        !missing.is_empty()
     }
 
-    pub(super) fn ask_nothing(&mut self) {
-        self.asked = Bits::new(self.cut.count());
+    pub(super) fn clear_request(&mut self) {
+        self.requested = Bits::new(self.cut.count());
     }
 
     /// Requested parts that are still missing.
-    pub(super) fn asked(&self) -> Vec<PartRange> {
-        PartRange::runs(self.lacking().filter(|&index| self.asked.has(index)))
+    pub(super) fn requested(&self) -> Vec<PartRange> {
+        PartRange::runs(self.missing().filter(|&index| self.requested.has(index)))
     }
 
     /// Encodes the parts that are present, for a later agent process.
     pub(super) fn note(&self) -> Vec<u8> {
-        let words = self.there.0.iter().flat_map(|word| word.to_be_bytes());
+        let words = self.present.0.iter().flat_map(|word| word.to_be_bytes());
         NOTE_FORMAT.into_iter().chain(self.cut.part_bytes().to_be_bytes()).chain(words).collect()
     }
 
     /// Decodes a note about a blob of `size` bytes; `None` if the note is not valid.
     pub(super) fn of_note(note: &[u8], size: u64) -> Option<Self> {
         let (part_bytes, words) = note.strip_prefix(&NOTE_FORMAT)?.split_first_chunk::<4>()?;
-        let mut map = Self::new(Cut::new(size, u32::from_be_bytes(*part_bytes)).ok()?, 0);
+        let mut map = Self::new(PartLayout::new(size, u32::from_be_bytes(*part_bytes)).ok()?, 0);
         let (words, rest) = words.as_chunks::<8>();
-        if !rest.is_empty() || words.len() != map.there.0.len() {
+        if !rest.is_empty() || words.len() != map.present.0.len() {
             return None;
         }
-        let there = Bits(words.iter().map(|word| u64::from_be_bytes(*word)).collect());
-        for index in (0..map.cut.count()).filter(|&index| there.has(index)) {
+        let present = Bits(words.iter().map(|word| u64::from_be_bytes(*word)).collect());
+        for index in (0..map.cut.count()).filter(|&index| present.has(index)) {
             map.take(index);
         }
         Some(map)
     }
 
-    fn lacking(&self) -> impl Iterator<Item = u32> {
+    fn missing(&self) -> impl Iterator<Item = u32> {
         // Skip full words first: a large blob has a million parts, and usually most of them are
         // present or most are missing.
-        let words = self.there.0.iter().zip(0u32..).filter(|(word, _)| **word != u64::MAX);
+        let words = self.present.0.iter().zip(0u32..).filter(|(word, _)| **word != u64::MAX);
         let indexes = words.flat_map(|(word, at)| {
             (0..64).filter(move |bit| word >> bit & 1 == 0).map(move |bit| at * 64 + bit)
         });
@@ -146,35 +150,35 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_knows_what_came(size in 1..300 * PART, came in prop::collection::vec(0..320u32, 0..400)) {
-            let mut map = PartMap::new(Cut::new(size, PART as u32).expect("a cut"), 0);
+        fn map_matches_a_set_of_parts(size in 1..300 * PART, arrived in prop::collection::vec(0..320u32, 0..400)) {
+            let mut map = PartMap::new(PartLayout::new(size, PART as u32).expect("a cut"), 0);
             let count = map.cut().count();
-            let mut there = BTreeSet::new();
-            for index in came {
-                prop_assert_eq!(map.take(index), index < count && there.insert(index));
+            let mut present = BTreeSet::new();
+            for index in arrived {
+                prop_assert_eq!(map.take(index), index < count && present.insert(index));
             }
-            prop_assert!((0..400).all(|index| map.has(index) == there.contains(&index)));
-            let bytes: u64 = there.iter().map(|&index| PART.min(size - u64::from(index) * PART)).sum();
+            prop_assert!((0..400).all(|index| map.has(index) == present.contains(&index)));
+            let bytes: u64 = present.iter().map(|&index| PART.min(size - u64::from(index) * PART)).sum();
             prop_assert_eq!((map.bytes(), map.is_whole()), (bytes, bytes == size));
-            let gap = (0..count).find(|index| !there.contains(index));
+            let gap = (0..count).find(|index| !present.contains(index));
             prop_assert_eq!(map.prefix(), gap.map_or(size, |gap| u64::from(gap) * PART));
             let read = PartMap::of_note(&map.note(), size);
             prop_assert_eq!(read.as_ref(), Some(&map));
 
-            let lacking: Vec<u32> = (0..count).filter(|index| !there.contains(index)).collect();
-            prop_assert!(map.asked().is_empty());
-            prop_assert_eq!(map.ask_below(u32::MAX), !lacking.is_empty());
-            prop_assert_eq!(map.asked(), PartRange::runs(lacking.iter().copied()));
-            if let Some(&first) = lacking.first() {
+            let missing: Vec<u32> = (0..count).filter(|index| !present.contains(index)).collect();
+            prop_assert!(map.requested().is_empty());
+            prop_assert_eq!(map.request_below(u32::MAX), !missing.is_empty());
+            prop_assert_eq!(map.requested(), PartRange::runs(missing.iter().copied()));
+            if let Some(&first) = missing.first() {
                 map.take(first);
-                prop_assert_eq!(map.asked(), PartRange::runs(lacking[1..].iter().copied()));
+                prop_assert_eq!(map.requested(), PartRange::runs(missing[1..].iter().copied()));
             }
-            map.ask_nothing();
-            prop_assert!(map.asked().is_empty());
+            map.clear_request();
+            prop_assert!(map.requested().is_empty());
         }
 
         #[test]
-        fn what_is_no_note_is_not_read(size in any::<u64>(), note in prop::collection::vec(any::<u8>(), 0..64), whole in any::<bool>()) {
+        fn invalid_note_is_not_read(size in any::<u64>(), note in prop::collection::vec(any::<u8>(), 0..64), whole in any::<bool>()) {
             let note = if whole { [&NOTE_FORMAT[..], &note].concat() } else { note };
             if let Some(map) = PartMap::of_note(&note, size) {
                 prop_assert!(map.bytes() <= size && map.prefix() <= size);
@@ -183,8 +187,8 @@ mod tests {
     }
 
     #[test]
-    fn a_beginning_counts_as_whole_parts_only() {
-        let cut = Cut::new(10 * PART + 5, PART as u32).expect("a cut");
+    fn prefix_counts_as_whole_parts_only() {
+        let cut = PartLayout::new(10 * PART + 5, PART as u32).expect("a cut");
         for (prefix, parts, bytes) in [
             (0, 0, 0),
             (PART - 1, 0, 0),
@@ -197,13 +201,13 @@ mod tests {
                 (parts, bytes)
             );
             assert_eq!(map.prefix(), bytes);
-            assert_eq!(map.ask_below(2), parts < 2);
+            assert_eq!(map.request_below(2), parts < 2);
         }
     }
 
     #[test]
     fn a_note_about_another_size_or_cut_off_is_none() {
-        let map = PartMap::new(Cut::new(100 * PART, PART as u32).expect("a cut"), 30 * PART);
+        let map = PartMap::new(PartLayout::new(100 * PART, PART as u32).expect("a cut"), 30 * PART);
         let note = map.note();
         assert!(PartMap::of_note(&note, 400 * PART).is_none());
         for length in 0..note.len() {

@@ -16,8 +16,8 @@ use std::time::Duration;
 
 use task_proto::Digest;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::part::{Cut, HEADER_BYTES, Part, PartRange};
-use task_proto::report::Progress;
+use task_proto::messages::part::{HEADER_BYTES, Part, PartLayout, PartRange};
+use task_proto::messages::report::Progress;
 use tokio::sync::{OwnedMutexGuard, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -27,83 +27,83 @@ use super::part_map::PartMap;
 use super::{FetchError, Fetcher};
 use crate::system::durable;
 use crate::system::layout::DataDir;
-use crate::transfer::parts::Asks;
-use crate::transfer::parts::{Arrived, Ear, Hearing};
+use crate::transfer::parts::PartRequest;
+use crate::transfer::parts::{PartReceiver, ReceivedPart, SubscriptionState};
 
 /// Largest note: its header and one bit per part, for the most parts that a blob may have.
 const MAX_NOTE_BYTES: u64 = 256 * 1024;
 /// Most parts written in one batch.
-const WRITTEN_TOGETHER: usize = 4;
-/// A note is written after this many new bytes, or after [`NOTED_AFTER`].
-const NOTED_BYTES: u64 = 16 << 20;
-const NOTED_AFTER: Duration = Duration::from_secs(5);
+const BATCH_PARTS: usize = 4;
+/// A note is written after this many new bytes, or after [`NOTE_INTERVAL`].
+const NOTE_INTERVAL_BYTES: u64 = 16 << 20;
+const NOTE_INTERVAL: Duration = Duration::from_secs(5);
 /// Delay after which parts that have arrived are removed from the request for missing parts.
-const TAKEN_BACK_AFTER: Duration = Duration::from_millis(100);
+const TRIM_DELAY: Duration = Duration::from_millis(100);
 
 /// Timeouts for pushed parts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct PartPatience {
+pub struct PartTimeouts {
     /// After this long without a part, the missing parts are requested. The timeout then doubles.
     pub silence: Duration,
     /// After this long without a subscription, the content is pulled.
-    pub deaf: Duration,
+    pub no_subscription: Duration,
     /// After this long without a new part, the content is pulled.
-    pub starved: Duration,
+    pub no_progress: Duration,
 }
 
-impl Default for PartPatience {
+impl Default for PartTimeouts {
     fn default() -> Self {
         Self {
             silence: Duration::from_secs(2),
-            deaf: Duration::from_secs(10),
-            starved: Duration::from_secs(30),
+            no_subscription: Duration::from_secs(10),
+            no_progress: Duration::from_secs(30),
         }
     }
 }
 
 /// Reasons to pull a content that the server pushes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum GaveUp {
+pub(super) enum PullReason {
     #[error("there is no MQTT session")]
     NoSession,
-    #[error("for {} s there was no subscription to its parts", .0.as_secs())]
-    Deaf(Duration),
-    #[error("for {} s no part of it came", .0.as_secs())]
-    Starved(Duration),
-    #[error("another pull listens to its parts")]
+    #[error("no subscription to its parts for {} s", .0.as_secs())]
+    NoSubscription(Duration),
+    #[error("no part arrived for {} s", .0.as_secs())]
+    NoProgress(Duration),
+    #[error("another pull subscribed to its parts")]
     Replaced,
 }
 
 /// The files in which parts are collected.
 #[derive(Clone)]
-struct Files {
+struct PartFiles {
     part: PathBuf,
     parts: PathBuf,
     note: PathBuf,
 }
 
-pub(super) struct Gathering<'a> {
+pub(super) struct PartCollector<'a> {
     content: BlobRef,
-    files: Files,
+    files: PartFiles,
     file: Arc<File>,
     /// `None` until a part has shown the part size.
     map: Option<PartMap>,
     /// Whether this agent process has received a part. An earlier process may have received others.
     is_cut: bool,
-    patience: PartPatience,
+    timeouts: PartTimeouts,
     progress: &'a watch::Sender<Progress>,
-    asks: &'a watch::Sender<Asks>,
+    part_requests: &'a watch::Sender<PartRequest>,
     /// Lock on the content, held until all work has ended, including writes that outlive this
     /// struct.
-    turn: Arc<OwnedMutexGuard<()>>,
+    lock: Arc<OwnedMutexGuard<()>>,
     /// Counts messages that were not parts of this content, and duplicate parts.
     foreign: u64,
-    double: u64,
+    duplicate: u64,
     noted_bytes: u64,
     noted_at: Instant,
     /// The note being written. Parts are accepted meanwhile: the server would judge a robot that
     /// does not acknowledge as too slow.
-    noting: Option<JoinHandle<io::Result<()>>>,
+    note_write: Option<JoinHandle<io::Result<()>>>,
 }
 
 /// Times of the latest events.
@@ -114,26 +114,26 @@ struct Times {
     /// Silence after which missing parts are requested next.
     silence: Duration,
     /// Time of the last new part, or of the subscription.
-    starved_since: Instant,
+    last_progress_at: Instant,
     /// `Some` while the subscription is missing.
-    deaf_since: Option<Instant>,
+    unsubscribed_since: Option<Instant>,
     /// Whether this subscription has not delivered a part yet.
     is_fresh: bool,
     /// Time of the first part since the last update of the request for missing parts.
-    came_at: Option<Instant>,
+    first_arrival_at: Option<Instant>,
 }
 
-impl<'a> Gathering<'a> {
+impl<'a> PartCollector<'a> {
     /// Opens the parts and the note that earlier attempts left.
     pub(super) fn open(
         fetcher: &Fetcher,
         package: &PackageRef,
         progress: &'a watch::Sender<Progress>,
-        asks: &'a watch::Sender<Asks>,
-        turn: Arc<OwnedMutexGuard<()>>,
+        part_requests: &'a watch::Sender<PartRequest>,
+        lock: Arc<OwnedMutexGuard<()>>,
     ) -> Result<Self, FetchError> {
         let content = package.content;
-        let files = Files::of(&fetcher.data, &content.digest);
+        let files = PartFiles::of(&fetcher.data, &content.digest);
         let failed = |source| FetchError::disk(&files.parts, source);
         let (file, map) = files.open(content.size).map_err(failed)?;
         Ok(Self {
@@ -142,15 +142,15 @@ impl<'a> Gathering<'a> {
             map,
             is_cut: false,
             files,
-            patience: fetcher.settings().parts,
+            timeouts: fetcher.settings().parts,
             progress,
-            asks,
-            turn,
+            part_requests,
+            lock,
             foreign: 0,
-            double: 0,
+            duplicate: 0,
             noted_bytes: 0,
             noted_at: Instant::now(),
-            noting: None,
+            note_write: None,
         })
     }
 
@@ -158,72 +158,79 @@ impl<'a> Gathering<'a> {
     /// pull is the better choice.
     pub(super) async fn run(
         mut self,
-        mut ear: Ear,
+        mut part_receiver: PartReceiver,
         cancel: &CancellationToken,
-    ) -> Result<Result<(), GaveUp>, FetchError> {
+    ) -> Result<Result<(), PullReason>, FetchError> {
         self.noted_bytes = self.bytes();
-        self.tell_progress();
+        self.report_progress();
         let ended = tokio::select! {
-            ended = self.gather(&mut ear) => ended,
+            ended = self.collect(&mut part_receiver) => ended,
             () = cancel.cancelled() => Err(FetchError::Cancelled),
         };
-        self.asks.send_modify(|asks| asks.missing = None);
-        if self.foreign > 0 || self.double > 0 {
-            let (foreign, double, digest) = (self.foreign, self.double, self.content.digest);
-            tracing::info!(%digest, foreign, double, "messages on its topic that were of no use");
+        self.part_requests.send_modify(|part_requests| part_requests.missing = None);
+        if self.foreign > 0 || self.duplicate > 0 {
+            let foreign = self.foreign;
+            let duplicate = self.duplicate;
+            let digest = self.content.digest;
+            tracing::info!(%digest, foreign, duplicate, "ignored messages on the topic of a content");
         }
         match ended {
             Ok(Ok(())) => {
-                self.noted().await?;
-                let (files, turn) = (self.files.clone(), self.turn.clone());
-                on_disk(&self.files.parts, move || files.whole().map(|()| drop(turn))).await?;
+                self.finish_note().await?;
+                let files = self.files.clone();
+                let lock = self.lock.clone();
+                on_disk(&self.files.parts, move || files.whole().map(|()| drop(lock))).await?;
             }
             Ok(Err(_)) | Err(FetchError::Cancelled) => {
-                self.noted().await?;
+                self.finish_note().await?;
                 self.begin_note();
-                self.noted().await?;
+                self.finish_note().await?;
             }
             Err(_) => {}
         }
         ended
     }
 
-    async fn gather(&mut self, ear: &mut Ear) -> Result<Result<(), GaveUp>, FetchError> {
+    async fn collect(
+        &mut self,
+        part_receiver: &mut PartReceiver,
+    ) -> Result<Result<(), PullReason>, FetchError> {
         let now = Instant::now();
         let mut times = Times {
             quiet_since: now,
-            silence: self.patience.silence,
-            starved_since: now,
-            deaf_since: Some(now),
+            silence: self.timeouts.silence,
+            last_progress_at: now,
+            unsubscribed_since: Some(now),
             is_fresh: true,
-            came_at: None,
+            first_arrival_at: None,
         };
         if self.map.as_ref().is_some_and(PartMap::is_whole) {
             return Ok(Ok(()));
         }
-        if *ear.hearing.borrow_and_update() == Hearing::Away {
-            return Ok(Err(GaveUp::NoSession));
+        if *part_receiver.subscription_state.borrow_and_update() == SubscriptionState::Disconnected
+        {
+            return Ok(Err(PullReason::NoSession));
         }
-        self.hear(*ear.hearing.borrow(), &mut times);
-        let mut batch = Vec::with_capacity(WRITTEN_TOGETHER);
+        self.update_subscription(*part_receiver.subscription_state.borrow(), &mut times);
+        let mut batch = Vec::with_capacity(BATCH_PARTS);
         loop {
             tokio::select! {
                 // Cancel-safe: a message stays in the channel until received.
-                count = ear.parts.recv_many(&mut batch, WRITTEN_TOGETHER) => {
+                count = part_receiver.parts.recv_many(&mut batch, BATCH_PARTS) => {
                     if count == 0 {
-                        return Ok(Err(GaveUp::Replaced));
+                        return Ok(Err(PullReason::Replaced));
                     }
-                    self.take(std::mem::take(&mut batch), &mut times).await?;
+                    self.write_batch(std::mem::take(&mut batch), &mut times).await?;
                     if self.map.as_ref().is_some_and(PartMap::is_whole) {
                         return Ok(Ok(()));
                     }
                 }
                 // Cancel-safe: a watch remembers a change.
-                Ok(()) = ear.hearing.changed() => self.hear(*ear.hearing.borrow_and_update(), &mut times),
+                Ok(()) = part_receiver.subscription_state.changed() => self.update_subscription(*part_receiver.subscription_state.borrow_and_update(), &mut times),
                 // Cancel-safe: the timer is recreated on each iteration.
-                () = tokio::time::sleep_until(self.next_look(&times)) => {
-                    if let Some(gave_up) = self.look(&mut times) {
-                        return Ok(Err(gave_up));
+                () = tokio::time::sleep_until(self.next_deadline(&times)) => {
+                    if let Some(reason) = self.check_deadlines(&mut times) {
+                        return Ok(Err(reason));
                     }
                 }
             }
@@ -232,46 +239,51 @@ impl<'a> Gathering<'a> {
 
     /// Takes messages from the session, writes the valid parts, and drops the messages, which
     /// acknowledges them.
-    async fn take(&mut self, batch: Vec<Arrived>, times: &mut Times) -> Result<(), FetchError> {
+    async fn write_batch(
+        &mut self,
+        batch: Vec<ReceivedPart>,
+        times: &mut Times,
+    ) -> Result<(), FetchError> {
         let now = Instant::now();
         let mut writes = Vec::with_capacity(batch.len());
-        for arrived in batch {
-            let Some((index, from)) = self.judge(&arrived.message) else { continue };
+        for part in batch {
+            let Some((index, from)) = self.validate(&part.message) else { continue };
             times.quiet_since = now;
-            times.silence = self.patience.silence;
+            times.silence = self.timeouts.silence;
             let Some(map) = &mut self.map else { continue };
-            if std::mem::take(&mut times.is_fresh) && map.ask_below(index) {
+            if std::mem::take(&mut times.is_fresh) && map.request_below(index) {
                 // The subscription came late: parts published earlier are sent again only on
                 // request.
-                self.say();
+                self.request_missing();
             }
-            let is_there = self.map.as_ref().is_some_and(|map| map.has(index));
-            if is_there { self.double += 1 } else { writes.push((index, from, arrived)) }
+            let is_present = self.map.as_ref().is_some_and(|map| map.has(index));
+            if is_present { self.duplicate += 1 } else { writes.push((index, from, part)) }
         }
         if writes.is_empty() {
             return Ok(());
         }
-        let (file, turn) = (self.file.clone(), self.turn.clone());
+        let file = self.file.clone();
+        let lock = self.lock.clone();
         let written = on_disk(&self.files.parts, move || {
-            for (_, from, arrived) in &writes {
-                file.write_all_at(&arrived.message[HEADER_BYTES..], *from)?;
+            for (_, from, part) in &writes {
+                file.write_all_at(&part.message[HEADER_BYTES..], *from)?;
             }
-            drop(turn);
+            drop(lock);
             Ok(writes)
         })
         .await?;
         let Some(map) = &mut self.map else { return Ok(()) };
         for (index, ..) in &written {
             // A batch may hold the same part twice.
-            self.double += u64::from(!map.take(*index));
+            self.duplicate += u64::from(!map.take(*index));
         }
-        times.starved_since = now;
-        self.tell_progress();
-        times.came_at.get_or_insert(now);
-        let due = self.bytes() - self.noted_bytes >= NOTED_BYTES
-            || self.noted_at.elapsed() >= NOTED_AFTER;
-        if due && self.noting.as_ref().is_none_or(JoinHandle::is_finished) {
-            self.noted().await?;
+        times.last_progress_at = now;
+        self.report_progress();
+        times.first_arrival_at.get_or_insert(now);
+        let due = self.bytes() - self.noted_bytes >= NOTE_INTERVAL_BYTES
+            || self.noted_at.elapsed() >= NOTE_INTERVAL;
+        if due && self.note_write.as_ref().is_none_or(JoinHandle::is_finished) {
+            self.finish_note().await?;
             self.begin_note();
         }
         Ok(())
@@ -279,16 +291,16 @@ impl<'a> Gathering<'a> {
 
     /// Index and offset of a part. `None` if the message is not a part of this content with the
     /// known part size.
-    fn judge(&mut self, message: &[u8]) -> Option<(u32, u64)> {
+    fn validate(&mut self, message: &[u8]) -> Option<(u32, u64)> {
         let fits = Part::decode(message, self.content.size).and_then(|part| {
-            let cut = Cut::new(self.content.size, part.part_bytes)?;
+            let cut = PartLayout::new(self.content.size, part.part_bytes)?;
             Ok((part.index, cut))
         });
         let (index, cut) = match fits {
             Ok(fits) => fits,
             Err(error) => {
                 if self.foreign == 0 {
-                    tracing::warn!(digest = %self.content.digest, %error, "a message is no part of it");
+                    tracing::warn!(digest = %self.content.digest, %error, "ignored a message that is not a part of the content");
                 }
                 self.foreign += 1;
                 return None;
@@ -309,75 +321,84 @@ impl<'a> Gathering<'a> {
         Some((index, cut.range(index).start))
     }
 
-    fn hear(&mut self, hearing: Hearing, times: &mut Times) {
+    fn update_subscription(&mut self, subscription_state: SubscriptionState, times: &mut Times) {
         let now = Instant::now();
-        match hearing {
-            Hearing::Yes => {
-                (times.quiet_since, times.starved_since, times.deaf_since) = (now, now, None);
-                (times.silence, times.is_fresh) = (self.patience.silence, true);
+        match subscription_state {
+            SubscriptionState::Active => {
+                (times.quiet_since, times.last_progress_at, times.unsubscribed_since) =
+                    (now, now, None);
+                (times.silence, times.is_fresh) = (self.timeouts.silence, true);
                 if let Some(map) = &mut self.map {
-                    map.ask_nothing();
+                    map.clear_request();
                 }
-                self.asks.send_modify(|asks| {
-                    *asks = Asks { missing: Some(Vec::new()), times: asks.times + 1 }
+                self.part_requests.send_modify(|part_requests| {
+                    *part_requests =
+                        PartRequest { missing: Some(Vec::new()), times: part_requests.times + 1 }
                 });
             }
-            Hearing::Asked | Hearing::Refused | Hearing::Away => {
-                times.deaf_since.get_or_insert(now);
-                self.asks.send_if_modified(|asks| asks.missing.take().is_some());
+            SubscriptionState::Pending
+            | SubscriptionState::Refused
+            | SubscriptionState::Disconnected => {
+                times.unsubscribed_since.get_or_insert(now);
+                self.part_requests
+                    .send_if_modified(|part_requests| part_requests.missing.take().is_some());
             }
         }
     }
 
-    fn next_look(&self, times: &Times) -> Instant {
-        let next = match times.deaf_since {
-            Some(since) => since + self.patience.deaf,
-            None => {
-                (times.quiet_since + times.silence).min(times.starved_since + self.patience.starved)
-            }
+    fn next_deadline(&self, times: &Times) -> Instant {
+        let next = match times.unsubscribed_since {
+            Some(since) => since + self.timeouts.no_subscription,
+            None => (times.quiet_since + times.silence)
+                .min(times.last_progress_at + self.timeouts.no_progress),
         };
-        times.came_at.map_or(next, |at| next.min(at + TAKEN_BACK_AFTER))
+        times.first_arrival_at.map_or(next, |at| next.min(at + TRIM_DELAY))
     }
 
     /// Requests the missing parts, or gives up.
-    fn look(&mut self, times: &mut Times) -> Option<GaveUp> {
+    fn check_deadlines(&mut self, times: &mut Times) -> Option<PullReason> {
         let now = Instant::now();
-        if times.came_at.take_if(|at| now >= *at + TAKEN_BACK_AFTER).is_some() {
-            self.take_back();
+        if times.first_arrival_at.take_if(|at| now >= *at + TRIM_DELAY).is_some() {
+            self.trim_request();
         }
-        if let Some(since) = times.deaf_since {
-            return (now >= since + self.patience.deaf).then_some(GaveUp::Deaf(self.patience.deaf));
+        if let Some(since) = times.unsubscribed_since {
+            return (now >= since + self.timeouts.no_subscription)
+                .then_some(PullReason::NoSubscription(self.timeouts.no_subscription));
         }
-        if now >= times.starved_since + self.patience.starved {
-            return Some(GaveUp::Starved(self.patience.starved));
+        if now >= times.last_progress_at + self.timeouts.no_progress {
+            return Some(PullReason::NoProgress(self.timeouts.no_progress));
         }
         if now >= times.quiet_since + times.silence {
             times.quiet_since = now;
             times.silence *= 2;
             if let Some(map) = &mut self.map {
-                map.ask_below(u32::MAX);
+                map.request_below(u32::MAX);
             }
-            self.say();
+            self.request_missing();
         }
         None
     }
 
-    fn say(&self) {
+    fn request_missing(&self) {
         let missing = match &self.map {
-            Some(map) => map.asked(),
+            Some(map) => map.requested(),
             // The number of parts is still unknown.
             None => vec![PartRange { from: 0, to: u32::MAX }],
         };
-        self.asks
-            .send_modify(|asks| *asks = Asks { missing: Some(missing), times: asks.times + 1 });
+        self.part_requests.send_modify(|part_requests| {
+            *part_requests = PartRequest { missing: Some(missing), times: part_requests.times + 1 }
+        });
     }
 
     /// Removes the parts that have arrived from the request, so that a report sent for another
     /// reason does not request them again.
-    fn take_back(&self) {
-        let asked = |asks: &Asks| asks.missing.as_ref().is_some_and(|missing| !missing.is_empty());
-        if let Some(map) = self.map.as_ref().filter(|_| asked(&self.asks.borrow())) {
-            self.asks.send_modify(|asks| asks.missing = Some(map.asked()));
+    fn trim_request(&self) {
+        let requested = |part_requests: &PartRequest| {
+            part_requests.missing.as_ref().is_some_and(|missing| !missing.is_empty())
+        };
+        if let Some(map) = self.map.as_ref().filter(|_| requested(&self.part_requests.borrow())) {
+            self.part_requests
+                .send_modify(|part_requests| part_requests.missing = Some(map.requested()));
         }
     }
 
@@ -386,26 +407,28 @@ impl<'a> Gathering<'a> {
         self.map.as_ref().map_or(0, PartMap::bytes)
     }
 
-    fn tell_progress(&self) {
+    fn report_progress(&self) {
         self.progress.send_replace(Progress { done: self.bytes(), total: self.content.size });
     }
 
     /// Starts to sync the received parts to the disk and then to write the note.
     fn begin_note(&mut self) {
         let Some(map) = &self.map else { return };
-        let (note, file, path, turn) =
-            (map.note(), self.file.clone(), self.files.note.clone(), self.turn.clone());
+        let note = map.note();
+        let file = self.file.clone();
+        let path = self.files.note.clone();
+        let lock = self.lock.clone();
         (self.noted_bytes, self.noted_at) = (map.bytes(), Instant::now());
-        self.noting = Some(tokio::task::spawn_blocking(move || {
+        self.note_write = Some(tokio::task::spawn_blocking(move || {
             file.sync_data()?;
-            durable::write(&path, &note, 0o600).map(|()| drop(turn))
+            durable::write(&path, &note, 0o600).map(|()| drop(lock))
         }));
     }
 
     /// Waits until the current note is written.
-    async fn noted(&mut self) -> Result<(), FetchError> {
-        match self.noting.take() {
-            Some(noting) => finished(&self.files.note, noting).await,
+    async fn finish_note(&mut self) -> Result<(), FetchError> {
+        match self.note_write.take() {
+            Some(note_write) => finished(&self.files.note, note_write).await,
             None => Ok(()),
         }
     }
@@ -426,8 +449,8 @@ async fn finished<T>(path: &Path, work: JoinHandle<io::Result<T>>) -> Result<T, 
 
 /// Turns the parts up to the first gap into the `.part` that a pull resumes from, if they are more
 /// than the `.part` already holds.
-pub(super) fn hand_over(data: &DataDir, content: BlobRef) -> io::Result<()> {
-    let files = Files::of(data, &content.digest);
+pub(super) fn convert_to_part(data: &DataDir, content: BlobRef) -> io::Result<()> {
+    let files = PartFiles::of(data, &content.digest);
     let Some(map) = files.read_note(content.size) else { return files.discard() };
     let prefix = map.prefix();
     let pulled = fs::metadata(&files.part).map_or(0, |metadata| metadata.len());
@@ -442,10 +465,10 @@ pub(super) fn hand_over(data: &DataDir, content: BlobRef) -> io::Result<()> {
 
 /// Deletes the collected parts of a content.
 pub(super) fn discard(data: &DataDir, content: &Digest) -> io::Result<()> {
-    Files::of(data, content).discard()
+    PartFiles::of(data, content).discard()
 }
 
-impl Files {
+impl PartFiles {
     fn of(data: &DataDir, digest: &Digest) -> Self {
         Self {
             part: data.blob_part(digest),

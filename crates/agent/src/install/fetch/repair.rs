@@ -27,25 +27,30 @@ const MAX_COPIES: usize = 8;
 const MAX_LEAD_BYTES: u64 = 4096;
 
 impl Fetcher {
-    /// Repairs a complete `.part` of a content. Writes that outlive this call hold the turn.
+    /// Repairs a complete `.part` of a content. Writes that outlive this call hold the lock.
     pub(super) async fn repair_content(
         &self,
         package: &PackageRef,
-        turn: &Arc<OwnedMutexGuard<()>>,
+        lock: &Arc<OwnedMutexGuard<()>>,
     ) -> Result<(), FetchError> {
-        let (repository, blob) = (RepositoryName::of_package(&package.name), package.content);
+        let repository = RepositoryName::of_package(&package.name);
+        let blob = package.content;
         let part = self.data.blob_part(&blob.digest);
         let file = OpenOptions::new().read(true).write(true).open(&part);
         let file = Arc::new(file.map_err(|source| FetchError::disk(&part, source))?);
         for (from, length) in ranges(blob.size) {
-            let (read, mut first) = (file.clone(), vec![0; length]);
+            let read = file.clone();
+            let mut first = vec![0; length];
             let first =
                 on_disk(&part, move || read.read_exact_at(&mut first, from).map(|()| first))
                     .await?;
-            if let Some(agreed) = self.agreed(&repository, blob, from, first).await? {
-                let (written, turn) = (file.clone(), turn.clone());
-                on_disk(&part, move || written.write_all_at(&agreed, from).map(|()| drop(turn)))
-                    .await?;
+            if let Some(agreed_copy) = self.agreed_copy(&repository, blob, from, first).await? {
+                let written = file.clone();
+                let lock = lock.clone();
+                on_disk(&part, move || {
+                    written.write_all_at(&agreed_copy, from).map(|()| drop(lock))
+                })
+                .await?;
             }
         }
         Ok(())
@@ -60,17 +65,17 @@ impl Fetcher {
     ) -> Result<Vec<u8>, FetchError> {
         for (from, length) in ranges(blob.size) {
             let range = from as usize..from as usize + length;
-            if let Some(agreed) =
-                self.agreed(repository, blob, from, bytes[range.clone()].to_vec()).await?
+            if let Some(agreed_copy) =
+                self.agreed_copy(repository, blob, from, bytes[range.clone()].to_vec()).await?
             {
-                bytes[range].copy_from_slice(&agreed);
+                bytes[range].copy_from_slice(&agreed_copy);
             }
         }
         Ok(bytes)
     }
 
     /// Bytes of a range on which copies agree; `None` if they equal `first`.
-    async fn agreed(
+    async fn agreed_copy(
         &self,
         repository: &RepositoryName,
         blob: BlobRef,
@@ -89,12 +94,11 @@ impl Fetcher {
                 Err(error) if error.is_cut() => failure = Some(error),
                 Err(error) => return Err(error),
             }
-            if let Some(agreed) = majority(&copies) {
-                return Ok(Some(agreed));
+            if let Some(agreed_copy) = majority(&copies) {
+                return Ok(Some(agreed_copy));
             }
         }
-        let reason =
-            format!("{} copies of those from byte {from} on agree on nothing", copies.len());
+        let reason = format!("{} copies of the bytes from {from} on do not agree", copies.len());
         Err(failure.unwrap_or(FetchError::DigestMismatch { digest: blob.digest, reason }))
     }
 
@@ -105,7 +109,8 @@ impl Fetcher {
         from: u64,
         length: usize,
     ) -> Result<Vec<u8>, FetchError> {
-        let (lead, end) = (rand::random_range(1..=MAX_LEAD_BYTES), from + length as u64);
+        let lead = rand::random_range(1..=MAX_LEAD_BYTES);
+        let end = from + length as u64;
         let piece = async |from, end| {
             self.download_range(repository, blob, from..end).await?.collect(end - from).await
         };
@@ -133,8 +138,8 @@ fn ranges(size: u64) -> impl Iterator<Item = (u64, usize)> {
 /// such value.
 fn majority(copies: &[Vec<u8>]) -> Option<Vec<u8>> {
     let (first, others) = copies.split_first()?;
-    let mut agreed = first.clone();
-    for (at, byte) in agreed.iter_mut().enumerate() {
+    let mut agreed_copy = first.clone();
+    for (at, byte) in agreed_copy.iter_mut().enumerate() {
         if others.len() > 1 && others.iter().all(|copy| copy[at] == *byte) {
             continue;
         }
@@ -149,7 +154,7 @@ fn majority(copies: &[Vec<u8>]) -> Option<Vec<u8>> {
         }
         *byte = best;
     }
-    Some(agreed)
+    Some(agreed_copy)
 }
 
 #[cfg(test)]
@@ -160,18 +165,18 @@ mod tests {
     fn majority_needs_two_copies_that_agree_on_each_byte() {
         let copies =
             |texts: &[&str]| texts.iter().map(|text| text.as_bytes().to_vec()).collect::<Vec<_>>();
-        let agreed = |texts: &[&str]| {
+        let agreed_copy = |texts: &[&str]| {
             majority(&copies(texts)).map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
         };
-        assert_eq!(agreed(&["abc"]), None);
-        assert_eq!(agreed(&["abc", "abx"]), None);
+        assert_eq!(agreed_copy(&["abc"]), None);
+        assert_eq!(agreed_copy(&["abc", "abx"]), None);
         assert_eq!(
-            agreed(&["abc", "abx", "ybc"]).as_deref(),
+            agreed_copy(&["abc", "abx", "ybc"]).as_deref(),
             Some("abc"),
             "each copy has a fault of its own"
         );
-        assert_eq!(agreed(&["abx", "abc", "abx", "abc"]), None, "two against two");
-        assert_eq!(agreed(&["abx", "abc", "abc"]).as_deref(), Some("abc"));
+        assert_eq!(agreed_copy(&["abx", "abc", "abx", "abc"]), None, "two against two");
+        assert_eq!(agreed_copy(&["abx", "abc", "abc"]).as_deref(), Some("abc"));
     }
 
     #[test]

@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::TaskManifest;
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
+use task_proto::packages::manifest::TaskManifest;
 use task_proto::{Digest, RepositoryName};
 use tokio::sync::{OwnedMutexGuard, watch};
 use tokio_util::sync::CancellationToken;
@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use super::{FetchError, Fetcher};
 
 /// Number of full repeats for bytes with another digest. After that, ranges are compared.
-const MAX_WHOLE_AGAIN: u32 = 2;
+const MAX_FULL_RETRIES: u32 = 2;
 
 impl Fetcher {
     /// Pulls a content. A `.part` damaged by a power cut and wrong pushed parts are pulled again as
@@ -27,30 +27,30 @@ impl Fetcher {
         manifest: &TaskManifest,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
-        turn: Arc<OwnedMutexGuard<()>>,
+        lock: Arc<OwnedMutexGuard<()>>,
     ) -> Result<(), FetchError> {
-        for again in 1..=MAX_WHOLE_AGAIN {
-            match self.pull_content(package, manifest, progress, cancel, turn.clone()).await {
+        for retry in 1..=MAX_FULL_RETRIES {
+            match self.pull_content(package, manifest, progress, cancel, lock.clone()).await {
                 Err(FetchError::DigestMismatch { reason, .. }) => {
-                    tracing::warn!(package = %package.name, reason, again, "other bytes came; they are pulled again");
+                    tracing::warn!(package = %package.name, reason, retry, "received wrong bytes; pulling them again");
                 }
                 ended => return ended,
             }
             self.discard(package)?;
             cancel
-                .run_until_cancelled(tokio::time::sleep(self.pause_before(again)))
+                .run_until_cancelled(tokio::time::sleep(self.pause_before(retry)))
                 .await
                 .ok_or(FetchError::Cancelled)?;
         }
-        match self.pull_content(package, manifest, progress, cancel, turn.clone()).await {
+        match self.pull_content(package, manifest, progress, cancel, lock.clone()).await {
             Err(FetchError::DigestMismatch { .. })
                 if self.present(package)? == package.content.size => {}
             ended => return ended.map_err(FetchError::confirmed),
         }
-        tracing::warn!(package = %package.name, "other bytes came again; ranges of them are compared");
-        let repaired = cancel.run_until_cancelled(self.repair_content(package, &turn)).await;
+        tracing::warn!(package = %package.name, "received wrong bytes again; comparing ranges");
+        let repaired = cancel.run_until_cancelled(self.repair_content(package, &lock)).await;
         repaired.ok_or(FetchError::Cancelled)??;
-        self.pull_content(package, manifest, progress, cancel, turn)
+        self.pull_content(package, manifest, progress, cancel, lock)
             .await
             .map_err(FetchError::confirmed)
     }
@@ -61,9 +61,9 @@ impl Fetcher {
         repository: &RepositoryName,
         blob: BlobRef,
     ) -> Result<Vec<u8>, FetchError> {
-        let mut again = 0;
+        let mut retry = 0;
         loop {
-            let is_last = again == MAX_WHOLE_AGAIN;
+            let is_last = retry == MAX_FULL_RETRIES;
             let error = match self.pull_once(repository, blob).await {
                 Ok(bytes) if Digest::of(&bytes) == blob.digest => return Ok(bytes),
                 Ok(bytes) if is_last => {
@@ -75,15 +75,15 @@ impl Fetcher {
                     let is_repaired = found == blob.digest;
                     return is_repaired
                         .then_some(bytes)
-                        .ok_or(FetchError::other_bytes(blob.digest, found).confirmed());
+                        .ok_or(FetchError::digest_mismatch(blob.digest, found).confirmed());
                 }
-                Ok(bytes) => FetchError::other_bytes(blob.digest, Digest::of(&bytes)),
+                Ok(bytes) => FetchError::digest_mismatch(blob.digest, Digest::of(&bytes)),
                 Err(error @ FetchError::DigestMismatch { .. }) if !is_last => error,
                 Err(error) => return Err(error.confirmed()),
             };
-            again += 1;
-            tracing::warn!(digest = %blob.digest, %error, again, "other bytes came; they are pulled again");
-            tokio::time::sleep(self.pause_before(again)).await;
+            retry += 1;
+            tracing::warn!(digest = %blob.digest, %error, retry, "received wrong bytes; pulling them again");
+            tokio::time::sleep(self.pause_before(retry)).await;
         }
     }
 
@@ -97,7 +97,7 @@ impl Fetcher {
         download.collect(blob.size).await
     }
 
-    fn pause_before(&self, again: u32) -> Duration {
-        self.settings().reconnect_wait.mul_f64(rand::random::<f64>() * f64::from(again))
+    fn pause_before(&self, retry: u32) -> Duration {
+        self.settings().reconnect_wait.mul_f64(rand::random::<f64>() * f64::from(retry))
     }
 }

@@ -3,12 +3,12 @@
 
 use std::time::Duration;
 
-use task_proto::api::{ExternalBroker, MqttEndpoint, MqttPlace};
-use task_proto::topic::TopicPrefix;
+use task_proto::api::{BrokerAddress, ExternalBroker, MqttEndpoint};
+use task_proto::messages::topic::TopicPrefix;
 use tokio::sync::watch;
 
 use super::MqttAccess;
-use crate::link::state::Shared;
+use crate::link::state::LinkState;
 
 /// Longest wait before the session's first question to the server about its place.
 const FIRST_QUESTION: Duration = Duration::from_secs(10);
@@ -47,7 +47,7 @@ impl MqttAccess {
             };
         };
         let other = number.checked_sub(1).and_then(|at| alternatives.into_iter().nth(at));
-        let MqttPlace { host, port, tls } = other.unwrap_or(MqttPlace { host, port, tls });
+        let BrokerAddress { host, port, tls } = other.unwrap_or(BrokerAddress { host, port, tls });
         let host = host.unwrap_or_else(|| self.host.clone());
         Destination { host, port, prefix, is_encrypted: tls, external }
     }
@@ -66,7 +66,7 @@ pub(super) fn place_count(endpoint: Option<&MqttEndpoint>) -> usize {
 
 /// Waits until the server's first place is no longer `there`, the place of the current session or
 /// attempt.
-pub(super) async fn moved(
+pub(super) async fn first_place_changed(
     endpoint: &mut watch::Receiver<Option<MqttEndpoint>>,
     access: &MqttAccess,
     there: &Destination,
@@ -82,26 +82,26 @@ pub(super) async fn moved(
 
 /// Asks the server for its place from time to time, until that place differs from `there`. A server
 /// and a robot that search for a broker at the same time may find different ones; while the
-/// server's answer stays the same, [`moved`] does not return. `asked` counts the questions, and
-/// each doubles the wait.
-pub(super) async fn named_elsewhere(
-    shared: &Shared,
+/// server's answer stays the same, [`first_place_changed`] does not return. `questions` counts the
+/// questions, and each doubles the wait.
+pub(super) async fn await_other_place(
+    link_state: &LinkState,
     access: &MqttAccess,
     there: &Destination,
-    asked: &mut u32,
+    questions: &mut u32,
 ) -> Destination {
-    let mut answers = shared.endpoint_answers.subscribe();
+    let mut answers = link_state.endpoint_answers.subscribe();
     loop {
         // Cancel-safe: the timer is recreated on each iteration.
-        tokio::time::sleep(wait_before_question(*asked, rand::random())).await;
-        *asked = asked.saturating_add(1);
+        tokio::time::sleep(wait_before_question(*questions, rand::random())).await;
+        *questions = questions.saturating_add(1);
         answers.borrow_and_update();
-        shared.find.notify_one();
+        link_state.refresh_endpoint.notify_one();
         // Cancel-safe: a watch remembers a change. Without an answer the session stays.
         if answers.changed().await.is_err() {
             return std::future::pending().await;
         }
-        let first = access.destination(shared.endpoint.borrow().as_ref(), 0);
+        let first = access.destination(link_state.endpoint.borrow().as_ref(), 0);
         if first != *there {
             return first;
         }
@@ -109,8 +109,8 @@ pub(super) async fn named_elsewhere(
 }
 
 /// The wait before the next question. `jitter`, uniform from 0 to 1, randomizes its second half.
-fn wait_before_question(asked: u32, jitter: f64) -> Duration {
-    let longest = FIRST_QUESTION.saturating_mul(1 << asked.min(10)).min(MAX_QUESTION);
+fn wait_before_question(questions: u32, jitter: f64) -> Duration {
+    let longest = FIRST_QUESTION.saturating_mul(1 << questions.min(10)).min(MAX_QUESTION);
     longest.mul_f64(0.5 + jitter.clamp(0.0, 1.0) / 2.0)
 }
 
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn questions_begin_soon_and_become_rare() {
+    fn endpoint_questions_back_off() {
         assert_eq!(wait_before_question(0, 0.0), Duration::from_secs(5));
         assert_eq!(wait_before_question(0, 1.0), FIRST_QUESTION);
         assert_eq!(wait_before_question(2, 1.0), FIRST_QUESTION * 4);

@@ -1,7 +1,7 @@
 //! Reads the environments of many processes. The kernel blocks the reader for as long as the memory
 //! of the other process is locked. A hanging driver, a hanging network file system, or any user
 //! with a file system of their own can make this permanent. So a separate thread does the reading,
-//! and a process whose environment does not arrive delays one look, once.
+//! and a process whose environment does not arrive delays one call, once.
 
 use std::collections::HashMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -11,26 +11,26 @@ use std::time::Duration;
 use super::ProcessEntry;
 
 /// Maximum time for one environment to arrive.
-const PATIENCE: Duration = Duration::from_millis(500);
-/// Maximum number of missing environments per look; the remaining processes are not examined.
+const READ_TIMEOUT: Duration = Duration::from_millis(500);
+/// Maximum number of missing environments per call; the remaining processes are not examined.
 const MAX_WAITS: usize = 10;
 
 /// A process: its pid and its start time.
 type Key = (u32, u64);
 
 /// Processes that an abandoned reader thread still waits for.
-static SILENT: Silent = Silent(Mutex::new(None));
+static STALLED: StalledReads = StalledReads(Mutex::new(None));
 
 /// Results of `read` on the environment of each of `entries`, except those that do not arrive.
 /// `read` may block forever.
-pub fn look<T: Send + 'static>(
+pub fn read_all<T: Send + 'static>(
     entries: Vec<ProcessEntry>,
     read: impl Fn(&ProcessEntry) -> T + Clone + Send + 'static,
 ) -> Vec<(ProcessEntry, T)> {
-    SILENT.look(entries, read)
+    STALLED.read_all(entries, read)
 }
 
-struct Silent(Mutex<Option<HashMap<Key, Reader>>>);
+struct StalledReads(Mutex<Option<HashMap<Key, Reader>>>);
 
 /// A thread that reads processes one after another, and the number of processes it has read.
 #[derive(Clone)]
@@ -40,18 +40,20 @@ struct Reader {
     at: usize,
 }
 
-impl Silent {
-    fn look<T: Send + 'static>(
+impl StalledReads {
+    fn read_all<T: Send + 'static>(
         &self,
         entries: Vec<ProcessEntry>,
         read: impl Fn(&ProcessEntry) -> T + Clone + Send + 'static,
     ) -> Vec<(ProcessEntry, T)> {
-        let mut rest = self.without_silent(entries);
+        let mut rest = self.without_stalled(entries);
         let mut found = Vec::with_capacity(rest.len());
         for _ in 0..MAX_WAITS {
             let (sender, receiver) = mpsc::channel();
             let count = Arc::new(AtomicUsize::new(0));
-            let (reading, counting, read) = (rest.clone(), count.clone(), read.clone());
+            let reading = rest.clone();
+            let counting = count.clone();
+            let read = read.clone();
             let work = move || {
                 for entry in reading {
                     let what = read(&entry);
@@ -68,23 +70,23 @@ impl Silent {
                 Err(_) => work(),
             }
             let before = found.len();
-            while let Ok(one) = receiver.recv_timeout(PATIENCE) {
+            while let Ok(one) = receiver.recv_timeout(READ_TIMEOUT) {
                 found.push(one);
             }
             rest.drain(..found.len() - before);
-            let Some(silent) = rest.first() else { return found };
+            let Some(stalled) = rest.first() else { return found };
             tracing::warn!(
-                pid = silent.pid,
-                "the environment of this process does not come: its memory is locked"
+                pid = stalled.pid,
+                "cannot read the environment of a process: its memory is locked"
             );
-            self.note(silent, Reader { read: count, at: found.len() - before });
+            self.note(stalled, Reader { read: count, at: found.len() - before });
             rest.remove(0);
         }
         found
     }
 
     /// Filters out processes that a reader still waits for, and forgets those that no longer exist.
-    fn without_silent(&self, entries: Vec<ProcessEntry>) -> Vec<ProcessEntry> {
+    fn without_stalled(&self, entries: Vec<ProcessEntry>) -> Vec<ProcessEntry> {
         let mut known = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(known) = known.as_mut() else { return entries };
         known.retain(|_, reader| reader.read.load(Ordering::Acquire) == reader.at);
@@ -106,11 +108,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_that_does_not_come_is_waited_for_once_until_it_does() {
+    fn stalled_process_delays_only_the_first_call() {
         let entry =
             |pid| ProcessEntry { pid, parent: 1, group: pid, start_ticks: 0, is_zombie: false };
         let entries: Vec<_> = (1..=4).map(entry).collect();
-        let silent = Silent(Mutex::new(None));
+        let stalled = StalledReads(Mutex::new(None));
         let (release, held) = mpsc::channel::<()>();
         let held = Arc::new(Mutex::new(held));
         let reads = Arc::new(AtomicUsize::new(0));
@@ -123,21 +125,21 @@ mod tests {
             }
             entry.pid * 10
         };
-        let look = || {
-            silent
-                .look(entries.clone(), read.clone())
+        let read_all = || {
+            stalled
+                .read_all(entries.clone(), read.clone())
                 .into_iter()
                 .map(|(_, ten)| ten)
                 .collect::<Vec<_>>()
         };
-        assert_eq!(look(), [10, 30, 40]);
-        assert_eq!(look(), [10, 30, 40]);
-        assert_eq!(reads.load(Ordering::SeqCst), 1, "nobody waits for it again");
+        assert_eq!(read_all(), [10, 30, 40]);
+        assert_eq!(read_all(), [10, 30, 40]);
+        assert_eq!(reads.load(Ordering::SeqCst), 1, "the stalled process is not waited for again");
         drop(release);
-        let waiting = silent.0.lock().expect("sound").as_ref().expect("noted")[&(2, 0)].clone();
+        let waiting = stalled.0.lock().expect("sound").as_ref().expect("noted")[&(2, 0)].clone();
         while waiting.read.load(Ordering::Acquire) == waiting.at {
             std::thread::yield_now();
         }
-        assert_eq!(look(), [10, 20, 30, 40]);
+        assert_eq!(read_all(), [10, 20, 30, 40]);
     }
 }

@@ -3,19 +3,21 @@
 use std::sync::Arc;
 
 use task_proto::TaskName;
-use task_proto::report::{
+use task_proto::messages::report::{
     ActiveVersion, Condition, Failure, FailureCode, Phase, Report, TaskReport,
 };
+use task_proto::time::millis;
 use tokio::time::Instant;
 
-use super::hearing::REFUSALS;
+use super::messages::REFUSALS;
 use super::{Driver, View};
 use crate::reconcile::admission;
 use crate::system::clock;
 use crate::task::effects::Effects;
 use crate::task::ledger::{LostFiles, TaskRecord};
-use crate::task::observed::{Health, ProcessState, Vouched};
+use crate::task::observed::{Health, ProcessState, SignatureVerdict};
 use crate::task::plan::Lane;
+use crate::task::run::ActiveRun;
 use crate::transfer::link_meter;
 
 /// Battery changes within one step of this size are not reported.
@@ -25,32 +27,38 @@ impl<E: Effects> Driver<E> {
     /// Publishes a snapshot if its content differs from the last one.
     pub(super) fn publish_report(&mut self) {
         let report = self.report();
-        let again = std::mem::take(&mut self.asks_again);
-        let news =
-            self.shared.reports.borrow().as_ref().is_none_or(|last| !says_the_same(last, &report));
+        let again = std::mem::take(&mut self.report_parts_again);
+        let news = self
+            .link_state
+            .reports
+            .borrow()
+            .as_ref()
+            .is_none_or(|last| !has_same_content(last, &report));
         if news || again {
             self.seq = report.seq;
-            self.shared.reports.send_replace(Some(Arc::new(report)));
+            self.link_state.reports.send_replace(Some(Arc::new(report)));
         }
         let settled = self.is_settled();
-        self.shared.settled.send_if_modified(|last| std::mem::replace(last, settled) != settled);
+        self.link_state
+            .settled
+            .send_if_modified(|last| std::mem::replace(last, settled) != settled);
     }
 
     fn report(&self) -> Report {
         let now_ms = self.effects.now().boot_ms;
         let tasks = self.ledger.tasks.iter();
         Report {
-            robot_id: self.speaker.robot_id.clone(),
+            robot_id: self.agent_identity.robot_id.clone(),
             start: self.ledger.start,
-            instance: self.speaker.instance.clone(),
-            place: self.speaker.place,
-            boot_id: self.speaker.boot_id.clone(),
+            instance: self.agent_identity.instance.clone(),
+            place: self.agent_identity.place,
+            boot_id: self.agent_identity.boot_id.clone(),
             seq: self.seq + 1,
             observed_generation: self.observed,
-            uptime_ms: u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX),
+            uptime_ms: millis(self.started.elapsed()),
             host: self.effects.host_facts(),
             conditions: self.all_conditions(),
-            link: self.shared.meter.facts(Instant::now()),
+            link: self.link_state.meter.facts(Instant::now()),
             tasks: tasks
                 .map(|(task, record)| task_report(task, record, self.views.get(task), now_ms))
                 .collect(),
@@ -65,10 +73,10 @@ impl<E: Effects> Driver<E> {
         if self.held {
             conditions.push(condition(
                 "held",
-                "a person at the robot said hold: nothing is started or switched",
+                "no task is started or switched until a person at the robot releases it",
             ));
         }
-        conditions.extend(self.ledger.removal().map(|text| condition("removed", &text)));
+        conditions.extend(self.ledger.removal_message().map(|text| condition("removed", &text)));
         if let Some(text) = &self.robot.no_task_user {
             conditions.push(condition(FailureCode::NO_TASK_USER.as_str(), text));
         }
@@ -76,7 +84,7 @@ impl<E: Effects> Driver<E> {
         if self.desired.as_ref().is_some_and(|state| admission::is_expired(state, wall_ms)) {
             conditions.push(condition(
                 "state_expired",
-                "the desired state has expired: nothing new is begun",
+                "the desired state has expired: no new work is started",
             ));
         }
         if wall_ms < clock::PROGRAM_EXISTS_SINCE_MS {
@@ -89,12 +97,12 @@ impl<E: Effects> Driver<E> {
         if let Some(text) = &self.trust.refused_list {
             conditions.push(condition("publishers_refused", text));
         }
-        let undone: Vec<&str> =
-            self.views.values().filter_map(|view| view.undone.as_deref()).collect();
-        if !undone.is_empty() {
-            conditions.push(condition("step_failed", &undone.join("; ")));
+        let failed_steps: Vec<&str> =
+            self.views.values().filter_map(|view| view.failed_step.as_deref()).collect();
+        if !failed_steps.is_empty() {
+            conditions.push(condition("step_failed", &failed_steps.join("; ")));
         }
-        conditions.extend(self.withheld.clone());
+        conditions.extend(self.state_unavailable.clone());
         conditions
     }
 
@@ -111,7 +119,7 @@ impl<E: Effects> Driver<E> {
 }
 
 /// Whether two snapshots differ only in fields that always change.
-fn says_the_same(last: &Report, next: &Report) -> bool {
+fn has_same_content(last: &Report, next: &Report) -> bool {
     let without_times = |report: &Report| {
         let mut report = report.clone();
         (report.seq, report.uptime_ms, report.host.disk_free_bytes) = (0, 0, 0);
@@ -126,14 +134,10 @@ fn says_the_same(last: &Report, next: &Report) -> bool {
         && !link_meter::is_news(last.link.as_ref(), next.link.as_ref())
 }
 
-/// Why the active run is degraded: something that was there is missing, the robot does not allow an
-/// older run than ordered to start again, or the run's output files cannot be uploaded.
+/// Why the active run is degraded: something that was there is missing, an older run than ordered
+/// waits for its files or may not start again, or the run's output files cannot be uploaded.
 fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
-    let ready = record
-        .active
-        .as_ref()
-        .and_then(|active| active.process.as_ref())
-        .is_some_and(|process| process.ready);
+    let ready = record.active.as_ref().is_some_and(ActiveRun::is_ready);
     match view.map(|view| &view.health) {
         Some(Health::Missing(missing)) if ready => Some(missing.failure()),
         _ => {
@@ -144,20 +148,31 @@ fn degraded(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
             let files = record.collections.iter().find_map(|files| files.failure.as_ref());
             let lost = record.lost.as_ref().filter(of_order).map(|lost| &lost.failure);
             let distrusted = distrusted(record, view).filter(|_| ready);
-            distrusted.or(refusal.map(|(_, why)| why).or(files).or(lost).cloned())
+            let other = refusal.map(|(_, why)| why).or(files).or(lost).cloned();
+            distrusted.or_else(|| lacking_files(record)).or(other)
         }
     }
 }
 
+/// Reports that an older run than ordered waits for its files.
+fn lacking_files(record: &TaskRecord) -> Option<Failure> {
+    let anew = record.restoring.as_ref()?;
+    let text = "its files are fetched and built again";
+    let changed = || Failure::new(FailureCode::TREE_CHANGED, text);
+    Some(anew.failure.clone().unwrap_or_else(changed))
+}
+
 /// Reports that the running version would not be started again.
 fn distrusted(record: &TaskRecord, view: Option<&View>) -> Option<Failure> {
-    let active = record.active.as_ref().filter(|active| active.package == record.order.package)?;
-    let vouched = view?.prepared.as_ref()?.vouched;
+    let prepared = record.to_prepare().0;
+    let active = record.active.as_ref().filter(|active| active.package == *prepared)?;
+    let signatures = view?.prepared.as_ref()?.signatures;
     let text = format!(
-        "the trusted publishers' signatures are not enough for {} {} any more: it goes on, and is not started again",
+        "{} {} no longer has enough signatures of trusted publishers: it keeps running, but will not be started again",
         active.package.name, active.package.version
     );
-    (vouched == Vouched::No).then(|| Failure::new(FailureCode::UNTRUSTED_PACKAGE, text))
+    (signatures == SignatureVerdict::Insufficient)
+        .then(|| Failure::new(FailureCode::UNTRUSTED_PACKAGE, text))
 }
 
 fn task_report(
@@ -166,10 +181,10 @@ fn task_report(
     view: Option<&View>,
     now_ms: u64,
 ) -> TaskReport {
-    let (phase, failure) = record.standing();
+    let (phase, failure) = record.order_phase();
     let lane = match phase {
         Phase::Fetching => Some(Lane::Prepare),
-        Phase::Running => Some(Lane::Collect),
+        Phase::Running => Some(Lane::Upload),
         _ => None,
     };
     let progress = lane.and_then(|lane| view?.progress.get(&lane).copied());
@@ -188,13 +203,14 @@ fn task_report(
         phase: if unpacking { Phase::Unpacking } else { phase },
         phase_ms: now_ms.saturating_sub(record.phase_since_ms),
         progress: progress.filter(|_| !unpacking),
-        missing_parts: view.and_then(|view| view.asked.as_ref()?.borrow().missing.clone()),
+        missing_parts: view
+            .and_then(|view| view.requested_parts.as_ref()?.borrow().missing.clone()),
         attempts: record.preparation.attempts,
-        restarts: for_order.map_or(0, |active| active.restarts),
+        restarts: for_order.map_or(0, ActiveRun::restarts),
         failure: failure.cloned(),
         degraded: degraded(record, view),
         active: active.and_then(|active| {
-            let process = active.process.as_ref()?;
+            let process = active.process()?;
             let pid = match view.and_then(|view| view.process.as_ref()) {
                 Some(ProcessState::Alive { pid }) => Some(*pid),
                 _ => process.pid,

@@ -4,16 +4,16 @@
 use std::time::Duration;
 
 use task_proto::TaskName;
-use task_proto::report::{Failure, FailureCode, Progress};
+use task_proto::messages::report::{Failure, FailureCode, Progress};
 use tokio::sync::{Notify, watch};
 use tokio::task::Id;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
-use super::{Driver, Outcome, UnderWay};
+use super::{Driver, RunningStep};
 use crate::task::effects::Effects;
-use crate::task::plan::{self, Done, Lane, Step, StepFailure};
-use crate::transfer::parts::Asks;
+use crate::task::plan::{self, Done, Lane, Outcome, Step, StepFailure};
+use crate::transfer::parts::PartRequest;
 
 /// How long an interrupted step may take to end by itself.
 const INTERRUPT_GRACE: Duration = Duration::from_secs(5);
@@ -23,54 +23,61 @@ impl<E: Effects> Driver<E> {
         tracing::info!("{}", plan::describe(&task, &step));
         let cancel = CancellationToken::new();
         let (progress, transfer) = watch::channel(Progress { done: 0, total: 0 });
-        let (asks, asked) = watch::channel(Asks::default());
+        let (part_requests, requested_parts) = watch::channel(PartRequest::default());
         let view = self.views.entry(task.clone()).or_default();
-        if matches!(step, Step::PullContent { .. } | Step::Collect(_)) {
+        if matches!(step, Step::PullContent { .. } | Step::UploadOutputs(_)) {
             view.transfers.insert(step.lane(), transfer);
         }
-        view.asked =
-            matches!(step, Step::PullContent { is_pushed: true, .. }).then(|| asked.clone());
-        let running =
-            self.ledger.tasks.get(&task).and_then(|record| record.active.as_ref()?.process.clone());
-        let (effects, lane, news) = (self.effects.clone(), step.lane(), self.asks.clone());
-        let (name, doing, stop) = (task.clone(), step.clone(), cancel.clone());
+        view.requested_parts = matches!(step, Step::PullContent { is_pushed: true, .. })
+            .then(|| requested_parts.clone());
+        let running = self
+            .ledger
+            .tasks
+            .get(&task)
+            .and_then(|record| record.active.as_ref()?.process().cloned());
+        let effects = self.effects.clone();
+        let lane = step.lane();
+        let news = self.part_requests.clone();
+        let name = task.clone();
+        let doing = step.clone();
+        let stop = cancel.clone();
         let handle = self.steps.spawn(async move {
-            let done = |()| Done::Well;
+            let done = |()| Done::Complete;
             let work = async {
                 match &doing {
                     Step::CheckSigners(package) => effects.check_signers(package, &stop).await.map(done),
                     Step::PullManifest(package) => effects.pull_manifest(package, &stop).await,
-                    Step::LookForRos(_) => {
-                        effects.look_for_ros().await;
-                        Ok(Done::Well)
+                    Step::ProbeRos(_) => {
+                        effects.probe_ros().await;
+                        Ok(Done::Complete)
                     }
                     Step::PullContent { package, is_pushed: false } => {
                         effects.pull_content(package, &progress, &stop).await
                     }
                     Step::PullContent { package, is_pushed: true } => {
-                        let gathering = effects.gather_content(package, &progress, &asks, &stop);
+                        let gathering = effects.gather_content(package, &progress, &part_requests, &stop);
                         // Cancel-safe: the dropped future only notices changes.
                         tokio::select! {
                             done = gathering => done,
-                            () = notify(asked, &news) => unreachable!("it lasts as long as who asks"),
+                            () = forward_part_requests(requested_parts, &news) => unreachable!("the forwarder never returns"),
                         }
                     }
                     Step::Build(package) => effects.build(package, &stop).await.map(done),
-                    Step::Ask(question) => effects.ask_gate(&name, question).await.map(done),
+                    Step::QueryGate(question) => effects.query_gate(&name, question).await.map(done),
                     Step::Start(run) => effects.start(&name, run).await.map(Done::Started),
                     Step::Stop(run) => effects.stop(&name, run).await.map(done),
-                    Step::Collect(files) => effects.collect(&name, files, &progress, &stop).await.map(done),
+                    Step::UploadOutputs(files) => effects.upload_outputs(&name, files, &progress, &stop).await.map(done),
                     Step::Prune { kept } => effects.prune(&name, kept, running.as_ref()).await.map(done),
                     Step::Remove => effects.remove(&name).await.map(done),
                 }
             };
             let outcome = match doing.deadline() {
-                Some(deadline) => tokio::time::timeout(deadline, work).await.unwrap_or_else(|_| Err(late(deadline))),
+                Some(deadline) => tokio::time::timeout(deadline, work).await.unwrap_or_else(|_| Err(deadline_failure(deadline))),
                 None => work.await,
             };
             (name, lane, outcome)
         });
-        self.under_way.insert((task, lane), UnderWay { step, handle, cancel, drop_at: None });
+        self.under_way.insert((task, lane), RunningStep { step, handle, cancel, drop_at: None });
     }
 
     /// Cancels steps that are no longer needed, and drops those that do not end.
@@ -97,7 +104,7 @@ impl<E: Effects> Driver<E> {
         for ((task, _), under_way) in &mut self.under_way {
             if under_way.drop_at.is_some_and(|at| at <= now) {
                 tracing::warn!(
-                    "{} does not end and is dropped",
+                    "{} did not stop when cancelled and was dropped",
                     plan::describe(task, &under_way.step)
                 );
                 under_way.handle.abort();
@@ -129,10 +136,10 @@ impl<E: Effects> Driver<E> {
         let Some(under_way) = self.under_way.remove(&(task.clone(), lane)) else { return };
         let view = self.views.entry(task.clone()).or_default();
         if lane == Lane::Prepare {
-            view.asked = None;
+            view.requested_parts = None;
         }
         let transfer = view.transfers.remove(&lane).map(|transfer| *transfer.borrow());
-        match transfer.filter(|_| matches!(outcome, Ok(Done::ToldToWait { .. }))) {
+        match transfer.filter(|_| matches!(outcome, Ok(Done::RetryLater { .. }))) {
             // The gathered bytes stay, and their progress is shown while the robot waits for its
             // turn.
             Some(progress) if progress.total > 0 => view.progress.insert(lane, progress),
@@ -152,7 +159,7 @@ impl<E: Effects> Driver<E> {
             tracing::warn!("failed to {text}");
         }
         if matches!(under_way.step, Step::Stop(_) | Step::Prune { .. } | Step::Remove) {
-            view.undone = failed;
+            view.failed_step = failed;
         }
         self.finish(&task, &under_way.step, outcome);
     }
@@ -164,34 +171,36 @@ impl<E: Effects> Driver<E> {
             self.dirty = true;
             return;
         }
-        if matches!(step, Step::LookForRos(_)) {
+        if matches!(step, Step::ProbeRos(_)) {
             self.robot.installations =
                 Some(self.effects.robot_facts().installations.unwrap_or_default());
         }
-        let Some(view) = self.views.get(task) else { return };
-        let Some(situation) = self.situation(task, view, None, &[]) else { return };
-        let record = plan::finished(&situation, step, outcome);
-        if let (Step::Prune { kept }, Some(prepared)) =
-            (step, &mut self.views.entry(task.clone()).or_default().prepared)
-        {
+        let Some(record) = self.ledger.tasks.get(task) else { return };
+        let kind = self.views.get(task).and_then(|view| view.prepared.as_ref()?.kind());
+        let record = plan::finish_step(record, step, outcome, kind, &self.moment());
+        let view = self.views.entry(task.clone()).or_default();
+        match (step, &mut view.prepared) {
             // If the deletion failed, we do not retry before the next inspection of the disk.
-            prepared.versions.retain(|version| kept.contains(version));
-        } else if step.lane() == Lane::Prepare || matches!(step, Step::Start(_)) {
+            (Step::Prune { kept }, Some(prepared)) => {
+                prepared.versions.retain(|version| kept.contains(version));
+            }
             // A start deletes files that were changed on the disk.
-            self.views.entry(task.clone()).or_default().prepared = None;
+            (Step::Start(_), _) => (view.prepared, view.process) = (None, None),
+            (Step::Stop(_), _) => view.process = None,
+            (step, _) if step.lane() == Lane::Prepare => view.prepared = None,
+            _ => {}
         }
-        if matches!(step, Step::Start(_) | Step::Stop(_)) {
-            self.views.entry(task.clone()).or_default().process = None;
-        }
-        self.put(task, record);
+        self.store_record(task, record);
     }
 }
 
 /// Notifies `news` each time the gathering step asks for missing parts.
-async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
-    let mut times = asked.borrow().times;
-    while let Ok(asks) = asked.wait_for(|asks| asks.times != times).await {
-        times = asks.times;
+async fn forward_part_requests(mut requested_parts: watch::Receiver<PartRequest>, news: &Notify) {
+    let mut times = requested_parts.borrow().times;
+    while let Ok(part_requests) =
+        requested_parts.wait_for(|part_requests| part_requests.times != times).await
+    {
+        times = part_requests.times;
         news.notify_one();
     }
     std::future::pending().await
@@ -199,7 +208,7 @@ async fn notify(mut asked: watch::Receiver<Asks>, news: &Notify) {
 
 /// The failure of a step that did not end in time. The step is retried, because its progress is
 /// unknown.
-fn late(deadline: Duration) -> StepFailure {
+fn deadline_failure(deadline: Duration) -> StepFailure {
     let text = format!("the step did not end within {} s", deadline.as_secs());
     StepFailure {
         failure: Failure::new(FailureCode::DEADLINE_EXCEEDED, text),

@@ -1,20 +1,22 @@
 //! Tests of the driver's logic, with a robot whose effects only record calls.
 
+mod changed;
 mod fake;
 mod hanging;
 mod removed;
 
 use task_proto::api::ReportReply;
 use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
-use task_proto::part::PartRange;
-use task_proto::report::{Failure, FailureCode, Phase, Report};
+use task_proto::messages::part::PartRange;
+use task_proto::messages::report::{Failure, FailureCode, Phase, Report};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use task_proto::{DeploymentId, Digest};
 
 use self::fake::Fake;
 use super::*;
 use crate::task::ledger::GateStep;
 use crate::task::observed::Missing;
+use crate::task::plan::StepFailure;
 
 /// How long a test waits for an event that should come at once.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -37,8 +39,8 @@ fn order(version: &str) -> DesiredTask {
 /// A running driver, and the server's side of it.
 struct Bench {
     fake: Arc<Fake>,
-    shared: Shared,
-    heard: mpsc::Sender<Heard>,
+    link_state: LinkState,
+    server_messages: mpsc::Sender<ServerMessage>,
     key: SigningKey,
     robot: RobotId,
     driver: tokio::task::JoinHandle<()>,
@@ -46,15 +48,16 @@ struct Bench {
 
 impl Bench {
     async fn new() -> Self {
-        let (key, robot) = (SigningKey::random(), RobotId::random());
+        let key = SigningKey::random();
+        let robot = RobotId::random();
         let fake = Arc::new(Fake::default());
         fake.sees(Health::Holds { since_ms: 0 });
         Self::with(fake, Ledger::new(0), key, robot).await
     }
 
     async fn with(fake: Arc<Fake>, ledger: Ledger, key: SigningKey, robot: RobotId) -> Self {
-        let shared = Shared::new(CancellationToken::new());
-        let speaker = Speaker {
+        let link_state = LinkState::new(CancellationToken::new());
+        let agent_identity = AgentIdentity {
             robot_id: robot.clone(),
             server_key: key.public_key(),
             instance: InstanceId::random(),
@@ -63,12 +66,20 @@ impl Bench {
             name: Some("atlas".parse().expect("valid")),
             labels: None,
         };
-        let driver = Driver::new(fake.clone(), speaker, shared.clone(), ledger, None).await;
-        let (heard, messages) = mpsc::channel(4);
-        Self { fake, shared, heard, key, robot, driver: tokio::spawn(driver.run(messages)) }
+        let driver =
+            Driver::new(fake.clone(), agent_identity, link_state.clone(), ledger, None).await;
+        let (server_messages, messages) = mpsc::channel(4);
+        Self {
+            fake,
+            link_state,
+            server_messages,
+            key,
+            robot,
+            driver: tokio::spawn(driver.run(messages)),
+        }
     }
 
-    fn sealed(&self, generation: u64, tasks: Vec<DesiredTask>, key: &SigningKey) -> Heard {
+    fn sealed(&self, generation: u64, tasks: Vec<DesiredTask>, key: &SigningKey) -> ServerMessage {
         let now_ms = crate::system::clock::wall_ms();
         let state = DesiredState {
             robot_id: self.robot.clone(),
@@ -81,20 +92,20 @@ impl Bench {
         };
         let payload = serde_json::to_vec(&state).expect("json");
         let envelope = Box::new(Envelope::seal(DESIRED_STATE_TYPE, &payload, key));
-        Heard::Desired { envelope, inline: Inline::default(), was_asked_for: false }
+        ServerMessage::Desired { envelope, inline: Inline::default(), was_asked_for: false }
     }
 
     async fn order(&self, generation: u64, tasks: Vec<DesiredTask>) {
         self.say(self.sealed(generation, tasks, &self.key)).await;
     }
 
-    async fn say(&self, message: Heard) {
-        self.heard.send(message).await.expect("the driver listens");
+    async fn say(&self, message: ServerMessage) {
+        self.server_messages.send(message).await.expect("the driver listens");
     }
 
     /// The first report that satisfies `expected`.
     async fn report(&self, expected: impl Fn(&Report) -> bool) -> Report {
-        let mut reports = self.shared.reports.subscribe();
+        let mut reports = self.link_state.reports.subscribe();
         let found =
             reports.wait_for(|report| report.as_ref().is_some_and(|report| expected(report)));
         let found = tokio::time::timeout(PATIENCE, found)
@@ -109,7 +120,7 @@ impl Bench {
     }
 
     async fn end(self) -> Ledger {
-        self.shared.shutdown.cancel();
+        self.link_state.shutdown.cancel();
         self.driver.await.expect("no panic");
         self.fake.state(|state| state.ledgers.last().cloned()).expect("a ledger")
     }
@@ -133,7 +144,7 @@ async fn an_order_runs_and_its_withdrawal_removes_it() {
 }
 
 #[tokio::test]
-async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_it_is_installed() {
+async fn missing_ros_package_is_reported_before_the_pull_and_retried_after_installation() {
     let bench = Bench::new().await;
     bench.fake.state(|state| {
         state.exec_depends =
@@ -144,7 +155,7 @@ async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_i
     let report = bench.phase(Phase::Unmet).await;
     let failure = report.tasks[0].failure.clone().expect("why");
     assert_eq!(failure.code, FailureCode::REQUIREMENTS_UNMET);
-    let list = "lacks what talker 1.0 requires: ROS package nav2_bringup, ROS package slam_toolbox";
+    let list = "does not meet the requirements of talker 1.0: ROS package nav2_bringup, ROS package slam_toolbox";
     assert!(failure.text.contains(list), "{failure}");
     assert!(bench.fake.state(|state| state.contents.is_empty()), "nothing was pulled");
     // A person installs the missing packages; the same package is ordered again.
@@ -156,9 +167,10 @@ async fn a_robot_that_lacks_a_package_says_so_before_it_pulls_and_runs_it_once_i
 }
 
 #[tokio::test]
-async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
+async fn untrusted_package_fails_before_any_pull() {
     let bench = Bench::new().await;
-    let (unsigned, signed) = (order("1.0"), order("2.0"));
+    let unsigned = order("1.0");
+    let signed = order("2.0");
     bench.fake.state(|state| state.untrusted.insert(unsigned.package.manifest.digest));
     bench.order(1, vec![unsigned.clone()]).await;
     let report = bench.phase(Phase::Failed).await;
@@ -168,7 +180,7 @@ async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
             state.manifests.is_empty() && state.contents.is_empty() && state.started.is_empty()
         );
         assert_eq!(
-            (&state.heeded, &state.checked),
+            (&state.applied, &state.checked),
             (&vec![Generation(1)], &vec![unsigned.package.manifest.digest])
         );
     });
@@ -194,7 +206,7 @@ async fn what_nobody_trusted_has_signed_fails_before_anything_is_pulled() {
 }
 
 #[tokio::test]
-async fn what_was_staged_waits_once_the_list_of_its_publishers_is_over() {
+async fn staged_version_waits_after_its_publisher_list_expires() {
     let bench = Bench::new().await;
     let held = order("1.0");
     bench.fake.state(|state| state.held = true);
@@ -202,7 +214,7 @@ async fn what_was_staged_waits_once_the_list_of_its_publishers_is_over() {
     bench.phase(Phase::Deferred).await;
     bench.fake.state(|state| {
         state.untrusted.insert(held.package.manifest.digest);
-        state.trust.list_is_over = true;
+        state.trust.list_expired = true;
     });
     bench.phase(Phase::Failed).await;
     let (checked, started) = bench.fake.state(|state| (state.checked.len(), state.started.len()));
@@ -212,7 +224,8 @@ async fn what_was_staged_waits_once_the_list_of_its_publishers_is_over() {
 #[tokio::test]
 async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     let bench = Bench::new().await;
-    let (old, fake) = (order("1.0"), bench.fake.clone());
+    let old = order("1.0");
+    let fake = bench.fake.clone();
     bench.order(1, vec![old.clone()]).await;
     bench.phase(Phase::Running).await;
     bench.fake.slow.store(true, std::sync::atomic::Ordering::SeqCst);
@@ -238,7 +251,7 @@ async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
 
 fn missing(since_ms: u64) -> Health {
     Health::Missing(Missing {
-        is_its_own: true,
+        is_own_fault: true,
         since_ms,
         code: FailureCode::NODE_VANISHED,
         what: "`/mapper` is gone".to_owned(),
@@ -247,7 +260,7 @@ fn missing(since_ms: u64) -> Health {
 }
 
 #[tokio::test]
-async fn what_ros_says_makes_a_task_ready_degraded_and_whole_again() {
+async fn ros_health_makes_a_task_ready_degraded_and_recovered() {
     let bench = Bench::new().await;
     bench.fake.sees(Health::Unknown);
     let order = order("1.0");
@@ -287,8 +300,9 @@ async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
     assert_eq!(task.failure.as_ref().expect("why").to_string(), "lifecycle_failed: it will not");
     assert_eq!(task.active.as_ref().expect("the old one").deployment, old.deployment);
     // Neither a report nor a new agent triggers a retry; a new run does.
-    let (fake, key, robot) =
-        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let fake = bench.fake.clone();
+    let key = SigningKey::from_bytes(bench.key.to_bytes());
+    let robot = bench.robot.clone();
     let ledger = bench.end().await;
     let bench = Bench::with(fake, ledger, key, robot).await;
     bench.report(back).await;
@@ -299,7 +313,7 @@ async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
 }
 
 #[tokio::test]
-async fn the_gate_is_asked_first_and_its_reason_is_reported() {
+async fn gate_is_asked_before_a_start_and_its_reason_is_reported() {
     let bench = Bench::new().await;
     bench.fake.state(|state| state.gate = Some(Err("carries a load".to_owned())));
     let order = order("1.0");
@@ -326,7 +340,7 @@ async fn the_gate_is_asked_first_and_its_reason_is_reported() {
 }
 
 #[tokio::test]
-async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
+async fn job_succeeds_after_its_outputs_are_uploaded() {
     let bench = Bench::new().await;
     bench.fake.state(|state| state.jobs = true);
     let order = order("1.0");
@@ -339,15 +353,19 @@ async fn a_job_has_succeeded_once_its_files_are_at_the_server() {
     assert_eq!((report.tasks[0].phase, &report.tasks[0].active), (Phase::Running, &None));
     // The agent dies meanwhile: the job does not run again, its files are sent again, and this time
     // refused.
-    let (fake, key, robot) =
-        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let fake = bench.fake.clone();
+    let key = SigningKey::from_bytes(bench.key.to_bytes());
+    let robot = bench.robot.clone();
     let ledger = bench.end().await;
     let failure = Failure::new(FailureCode::OUTPUTS_LOST, "too much");
     fake.state(|state| state.upload = Some(Err(StepFailure { failure, retry_after_ms: None })));
     let bench = Bench::with(fake, ledger, key, robot).await;
     let report = bench.phase(Phase::Succeeded).await;
     let lost = report.tasks[0].degraded.as_ref().expect("said").to_string();
-    assert_eq!(lost, "outputs_lost: files of run 1 did not come back: outputs_lost: too much");
+    assert_eq!(
+        lost,
+        "outputs_lost: output files of run 1 were not uploaded: outputs_lost: too much"
+    );
     bench.fake.state(|state| state.upload = Some(Ok(())));
     bench.order(2, vec![DesiredTask { run: 2, ..order }]).await;
     bench.phase(Phase::Running).await;
@@ -391,7 +409,7 @@ async fn a_refused_state_is_named_and_the_old_one_stays() {
 }
 
 #[tokio::test]
-async fn what_is_not_stopped_or_deleted_is_said_until_it_is() {
+async fn failed_stop_or_removal_is_reported_until_it_succeeds() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
@@ -418,12 +436,13 @@ async fn what_is_not_stopped_or_deleted_is_said_until_it_is() {
 }
 
 #[tokio::test]
-async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
+async fn restarted_agent_adopts_running_tasks_and_orders() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
-    let (fake, key, robot) =
-        (bench.fake.clone(), SigningKey::from_bytes(bench.key.to_bytes()), bench.robot.clone());
+    let fake = bench.fake.clone();
+    let key = SigningKey::from_bytes(bench.key.to_bytes());
+    let robot = bench.robot.clone();
     let ledger = bench.end().await;
     let bench = Bench::with(fake, ledger, key, robot).await;
     let report = bench.phase(Phase::Running).await;
@@ -432,7 +451,7 @@ async fn a_restarted_agent_adopts_what_runs_and_what_was_ordered() {
 }
 
 #[tokio::test]
-async fn nothing_is_begun_until_the_ledger_can_be_written() {
+async fn unwritable_ledger_blocks_new_steps() {
     let bench = Bench::new().await;
     bench.fake.state(|state| state.disk_full = true);
     bench.order(1, vec![order("1.0")]).await;
@@ -447,7 +466,7 @@ async fn nothing_is_begun_until_the_ledger_can_be_written() {
 }
 
 #[tokio::test]
-async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
+async fn unwritable_ledger_does_not_block_stops_and_removals() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
@@ -472,7 +491,7 @@ async fn what_is_ordered_to_end_ends_although_the_ledger_can_not_be_written() {
 }
 
 #[tokio::test]
-async fn a_robot_whose_clock_starts_in_1970_says_so_and_works() {
+async fn clock_at_1970_is_reported_and_tasks_run() {
     let bench = Bench::new().await;
     bench.fake.state(|state| state.wall_ms = Some(5_000));
     bench.order(1, vec![order("1.0")]).await;
@@ -501,23 +520,23 @@ async fn hold_keeps_a_staged_version_from_starting() {
 }
 
 #[tokio::test]
-async fn the_servers_name_wins_and_the_difference_is_said() {
+async fn server_name_wins_and_the_difference_is_reported() {
     let bench = Bench::new().await;
     let reply = |name: &str| ReportReply {
         generation: Generation(0),
         name: name.parse().expect("valid"),
         labels: Labels::new(),
     };
-    bench.say(Heard::Confirmed { seq: 1, reply: Some(reply("bolt")) }).await;
+    bench.say(ServerMessage::Confirmed { seq: 1, reply: Some(reply("bolt")) }).await;
     bench.report(|report| has(report, "settings_differ")).await;
-    bench.say(Heard::Confirmed { seq: 2, reply: Some(reply("atlas")) }).await;
+    bench.say(ServerMessage::Confirmed { seq: 2, reply: Some(reply("atlas")) }).await;
     bench.report(|report| !has(report, "settings_differ")).await;
 }
 
 #[tokio::test]
-async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
+async fn pull_deferred_by_the_server_stays_fetching_without_a_failure() {
     let bench = Bench::new().await;
-    bench.fake.state(|state| state.told_to_wait = vec![1, 3_600_000]);
+    bench.fake.state(|state| state.retry_later = vec![1, 3_600_000]);
     bench.order(1, vec![order("1.0")]).await;
     let waits = |report: &Report| report.tasks.first().is_some_and(|task| task.progress.is_some());
     let report = bench.report(waits).await;
@@ -538,7 +557,7 @@ async fn a_robot_that_is_told_to_wait_stays_fetching_without_a_failure() {
 }
 
 #[tokio::test]
-async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_it() {
+async fn inline_blobs_are_offered_only_if_an_accepted_state_names_them() {
     let bench = Bench::new().await;
     let blob = |bytes: &[u8]| BlobRef { digest: Digest::of(bytes), size: bytes.len() as u64 };
     let mut order = order("1.0");
@@ -547,9 +566,9 @@ async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_i
     came.insert(Digest::of(b"config"), b"config".to_vec());
     came.insert(Digest::of(b"content"), b"others".to_vec());
     came.insert(Digest::of(b"not asked for"), b"not asked for".to_vec());
-    let rung = |heard: Heard| match heard {
-        Heard::Desired { envelope, .. } => {
-            Heard::Desired { envelope, inline: came.clone(), was_asked_for: false }
+    let rung = |message: ServerMessage| match message {
+        ServerMessage::Desired { envelope, .. } => {
+            ServerMessage::Desired { envelope, inline: came.clone(), was_asked_for: false }
         }
         other => other,
     };
@@ -563,13 +582,13 @@ async fn what_came_with_an_order_is_offered_if_the_order_is_accepted_and_names_i
 }
 
 #[tokio::test]
-async fn parts_that_are_lacking_are_reported_each_time_they_are_asked_for() {
+async fn missing_parts_are_reported_on_each_request() {
     let bench = Bench::new().await;
     let pushed = DesiredTask { delivery: Delivery::DirectPush, ..order("1.0") };
     bench.order(1, vec![pushed.clone()]).await;
     bench.phase(Phase::Fetching).await;
     let says = |missing: Option<Vec<PartRange>>, times| {
-        bench.fake.asks.send_replace(Asks { missing, times })
+        bench.fake.part_requests.send_replace(PartRequest { missing, times })
     };
     let missing = |report: &Report| report.tasks[0].missing_parts.clone();
     says(Some(Vec::new()), 1);
@@ -616,12 +635,12 @@ async fn tasks_of_higher_priority_are_prepared_first() {
 }
 
 #[tokio::test]
-async fn a_report_has_what_was_measured_of_the_link() {
+async fn report_contains_link_measurements() {
     let bench = Bench::new().await;
     let report = bench.report(|_| true).await;
     assert_eq!(report.link, None);
-    bench.shared.meter.transferred(1 << 20, std::time::Duration::from_secs(1));
-    bench.shared.meter.reconnected(Instant::now());
+    bench.link_state.meter.transferred(1 << 20, std::time::Duration::from_secs(1));
+    bench.link_state.meter.reconnected(Instant::now());
     let report = bench.report(|report| report.link.is_some()).await;
     let link = report.link.expect("waited for");
     assert_eq!((link.throughput_bytes_per_s, link.reconnects), (Some(1 << 20), 1));

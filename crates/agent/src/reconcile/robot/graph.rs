@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use task_proto::TaskName;
 use task_proto::desired::PackageRef;
-use task_proto::report::{Failure, RosFacts};
+use task_proto::messages::report::{Failure, RosFacts};
 
 use super::Robot;
 use super::runs::other_runs;
@@ -17,12 +17,12 @@ use crate::setup::launch;
 impl Robot {
     /// The graph, opened if necessary, once discovery can show its participants.
     pub async fn graph(&self) -> Result<Graph, Failure> {
-        self.graph.settled(self.ros_facts().as_ref()).await
+        self.graph.open_after_discovery(self.ros_facts().as_ref()).await
     }
 
     /// Joins the ROS 2 graph in `facts` while this version runs, so that the log messages of its
     /// nodes are kept even if the package promises nothing about them.
-    pub(super) fn listen_to(&self, package: &PackageRef, facts: Option<&RosFacts>) {
+    pub(super) fn open_graph(&self, package: &PackageRef, facts: Option<&RosFacts>) {
         let Some(manifest) = fetch::stored_manifest(&self.data, package) else { return };
         let is_ros_2 = match launch::of(&manifest).ros {
             Some(version) => version == RosVersion::Ros2,

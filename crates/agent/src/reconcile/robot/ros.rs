@@ -6,11 +6,11 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 
-use task_proto::manifest::TaskManifest;
-use task_proto::report::{FailureCode, RosFacts};
+use task_proto::messages::report::{FailureCode, RosFacts};
+use task_proto::packages::manifest::TaskManifest;
 
 use super::Robot;
-use super::outcomes::finally;
+use super::outcomes::permanent_failure;
 use crate::process::run_dir::RunDir;
 use crate::ros::probe;
 use crate::setup::environment;
@@ -20,11 +20,11 @@ use crate::setup::underlay;
 use crate::system::durable;
 use crate::system::layout::VersionDir;
 use crate::system::task_user::TaskUser;
-use crate::task::ledger::ActiveRun;
 use crate::task::plan::StepFailure;
+use crate::task::run::ActiveRun;
 
 /// The directory for the files of the ROS probe.
-const SURVEY_DIR: &str = "survey";
+const PROBE_DIR: &str = "survey";
 
 /// The variable with the directory for the nodes' own logs. The directory is emptied first: ROS
 /// makes new files at each start and deletes none. If the deletion fails, the task still starts.
@@ -32,7 +32,8 @@ pub(super) async fn node_logs(
     version: &VersionDir,
     user: Option<&TaskUser>,
 ) -> [(String, String); 1] {
-    let (logs, user) = (version.node_logs(), user.cloned());
+    let logs = version.node_logs();
+    let user = user.cloned();
     let variable = ("ROS_LOG_DIR".to_owned(), logs.display().to_string());
     let empty = move || {
         durable::remove_dir_all(&logs)?;
@@ -41,7 +42,7 @@ pub(super) async fn node_logs(
     };
     let emptied = tokio::task::spawn_blocking(empty).await;
     if let Err(error) = emptied.map_err(io::Error::from).flatten() {
-        tracing::warn!(%error, "cannot delete what nodes wrote into logs of their own");
+        tracing::warn!(%error, "cannot delete the nodes' own log files");
     }
     [variable]
 }
@@ -49,7 +50,7 @@ pub(super) async fn node_logs(
 impl Robot {
     /// The ROS facts for tasks that are started now.
     pub(super) fn ros_facts(&self) -> Option<RosFacts> {
-        self.ros_facts_in(&self.held().environment)
+        self.ros_facts_in(&self.resolved().environment)
     }
 
     /// The ROS facts for tasks with this environment.
@@ -75,7 +76,7 @@ impl Robot {
         let version = launch::of(manifest).ros;
         let found =
             underlay::setup_files(&self.installations(), version, &manifest.requires.ros_distro);
-        found.map_err(|error| finally(FailureCode::REQUIREMENTS_UNMET, &error))
+        found.map_err(|error| permanent_failure(FailureCode::REQUIREMENTS_UNMET, &error))
     }
 
     /// The setup files for a run that is to be started. If one is missing, the installations are
@@ -87,10 +88,10 @@ impl Robot {
         manifest: &TaskManifest,
     ) -> Result<Vec<PathBuf>, StepFailure> {
         let again = |_| {
-            self.find_ros();
+            self.find_installations();
             self.setup_files(manifest)
         };
-        let retry_after_ms = run.ever_ready.then_some(0);
+        let retry_after_ms = run.was_ever_ready().then_some(0);
         self.setup_files(manifest)
             .or_else(again)
             .map_err(|error| StepFailure { retry_after_ms, ..error })
@@ -98,26 +99,29 @@ impl Robot {
 
     /// Adopts the installations found by the effective settings, until a probe has inspected them.
     /// Tasks that were started already may have to be restarted before the probe runs.
-    pub(super) fn find_ros(&self) {
-        let found = self.held().installations();
+    pub(super) fn find_installations(&self) {
+        let found = self.resolved().installations();
         *self.ros.write().unwrap_or_else(PoisonError::into_inner) = found;
     }
 
     /// Probes the installations, and repeats the probe if the settings have changed meanwhile.
-    pub(super) async fn survey(&self) {
-        let dir = self.data.root().join(SURVEY_DIR);
+    pub(super) async fn probe_installations(&self) {
+        let dir = self.data.root().join(PROBE_DIR);
         loop {
-            let held = self.held();
-            let found = held.installations();
+            let resolved = self.resolved();
+            let found = resolved.installations();
             let seen = match &self.task_user {
-                Ok(user) => probe::survey(found, &held.environment, &dir, user.as_ref()).await,
+                Ok(user) => {
+                    probe::probe_installations(found, &resolved.environment, &dir, user.as_ref())
+                        .await
+                }
                 // Setup files may belong to any user, so they are never sourced as root for want of
                 // a task user.
                 Err(_) => found,
             };
             // A change of the settings happens before its write to this field.
             let mut ros = self.ros.write().unwrap_or_else(PoisonError::into_inner);
-            if Arc::ptr_eq(&held, &self.held()) {
+            if Arc::ptr_eq(&resolved, &self.resolved()) {
                 *ros = seen;
                 return;
             }
@@ -130,7 +134,7 @@ mod tests {
     use std::os::unix::fs::PermissionsExt as _;
 
     use serde_json::json;
-    use task_proto::settings::RobotSettings;
+    use task_proto::desired::settings::RobotSettings;
 
     use super::super::tests::{robot, run_dir};
     use super::*;
@@ -145,7 +149,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn logs_of_nodes_begin_anew_at_each_start() {
+    async fn node_log_directory_is_emptied_at_each_start() {
         let temp = tempfile::tempdir().expect("a directory");
         let digest = task_proto::Digest::of(b"manifest");
         let data = crate::system::layout::DataDir::new(temp.path()).expect("a directory");
@@ -162,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_server_says_of_ros_holds_before_anybody_has_looked_into_it() {
+    fn server_ros_settings_apply_before_a_probe() {
         let temp = tempfile::tempdir().expect("a directory");
         let (own, _) = setup(temp.path(), "own.bash", "");
         let (path, settings) = setup(temp.path(), "setup.bash", "");
@@ -188,13 +192,13 @@ mod tests {
     }
 
     #[test]
-    fn a_run_stays_in_its_domain_whatever_is_set_later() {
+    fn run_keeps_its_ros_domain_after_a_settings_change() {
         let temp = tempfile::tempdir().expect("a directory");
         let (_, settings) = setup(temp.path(), "setup.bash", "");
         let robot = robot(temp.path(), "");
         let set = |id| robot.adopt(&RobotSettings { ros_domain_id: Some(id), ..settings.clone() });
         set(7);
-        let run = run_dir(&temp.path().join("run"), robot.held().environment.clone());
+        let run = run_dir(&temp.path().join("run"), robot.resolved().environment.clone());
         set(9);
         let domain = |facts: Option<RosFacts>| facts.and_then(|facts| facts.domain_id);
         assert_eq!(domain(robot.ros_facts_of(run.path())), Some(7));
@@ -202,9 +206,10 @@ mod tests {
     }
 
     #[tokio::test(flavor = "multi_thread")]
-    async fn a_look_that_began_under_other_settings_is_not_what_counts() {
+    async fn probe_begun_under_old_settings_is_repeated() {
         let temp = tempfile::tempdir().expect("a directory");
-        let (begun, go) = (temp.path().join("begun"), temp.path().join("go"));
+        let begun = temp.path().join("begun");
+        let go = temp.path().join("go");
         let waiting = format!(
             "touch {}\nuntil [ -e {} ]; do read -rt 0.05 _ <> <(:); done\n",
             begun.display(),
@@ -218,7 +223,7 @@ mod tests {
         robot.adopt(&before);
         let looking = tokio::spawn({
             let robot = robot.clone();
-            async move { robot.look_for_ros().await }
+            async move { robot.probe_ros().await }
         });
         while !begun.exists() {
             tokio::task::yield_now().await;

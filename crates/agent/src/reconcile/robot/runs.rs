@@ -4,15 +4,15 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use task_proto::report::FailureCode;
+use task_proto::messages::report::FailureCode;
 
-use super::outcomes::later;
-use super::{RUN_RECORD, Robot, on_disk};
+use super::outcomes::retryable_failure;
+use super::{RUN_RECORD, Robot, blocking_io};
 use crate::process::supervisor::SupervisorError;
 use crate::system::clock;
 use crate::system::durable;
-use crate::task::ledger::{ActiveRun, ProcessRecord};
 use crate::task::plan::StepFailure;
+use crate::task::run::{ActiveRun, ProcessRecord};
 
 impl Robot {
     /// Ends the processes of every run directory in `runs` except `kept`: a start that seemed to
@@ -28,7 +28,7 @@ impl Robot {
             match self.supervisor.stop(dir, Duration::ZERO).await {
                 Err(error)
                     if error.is_malformed()
-                        && recorded(dir).is_some_and(|run| went_down_with_its_boot(&run)) => {}
+                        && recorded_process(dir).is_some_and(|run| is_from_earlier_boot(&run)) => {}
                 stopped => {
                     stopped?;
                 }
@@ -38,26 +38,27 @@ impl Robot {
     }
 
     /// Deletes every run directory except `kept`, after ending its processes.
-    pub(super) async fn forget_runs(
+    pub(super) async fn delete_runs(
         &self,
         runs: &Path,
         kept: Option<&Path>,
     ) -> Result<(), StepFailure> {
         let ended = self.end_other_runs(runs, kept).await;
-        let others = ended.map_err(|error| later(FailureCode::IO_ERROR, &error, 0))?;
-        on_disk(move || others.iter().try_for_each(|dir| durable::remove_dir_all(dir))).await
+        let others = ended.map_err(|error| retryable_failure(FailureCode::IO_ERROR, &error, 0))?;
+        blocking_io(move || others.iter().try_for_each(|dir| durable::remove_dir_all(dir))).await
     }
 }
 
 /// Whether the machine was restarted after the start of the process. If so, the process is gone,
 /// whatever its files say.
-pub(super) fn went_down_with_its_boot(process: &ProcessRecord) -> bool {
+pub(super) fn is_from_earlier_boot(process: &ProcessRecord) -> bool {
     clock::boot_id().is_ok_and(|boot_id| boot_id != process.boot_id)
 }
 
 /// The process in the copy of the ledger's record that was written before the start.
-fn recorded(dir: &Path) -> Option<ProcessRecord> {
-    serde_json::from_slice::<ActiveRun>(&std::fs::read(dir.join(RUN_RECORD)).ok()?).ok()?.process
+fn recorded_process(dir: &Path) -> Option<ProcessRecord> {
+    let run: ActiveRun = serde_json::from_slice(&std::fs::read(dir.join(RUN_RECORD)).ok()?).ok()?;
+    run.process().cloned()
 }
 
 /// Every run directory except `kept`.
@@ -72,15 +73,15 @@ mod tests {
     use std::os::unix::process::ExitStatusExt as _;
 
     use task_proto::desired::{BlobRef, DesiredTask, PackageRef, Wanted};
-    use task_proto::manifest::TaskManifest;
+    use task_proto::packages::manifest::TaskManifest;
     use task_proto::{DeploymentId, Digest};
 
     use super::super::tests::{robot, run_dir};
     use super::*;
     use crate::process::containment::RUN_DIR_VARIABLE;
     use crate::task::effects::Effects as _;
-    use crate::task::ledger::RunRules;
     use crate::task::observed::ProcessState;
+    use crate::task::run::RunRules;
 
     fn run_of(boot_id: &str) -> ActiveRun {
         let manifest = serde_json::json!({
@@ -89,8 +90,9 @@ mod tests {
         });
         let rules =
             RunRules::from(&serde_json::from_value::<TaskManifest>(manifest).expect("a manifest"));
-        let (name, version, blob) =
-            ("talker".parse(), "1.0".parse().expect("valid"), BlobRef::of(b"1"));
+        let name = "talker".parse();
+        let version = "1.0".parse().expect("valid");
+        let blob = BlobRef::of(b"1");
         let name: task_proto::TaskName = name.expect("valid");
         let order = DesiredTask {
             task: name.clone(),
@@ -106,21 +108,19 @@ mod tests {
             boot_id: boot_id.to_owned(),
             started_ms: 1,
             pid: Some(7),
-            ready: true,
-            condemned: None,
         };
-        ActiveRun { process: Some(process), ..ActiveRun::of(&order, rules, 0) }
+        ActiveRun::of(&order, rules, 0).begin(process).become_ready()
     }
 
     #[tokio::test]
-    async fn a_run_that_can_not_be_read_is_gone_once_the_machine_was_started_again() {
+    async fn unreadable_run_is_gone_after_a_reboot() {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");
-        let (now, before) =
-            (run_of(&clock::boot_id().expect("a boot id")), run_of("an earlier boot"));
+        let now = run_of(&clock::boot_id().expect("a boot id"));
+        let before = run_of("an earlier boot");
         let [now_process, before_process] =
-            [&now, &before].map(|run| run.process.clone().expect("a process"));
+            [&now, &before].map(|run| run.process().cloned().expect("a process"));
         let dir = run_dir(&robot.run_dir(&talker, &now_process), BTreeMap::new());
         std::fs::write(dir.path().join("pid.json"), "{").expect("written");
         let record = |run: &ActiveRun| {
@@ -137,11 +137,11 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_start_that_hangs_keeps_nobody_waiting_who_looks() {
+    async fn hanging_start_does_not_block_observation() {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");
-        let process = run_of("boot").process.expect("a process");
+        let process = run_of("boot").process().cloned().expect("a process");
         let dir = run_dir(&robot.run_dir(&talker, &process), BTreeMap::new());
         let hangs = dir.try_lock().expect("locked").expect("nobody has it");
         let looking =
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_still_runs_of_an_old_run_is_ended_before_its_directory_goes() {
+    async fn leftover_processes_end_before_their_run_directory_is_deleted() {
         let temp = tempfile::tempdir().expect("a directory");
         let robot = robot(temp.path(), "");
         let talker = "talker".parse().expect("valid");

@@ -6,43 +6,44 @@ use tokio_util::sync::CancellationToken;
 
 use super::Robot;
 use super::outcomes::fetch_failure;
-use crate::config::trust::{Distrust, Use};
-use crate::install::signature_policy::NotVouched;
+use crate::config::trust::{PackageUse, TrustError};
+use crate::install::signature_policy::SignatureError;
 use crate::task::plan::StepFailure;
 
 impl Robot {
     /// Checks that the signatures permit this use of the package. Missing evidence is fetched.
-    pub(super) async fn vouched(
+    pub(super) async fn check_signatures(
         &self,
         package: &PackageRef,
-        purpose: Use,
+        purpose: PackageUse,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
-        let Some(vouching) = &self.vouching else { return Ok(()) };
-        vouching.vouch(package, purpose, cancel).await.map_err(|error| match error {
-            NotVouched::Distrusted(distrust) => refusal(&distrust, package),
-            NotVouched::Fetch(error) => fetch_failure(error),
+        let Some(signature_policy) = &self.signature_policy else { return Ok(()) };
+        signature_policy.ensure_trusted(package, purpose, cancel).await.map_err(|error| match error
+        {
+            SignatureError::Distrusted(trust_error) => refusal(&trust_error, package),
+            SignatureError::Fetch(error) => fetch_failure(error),
         })
     }
 
     /// Checks again that a package found trusted a moment ago still is. If not, the step is retried
     /// after a full check.
-    pub(super) fn still_vouched(&self, package: &PackageRef) -> Result<(), StepFailure> {
-        let Some(vouching) = &self.vouching else { return Ok(()) };
-        let judged = vouching.judge(package, Use::Begin);
-        judged.map_err(|distrust| StepFailure {
+    pub(super) fn recheck_signatures(&self, package: &PackageRef) -> Result<(), StepFailure> {
+        let Some(signature_policy) = &self.signature_policy else { return Ok(()) };
+        let judged = signature_policy.check_package(package, PackageUse::New);
+        judged.map_err(|trust_error| StepFailure {
             retry_after_ms: Some(0),
-            ..refusal(&distrust, package)
+            ..refusal(&trust_error, package)
         })
     }
 }
 
 /// The failure for a distrusted package. A retry helps only with the list of publishers, which is
 /// updated by itself: other signatures come with another order.
-fn refusal(distrust: &Distrust, package: &PackageRef) -> StepFailure {
+fn refusal(trust_error: &TrustError, package: &PackageRef) -> StepFailure {
     StepFailure {
-        failure: distrust.failure(package),
-        retry_after_ms: distrust.may_pass().then_some(0),
+        failure: trust_error.failure(package),
+        retry_after_ms: trust_error.may_pass().then_some(0),
     }
 }
 
@@ -53,9 +54,9 @@ mod tests {
 
     use nix::mount::{MsFlags, mount};
     use task_proto::desired::{BlobRef, DesiredState, Evidence, SignatureRef};
-    use task_proto::envelope::SigningKey;
-    use task_proto::publisher::PackageStatement;
-    use task_proto::report::FailureCode;
+    use task_proto::messages::report::FailureCode;
+    use task_proto::packages::publisher::PackageStatement;
+    use task_proto::trust::envelope::SigningKey;
     use task_proto::{Digest, Generation, RobotId};
 
     use super::super::tests::robot;
@@ -102,7 +103,7 @@ mod tests {
         let envelope = BlobRef::of(&statement);
         robot.offer(vec![(envelope, statement.into()), (package.config, manifest.into())]);
         let signatures = vec![SignatureRef { manifest: package.manifest.digest, envelope }];
-        robot.heed(&DesiredState {
+        robot.apply_state(&DesiredState {
             robot_id: RobotId::random(),
             generation: Generation(1),
             issued_at_ms: 0,
@@ -118,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn an_order_waits_for_a_disk_that_is_full_wherever_it_meets_it() {
+    fn full_disk_is_retryable_in_every_step() {
         let temp = tempfile::tempdir().expect("a directory");
         with_own_mounts(|| {
             mount(

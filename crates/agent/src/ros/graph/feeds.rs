@@ -10,14 +10,14 @@ use futures_util::StreamExt;
 use ros2_client::Log;
 use ros2_client::builtin_interfaces::Time;
 use serde::{Deserialize, Serialize};
-use task_proto::log::LogLevel;
-use task_proto::ros::GraphName;
+use task_proto::telemetry::log::LogLevel;
+use task_proto::telemetry::ros::GraphName;
 use tokio::sync::{broadcast, watch};
 use tokio_util::sync::CancellationToken;
 
-use super::endpoint::{Cdr, Delivery, Endpoints, Reader, Sample};
-use super::names::{self, Role};
 use super::{EndpointId, GraphError, ParticipantId, Snapshot};
+use crate::ros::graph::dds::endpoint::{Cdr, Delivery, Endpoints, Reader, Sample};
+use crate::ros::graph::dds::names::{self, Role};
 
 /// Maximum number of messages that wait for a slow subscriber.
 pub const CAPACITY: usize = 1024;
@@ -113,7 +113,7 @@ pub struct Feeds {
 }
 
 /// A task to spawn.
-type Running = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
+type FeedTask = std::pin::Pin<Box<dyn Future<Output = ()> + Send>>;
 
 impl Feeds {
     /// A subscription to `/rosout`, and the reading task if there was none. The first subscriber
@@ -123,14 +123,14 @@ impl Feeds {
         endpoints: &Endpoints,
         snapshot: watch::Receiver<Arc<Snapshot>>,
         closing: &CancellationToken,
-    ) -> Result<(broadcast::Receiver<Arc<RosoutLine>>, Option<Running>), GraphError> {
+    ) -> Result<(broadcast::Receiver<Arc<RosoutLine>>, Option<FeedTask>), GraphError> {
         let read = || {
             let delivery = Delivery::Lasting { depth: 500 };
             let reader = reader(endpoints, "/rosout", "rcl_interfaces/msg/Log", delivery)?;
-            let mut lost = Lost::default();
+            let mut gaps = GapCounter::default();
             let lines = move |sample: Sample<Cdr>| {
                 let log: Log = sample.message.value(0)?;
-                let lost = lost.before(sample.writer, sample.number);
+                let lost = gaps.count_missing(sample.writer, sample.number);
                 Some(vec![RosoutLine::of(
                     log,
                     sample.writer.participant(),
@@ -140,7 +140,7 @@ impl Feeds {
             };
             Ok((reader, lines))
         };
-        listen(&self.rosout, closing, read)
+        subscribe(&self.rosout, closing, read)
     }
 
     /// A subscription to `/diagnostics`, and the reading task if there was none.
@@ -148,14 +148,15 @@ impl Feeds {
         &self,
         endpoints: &Endpoints,
         closing: &CancellationToken,
-    ) -> Result<(broadcast::Receiver<Arc<DiagnosticStatus>>, Option<Running>), GraphError> {
+    ) -> Result<(broadcast::Receiver<Arc<DiagnosticStatus>>, Option<FeedTask>), GraphError> {
         let read = || {
             let delivery = Delivery::Reliable { depth: 100 };
             let reader =
                 reader(endpoints, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", delivery)?;
             let statuses = |sample: Sample<Cdr>| {
                 let array: DiagnosticArray = sample.message.value(0)?;
-                let (stamp, participant) = (array.stamp, sample.writer.participant());
+                let stamp = array.stamp;
+                let participant = sample.writer.participant();
                 let statuses = array.status.into_iter().take(MAX_STATUSES);
                 Some(
                     statuses
@@ -165,7 +166,7 @@ impl Feeds {
             };
             Ok((reader, statuses))
         };
-        listen(&self.diagnostics, closing, read)
+        subscribe(&self.diagnostics, closing, read)
     }
 }
 
@@ -182,11 +183,11 @@ fn reader(
 }
 
 /// Joins the feed that is being read, or starts one.
-fn listen<T, M>(
+fn subscribe<T, M>(
     feed: &Mutex<Option<broadcast::Sender<Arc<T>>>>,
     closing: &CancellationToken,
     read: impl FnOnce() -> Result<(Reader<Cdr>, M), GraphError>,
-) -> Result<(broadcast::Receiver<Arc<T>>, Option<Running>), GraphError>
+) -> Result<(broadcast::Receiver<Arc<T>>, Option<FeedTask>), GraphError>
 where
     T: Send + Sync + 'static,
     M: FnMut(Sample<Cdr>) -> Option<Vec<T>> + Send + 'static,
@@ -199,7 +200,7 @@ where
     let (sender, receiver) = broadcast::channel(CAPACITY);
     *feed = Some(sender.clone());
     let closing = closing.clone();
-    let running = async move {
+    let task = async move {
         let mut samples = pin!(reader.samples());
         while let Some(Some(sample)) = closing.run_until_cancelled(samples.next()).await {
             for message in messages(sample).into_iter().flatten() {
@@ -208,17 +209,17 @@ where
             }
         }
     };
-    Ok((receiver, Some(Box::pin(running))))
+    Ok((receiver, Some(Box::pin(task))))
 }
 
 /// Finds gaps in writers' sequence numbers.
 #[derive(Default)]
-struct Lost {
+struct GapCounter {
     last: BTreeMap<EndpointId, i64>,
 }
 
-impl Lost {
-    fn before(&mut self, writer: EndpointId, number: i64) -> u64 {
+impl GapCounter {
+    fn count_missing(&mut self, writer: EndpointId, number: i64) -> u64 {
         if self.last.len() >= MAX_WRITERS && !self.last.contains_key(&writer) {
             self.last.clear();
         }
@@ -313,8 +314,9 @@ mod tests {
 
     #[test]
     fn gaps_in_numbers_are_lost_messages() {
-        let mut lost = Lost::default();
-        let (one, two) = (EndpointId([1; 16]), EndpointId([2; 16]));
+        let mut gaps = GapCounter::default();
+        let one = EndpointId([1; 16]);
+        let two = EndpointId([2; 16]);
         let found = [
             (one, 7),
             (two, 1),
@@ -325,7 +327,7 @@ mod tests {
             (one, i64::MAX),
             (one, i64::MIN),
         ]
-        .map(|(writer, number)| lost.before(writer, number));
+        .map(|(writer, number)| gaps.count_missing(writer, number));
         assert_eq!(found[..6], [0, 0, 0, 3, 0, 0]);
         assert_eq!(found[7], 0);
     }

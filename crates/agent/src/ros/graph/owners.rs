@@ -18,8 +18,8 @@ use std::{fs, io};
 
 use nix::ifaddrs::getifaddrs;
 
-use super::snapshot::{Participant, ParticipantId};
 use crate::process::program::ProcessIdentity;
+use crate::ros::graph::dds::snapshot::{Participant, ParticipantId};
 
 /// Resolution of the kernel's process start times, and of the age computed from them.
 const CLOCK_STEP: Duration = Duration::from_millis(20);
@@ -61,23 +61,23 @@ impl Owners {
     /// Reads the data from the kernel. This reads `/proc`, so it belongs on a thread that may
     /// block.
     pub(super) fn of(participants: &BTreeMap<ParticipantId, Participant>, pids: &[u32]) -> Self {
-        let host = Host::look(Path::new("/proc"), pids).unwrap_or_else(|error| {
-            tracing::warn!(error = %error, "cannot tell whose DDS participants are");
+        let host = Host::read(Path::new("/proc"), pids).unwrap_or_else(|error| {
+            tracing::warn!(error = %error, "cannot determine the owners of DDS participants");
             Host::default()
         });
-        host.judge(participants)
+        host.classify(participants)
     }
 
     /// The process on this host that contains the participant, if it can be determined. This
     /// examines every process.
     pub(super) fn process_of(participant: &Participant) -> Option<u32> {
-        let host = Host::look(Path::new("/proc"), &[]).ok()?;
+        let host = Host::read(Path::new("/proc"), &[]).ok()?;
         host.holder(Path::new("/proc"), &participant.locators)
     }
 }
 
 impl Host {
-    fn look(proc: &Path, pids: &[u32]) -> io::Result<Self> {
+    fn read(proc: &Path, pids: &[u32]) -> io::Result<Self> {
         let mut host = Self { complete: true, ..Self::default() };
         host.addresses = getifaddrs()?.filter_map(|interface| ip_of(&interface)).collect();
         host.former = former(&host.addresses);
@@ -110,7 +110,7 @@ impl Host {
         Ok(host)
     }
 
-    fn judge(&self, participants: &BTreeMap<ParticipantId, Participant>) -> Owners {
+    fn classify(&self, participants: &BTreeMap<ParticipantId, Participant>) -> Owners {
         let mut owners = Owners::default();
         for (id, participant) in participants {
             let seen_for = participant.first_seen.elapsed();
@@ -130,7 +130,9 @@ impl Host {
     fn holds(&self, locators: &BTreeSet<SocketAddr>, seen_for: Duration) -> Option<bool> {
         let ports =
             locators.iter().filter(|locator| self.is_here(locator.ip())).map(SocketAddr::port);
-        let (mut theirs, mut others, mut shared) = (false, false, false);
+        let mut theirs = false;
+        let mut others = false;
+        let mut shared = false;
         let is_held =
             |socket: &u64| self.held.get(socket).is_some_and(|age| *age + CLOCK_STEP >= seen_for);
         for sockets in ports.filter_map(|port| self.sockets.get(&port)) {
@@ -304,14 +306,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_seen_before_a_process_was_started_is_not_its_own() {
+    fn participant_seen_before_the_process_start_belongs_to_another() {
         let locators = participant(&["192.168.1.5:7411"]).locators;
         assert_eq!(host(true).holds(&locators, Duration::from_secs(10)), Some(true));
         assert_eq!(host(true).holds(&locators, Duration::from_secs(11)), Some(false));
     }
 
     #[test]
-    fn a_participant_is_gone_when_nobody_can_be_it() {
+    fn participant_without_a_possible_process_is_gone() {
         for (locators, seen_for_s, expected) in [
             (&["192.168.1.5:7415"][..], 1, true),
             (&["192.168.1.5:7413"], 1, false),

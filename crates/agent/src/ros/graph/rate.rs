@@ -9,7 +9,7 @@ use futures_util::StreamExt;
 use tokio::sync::watch;
 use tokio_util::sync::{CancellationToken, DropGuard};
 
-use super::endpoint::{Counted, Reader};
+use crate::ros::graph::dds::endpoint::{Counted, Reader};
 
 /// Time span over which samples are counted.
 pub const WINDOW: Duration = Duration::from_secs(5);
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fast_topic_is_remembered_only_so_far() {
+    fn samples_of_a_fast_topic_are_bounded() {
         let start = Instant::now();
         let mut arrivals = Arrivals::since(start);
         for number in 1..=20_000_u64 {

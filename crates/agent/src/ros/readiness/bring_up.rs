@@ -1,5 +1,5 @@
 //! Brings one promised node up: its parameters are set, then it is configured and activated, from
-//! any lifecycle state. Pure: the module returns the next question for the node and takes the
+//! any lifecycle state. Pure: the module returns the next request to the node and takes the
 //! answers in.
 //!
 //! ```text
@@ -10,33 +10,33 @@
 use std::collections::BTreeMap;
 
 use serde_json::Value;
-use task_proto::report::{Failure, FailureCode};
-use task_proto::ros::{GraphName, LifecycleState, Transition};
+use task_proto::messages::report::{Failure, FailureCode};
+use task_proto::telemetry::ros::{GraphName, LifecycleState, Transition};
 
 use crate::ros::graph::ParticipantId;
 
 /// Pause before a question is repeated, when no answer came or the answer is expected to change
 /// soon.
-const ASK_AGAIN_MS: u64 = 500;
+const RETRY_INTERVAL_MS: u64 = 500;
 /// Interval between queries for the state of a lifecycle node that is up.
-const LOOK_EVERY_MS: u64 = 2000;
+const POLL_INTERVAL_MS: u64 = 2000;
 /// Time that a node that is up has to declare parameters before the undeclared ones count as
 /// rejected.
-const UNDECLARED_PATIENCE_MS: u64 = 3000;
+const UNDECLARED_TIMEOUT_MS: u64 = 3000;
 
-/// A question for a node.
+/// A request to a node.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Question {
+pub struct NodeRequest {
     pub node: GraphName,
     /// The participant of the node; answers of a later participant do not count.
     pub instance: ParticipantId,
-    pub ask: Ask,
+    pub kind: RequestKind,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub enum Ask {
+pub enum RequestKind {
     /// Any answer at all: a query for no parameter.
-    Anything,
+    Ping,
     /// The node's lifecycle state.
     State,
     /// Make a lifecycle transition.
@@ -46,12 +46,12 @@ pub enum Ask {
 
 #[derive(Debug, Clone, PartialEq)]
 pub enum Answer {
-    Something,
+    Pong,
     /// The node's lifecycle state.
     State(LifecycleState),
     /// Whether it made the transition.
     Transition(bool),
-    /// For each parameter, in the order asked: accepted, or the reason for the rejection.
+    /// For each parameter, in the order requested: accepted, or the reason for the rejection.
     Set(Vec<Result<(), String>>),
     /// No answer within the time limit.
     None,
@@ -64,12 +64,12 @@ pub(super) struct BringUp {
     is_lifecycle: bool,
     /// Whether the node offers services whose availability can only be tested by a question to the
     /// node.
-    is_asked: bool,
+    must_answer: bool,
     instance: ParticipantId,
     /// Parameters that the node has not accepted yet, each with its last rejection.
     pending: BTreeMap<String, (Value, Option<String>)>,
     /// The state in which they were last tried; a node without lifecycle counts as active.
-    tried_in: Option<LifecycleState>,
+    set_attempted_in: Option<LifecycleState>,
     /// Start of the time in which only undeclared parameters are left.
     undeclared_since_ms: Option<u64>,
     state: Option<LifecycleState>,
@@ -80,7 +80,7 @@ pub(super) struct BringUp {
     answered: bool,
     silent_since_ms: Option<u64>,
     in_flight: bool,
-    ask_at_ms: u64,
+    next_request_at_ms: u64,
 }
 
 /// Whether a rejection only means that the node has not declared the parameter yet: rclcpp and
@@ -102,10 +102,10 @@ impl BringUp {
         Self {
             node,
             is_lifecycle,
-            is_asked: false,
+            must_answer: false,
             instance,
             pending: pending.map(|(name, value)| (name.clone(), (value.clone(), None))).collect(),
-            tried_in: None,
+            set_attempted_in: None,
             undeclared_since_ms: None,
             state: None,
             is_up,
@@ -114,7 +114,7 @@ impl BringUp {
             answered: false,
             silent_since_ms: None,
             in_flight: false,
-            ask_at_ms: 0,
+            next_request_at_ms: 0,
         }
     }
 
@@ -123,13 +123,13 @@ impl BringUp {
     }
 
     /// Requires that the node answers a question.
-    pub(super) fn must_answer(&mut self) {
-        self.is_asked = true;
+    pub(super) fn require_answer(&mut self) {
+        self.must_answer = true;
     }
 
     /// Whether the node answered once, if an answer is required.
-    pub(super) fn answers(&self) -> bool {
-        self.answered || !self.is_asked
+    pub(super) fn has_answered(&self) -> bool {
+        self.answered || !self.must_answer
     }
 
     pub(super) fn refused(&self) -> Option<&Failure> {
@@ -141,7 +141,7 @@ impl BringUp {
         self.is_up
     }
 
-    pub(super) fn has_its_parameters(&self) -> bool {
+    pub(super) fn has_all_parameters(&self) -> bool {
         self.pending.is_empty()
     }
 
@@ -156,46 +156,48 @@ impl BringUp {
         self.silent_since_ms
     }
 
-    /// The next question for the node, if any.
-    pub(super) fn question(&mut self, now_ms: u64) -> Option<Question> {
-        if self.in_flight || self.refused.is_some() || now_ms < self.ask_at_ms {
+    /// The next request to the node, if any.
+    pub(super) fn next_request(&mut self, now_ms: u64) -> Option<NodeRequest> {
+        if self.in_flight || self.refused.is_some() || now_ms < self.next_request_at_ms {
             return None;
         }
-        let ask = self.ask()?;
+        let kind = self.next_kind()?;
         self.in_flight = true;
-        Some(Question { node: self.node.clone(), instance: self.instance, ask })
+        Some(NodeRequest { node: self.node.clone(), instance: self.instance, kind })
     }
 
-    fn ask(&self) -> Option<Ask> {
-        let unasked = (self.is_asked && !self.answered).then_some(Ask::Anything);
+    fn next_kind(&self) -> Option<RequestKind> {
+        let ping = (self.must_answer && !self.answered).then_some(RequestKind::Ping);
         if self.is_lifecycle && (self.is_up || self.state.is_none()) {
-            return Some(Ask::State);
+            return Some(RequestKind::State);
         }
         let stage = self.state.unwrap_or(LifecycleState::Active);
-        let may_take = self.tried_in != Some(stage) || stage == LifecycleState::Active;
-        if stage != LifecycleState::Changing && !self.pending.is_empty() && may_take {
+        let may_set = self.set_attempted_in != Some(stage) || stage == LifecycleState::Active;
+        if stage != LifecycleState::Changing && !self.pending.is_empty() && may_set {
             let pending =
                 self.pending.iter().map(|(name, (value, _))| (name.clone(), value.clone()));
-            return Some(Ask::Set(pending.collect()));
+            return Some(RequestKind::Set(pending.collect()));
         }
         match self.state {
-            Some(LifecycleState::Unconfigured) => Some(Ask::Transition(Transition::Configure)),
-            Some(LifecycleState::Inactive) => Some(Ask::Transition(Transition::Activate)),
-            Some(LifecycleState::Changing | LifecycleState::Active) => Some(Ask::State),
-            Some(LifecycleState::Finalized) | None => unasked,
+            Some(LifecycleState::Unconfigured) => {
+                Some(RequestKind::Transition(Transition::Configure))
+            }
+            Some(LifecycleState::Inactive) => Some(RequestKind::Transition(Transition::Activate)),
+            Some(LifecycleState::Changing | LifecycleState::Active) => Some(RequestKind::State),
+            Some(LifecycleState::Finalized) | None => ping,
         }
     }
 
-    pub(super) fn answered(&mut self, question: &Question, answer: Answer, now_ms: u64) {
-        if question.instance != self.instance {
+    pub(super) fn record_answer(&mut self, request: &NodeRequest, answer: Answer, now_ms: u64) {
+        if request.instance != self.instance {
             return;
         }
         self.in_flight = false;
-        self.ask_at_ms = now_ms;
+        self.next_request_at_ms = now_ms;
         if answer == Answer::None {
             self.silent_since_ms.get_or_insert(now_ms);
-            self.ask_at_ms = now_ms + ASK_AGAIN_MS;
-            if matches!(question.ask, Ask::Transition(_)) {
+            self.next_request_at_ms = now_ms + RETRY_INTERVAL_MS;
+            if matches!(request.kind, RequestKind::Transition(_)) {
                 // The node may have made the transition all the same: query the state before asking
                 // again.
                 self.state = None;
@@ -204,26 +206,28 @@ impl BringUp {
         }
         self.answered = true;
         self.silent_since_ms = None;
-        match (&question.ask, answer) {
-            (_, Answer::State(state)) => self.is_in(state, now_ms),
-            (Ask::Transition(transition), Answer::Transition(true)) => {
-                self.is_in(goal(*transition), now_ms)
+        match (&request.kind, answer) {
+            (_, Answer::State(state)) => self.enter_state(state, now_ms),
+            (RequestKind::Transition(transition), Answer::Transition(true)) => {
+                self.enter_state(goal(*transition), now_ms)
             }
-            (Ask::Transition(transition), Answer::Transition(false)) => {
+            (RequestKind::Transition(transition), Answer::Transition(false)) => {
                 self.failed = Some(*transition);
                 self.state = None;
             }
-            (Ask::Set(asked), Answer::Set(results)) => self.took(asked, results, now_ms),
+            (RequestKind::Set(requested), Answer::Set(results)) => {
+                self.record_set_results(requested, results, now_ms)
+            }
             _ => {}
         }
     }
 
-    fn is_in(&mut self, state: LifecycleState, now_ms: u64) {
+    fn enter_state(&mut self, state: LifecycleState, now_ms: u64) {
         self.state = Some(state);
         // Until the result of the other attempt is known, nothing has failed: another program may
         // bring the node up as well.
         let failed = if state == LifecycleState::Changing { None } else { self.failed.take() };
-        if let Some(transition) = failed.filter(|transition| !leads_to(*transition, state)) {
+        if let Some(transition) = failed.filter(|transition| !reached_goal(*transition, state)) {
             let text = format!(
                 "`{}` failed to {} and is {}",
                 self.node,
@@ -232,47 +236,52 @@ impl BringUp {
             );
             self.refused = Some(Failure::new(FailureCode::LIFECYCLE_FAILED, text));
         } else if state == LifecycleState::Finalized && !self.is_up {
-            let text = format!("`{}` is finalized, from where nothing leads to active", self.node);
+            let text = format!("`{}` is finalized and cannot become active", self.node);
             self.refused = Some(Failure::new(FailureCode::LIFECYCLE_FAILED, text));
         }
         self.is_up |= state == LifecycleState::Active && self.pending.is_empty();
         if self.is_up {
-            self.ask_at_ms = now_ms + LOOK_EVERY_MS;
+            self.next_request_at_ms = now_ms + POLL_INTERVAL_MS;
         } else if state == LifecycleState::Changing {
-            self.ask_at_ms = now_ms + ASK_AGAIN_MS;
+            self.next_request_at_ms = now_ms + RETRY_INTERVAL_MS;
         }
     }
 
-    fn took(&mut self, asked: &[(String, Value)], results: Vec<Result<(), String>>, now_ms: u64) {
+    fn record_set_results(
+        &mut self,
+        requested: &[(String, Value)],
+        results: Vec<Result<(), String>>,
+        now_ms: u64,
+    ) {
         let stage = self.state.unwrap_or(LifecycleState::Active);
-        self.tried_in = Some(stage);
-        for ((name, _), result) in asked.iter().zip(results) {
+        self.set_attempted_in = Some(stage);
+        for ((name, _), result) in requested.iter().zip(results) {
             match result {
                 Ok(()) => {
                     self.pending.remove(name);
                 }
                 Err(reason) => {
-                    if let Some((_, said)) = self.pending.get_mut(name) {
-                        *said = Some(reason);
+                    if let Some((_, reason_seen)) = self.pending.get_mut(name) {
+                        *reason_seen = Some(reason);
                     }
                 }
             }
         }
         let rejected = || {
-            self.pending
-                .iter()
-                .filter_map(|(name, (value, said))| Some((name, value, said.as_ref()?)))
+            self.pending.iter().filter_map(|(name, (value, reason_seen))| {
+                Some((name, value, reason_seen.as_ref()?))
+            })
         };
-        let for_good = rejected().any(|(_, _, reason)| !is_undeclared(reason));
+        let is_final = rejected().any(|(_, _, reason)| !is_undeclared(reason));
         let waits = stage == LifecycleState::Active && rejected().next().is_some();
         let since_ms = if waits { *self.undeclared_since_ms.get_or_insert(now_ms) } else { now_ms };
-        if for_good || now_ms.saturating_sub(since_ms) >= UNDECLARED_PATIENCE_MS {
+        if is_final || now_ms.saturating_sub(since_ms) >= UNDECLARED_TIMEOUT_MS {
             let each = rejected()
                 .map(|(name, value, reason)| format!("`{}` {name} = {value}: {reason}", self.node));
             let text = each.collect::<Vec<_>>().join("; ");
             self.refused = Some(Failure::new(FailureCode::PARAMETER_REJECTED, text));
         } else if waits {
-            self.ask_at_ms = now_ms + ASK_AGAIN_MS;
+            self.next_request_at_ms = now_ms + RETRY_INTERVAL_MS;
         } else if stage == LifecycleState::Active {
             self.is_up = true;
         }
@@ -280,7 +289,7 @@ impl BringUp {
 }
 
 /// Whether a node in this state has reached the goal of a transition.
-fn leads_to(transition: Transition, state: LifecycleState) -> bool {
+fn reached_goal(transition: Transition, state: LifecycleState) -> bool {
     let is_passed = transition == Transition::Configure && state == LifecycleState::Active;
     is_passed || state == goal(transition)
 }

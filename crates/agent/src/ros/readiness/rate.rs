@@ -36,7 +36,7 @@ impl Rate {
     }
 
     /// Records that `count` messages have come until now.
-    pub(super) fn counted(&mut self, count: u64, now_ms: u64) {
+    pub(super) fn record(&mut self, count: u64, now_ms: u64) {
         if self.counts.back().is_some_and(|(_, last)| *last > count) {
             self.counts.clear();
         }
@@ -76,25 +76,25 @@ mod tests {
     /// Counts every 100 ms while messages come every `every_ms`.
     fn watched(rate: &mut Rate, from_ms: u64, until_ms: u64, every_ms: u64) {
         for now_ms in (from_ms..=until_ms).step_by(100) {
-            rate.counted(now_ms / every_ms, now_ms);
+            rate.record(now_ms / every_ms, now_ms);
         }
     }
 
     #[test]
-    fn a_rate_is_known_after_its_stretch_and_forgets_what_was_before() {
+    fn rate_is_known_after_one_window_and_ignores_older_messages() {
         let mut rate = Rate::of(5.0);
         watched(&mut rate, 0, 1900, 200);
         assert_eq!((rate.hz(), rate.suffices()), (None, None));
         watched(&mut rate, 2000, 4000, 200);
         assert_eq!((rate.hz(), rate.suffices()), (Some(5.0), Some(true)));
         for now_ms in (4100..=6100).step_by(100) {
-            rate.counted(20, now_ms);
+            rate.record(20, now_ms);
         }
         assert_eq!((rate.hz(), rate.suffices()), (Some(0.0), Some(false)));
     }
 
     #[test]
-    fn a_slow_topic_has_a_long_stretch_and_half_the_rate_is_too_little() {
+    fn slow_topic_has_a_long_window_and_half_the_rate_is_too_low() {
         let mut rate = Rate::of(0.1);
         watched(&mut rate, 0, 39_000, 10_000);
         assert_eq!(rate.suffices(), None);
@@ -106,10 +106,10 @@ mod tests {
     }
 
     #[test]
-    fn a_count_that_begins_anew_is_no_flood() {
+    fn restarted_count_does_not_raise_the_rate() {
         let mut rate = Rate::of(5.0);
         watched(&mut rate, 0, 3000, 10);
-        rate.counted(0, 3100);
+        rate.record(0, 3100);
         assert_eq!(rate.hz(), None);
     }
 }

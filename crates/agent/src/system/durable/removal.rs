@@ -115,7 +115,8 @@ mod tests {
     #[test]
     fn a_tree_deeper_than_any_path_is_removed() {
         let temp = tempfile::tempdir().expect("a directory");
-        let (tree, outside) = (temp.path().join("tree"), temp.path().join("outside"));
+        let tree = temp.path().join("tree");
+        let outside = temp.path().join("outside");
         fs::create_dir(&tree).expect("made");
         fs::write(&outside, "kept").expect("written");
         // These names conflict with those of directories that are moved up.

@@ -9,67 +9,71 @@
 
 use task_proto::desired::Wanted;
 
-use super::{Next, Situation, Step, record, takes_over, transition};
-use crate::task::ledger::{GateAnswer, GateQuestion, GateStep};
+use super::{Lane, Next, Outcome, PlanInput, Step, StepFailure, change, takes_over};
+use crate::task::ledger::{GateAnswer, GateQuestion, GateRecord, GateStep};
 use crate::task::observed::ProcessState;
+use crate::task::run::ActiveRun;
+use crate::task::timing::Moment;
+
+/// The longest wait before the robot's gate is asked again.
+const MAX_GATE_BACKOFF_MS: u64 = 60 * 1000;
 
 /// The gate's decision about the next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
+pub(super) enum GateDecision {
     /// There is no gate, the gate allowed the step, or the step needs no permission.
-    Go,
+    Proceed,
     /// The gate has not answered yet.
-    Asked,
+    Pending,
     /// The gate refused and is asked again later.
-    NotNow,
+    Refused,
 }
 
 /// The next question to the gate, if one is due now.
-pub fn consult(s: &Situation<'_>) -> Next {
+pub fn check_gate(s: &PlanInput<'_>) -> Next {
     let rest = |until_ms| Next::Rest { until_ms };
     // The allowed step may be the one under way.
-    if s.acting {
+    if s.is_busy(Lane::Run) {
         return rest(None);
     }
     match (question(s), &s.record.gate) {
         (None, None) => rest(None),
-        (None, Some(_)) => record(transition::ungated(s)),
+        (None, Some(_)) => change(s, |record| record.gate = None),
         (Some(question), Some(gate)) if gate.question == question => match gate.answer {
             Some(GateAnswer::Allowed) => rest(None),
-            Some(GateAnswer::Refused(_)) if s.now_ms < gate.retry_at_ms => {
+            Some(GateAnswer::Refused(_)) if s.at.now_ms < gate.retry_at_ms => {
                 rest(Some(gate.retry_at_ms))
             }
-            _ => Next::Act(Step::Ask(question)),
+            _ => Next::Act(Step::QueryGate(question)),
         },
-        (Some(question), _) => Next::Act(Step::Ask(question)),
+        (Some(question), _) => Next::Act(Step::QueryGate(question)),
     }
 }
 
 /// Whether the gate permits the next step.
-pub(super) fn verdict(s: &Situation<'_>) -> Verdict {
-    let Some(question) = question(s) else { return Verdict::Go };
+pub(super) fn decision(s: &PlanInput<'_>) -> GateDecision {
+    let Some(question) = question(s) else { return GateDecision::Proceed };
     match s.record.gate.as_ref().filter(|gate| gate.question == question).map(|gate| &gate.answer) {
-        Some(Some(GateAnswer::Allowed)) => Verdict::Go,
-        Some(Some(GateAnswer::Refused(_))) => Verdict::NotNow,
-        _ => Verdict::Asked,
+        Some(Some(GateAnswer::Allowed)) => GateDecision::Proceed,
+        Some(Some(GateAnswer::Refused(_))) => GateDecision::Refused,
+        _ => GateDecision::Pending,
     }
 }
 
 /// The question that the gate has to answer before any further step.
-fn question(s: &Situation<'_>) -> Option<GateQuestion> {
-    if !s.gated {
+fn question(s: &PlanInput<'_>) -> Option<GateQuestion> {
+    if !s.permissions.gated {
         return None;
     }
     let order = &s.record.order;
     let active = s.record.active.as_ref();
-    let process = active.and_then(|active| active.process.as_ref());
-    let of_order = |step| GateQuestion {
+    let question_for_order = |step| GateQuestion {
         step,
         deployment: order.deployment.clone(),
         run: order.run,
         version: order.package.version.clone(),
     };
-    let of_active = |step| {
+    let question_for_active = |step| {
         let active = active?;
         Some(GateQuestion {
             step,
@@ -79,29 +83,55 @@ fn question(s: &Situation<'_>) -> Option<GateQuestion> {
         })
     };
     let takes_over = takes_over(s) && active.is_none_or(|active| !active.is_for(order));
-    if let Some(process) = process {
-        if process.condemned.is_some() || !matches!(s.process, ProcessState::Alive { .. }) {
+    if let Some(active) = active.filter(|active| active.process().is_some()) {
+        if active.pending_stop().is_some() || !matches!(s.process, ProcessState::Alive { .. }) {
             return None;
         }
         return match s.desired.is_some_and(|task| task.wanted == Wanted::Running) {
-            false => of_active(GateStep::Stop),
-            true => takes_over.then(|| of_order(GateStep::Switch)),
+            false => question_for_active(GateStep::Stop),
+            true => takes_over.then(|| question_for_order(GateStep::Switch)),
         };
     }
     if takes_over {
-        let switch = of_order(GateStep::Switch);
-        let allowed = |gate: &&crate::task::ledger::GateRecord| {
+        let switch = question_for_order(GateStep::Switch);
+        let allowed = |gate: &&GateRecord| {
             gate.question == switch && gate.answer == Some(GateAnswer::Allowed)
         };
         return Some(if s.record.gate.as_ref().is_some_and(|gate| allowed(&gate)) {
             switch
         } else {
-            of_order(GateStep::Start)
+            question_for_order(GateStep::Start)
         });
     }
-    let starts = |active: &&crate::task::ledger::ActiveRun| {
-        active.end.is_none() && !active.admitted && !s.held
-    };
+    let starts =
+        |active: &&ActiveRun| active.is_waiting() && !active.is_admitted() && !s.permissions.held;
     active.filter(starts)?;
-    (order.wanted == Wanted::Running && s.desired.is_some()).then(|| of_active(GateStep::Start))?
+    (order.wanted == Wanted::Running && s.desired.is_some())
+        .then(|| question_for_active(GateStep::Start))?
+}
+
+/// Keeps the record of a question that is asked again, and begins that of another question.
+pub(super) fn begin(gate: &mut Option<GateRecord>, question: &GateQuestion) {
+    if gate.as_ref().is_none_or(|gate| gate.question != *question) {
+        let question = question.clone();
+        *gate = Some(GateRecord { question, answer: None, refusals: 0, retry_at_ms: 0 });
+    }
+}
+
+/// Records the answer to the question, if that is still the current one.
+pub(super) fn finish(
+    gate: Option<&mut GateRecord>,
+    question: &GateQuestion,
+    outcome: Outcome,
+    at: &Moment<'_>,
+) {
+    let Some(gate) = gate.filter(|gate| gate.question == *question) else { return };
+    gate.answer = Some(match outcome {
+        Ok(_) => GateAnswer::Allowed,
+        Err(StepFailure { failure, .. }) => {
+            gate.refusals = gate.refusals.saturating_add(1);
+            gate.retry_at_ms = at.retry_at(gate.refusals, MAX_GATE_BACKOFF_MS);
+            GateAnswer::Refused(failure)
+        }
+    });
 }

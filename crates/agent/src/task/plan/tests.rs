@@ -2,16 +2,20 @@
 //! twice, no task has two processes, unwanted steps are interrupted, and the world converges once
 //! it is quiet.
 
+mod changed_trees;
 mod world;
 
-use proptest::prelude::*;
-use task_proto::manifest::{OnBoot, Outputs, Restart, Run, TaskKind};
-use task_proto::report::{FailureCode, Phase};
+use std::time::Duration;
 
-use self::world::{Happening, Sight, World, happening, health, manifest, order, package};
+use proptest::prelude::*;
+use task_proto::messages::report::{FailureCode, Phase};
+use task_proto::packages::manifest::{OnBoot, Outputs, Restart, Run, TaskKind};
+
+use self::world::{HealthSample, World, WorldEvent, event, health, manifest, order, package};
 use super::*;
 use crate::task::ledger::GateStep;
 use crate::task::observed::Missing;
+use crate::task::timing::backoff_ms;
 
 fn run_rules() -> impl Strategy<Value = Run> {
     let kind = prop_oneof![Just(TaskKind::Service), Just(TaskKind::Job)];
@@ -31,18 +35,18 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 512, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn whatever_happens_it_is_safe_and_converges(
+    fn any_event_sequence_is_safe_and_converges(
         rules in run_rules(),
         outputs in prop::bool::ANY,
-        asks in any::<bool>(),
+        checks_signatures in any::<bool>(),
         bad in prop_oneof![Just(None), Just(Some(0)), Just(Some(1))],
-        happenings in prop::collection::vec(happening(), 1..80),
+        happenings in prop::collection::vec(event(), 1..80),
     ) {
         let outputs = Outputs { paths: outputs.then(|| "maps/*".to_owned()).into_iter().collect() };
         let mut world = World::new(rules);
-        (world.bad, world.outputs, world.asks) = (bad, outputs, asks);
-        for happening in happenings {
-            world.happen(happening);
+        (world.bad, world.outputs, world.checks_signatures) = (bad, outputs, checks_signatures);
+        for event in happenings {
+            world.apply(event);
             prop_assert!(world.alive.len() <= 1);
         }
         world.settle();
@@ -52,13 +56,14 @@ proptest! {
             }
             (Some(order), Some(record)) => {
                 prop_assert_eq!(&record.order, order);
-                let phase = record.standing().0;
-                prop_assert_eq!(phase, record.phase);
+                let phase = record.order_phase().0;
+                let written = serde_json::to_value(record).expect("json");
+                prop_assert_eq!(&serde_json::json!(phase), &written["phase"]);
                 match order.wanted {
                     Wanted::Stopped => prop_assert!(world.alive.is_empty() && phase == Phase::Stopped),
                     Wanted::Running => {
                         let active = record.active.as_ref().filter(|active| active.is_for(order));
-                        let runs = active.is_some_and(|active| active.process.is_some()) && world.alive.len() == 1;
+                        let runs = active.is_some_and(|active| active.process().is_some()) && world.alive.len() == 1;
                         prop_assert!(runs == (phase == Phase::Running), "{phase} {active:?} {:?}", world.alive);
                         prop_assert!(runs || phase.is_final(), "stuck in {phase}: {record:?}");
                         let old_runs = active.is_none() && world.alive.len() == 1;
@@ -83,28 +88,28 @@ proptest! {
 
 fn running(run: Run) -> World {
     let mut world = World::new(run);
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     while world.alive.is_empty() {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
-    world.happen(Happening::Wait { ms: 2000 });
-    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+    world.apply(WorldEvent::Wait { ms: 2000 });
+    assert_eq!(world.record.as_ref().expect("a record").phase(), Phase::Running);
     world
 }
 
 fn phase(world: &World) -> Phase {
-    world.record.as_ref().expect("a record").phase
+    world.record.as_ref().expect("a record").phase()
 }
 
 #[test]
 fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
     let mut world = running(Run::default());
     let old = world.alive.clone();
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]));
     assert_eq!((phase(&world), &world.alive), (Phase::Fetching, &old));
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     assert_eq!((phase(&world), &world.alive), (Phase::Running, &old));
     assert!(world.steps.is_empty(), "the cancelled step is interrupted: {:?}", world.steps);
 }
@@ -112,8 +117,8 @@ fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
 #[test]
 fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
     let mut world = running(Run::default());
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
-    world.happen(Happening::Reboot);
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Reboot);
     let mut lanes: Vec<Lane> = world.steps.iter().map(|(step, _)| step.lane()).collect();
     lanes.sort();
     assert_eq!(lanes, [Lane::Prepare, Lane::Run]);
@@ -121,55 +126,36 @@ fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
 }
 
 #[test]
-fn a_start_that_seemed_to_fail_is_stopped_before_anything_is_made_of_it() {
+fn apparently_failed_start_is_stopped_before_the_failure_counts() {
     let mut world = World::new(Run::default());
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     while !matches!(world.steps[..], [(Step::Start(_), false)]) {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
     let (Step::Start(run), _) = world.steps[0].clone() else { panic!("looked for") };
     // The shim did not answer in time but has started the process.
-    world.alive.push(run.process.expect("begun").dir);
-    world.happen(Happening::Effect { well: false });
+    world.alive.push(run.process().expect("begun").dir.clone());
+    world.apply(WorldEvent::Effect { succeeds: false });
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     let active = |world: &World| {
         world.record.as_ref().and_then(|record| record.active.clone()).expect("active")
     };
-    assert_eq!((world.alive.len(), active(&world).restarts, active(&world).process), (0, 1, None));
+    assert_eq!(
+        (world.alive.len(), active(&world).restarts(), active(&world).process()),
+        (0, 1, None)
+    );
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
 }
 
 #[test]
-fn run_whose_tree_was_changed_is_fetched_and_built_anew_before_it_starts() {
-    let mut world = running(Run::default());
-    world.happen(Happening::ProcessEnds { code: 1 });
-    world.happen(Happening::Wait { ms: 90_000 });
-    assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
-    world.happen(Happening::FindsChange);
-    let standing = |world: &World| {
-        let record = world.record.clone().expect("a record");
-        (record.standing().0, record.standing().1.map(|failure| failure.code.clone()))
-    };
-    assert!(matches!(world.steps[..], [(Step::PullContent { .. }, false)]), "{:?}", world.steps);
-    assert_eq!(
-        standing(&world),
-        (Phase::Fetching, Some(task_proto::report::FailureCode::TREE_CHANGED))
-    );
-    world.happen(Happening::Wait { ms: 90_000 });
-    assert!(world.alive.is_empty(), "it is not started before it is there");
-    world.settle();
-    assert_eq!((standing(&world), world.alive.len()), ((Phase::Running, None), 1));
-}
-
-#[test]
-fn a_wait_beyond_all_numbers_is_the_longest_there_is() {
+fn oversized_retry_delay_saturates() {
     let mut world = World::new(Run::default());
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
-    world.happen(Happening::ToldToWait { ms: u64::MAX });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::RetryLater { ms: u64::MAX });
     assert_eq!(world.record.as_ref().expect("a record").preparation.retry_at_ms, u64::MAX);
     assert!(world.steps.is_empty(), "{:?}", world.steps);
 }
@@ -178,28 +164,28 @@ fn a_wait_beyond_all_numbers_is_the_longest_there_is() {
 fn hold_starts_nothing_and_stops_nothing() {
     let mut world = running(Run::default());
     let old = world.alive.clone();
-    world.happen(Happening::Hold(true));
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Hold(true));
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     for _ in 0..4 {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
     assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
-    world.happen(Happening::Hold(false));
+    world.apply(WorldEvent::Hold(false));
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]));
 }
 
 #[test]
-fn a_job_that_the_robot_lost_is_interrupted_unless_it_is_idempotent() {
+fn lost_job_is_interrupted_unless_idempotent() {
     for (idempotent, expected) in [(false, Phase::Failed), (true, Phase::Starting)] {
         let mut world = running(Run { kind: TaskKind::Job, idempotent, ..Run::default() });
-        world.happen(Happening::Reboot);
+        world.apply(WorldEvent::Reboot);
         assert_eq!(phase(&world), expected);
     }
 }
 
 #[test]
-fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_job() {
+fn start_cut_by_power_loss_is_repeated_except_for_jobs() {
     let job = |idempotent| Run { kind: TaskKind::Job, idempotent, ..Run::default() };
     for (run, may_have_begun, expected) in [
         (job(false), true, Phase::Failed),
@@ -208,15 +194,15 @@ fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_
         (Run::default(), true, Phase::Starting),
     ] {
         let mut world = World::new(run);
-        world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+        world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
         while !matches!(world.steps[..], [(Step::Start(_), false)]) {
-            world.happen(Happening::Effect { well: true });
-            world.happen(Happening::Learn);
+            world.apply(WorldEvent::Effect { succeeds: true });
+            world.apply(WorldEvent::Learn);
         }
         if may_have_begun {
-            world.happen(Happening::Effect { well: true });
+            world.apply(WorldEvent::Effect { succeeds: true });
         }
-        world.happen(Happening::Reboot);
+        world.apply(WorldEvent::Reboot);
         assert_eq!(phase(&world), expected, "{may_have_begun}");
         assert_eq!(
             matches!(world.steps[..], [(Step::Start(_), false)]),
@@ -226,39 +212,39 @@ fn a_start_that_a_power_cut_met_is_made_again_unless_it_may_have_been_that_of_a_
 }
 
 #[test]
-fn a_job_of_which_nothing_ran_is_started_again() {
+fn job_that_never_ran_is_started_again() {
     let mut world = World::new(Run { kind: TaskKind::Job, ..Run::default() });
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     while !matches!(world.steps[..], [(Step::Start(_), false)]) {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
-    world.happen(Happening::Effect { well: false });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: false });
+    world.apply(WorldEvent::Learn);
     assert_eq!((phase(&world), world.alive.len()), (Phase::Starting, 0));
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
 }
 
 #[test]
-fn files_of_a_run_that_was_replaced_before_it_was_ready_come_back() {
+fn outputs_of_a_run_replaced_before_ready_are_uploaded() {
     let mut world = World::new(Run::default());
     world.outputs = Outputs { paths: vec!["maps/*".to_owned()] };
-    world.health = health(Sight::NotAll, 0);
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.health = health(HealthSample::NotAll, 0);
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     while world.alive.is_empty() {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     let mut collected = Vec::new();
     for _ in 0..20 {
         collected.extend(world.steps.iter().filter_map(|(step, _)| match step {
-            Step::Collect(files) => Some(files.package.clone()),
+            Step::UploadOutputs(files) => Some(files.package.clone()),
             _ => None,
         }));
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
     assert_eq!(collected.first(), Some(&package(0)), "{collected:?}");
 }
@@ -266,16 +252,16 @@ fn files_of_a_run_that_was_replaced_before_it_was_ready_come_back() {
 #[test]
 fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
     let mut world = World::new(Run::default());
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     for _ in 0..200 {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
         if world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
-            world.happen(Happening::ProcessEnds { code: 3 });
+            world.apply(WorldEvent::ProcessEnds { code: 3 });
         }
-        world.happen(Happening::Wait { ms: 500 });
+        world.apply(WorldEvent::Wait { ms: 500 });
     }
-    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    let (phase, failure) = world.record.as_ref().expect("a record").order_phase();
     assert_eq!(phase, Phase::Failed);
     assert!(failure.expect("a failure").text.contains("exited with code 3"));
 }
@@ -283,10 +269,10 @@ fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
 fn bad_switch(world: &mut World) -> String {
     let old = world.alive[0].clone();
     world.bad = Some(1);
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     while !world.alive.iter().any(|dir| dir.starts_with("d0000000000000001")) {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
     old
 }
@@ -296,13 +282,13 @@ fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() 
     let mut world = running(Run::default());
     bad_switch(&mut world);
     assert_eq!(phase(&world), Phase::Starting);
-    world.happen(Happening::Wait { ms: 30_000 });
+    world.apply(WorldEvent::Wait { ms: 30_000 });
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
     assert_eq!(phase(&world), Phase::Starting, "it is not final before the process is gone");
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     let record = world.record.as_ref().expect("a record");
-    let (phase, failure) = record.standing();
+    let (phase, failure) = record.order_phase();
     assert_eq!(phase, Phase::RolledBack);
     assert_eq!(failure.expect("why").to_string(), "not_ready: `/mapper` is gone within 30 s");
     assert!(
@@ -312,32 +298,32 @@ fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() 
     );
     world.settle();
     assert_eq!(
-        (world.alive.len(), world.record.as_ref().expect("a record").phase),
+        (world.alive.len(), world.record.as_ref().expect("a record").phase()),
         (1, Phase::RolledBack)
     );
     // A reboot brings the old run back, and the order is not retried by itself.
-    world.happen(Happening::Reboot);
+    world.apply(WorldEvent::Reboot);
     world.settle();
     let record = world.record.as_ref().expect("a record");
     assert_eq!(
-        (record.phase, &record.active.as_ref().expect("active").package),
+        (record.phase(), &record.active.as_ref().expect("active").package),
         (Phase::RolledBack, &package(0))
     );
     world.bad = None;
-    world.happen(Happening::Order { deployment: 1, run: 2, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 2, stop: false });
     world.settle();
-    assert_eq!(world.record.as_ref().expect("a record").phase, Phase::Running);
+    assert_eq!(world.record.as_ref().expect("a record").phase(), Phase::Running);
 }
 
 #[test]
-fn run_that_came_back_goes_on_when_it_is_ordered_again() {
+fn restored_run_continues_when_ordered_again() {
     let mut world = running(Run::default());
     bad_switch(&mut world);
-    world.happen(Happening::Wait { ms: 30_000 });
+    world.apply(WorldEvent::Wait { ms: 30_000 });
     world.settle();
     let old = world.alive.clone();
     assert_eq!((phase(&world), old.len()), (Phase::RolledBack, 1));
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     world.settle();
     assert_eq!((phase(&world), &world.alive), (Phase::Running, &old));
 }
@@ -349,14 +335,14 @@ fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
         bad_switch(&mut world);
         for at in 0..12 {
             if at == cut {
-                world.happen(Happening::Reboot);
+                world.apply(WorldEvent::Reboot);
             }
-            world.happen(if at % 2 == 0 {
-                Happening::Wait { ms: 15_000 }
+            world.apply(if at % 2 == 0 {
+                WorldEvent::Wait { ms: 15_000 }
             } else {
-                Happening::Effect { well: true }
+                WorldEvent::Effect { succeeds: true }
             });
-            world.happen(Happening::Learn);
+            world.apply(WorldEvent::Learn);
         }
         world.settle();
         assert_eq!((phase(&world), world.alive.len()), (Phase::RolledBack, 1), "cut at {cut}");
@@ -368,29 +354,29 @@ fn when_the_old_version_fails_after_it_came_back_the_order_has_failed() {
     let mut world = running(Run::default());
     bad_switch(&mut world);
     for _ in 0..10_000 {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
         if phase(&world) == Phase::RolledBack {
-            world.happen(Happening::ProcessEnds { code: 3 });
+            world.apply(WorldEvent::ProcessEnds { code: 3 });
         }
-        world.happen(Happening::Wait { ms: 30_000 });
+        world.apply(WorldEvent::Wait { ms: 30_000 });
     }
-    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    let (phase, failure) = world.record.as_ref().expect("a record").order_phase();
     let text = &failure.expect("why").text;
     assert_eq!((phase, world.alive.len()), (Phase::Failed, 0));
     assert!(
-        text.contains("within 30 s\n1.0, which had come back, failed: the process ended"),
+        text.contains("within 30 s\n1.0, which had been restored, failed: the process ended"),
         "{text}"
     );
 }
 
 #[test]
-fn what_the_operator_had_stopped_does_not_come_back() {
+fn stopped_run_does_not_come_back() {
     let mut world = running(Run::default());
-    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
+    world.apply(WorldEvent::Order { deployment: 0, run: 2, stop: true });
     world.settle();
     assert_eq!(phase(&world), Phase::Stopped);
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     assert!(
         world.steps.iter().all(|(step, _)| step.lane() == Lane::Prepare),
         "the old one stays down meanwhile"
@@ -412,7 +398,7 @@ fn a_first_version_and_a_job_that_do_not_get_ready_have_failed() {
 
 fn bad_order(world: &mut World) {
     world.bad = Some(1);
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     world.settle();
 }
 
@@ -422,36 +408,36 @@ fn a_task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
         [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)]
     {
         let mut world = running(Run { restart, ..Run::default() });
-        world.happen(Happening::Sees(Sight::NotAll));
-        world.happen(Happening::Wait { ms: 29_999 });
+        world.apply(WorldEvent::Sees(HealthSample::NotAll));
+        world.apply(WorldEvent::Wait { ms: 29_999 });
         assert!(world.steps.is_empty());
-        world.happen(Happening::Wait { ms: 1 });
+        world.apply(WorldEvent::Wait { ms: 1 });
         assert_eq!(matches!(world.steps[..], [(Step::Stop(_), false)]), again, "{restart:?}");
         assert_eq!(phase(&world), Phase::Running);
         world.settle();
         let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
-        assert_eq!((phase(&world), active.restarts), (Phase::Running, u32::from(again)));
+        assert_eq!((phase(&world), active.restarts()), (Phase::Running, u32::from(again)));
     }
 }
 
 #[test]
-fn a_task_must_hold_for_its_time_without_a_break() {
+fn readiness_must_hold_without_interruption() {
     let mut world = World::new(Run::default());
     world.health = Health::Unknown;
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     while world.alive.is_empty() {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
-    for sight in [Sight::All, Sight::NotAll, Sight::All] {
-        world.happen(Happening::Sees(sight));
-        world.happen(Happening::Wait { ms: 1999 });
+    for sample in [HealthSample::All, HealthSample::NotAll, HealthSample::All] {
+        world.apply(WorldEvent::Sees(sample));
+        world.apply(WorldEvent::Wait { ms: 1999 });
         assert_eq!(phase(&world), Phase::Starting);
     }
-    world.happen(Happening::Wait { ms: 1 });
+    world.apply(WorldEvent::Wait { ms: 1 });
     assert_eq!(phase(&world), Phase::Running);
     let mut world = running(Run::default());
-    world.happen(Happening::Sees(Sight::Refused));
+    world.apply(WorldEvent::Sees(HealthSample::Refused));
     assert_eq!(
         (phase(&world), world.steps.len()),
         (Phase::Running, 0),
@@ -460,43 +446,43 @@ fn a_task_must_hold_for_its_time_without_a_break() {
 }
 
 #[test]
-fn what_was_good_before_a_power_cut_is_tried_again_when_it_is_refused_after() {
+fn run_ready_before_a_power_cut_is_retried_after_a_refusal() {
     let mut world = running(Run::default());
-    world.happen(Happening::Reboot);
-    world.health = health(Sight::Refused, 0);
+    world.apply(WorldEvent::Reboot);
+    world.health = health(HealthSample::Refused, 0);
     for _ in 0..20 {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
-        world.happen(Happening::Wait { ms: 30_000 });
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
+        world.apply(WorldEvent::Wait { ms: 30_000 });
     }
     let active = world.record.as_ref().expect("a record").active.as_ref().expect("active");
-    assert!(active.end.is_none() && active.restarts > 0, "{active:?}");
-    world.health = health(Sight::All, 0);
+    assert!(active.end().is_none() && active.restarts() > 0, "{active:?}");
+    world.health = health(HealthSample::All, 0);
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
 }
 
 #[test]
-fn what_is_no_fault_of_its_own_ends_no_run() {
+fn external_fault_does_not_stop_a_run() {
     let mut world = running(Run::default());
-    let Health::Missing(missing) = health(Sight::NotAll, 0) else { panic!("it is missing") };
-    for (is_its_own, stops) in [(false, 0), (true, 1)] {
-        world.health = Health::Missing(Missing { is_its_own, ..missing.clone() });
-        world.happen(Happening::Wait { ms: 600_000 });
+    let Health::Missing(missing) = health(HealthSample::NotAll, 0) else { panic!("it is missing") };
+    for (is_own_fault, stops) in [(false, 0), (true, 1)] {
+        world.health = Health::Missing(Missing { is_own_fault, ..missing.clone() });
+        world.apply(WorldEvent::Wait { ms: 600_000 });
         assert_eq!(world.steps.len(), stops, "{:?}", world.steps);
     }
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
 }
 
 #[test]
-fn a_job_has_its_deadline() {
+fn job_is_stopped_at_its_deadline() {
     let mut world = running(Run { kind: TaskKind::Job, deadline_s: Some(60), ..Run::default() });
-    world.happen(Happening::Wait { ms: 57_999 });
+    world.apply(WorldEvent::Wait { ms: 57_999 });
     assert!(world.steps.is_empty());
-    world.happen(Happening::Wait { ms: 1 });
+    world.apply(WorldEvent::Wait { ms: 1 });
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
     world.settle();
-    let (phase, failure) = world.record.as_ref().expect("a record").standing();
+    let (phase, failure) = world.record.as_ref().expect("a record").order_phase();
     assert_eq!(
         (phase, &failure.expect("why").code),
         (Phase::Failed, &FailureCode::DEADLINE_EXCEEDED)
@@ -508,50 +494,50 @@ fn the_gate_allows_a_switch_as_a_whole() {
     let mut world = running(Run::default());
     world.gated = true;
     let old = world.alive.clone();
-    world.happen(Happening::Order { deployment: 1, run: 1, stop: false });
-    while !matches!(world.steps[..], [(Step::Ask(_), _)]) {
-        world.happen(Happening::Effect { well: true });
-        world.happen(Happening::Learn);
+    world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
+    while !matches!(world.steps[..], [(Step::QueryGate(_), _)]) {
+        world.apply(WorldEvent::Effect { succeeds: true });
+        world.apply(WorldEvent::Learn);
     }
     let step = |world: &World| match &world.steps[..] {
-        [(Step::Ask(question), false)] => Some(question.step),
+        [(Step::QueryGate(question), false)] => Some(question.step),
         _ => None,
     };
     assert_eq!(step(&world), Some(GateStep::Switch));
     for _ in 0..3 {
-        world.happen(Happening::Effect { well: false });
+        world.apply(WorldEvent::Effect { succeeds: false });
         assert_eq!((phase(&world), &world.alive), (Phase::Deferred, &old));
         assert!(world.steps.is_empty(), "it is asked again later");
-        world.happen(Happening::Wait { ms: 60_000 });
+        world.apply(WorldEvent::Wait { ms: 60_000 });
         assert_eq!((phase(&world), step(&world)), (Phase::Deferred, Some(GateStep::Switch)));
     }
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     assert!(matches!(world.steps[..], [(Step::Stop(_), false)]), "{:?}", world.steps);
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
     world.settle();
     // A crash is not a new start, a reboot is.
-    world.happen(Happening::ProcessEnds { code: 1 });
-    world.happen(Happening::Wait { ms: 60_000 });
+    world.apply(WorldEvent::ProcessEnds { code: 1 });
+    world.apply(WorldEvent::Wait { ms: 60_000 });
     assert!(matches!(world.steps[..], [(Step::Start(_), false)]), "{:?}", world.steps);
     world.settle();
-    world.happen(Happening::Reboot);
+    world.apply(WorldEvent::Reboot);
     assert_eq!(step(&world), Some(GateStep::Start));
-    world.happen(Happening::Effect { well: false });
+    world.apply(WorldEvent::Effect { succeeds: false });
     assert_eq!(phase(&world), Phase::Deferred);
 }
 
 #[test]
-fn a_stop_that_the_gate_refuses_waits_while_the_task_is_looked_after() {
+fn stop_refused_by_the_gate_waits_under_supervision() {
     let mut world = running(Run::default());
     world.gated = true;
-    world.happen(Happening::Order { deployment: 0, run: 2, stop: true });
-    world.happen(Happening::Effect { well: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 2, stop: true });
+    world.apply(WorldEvent::Effect { succeeds: false });
     assert_eq!((phase(&world), world.alive.len()), (Phase::Deferred, 1));
-    world.happen(Happening::Sees(Sight::NotAll));
-    world.happen(Happening::Wait { ms: 30_000 });
+    world.apply(WorldEvent::Sees(HealthSample::NotAll));
+    world.apply(WorldEvent::Wait { ms: 30_000 });
     assert!(
         world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))),
         "what failed is stopped unasked"
@@ -563,10 +549,10 @@ fn a_stop_that_the_gate_refuses_waits_while_the_task_is_looked_after() {
 #[test]
 fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
     let mut world = running(Run { on_boot: OnBoot::Hold, ..Run::default() });
-    world.happen(Happening::Reboot);
+    world.apply(WorldEvent::Reboot);
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
-    world.happen(Happening::Order { deployment: 0, run: 2, stop: false });
+    world.apply(WorldEvent::Order { deployment: 0, run: 2, stop: false });
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Running, 1));
 }
@@ -595,20 +581,20 @@ fn every_step_of_the_run_lane_has_a_deadline() {
 }
 
 #[test]
-fn who_has_signed_it_is_looked_for_before_anything_of_it_is_fetched() {
+fn signers_are_checked_before_any_fetch() {
     let mut world = World::new(Run::default());
-    world.asks = true;
-    world.happen(Happening::Order { deployment: 0, run: 1, stop: false });
+    world.checks_signatures = true;
+    world.apply(WorldEvent::Order { deployment: 0, run: 1, stop: false });
     assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     assert!(matches!(world.steps[..], [(Step::PullManifest(_), false)]), "{:?}", world.steps);
     // The publisher loses its trust during the pull.
-    world.happen(Happening::Signed(false));
-    world.happen(Happening::Effect { well: true });
-    world.happen(Happening::Learn);
+    world.apply(WorldEvent::Signed(false));
+    world.apply(WorldEvent::Effect { succeeds: true });
+    world.apply(WorldEvent::Learn);
     assert!(matches!(world.steps[..], [(Step::CheckSigners(_), false)]), "{:?}", world.steps);
-    world.happen(Happening::Effect { well: true });
+    world.apply(WorldEvent::Effect { succeeds: true });
     assert_eq!(phase(&world), Phase::Failed);
     let failure =
         world.record.as_ref().expect("a record").preparation.failure.clone().expect("a reason");

@@ -9,14 +9,14 @@ use std::path::Path;
 use sha2::{Digest as _, Sha256};
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
-use task_proto::id::OutputPath;
-use task_proto::output::{MAX_FILES, OutputFile};
+use task_proto::ids::OutputPath;
+use task_proto::packages::output::{MAX_FILES, OutputFile};
 
-use super::{OutputError, too_many};
+use super::{OutputError, too_many_files};
 use crate::system::untrusted_file::{Directory, Entry};
 
 /// Most names examined for one pattern.
-const MAX_LOOKED_AT: usize = 200_000;
+const MAX_EXAMINED_NAMES: usize = 200_000;
 /// Deepest directory that is searched.
 const MAX_DEPTH: usize = 48;
 
@@ -37,13 +37,14 @@ pub(super) fn files(
         opened => opened.map_err(unreadable(""))?,
     };
     for parts in patterns {
-        let mut search = Search { found: &mut found, left: MAX_LOOKED_AT, unreadable: &unreadable };
+        let mut search =
+            Search { found: &mut found, left: MAX_EXAMINED_NAMES, unreadable: &unreadable };
         search.descend(&root, "", &parts, 0)?;
     }
     let bytes: u64 = found.values().sum();
     if bytes > max_bytes {
         return Err(OutputError::TooMuch(format!(
-            "the files have {bytes} bytes, {max_bytes} may be brought back (limits.output_bytes of this robot)"
+            "the files have {bytes} bytes; the limit is {max_bytes} (limits.output_bytes of this robot)"
         )));
     }
     let hashed = found.into_iter().map(|(path, size)| {
@@ -97,7 +98,7 @@ where
             let name = name.map_err(unreadable(prefix))?;
             self.left = self.left.checked_sub(1).ok_or_else(|| {
                 OutputError::TooMuch(format!(
-                    "more than {MAX_LOOKED_AT} names would have to be looked at"
+                    "the search would examine more than {MAX_EXAMINED_NAMES} names"
                 ))
             })?;
             // A name that is not printable text can't appear in a manifest either.
@@ -121,14 +122,15 @@ where
     fn add(&mut self, below: &str, size: u64) -> Result<(), OutputError> {
         let Ok(name) = below.parse::<OutputPath>() else { return Ok(()) };
         self.found.insert(name, size);
-        if self.found.len() > MAX_FILES { Err(too_many()) } else { Ok(()) }
+        if self.found.len() > MAX_FILES { Err(too_many_files()) } else { Ok(()) }
     }
 }
 
 /// Hashes a file up to the size that was found, because a process may keep appending to it.
 pub(super) fn hash(root: &Directory, path: &Path, found: u64) -> io::Result<BlobRef> {
     let mut file = root.file(path)?.take(found);
-    let (mut hash, mut size) = (Sha256::new(), 0);
+    let mut hash = Sha256::new();
+    let mut size = 0;
     let mut buffer = vec![0; 256 * 1024];
     loop {
         match file.read(&mut buffer)? {

@@ -13,35 +13,35 @@ use http::header::{CONTENT_RANGE, CONTENT_TYPE, LOCATION, RANGE, RETRY_AFTER};
 use reqwest::{Method, RequestBuilder, Response, StatusCode, Url};
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::output::OutputSet;
-use task_proto::report::Progress;
+use task_proto::messages::report::Progress;
+use task_proto::packages::oci::MANIFEST_TYPE;
+use task_proto::packages::output::OutputSet;
 use tokio::sync::{Semaphore, watch};
 
-use super::{OutputError, OutputOrder, find};
+use super::{OutputError, OutputSpec, find};
 use crate::install::fetch::MAX_RETRY_AFTER;
 use crate::system::durable;
 use crate::system::task_user;
 use crate::system::untrusted_file::Directory;
 use crate::transfer::credential::Credential;
-use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryWords};
+use crate::transfer::registry_error::{CONTENT_DIGEST, RegistryError};
 
 /// Bytes per request: the most that a cut of a bad link loses.
 const CHUNK_BYTES: u64 = 1024 * 1024;
 /// Registry error code for a manifest with missing files.
 const FILES_MISSING: &str = "MANIFEST_BLOB_UNKNOWN";
 /// Registry error code for bytes that do not match the digest.
-const OTHER_BYTES: &str = "DIGEST_INVALID";
+const DIGEST_MISMATCH: &str = "DIGEST_INVALID";
 /// Timeout for one request.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(180);
 /// Most restarts of an upload in one attempt, after the server forgot the upload or received other
 /// bytes.
-const MAX_BEGINNINGS: u32 = 3;
+const MAX_RESTARTS: u32 = 3;
 /// Most repeats of a request in one attempt, after the server received other bytes than its body.
-const MAX_SENT_AGAIN: u32 = 3;
+const MAX_RESENDS: u32 = 3;
 /// Registry error code for an unreadable manifest. Ours is readable, so the network changed its
 /// bytes.
-const OTHER_MANIFEST: &str = "MANIFEST_INVALID";
+const MANIFEST_MISMATCH: &str = "MANIFEST_INVALID";
 
 /// The server's registry, with this robot's access.
 #[derive(Clone)]
@@ -81,7 +81,7 @@ impl Registry {
         request: RequestBuilder,
     ) -> Result<(), OutputError> {
         let response = self.send(what, request).await?;
-        if is_of(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
+        if confirms_digest(&response, digest) { Ok(()) } else { Err(not_the_server(&response)) }
     }
 
     /// Like [`Self::store`], for bytes in memory that match the digest. If the server received
@@ -96,10 +96,10 @@ impl Registry {
         loop {
             match self.store(what, digest, request()).await {
                 Err(OutputError::Refused { code, text, .. })
-                    if code == OTHER_BYTES || code == OTHER_MANIFEST =>
+                    if code == DIGEST_MISMATCH || code == MANIFEST_MISMATCH =>
                 {
-                    if again == MAX_SENT_AGAIN {
-                        return Err(OutputError::Garbled { text });
+                    if again == MAX_RESENDS {
+                        return Err(OutputError::Corrupted { text });
                     }
                     again += 1;
                     tracing::warn!(
@@ -131,7 +131,7 @@ impl Registry {
         match response.status() {
             StatusCode::NOT_FOUND => Ok(false),
             status if !status.is_success() => Err(refusal("a file", response).await),
-            _ if is_of(&response, digest) => Ok(true),
+            _ if confirms_digest(&response, digest) => Ok(true),
             _ => Err(not_the_server(&response)),
         }
     }
@@ -149,12 +149,13 @@ impl Registry {
 /// Pushes all of `output`.
 pub(super) async fn push(
     registry: &Registry,
-    order: &OutputOrder,
+    spec: &OutputSpec,
     output: &OutputSet,
     progress: &watch::Sender<Progress>,
 ) -> Result<(), OutputError> {
-    let refused =
-        || OutputError::TooMuch("the robot's or task's name can't be a repository's".to_owned());
+    let refused = || {
+        OutputError::TooMuch("the robot's or task's name is not a valid repository name".to_owned())
+    };
     let (repository, tag) = output.repository().zip(output.tag()).ok_or_else(refused)?;
     let total = output.files.iter().map(|file| file.blob.size).sum();
     progress.send_replace(Progress { done: 0, total });
@@ -163,18 +164,18 @@ pub(super) async fn push(
     let mut push = Push {
         registry,
         base: format!("/v2/{repository}"),
-        notes: read_notes(&order.notes, output),
-        order,
-        notes_path: &order.notes,
+        notes: read_notes(&spec.notes, output),
+        spec,
+        notes_path: &spec.notes,
         done: 0,
         progress,
     };
     let config =
-        serde_json::to_vec(output).map_err(|error| note_error(&order.notes, error.into()))?;
+        serde_json::to_vec(output).map_err(|error| note_error(&spec.notes, error.into()))?;
     let config_ref = BlobRef { digest: Digest::of(&config), size: config.len() as u64 };
     push.small(config_ref.digest, config.into()).await?;
     let manifest = serde_json::to_vec(&output.manifest(config_ref))
-        .map_err(|error| note_error(&order.notes, error.into()))?;
+        .map_err(|error| note_error(&spec.notes, error.into()))?;
     let list = async || {
         let put = || {
             let put = registry.request(Method::PUT, &format!("/v2/{repository}/manifests/{tag}"));
@@ -204,7 +205,7 @@ pub(super) async fn push(
 struct Push<'a> {
     registry: &'a Registry,
     base: String,
-    order: &'a OutputOrder,
+    spec: &'a OutputSpec,
     notes: Notes,
     notes_path: &'a Path,
     /// Bytes of all files before the current one.
@@ -217,11 +218,11 @@ impl Push<'_> {
         if self.registry.has(&self.base, blob.digest).await? {
             return Ok(());
         }
-        let mut beginnings = 0;
+        let mut restarts = 0;
         loop {
             let sent = match blob.size <= CHUNK_BYTES {
                 true => {
-                    let bytes = read_part(self.order, path, 0, blob.size).await?;
+                    let bytes = read_part(self.spec, path, 0, blob.size).await?;
                     if Digest::of(&bytes) != blob.digest {
                         return Err(self.changed(path));
                     }
@@ -229,13 +230,13 @@ impl Push<'_> {
                 }
                 false => self.large(path, blob).await,
             };
-            let is_first = beginnings < MAX_BEGINNINGS;
+            let is_first = restarts < MAX_RESTARTS;
             match sent {
                 // The server has deleted the upload, or stored a chunk and its answer was lost.
                 Err(OutputError::Refused { status: 404 | 416, .. }) if is_first => {
                     self.note(blob.digest, None)?
                 }
-                Err(OutputError::Refused { code, text, .. }) if code == OTHER_BYTES => {
+                Err(OutputError::Refused { code, text, .. }) if code == DIGEST_MISMATCH => {
                     self.note(blob.digest, None)?;
                     // A task that runs again overwrites its files. If the file is unchanged, the
                     // network is at fault.
@@ -243,12 +244,12 @@ impl Push<'_> {
                         return Err(self.changed(path));
                     }
                     if !is_first {
-                        return Err(OutputError::Garbled { text });
+                        return Err(OutputError::Corrupted { text });
                     }
                 }
                 done => return done,
             }
-            beginnings += 1;
+            restarts += 1;
         }
     }
 
@@ -264,20 +265,20 @@ impl Push<'_> {
     }
 
     async fn is_unchanged(&self, path: &str, blob: BlobRef) -> Result<bool, OutputError> {
-        let (root, file, size) = (self.order.directory.clone(), PathBuf::from(path), blob.size);
+        let root = self.spec.directory.clone();
+        let file = PathBuf::from(path);
+        let size = blob.size;
         let hash = move || find::hash(&Directory::open(&root)?, &file, size);
         let hashed =
-            task_user::do_as(self.order.user.as_ref(), hash).await.map_err(OutputError::User)?;
-        let hashed = hashed.map_err(|source| OutputError::Read {
-            path: self.order.directory.join(path),
-            source,
-        })?;
+            task_user::do_as(self.spec.user.as_ref(), hash).await.map_err(OutputError::User)?;
+        let hashed = hashed
+            .map_err(|source| OutputError::Read { path: self.spec.directory.join(path), source })?;
         Ok(hashed == blob)
     }
 
     fn changed(&self, path: &str) -> OutputError {
-        let source = std::io::Error::other("it was changed while it was sent");
-        OutputError::Read { path: self.order.directory.join(path), source }
+        let source = std::io::Error::other("it changed during the upload");
+        OutputError::Read { path: self.spec.directory.join(path), source }
     }
 
     async fn large(&mut self, path: &str, blob: BlobRef) -> Result<(), OutputError> {
@@ -297,7 +298,7 @@ impl Push<'_> {
         };
         while offset < blob.size {
             let bytes =
-                read_part(self.order, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
+                read_part(self.spec, path, offset, CHUNK_BYTES.min(blob.size - offset)).await?;
             let last = offset + bytes.len() as u64 - 1;
             let patch = self.registry.request(Method::PATCH, &location);
             let patch = patch.header(CONTENT_RANGE, format!("{offset}-{last}")).body(bytes);
@@ -336,12 +337,13 @@ fn read_notes(path: &Path, output: &OutputSet) -> Notes {
 }
 
 async fn read_part(
-    order: &OutputOrder,
+    spec: &OutputSpec,
     path: &str,
     offset: u64,
     length: u64,
 ) -> Result<Vec<u8>, OutputError> {
-    let (root, path) = (order.directory.clone(), PathBuf::from(path));
+    let root = spec.directory.clone();
+    let path = PathBuf::from(path);
     let failed_at = root.join(&path);
     let read = move || {
         let mut file = Directory::open(&root)?.file(&path)?;
@@ -354,7 +356,7 @@ async fn read_part(
             Err(std::io::Error::other("it became shorter"))
         }
     };
-    let read = task_user::do_as(order.user.as_ref(), read).await.map_err(OutputError::User)?;
+    let read = task_user::do_as(spec.user.as_ref(), read).await.map_err(OutputError::User)?;
     read.map_err(|source| OutputError::Read { path: failed_at, source })
 }
 
@@ -375,7 +377,7 @@ fn location(response: &Response) -> Result<String, OutputError> {
 }
 
 /// Whether the answer names this digest, as the answer of a registry with these bytes does.
-fn is_of(response: &Response, digest: Digest) -> bool {
+fn confirms_digest(response: &Response, digest: Digest) -> bool {
     response
         .headers()
         .get(CONTENT_DIGEST)
@@ -401,9 +403,10 @@ async fn refusal(what: &str, mut response: Response) -> OutputError {
         );
     let seconds =
         response.headers().get(RETRY_AFTER).and_then(|value| value.to_str().ok()?.parse().ok());
-    let words = RegistryWords::read(&mut response).await;
-    let (status, is_own) = (status.as_u16(), words.are_a_registrys());
-    let RegistryWords { code, text } = words;
+    let registry_error = RegistryError::read(&mut response).await;
+    let status = status.as_u16();
+    let is_own = registry_error.is_from_registry();
+    let RegistryError { code, text } = registry_error;
     if is_passing {
         let retry_after = seconds.map(|seconds| Duration::from_secs(seconds).min(MAX_RETRY_AFTER));
         return OutputError::Busy { status, text, retry_after };
@@ -419,7 +422,7 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn no_server_keeps_files_back_for_long() {
+    async fn server_retry_after_is_capped() {
         let busy = http::Response::builder()
             .status(503)
             .header(RETRY_AFTER, u64::MAX.to_string())

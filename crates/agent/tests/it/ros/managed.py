@@ -1,4 +1,5 @@
-"""A lifecycle node that refuses to be configured while its parameter "broken" is true. It leaves when its input ends."""
+"""A lifecycle node that refuses to be configured while its parameter "broken" is true. It leaves
+when its input ends."""
 import sys
 import threading
 

@@ -1,6 +1,8 @@
-"""A node with a bit of everything: topics, a service, parameters it may refuse, log lines, diagnostics.
+"""A node with a bit of everything: topics, a service, parameters it may refuse, log lines,
+diagnostics.
 
-It does what its standard input says, a line at a time, and prints "up" when it is there; it leaves when the input ends.
+It does what its standard input says, a line at a time, and prints "up" when it is there; it leaves
+when the input ends.
 """
 import sys
 import threading
@@ -33,7 +35,8 @@ scan = node.create_publisher(String, "scan", qos_profile_sensor_data)
 node.create_timer(0.05, lambda: chatter.publish(String(data="hello")))
 node.create_timer(0.1, lambda: scan.publish(String(data="x" * 5000)))
 node.create_subscription(String, "orders", lambda message: None, 10)
-node.create_service(Trigger, "say", lambda request, answer: Trigger.Response(success=True, message="said"))
+said = Trigger.Response(success=True, message="said")
+node.create_service(Trigger, "say", lambda request, answer: said)
 node.create_client(Trigger, "ask")
 diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
@@ -48,7 +51,11 @@ def obey():
         elif verb == "diagnose":
             values = [KeyValue(key="volts", value="11.1")]
             status = DiagnosticStatus(
-                level=DiagnosticStatus.WARN, name="battery", message=text, hardware_id="b1", values=values
+                level=DiagnosticStatus.WARN,
+                name="battery",
+                message=text,
+                hardware_id="b1",
+                values=values,
             )
             diagnostics.publish(DiagnosticArray(status=[status]))
         print("done", flush=True)

@@ -5,17 +5,20 @@ use std::sync::Mutex;
 
 use bytes::Bytes;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest};
-use task_proto::report::{Failure, FailureCode, HostFacts};
+use task_proto::messages::report::{Failure, FailureCode, HostFacts};
+use task_proto::packages::manifest::{
+    Build, ContentFacts, Outputs, Ready, Requires, Run, TaskManifest,
+};
 use task_proto::{DeploymentId, Digest, Generation};
 
 use crate::process::program::ExitStatus;
 use crate::reconcile::driver::*;
 use crate::setup::installation::Installation;
-use crate::task::ledger::{
-    ActiveRun, Collection, GateQuestion, GateStep, LedgerError, ProcessRecord,
-};
-use crate::task::observed::Exit;
+use crate::task::effects::Now;
+use crate::task::ledger::{GateQuestion, GateStep, LedgerError, OutputUpload};
+use crate::task::observed::{Exit, SignatureVerdict};
+use crate::task::plan::{Done, StepFailure};
+use crate::task::run::ProcessRecord;
 
 #[derive(Default)]
 pub(super) struct Fake {
@@ -29,7 +32,7 @@ pub(super) struct Fake {
     /// The number of observations of processes with an undeterminable state.
     pub(super) looks: watch::Sender<u64>,
     /// The missing parts, as announced by the gathering step.
-    pub(super) asks: watch::Sender<Asks>,
+    pub(super) part_requests: watch::Sender<PartRequest>,
 }
 
 #[derive(Default)]
@@ -40,7 +43,7 @@ pub(super) struct State {
     pub(super) started: Vec<(DeploymentId, u64)>,
     cancelled: u32,
     /// The waits, in milliseconds, that the next content pulls are told; the last one comes first.
-    pub(super) told_to_wait: Vec<u64>,
+    pub(super) retry_later: Vec<u64>,
     /// The blobs that came with the newest order.
     pub(super) offered: Vec<(BlobRef, Bytes)>,
     /// The tasks of the pulled contents, in order.
@@ -75,10 +78,12 @@ pub(super) struct State {
     pub(super) untrusted: BTreeSet<Digest>,
     pub(super) trust: TrustFacts,
     /// The states with recorded evidence, and the versions with checked signers.
-    pub(super) heeded: Vec<Generation>,
+    pub(super) applied: Vec<Generation>,
     pub(super) checked: Vec<Digest>,
     /// Versions that never become ready.
     pub(super) bad: BTreeSet<Digest>,
+    /// Versions whose files the next start finds changed, and deletes.
+    pub(super) changed: BTreeSet<Digest>,
     /// The health of every live process.
     health: watch::Sender<Health>,
 }
@@ -131,7 +136,7 @@ impl Effects for Fake {
         RobotFacts { installations: Some(vec![seen]), ..RobotFacts::default() }
     }
 
-    async fn look_for_ros(&self) {
+    async fn probe_ros(&self) {
         self.state(|state| state.seen_packages = state.ros_packages.clone());
     }
 
@@ -148,7 +153,7 @@ impl Effects for Fake {
             let content = state.contents.contains(&package.manifest.digest);
             let of_jobs = |mut manifest: TaskManifest| {
                 if state.jobs {
-                    manifest.run.kind = task_proto::manifest::TaskKind::Job;
+                    manifest.run.kind = task_proto::packages::manifest::TaskKind::Job;
                     manifest.outputs.paths = vec!["maps/*.pgm".to_owned()];
                 }
                 manifest
@@ -159,8 +164,12 @@ impl Effects for Fake {
             };
             let manifest = state.manifests.contains(&package.manifest.digest).then(manifest);
             let is_trusted = !state.untrusted.contains(&package.manifest.digest);
-            let vouched = if is_trusted { Vouched::Yes } else { Vouched::No };
-            Prepared { manifest, content, built: content, versions: Vec::new(), vouched }
+            let signatures = if is_trusted {
+                SignatureVerdict::Sufficient
+            } else {
+                SignatureVerdict::Insufficient
+            };
+            Prepared { manifest, content, built: content, versions: Vec::new(), signatures }
         })
     }
 
@@ -199,8 +208,8 @@ impl Effects for Fake {
         2
     }
 
-    fn heed(&self, desired: &DesiredState) {
-        self.state(|state| state.heeded.push(desired.generation));
+    fn apply_state(&self, desired: &DesiredState) {
+        self.state(|state| state.applied.push(desired.generation));
     }
 
     fn trust_facts(&self) -> TrustFacts {
@@ -217,7 +226,7 @@ impl Effects for Fake {
         Err(StepFailure { failure, retry_after_ms: None })
     }
 
-    fn keep_parts(&self, wanted: &[Digest]) {
+    fn retain_parts(&self, wanted: &[Digest]) {
         self.state(|state| state.kept_parts.push(wanted.to_vec()));
     }
 
@@ -227,7 +236,7 @@ impl Effects for Fake {
         _cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
         self.state(|state| state.manifests.insert(package.manifest.digest));
-        Ok(Done::Well)
+        Ok(Done::Complete)
     }
 
     async fn pull_content(
@@ -236,10 +245,10 @@ impl Effects for Fake {
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
-        if let Some(at_least_ms) = self.state(|state| state.told_to_wait.pop()) {
+        if let Some(at_least_ms) = self.state(|state| state.retry_later.pop()) {
             progress.send_replace(Progress { done: 1, total: 2 });
             self.pulls.send_modify(|pulls| *pulls += 1);
-            return Ok(Done::ToldToWait { at_least_ms });
+            return Ok(Done::RetryLater { at_least_ms });
         }
         if self.slow.load(std::sync::atomic::Ordering::SeqCst) {
             cancel.cancelled().await;
@@ -251,7 +260,7 @@ impl Effects for Fake {
             state.pulled.push(package.name.clone());
             state.contents.insert(package.manifest.digest)
         });
-        Ok(Done::Well)
+        Ok(Done::Complete)
     }
 
     fn offer(&self, blobs: Vec<(BlobRef, Bytes)>) {
@@ -262,14 +271,14 @@ impl Effects for Fake {
         &self,
         package: &PackageRef,
         progress: &watch::Sender<Progress>,
-        asks: &watch::Sender<Asks>,
+        part_requests: &watch::Sender<PartRequest>,
         cancel: &CancellationToken,
     ) -> Result<Done, StepFailure> {
         progress.send_replace(Progress { done: 1, total: package.content.size });
-        let mut said = self.asks.subscribe();
+        let mut said = self.part_requests.subscribe();
         loop {
             let now = said.borrow_and_update().clone();
-            asks.send_replace(now);
+            part_requests.send_replace(now);
             tokio::select! {
                 Ok(()) = said.changed() => {}
                 () = cancel.cancelled() => break,
@@ -288,7 +297,11 @@ impl Effects for Fake {
         Ok(())
     }
 
-    async fn ask_gate(&self, _task: &TaskName, question: &GateQuestion) -> Result<(), StepFailure> {
+    async fn query_gate(
+        &self,
+        _task: &TaskName,
+        question: &GateQuestion,
+    ) -> Result<(), StepFailure> {
         let answer = self.state(|state| {
             state.asked.push(question.step);
             state.gate.clone().expect("only then it is asked")
@@ -301,19 +314,27 @@ impl Effects for Fake {
 
     async fn start(&self, task: &TaskName, run: &ActiveRun) -> Result<u32, StepFailure> {
         self.state(|state| {
-            let dir = run.process.as_ref().expect("a process to start").dir.clone();
+            let dir = run.process().expect("a process to start").dir.clone();
             let written =
                 state.ledgers.last().and_then(|ledger| ledger.tasks.get(task)?.active.clone());
             assert_eq!(written.as_ref(), Some(run), "the ledger is written before the start");
             assert!(state.alive.is_empty(), "two processes of a task");
+            let version = &run.package.manifest.digest;
+            if state.changed.remove(version) {
+                state.contents.remove(version);
+            }
+            if !state.contents.contains(version) {
+                let failure = Failure::new(FailureCode::TREE_CHANGED, "src was changed");
+                return Err(StepFailure { failure, retry_after_ms: Some(0) });
+            }
             state.alive.insert(dir);
             state.started.push((run.deployment.clone(), run.run));
-        });
-        Ok(7)
+            Ok(7)
+        })
     }
 
     async fn stop(&self, _task: &TaskName, run: &ActiveRun) -> Result<(), StepFailure> {
-        let process = run.process.as_ref().expect("a process to stop");
+        let process = run.process().expect("a process to stop");
         self.state(|state| match &state.stop {
             Some(failure) => Err(failure.clone()),
             None => {
@@ -323,10 +344,10 @@ impl Effects for Fake {
         })
     }
 
-    async fn collect(
+    async fn upload_outputs(
         &self,
         _task: &TaskName,
-        files: &Collection,
+        files: &OutputUpload,
         progress: &watch::Sender<Progress>,
         cancel: &CancellationToken,
     ) -> Result<(), StepFailure> {
@@ -364,7 +385,7 @@ fn manifest(package: &PackageRef) -> TaskManifest {
         parameters: Default::default(),
         outputs: Outputs::default(),
         requires: Requires::default(),
-        limits: task_proto::manifest::Limits::default(),
+        limits: task_proto::packages::manifest::Limits::default(),
         exec_depends: Vec::new(),
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     }

@@ -3,9 +3,10 @@
 use super::*;
 
 #[tokio::test]
-async fn a_process_of_which_nothing_can_be_told_is_looked_at_seldom_and_holds_up_nobody() {
+async fn undeterminable_process_is_observed_rarely_and_does_not_block_other_tasks() {
     let bench = Bench::new().await;
-    let (talker, mut other) = (order("1.0"), order("2.0"));
+    let talker = order("1.0");
+    let mut other = order("2.0");
     other.task = "listener".parse().expect("valid");
     other.package.name = other.task.clone();
     bench.order(1, vec![talker.clone()]).await;
@@ -17,12 +18,12 @@ async fn a_process_of_which_nothing_can_be_told_is_looked_at_seldom_and_holds_up
     let looked = tokio::time::timeout(PATIENCE, looked.wait_for(|looks| *looks > 0)).await;
     looked.expect("it is looked at").expect("the fake lives");
     bench.order(2, vec![talker.clone(), other.clone()]).await;
-    let runs = |task: &task_proto::report::TaskReport| {
+    let runs = |task: &task_proto::messages::report::TaskReport| {
         task.task == other.task && task.phase == Phase::Running
     };
     bench.report(|report| report.tasks.iter().any(runs)).await;
     let looks = *bench.fake.looks.borrow();
-    let periods = began.elapsed().as_millis() as u64 / plan::LOOK_AGAIN_MS;
+    let periods = began.elapsed().as_millis() as u64 / plan::OBSERVE_AGAIN_MS;
     assert!(looks <= periods + 1, "{looks} looks");
     bench.fake.state(|state| (state.hangs, state.alive) = (false, Default::default()));
     bench

@@ -2,17 +2,18 @@
 //! agent exactly as the plan decides, and checks on the way that no job starts twice.
 
 use proptest::prelude::*;
-use task_proto::desired::{BlobRef, Delivery};
-use task_proto::manifest::{
+use task_proto::desired::{BlobRef, Delivery, PackageRef};
+use task_proto::messages::report::{Failure, FailureCode};
+use task_proto::packages::manifest::{
     Build, ContentFacts, Outputs, Ready, Requires, Run, TaskKind, TaskManifest,
 };
-use task_proto::report::{Failure, FailureCode};
 use task_proto::{DeploymentId, Digest};
 
 use crate::process::program::ExitStatus;
 use crate::setup::installation::Installation;
 use crate::task::observed::{Exit, Missing};
 use crate::task::plan::*;
+use crate::task::timing::Moment;
 
 /// One robot with one task.
 pub(super) struct World {
@@ -43,14 +44,14 @@ pub(super) struct World {
     pub(super) outputs: Outputs,
     /// Whether the robot checks signatures, the versions with signatures on its disk, and whether
     /// these signatures suffice.
-    pub(super) asks: bool,
-    vouched: Vec<PackageRef>,
+    pub(super) checks_signatures: bool,
+    signatures: Vec<PackageRef>,
     signed: bool,
 }
 
 /// An event in the world.
 #[derive(Debug, Clone)]
-pub(super) enum Happening {
+pub(super) enum WorldEvent {
     Order {
         deployment: u8,
         run: u64,
@@ -59,10 +60,10 @@ pub(super) enum Happening {
     Withdraw,
     /// The effect of a step happens, well or badly; the agent does not know yet.
     Effect {
-        well: bool,
+        succeeds: bool,
     },
     /// The server has no capacity for a pull and says when to come back.
-    ToldToWait {
+    RetryLater {
         ms: u64,
     },
     /// A start finds changed files on the disk and deletes them.
@@ -80,7 +81,7 @@ pub(super) enum Happening {
     /// Whether the signatures suffice from now on.
     Signed(bool),
     Gate(bool),
-    Sees(Sight),
+    Sees(HealthSample),
     Wait {
         ms: u64,
     },
@@ -88,42 +89,42 @@ pub(super) enum Happening {
 
 /// An observation of the ROS graph.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Sight {
+pub(super) enum HealthSample {
     Nothing,
     All,
     NotAll,
     Refused,
 }
 
-fn sight() -> impl Strategy<Value = Sight> {
-    prop_oneof![1 => Just(Sight::Nothing), 4 => Just(Sight::All), 1 => Just(Sight::NotAll), 1 => Just(Sight::Refused)]
+fn sample() -> impl Strategy<Value = HealthSample> {
+    prop_oneof![1 => Just(HealthSample::Nothing), 4 => Just(HealthSample::All), 1 => Just(HealthSample::NotAll), 1 => Just(HealthSample::Refused)]
 }
 
-pub(super) fn health(sight: Sight, since_ms: u64) -> Health {
-    match sight {
-        Sight::Nothing => Health::Unknown,
-        Sight::All => Health::Holds { since_ms },
-        Sight::NotAll => Health::Missing(Missing {
-            is_its_own: true,
+pub(super) fn health(sample: HealthSample, since_ms: u64) -> Health {
+    match sample {
+        HealthSample::Nothing => Health::Unknown,
+        HealthSample::All => Health::Holds { since_ms },
+        HealthSample::NotAll => Health::Missing(Missing {
+            is_own_fault: true,
             since_ms,
             code: FailureCode::NODE_VANISHED,
             what: "`/mapper` is gone".to_owned(),
             seen: String::new(),
         }),
-        Sight::Refused => {
+        HealthSample::Refused => {
             Health::Refused(Failure::new(FailureCode::NODE_NAME_TAKEN, "it was there before"))
         }
     }
 }
 
-pub(super) fn happening() -> impl Strategy<Value = Happening> {
-    use Happening::*;
+pub(super) fn event() -> impl Strategy<Value = WorldEvent> {
+    use WorldEvent::*;
     prop_oneof![
         4 => (0..3u8, 1..3u64, any::<bool>())
             .prop_map(|(deployment, run, stop)| Order { deployment, run, stop: stop && run == 2 }),
         1 => Just(Withdraw),
-        8 => prop::bool::weighted(0.8).prop_map(|well| Effect { well }),
-        2 => (0..90_000u64).prop_map(|ms| ToldToWait { ms }),
+        8 => prop::bool::weighted(0.8).prop_map(|succeeds| Effect { succeeds }),
+        2 => (0..90_000u64).prop_map(|ms| RetryLater { ms }),
         1 => Just(FindsChange),
         8 => Just(Learn),
         2 => (0..2i32).prop_map(|code| ProcessEnds { code }),
@@ -134,7 +135,7 @@ pub(super) fn happening() -> impl Strategy<Value = Happening> {
         1 => any::<bool>().prop_map(MayBegin),
         1 => any::<bool>().prop_map(Signed),
         1 => any::<bool>().prop_map(Gate),
-        3 => sight().prop_map(Sees),
+        3 => sample().prop_map(Sees),
         3 => (0..90_000u64).prop_map(|ms| Wait { ms }),
     ]
 }
@@ -187,39 +188,39 @@ impl World {
             bad: None,
             gated: false,
             outputs: Outputs::default(),
-            asks: false,
-            vouched: Vec::new(),
+            checks_signatures: false,
+            signatures: Vec::new(),
             signed: true,
         }
     }
 
-    pub(super) fn happen(&mut self, happening: Happening) {
-        match happening {
-            Happening::Order { deployment, run, stop } => {
+    pub(super) fn apply(&mut self, event: WorldEvent) {
+        match event {
+            WorldEvent::Order { deployment, run, stop } => {
                 let wanted = if stop { Wanted::Stopped } else { Wanted::Running };
                 // A deployment is of one package.
                 self.desired = Some(order(deployment, deployment % 2, run, wanted));
             }
-            Happening::Withdraw => self.desired = None,
-            Happening::Effect { well } => self.effect(well),
-            Happening::ToldToWait { ms } => self.told_to_wait(ms),
-            Happening::Learn => self.learn(),
-            Happening::FindsChange => self.find_change(),
-            Happening::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
-            Happening::ProcessVanishes => self.end_process(None),
-            Happening::AgentDies => self.start_agent(self.boot),
-            Happening::Reboot => {
+            WorldEvent::Withdraw => self.desired = None,
+            WorldEvent::Effect { succeeds } => self.effect(succeeds),
+            WorldEvent::RetryLater { ms } => self.retry_later(ms),
+            WorldEvent::Learn => self.learn(),
+            WorldEvent::FindsChange => self.find_change(),
+            WorldEvent::ProcessEnds { code } => self.end_process(Some(ExitStatus::Code(code))),
+            WorldEvent::ProcessVanishes => self.end_process(None),
+            WorldEvent::AgentDies => self.start_agent(self.boot),
+            WorldEvent::Reboot => {
                 self.end_process(None);
                 self.now_ms = 1000;
-                self.health = health(Sight::All, 0);
+                self.health = health(HealthSample::All, 0);
                 self.start_agent(self.boot + 1);
             }
-            Happening::Hold(held) => self.held = held,
-            Happening::MayBegin(may_begin) => self.may_begin = may_begin,
-            Happening::Signed(signed) => self.signed = signed,
-            Happening::Gate(gated) => self.gated = gated,
-            Happening::Sees(sight) => self.health = health(sight, self.now_ms),
-            Happening::Wait { ms } => self.now_ms += ms,
+            WorldEvent::Hold(held) => self.held = held,
+            WorldEvent::MayBegin(may_begin) => self.may_begin = may_begin,
+            WorldEvent::Signed(signed) => self.signed = signed,
+            WorldEvent::Gate(gated) => self.gated = gated,
+            WorldEvent::Sees(sample) => self.health = health(sample, self.now_ms),
+            WorldEvent::Wait { ms } => self.now_ms += ms,
         }
         self.plan();
     }
@@ -257,11 +258,11 @@ impl World {
                 if self.record.is_none() || self.steps.iter().any(|(step, _)| step.lane() == lane) {
                     continue;
                 }
-                let next = self.with_situation(|s| match lane {
+                let next = self.with_plan_input(|s| match lane {
                     Lane::Run => supervise(s),
                     Lane::Prepare => prepare(s),
-                    Lane::Gate => consult(s),
-                    Lane::Collect => collect(s),
+                    Lane::Gate => check_gate(s),
+                    Lane::Upload => upload(s),
                 });
                 match next {
                     Next::Rest { .. } => {}
@@ -269,29 +270,42 @@ impl World {
                     Next::Act(step) => self.begin(step),
                 }
             }
+            self.reads_back();
             if before == (self.record.clone(), self.steps.len()) {
                 return;
             }
         }
     }
 
+    /// The next agent finds each record as this one has written it.
+    fn reads_back(&self) {
+        let json = serde_json::to_value(&self.record).expect("json");
+        assert_eq!(json["phase"], serde_json::json!(self.record.as_ref().map(TaskRecord::phase)));
+        assert_eq!(serde_json::from_value::<Option<TaskRecord>>(json).expect("read"), self.record);
+    }
+
     fn begin(&mut self, step: Step) {
         let record = self.record.as_ref().expect("a step is of a record");
-        let same = |run: &ActiveRun, other: &ActiveRun| {
-            run.deployment == other.deployment && run.run == other.run
-        };
         let new = match &step {
             Step::PullManifest(package)
             | Step::PullContent { package, .. }
             | Step::Build(package) => Some(package),
-            Step::Start(run) if record.active.as_ref().is_none_or(|active| !same(active, run)) => {
+            Step::Start(run)
+                if record.active.as_ref().is_none_or(|active| !active.is_same(run)) =>
+            {
                 Some(&run.package)
             }
             _ => None,
         };
-        let vouched = new.map_or(Vouched::Yes, |package| self.vouched_for(package));
-        assert_eq!(vouched, Vouched::Yes, "nobody trusted has signed what is begun: {step:?}");
-        self.record = Some(begun(record, &step, &self.boot.to_string(), self.start, self.now_ms));
+        let signatures =
+            new.map_or(SignatureVerdict::Sufficient, |package| self.signature_verdict(package));
+        assert_eq!(
+            signatures,
+            SignatureVerdict::Sufficient,
+            "nobody trusted has signed what is begun: {step:?}"
+        );
+        let boot_id = self.boot.to_string();
+        self.record = Some(begin_step(record, &step, self.start, &self.moment(&boot_id)));
         // The record written before a start fixes the content of the start.
         let step = match step {
             Step::Start(_) => Step::Start(Box::new(
@@ -302,14 +316,20 @@ impl World {
         self.steps.push((step, false));
     }
 
-    fn with_situation<T>(&self, ask: impl Fn(&Situation<'_>) -> T) -> T {
-        let record = self.record.as_ref().expect("there is a record");
-        let level = self
-            .disk
-            .iter()
-            .find(|(on_disk, _)| *on_disk == record.order.package)
-            .map_or(0, |(_, level)| *level);
-        let prepared = Prepared {
+    fn moment<'a>(&self, boot_id: &'a str) -> Moment<'a> {
+        Moment { boot_id, now_ms: self.now_ms, jitter: 0.5 }
+    }
+
+    /// The number of completed steps of this version.
+    fn level(&self, package: &PackageRef) -> u8 {
+        self.disk.iter().find(|(on_disk, _)| on_disk == package).map_or(0, |(_, level)| *level)
+    }
+
+    /// The files of the version to prepare.
+    fn prepared(&self, record: &TaskRecord) -> Prepared {
+        let package = record.to_prepare().0;
+        let level = self.level(package);
+        Prepared {
             manifest: (level > 0).then(|| TaskManifest {
                 outputs: self.outputs.clone(),
                 ..manifest(&self.manifest)
@@ -317,9 +337,14 @@ impl World {
             content: level > 1,
             built: level > 2,
             versions: self.disk.iter().map(|(package, _)| package.manifest.digest).collect(),
-            vouched: self.vouched_for(&record.order.package),
-        };
-        let process = match record.active.as_ref().and_then(|active| active.process.as_ref()) {
+            signatures: self.signature_verdict(package),
+        }
+    }
+
+    fn with_plan_input<T>(&self, ask: impl Fn(&PlanInput<'_>) -> T) -> T {
+        let record = self.record.as_ref().expect("there is a record");
+        let prepared = self.prepared(record);
+        let process = match record.active.as_ref().and_then(ActiveRun::process) {
             None => ProcessState::None,
             Some(process) if self.alive.contains(&process.dir) => ProcessState::Alive { pid: 7 },
             Some(process) => match self.ended.iter().find(|(dir, _)| *dir == process.dir) {
@@ -333,31 +358,35 @@ impl World {
         };
         let active = record.active.as_ref().map(|active| &active.package);
         let bad = self.bad.is_some_and(|number| active == Some(&package(number)));
-        let health = if bad { health(Sight::NotAll, 0) } else { self.health.clone() };
-        ask(&Situation {
+        let health = if bad { health(HealthSample::NotAll, 0) } else { self.health.clone() };
+        ask(&PlanInput {
             desired: self.desired.as_ref(),
             record,
             prepared: &prepared,
             process: &process,
             health: &health,
-            preparing: self.steps.iter().any(|(step, _)| step.lane() == Lane::Prepare),
-            acting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Run),
-            collecting: self.steps.iter().any(|(step, _)| step.lane() == Lane::Collect),
-            deleting: self.steps.iter().any(|(step, _)| step.deletes()),
+            under_way: &self.steps.iter().map(|(step, _)| step).collect::<Vec<_>>(),
             robot: &RobotFacts {
                 installations: self.ros_seen.then(|| vec![ros()]),
                 ..RobotFacts::default()
             },
-            may_begin: self.may_begin,
-            held: self.held,
-            gated: self.gated,
-            boot_id: &self.boot.to_string(),
-            now_ms: self.now_ms,
-            jitter: 0.5,
+            permissions: Permissions {
+                may_begin: self.may_begin,
+                held: self.held,
+                gated: self.gated,
+            },
+            at: self.moment(&self.boot.to_string()),
         })
     }
 
-    fn told_to_wait(&mut self, ms: u64) {
+    /// The agent learns of the end of a step.
+    fn finish(&mut self, step: &Step, outcome: Outcome) {
+        let record = self.record.as_ref().expect("a step is of a record");
+        let (boot_id, kind) = (self.boot.to_string(), self.prepared(record).kind());
+        self.record = Some(finish_step(record, step, outcome, kind, &self.moment(&boot_id)));
+    }
+
+    fn retry_later(&mut self, ms: u64) {
         let is_pull =
             |step: &Step| matches!(step, Step::PullManifest(_) | Step::PullContent { .. });
         let Some(at) = self.steps.iter().position(|(step, done)| !done && is_pull(step)) else {
@@ -365,16 +394,15 @@ impl World {
         };
         let (step, _) = self.steps.remove(at);
         let before = self.record.clone().expect("a step is of a record").preparation;
-        let told = Done::ToldToWait { at_least_ms: ms };
-        let record = self.with_situation(|s| finished(s, &step, Ok(told)));
-        let after = &record.preparation;
+        let told = Done::RetryLater { at_least_ms: ms };
+        self.finish(&step, Ok(told));
+        let after = &self.record.as_ref().expect("still").preparation;
         assert_eq!(
             (after.phase, after.attempts),
             (before.phase, before.attempts),
             "it counts as a try"
         );
         assert!(after.failure.is_none() && after.retry_at_ms >= self.now_ms.saturating_add(ms));
-        self.record = Some(record);
     }
 
     fn find_change(&mut self) {
@@ -388,34 +416,34 @@ impl World {
         };
         let (step, _) = self.steps.remove(at);
         self.raise(&run.package, 1);
-        let failure = Failure::new(FailureCode::TREE_CHANGED, "src is not what was unpacked");
-        let error = StepFailure { failure, retry_after_ms: Some(0) };
-        self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+        self.refuse_start(&step);
     }
 
-    fn effect(&mut self, well: bool) {
+    fn refuse_start(&mut self, start: &Step) {
+        let failure = Failure::new(FailureCode::TREE_CHANGED, "src was changed after unpacking");
+        self.finish(start, Err(StepFailure { failure, retry_after_ms: Some(0) }));
+    }
+
+    fn effect(&mut self, succeeds: bool) {
         let Some((step, done)) = self.steps.iter_mut().find(|(_, done)| !done) else { return };
         *done = true;
         let step = step.clone();
-        if !well {
+        if !succeeds {
             self.steps.retain(|(other, _)| *other != step);
             let failure = Failure::new(FailureCode::IO_ERROR, "it went badly");
-            let error = StepFailure { failure, retry_after_ms: Some(0) };
-            self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
-            return;
+            return self.finish(&step, Err(StepFailure { failure, retry_after_ms: Some(0) }));
         }
         match &step {
-            Step::CheckSigners(package) if self.signed => self.vouched.push(package.clone()),
+            Step::CheckSigners(package) if self.signed => self.signatures.push(package.clone()),
             Step::CheckSigners(_) => {
                 self.steps.retain(|(other, _)| *other != step);
                 let failure = Failure::new(FailureCode::UNTRUSTED_PACKAGE, "nobody has signed it");
-                let error = StepFailure { failure, retry_after_ms: None };
-                self.record = Some(self.with_situation(|s| finished(s, &step, Err(error.clone()))));
+                self.finish(&step, Err(StepFailure { failure, retry_after_ms: None }));
             }
             Step::PullManifest(package) => self.raise(package, 1),
-            Step::LookForRos(_) => self.ros_seen = true,
-            Step::Ask(_) => {}
-            Step::Collect(files) => {
+            Step::ProbeRos(_) => self.ros_seen = true,
+            Step::QueryGate(_) => {}
+            Step::UploadOutputs(files) => {
                 assert!(
                     self.disk.iter().any(|(package, _)| *package == files.package),
                     "its files are gone"
@@ -424,15 +452,19 @@ impl World {
                 let same = active.is_some_and(|run| {
                     run.deployment == files.deployment
                         && run.run == files.run
-                        && run.process.is_some()
+                        && run.process().is_some()
                 });
                 assert!(!same, "it still writes");
             }
             Step::PullContent { package, .. } => self.raise(package, 2),
             Step::Build(package) => self.raise(package, 3),
+            Step::Start(run) if self.level(&run.package) < 3 => {
+                self.steps.retain(|(other, _)| *other != step);
+                self.refuse_start(&step);
+            }
             Step::Start(run) => {
                 assert!(self.alive.is_empty(), "a second process of the task");
-                let dir = run.process.as_ref().expect("begun").dir.clone();
+                let dir = run.process().expect("begun").dir.clone();
                 assert!(
                     self.ended.iter().all(|(other, _)| *other != dir),
                     "a run directory is used twice"
@@ -452,7 +484,7 @@ impl World {
                     self.record.as_ref().and_then(|record| record.active.as_ref()),
                     Some(&**run)
                 );
-                let process = run.process.as_ref().expect("what lives");
+                let process = run.process().expect("what lives");
                 self.alive.retain(|dir| *dir != process.dir);
                 self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
             }
@@ -478,9 +510,10 @@ impl World {
         }
     }
 
-    fn vouched_for(&self, package: &PackageRef) -> Vouched {
-        let is_vouched = !self.asks || (self.signed && self.vouched.contains(package));
-        if is_vouched { Vouched::Yes } else { Vouched::No }
+    fn signature_verdict(&self, package: &PackageRef) -> SignatureVerdict {
+        let is_sufficient =
+            !self.checks_signatures || (self.signed && self.signatures.contains(package));
+        if is_sufficient { SignatureVerdict::Sufficient } else { SignatureVerdict::Insufficient }
     }
 
     fn raise(&mut self, package: &PackageRef, level: u8) {
@@ -496,22 +529,21 @@ impl World {
             if step == Step::Remove {
                 self.record = None;
             } else {
-                self.record =
-                    Some(self.with_situation(|s| finished(s, &step, Ok(Done::Started(7)))));
+                self.finish(&step, Ok(Done::Started(7)));
             }
         }
     }
 
     /// Lets every step succeed until no work is left.
     pub(super) fn settle(&mut self) {
-        self.happen(Happening::Hold(false));
-        self.happen(Happening::MayBegin(true));
-        self.happen(Happening::Signed(true));
-        self.health = health(Sight::All, 0);
+        self.apply(WorldEvent::Hold(false));
+        self.apply(WorldEvent::MayBegin(true));
+        self.apply(WorldEvent::Signed(true));
+        self.health = health(HealthSample::All, 0);
         for _ in 0..60 {
-            self.happen(Happening::Effect { well: true });
-            self.happen(Happening::Learn);
-            self.happen(Happening::Wait { ms: 400_000 });
+            self.apply(WorldEvent::Effect { succeeds: true });
+            self.apply(WorldEvent::Learn);
+            self.apply(WorldEvent::Wait { ms: 400_000 });
         }
         assert!(self.steps.is_empty(), "still under way: {:?}", self.steps);
     }
@@ -527,7 +559,7 @@ pub(super) fn manifest(run: &Run) -> TaskManifest {
         parameters: Default::default(),
         outputs: Outputs::default(),
         requires: Requires::default(),
-        limits: task_proto::manifest::Limits::default(),
+        limits: task_proto::packages::manifest::Limits::default(),
         exec_depends: vec!["std_msgs".to_owned()],
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     }

@@ -1,7 +1,7 @@
-//! The MQTT front alone, for measuring it: it lets in whoever names a robot id, stores nothing, and
-//! rings every robot that has come in once for each line on its standard input. It says its address
-//! on the first line of its output, and ends with its input. Not for a network: it listens on
-//! loopback.
+//! The MQTT front alone, for measurements. It admits every client that names a robot id, stores
+//! nothing, and for each line on standard input sends one desired state to every connected robot.
+//! It prints its address as the first line of its output, and ends with its input. It listens on
+//! loopback and is not for a network.
 
 use std::collections::BTreeSet;
 use std::io::Write as _;
@@ -12,18 +12,19 @@ use bytes::Bytes;
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use task_proto::RobotId;
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
     RobotMessage,
 };
-use taskd::limits::conduct::{Conduct, ConductLimits};
+use taskd::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
+use taskd::net::proxy_protocol::ProxyProtocol;
 
 /// As taskd itself has it.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// Bytes of what the robots are rung with.
+/// Size of a desired state.
 const PAYLOAD_BYTES: usize = 300;
 
 struct Open;
@@ -52,7 +53,7 @@ impl Inbox for Connected {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
     }
 
-    fn everyone_may_be_there(&self) {}
+    fn external_broker_connected(&self) {}
 }
 
 fn main() -> anyhow::Result<()> {
@@ -60,9 +61,10 @@ fn main() -> anyhow::Result<()> {
     let config = BrokerConfig {
         listen: ([127, 0, 0, 1], 0).into(),
         tls: None,
+        proxy_protocol: ProxyProtocol::new(&[]),
         prefix: TopicPrefix::default(),
         limits: Limits { max_silent_per_address: 20_000, ..Limits::default() },
-        conduct: Conduct::new(ConductLimits::default()),
+        robot_limiter: RobotLimiter::new(RobotLimits::default()),
     };
     let runtime = tokio::runtime::Runtime::new()?;
     let broker = runtime.block_on(Broker::start(config, Arc::new(Open), connected.clone()))?;
@@ -75,8 +77,8 @@ fn main() -> anyhow::Result<()> {
         let robots: Vec<RobotId> =
             connected.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
         for robot in &robots {
-            // Whoever has just left is missed by the one who counts.
-            let _ = broker.ring(robot, payload.clone());
+            // A robot that has just disconnected is missing in the count.
+            let _ = broker.send_desired(robot, payload.clone());
         }
     }
     Ok(())

@@ -3,16 +3,13 @@
 pub mod auth;
 pub mod blobs;
 pub mod broker;
-pub mod commands;
 pub mod config;
 pub mod domain;
 pub mod fleet;
 pub mod http;
-pub mod limits;
 pub mod link;
 pub mod net;
 pub mod orders;
-pub mod package;
 pub mod serve;
 pub mod store;
 pub mod system;

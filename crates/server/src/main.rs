@@ -6,13 +6,12 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use nix::sys::stat::{Mode, umask};
-use task_proto::line::OneLineEach;
-use taskd::commands;
-use taskd::commands::command_line::{Command, CommandLine};
+use task_proto::line::SingleLineWriter;
 use taskd::config::{Config, ConfigError, ServeFlags};
-use taskd::limits::log_limits::LogLimits;
 use taskd::net::open_files;
 use taskd::serve::Server;
+use taskd::serve::command_line::{Command, CommandLine, check_server};
+use taskd::serve::log_limits::LogLimits;
 use taskd::system::clock::Clock;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio_util::sync::CancellationToken;
@@ -20,51 +19,61 @@ use tracing_subscriber::EnvFilter;
 use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 
-/// The C library's allocator took a quarter of the time of a short answer, where memory is taken by
-/// one thread and given back by another all the time; see docs/measurements.md.
+/// The C library's allocator took a quarter of the time of a short answer, because memory is often
+/// allocated by one thread and freed by another; see docs/measurements.md.
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
-/// What may still run on a blocking thread when everything else has ended.
-const LEFTOVER_PATIENCE: Duration = Duration::from_millis(500);
-/// An eighth of what tokio takes if it is not told.
-const TASKS_PER_LOOK: u32 = 7;
+/// Time limit for blocking threads when everything else has ended.
+const SHUTDOWN_TIMEOUT: Duration = Duration::from_millis(500);
+/// Tasks that tokio runs between two polls for I/O: an eighth of its default.
+const EVENT_INTERVAL: u32 = 7;
 
 fn main() -> ExitCode {
-    commands::complete(CommandLine::describe);
+    task_cli::complete(CommandLine::describe);
     let CommandLine { connection, command } =
         CommandLine::read(std::env::args_os()).unwrap_or_else(|error| error.exit());
-    // Sockets are looked at after so many tasks: those that hand out blobs take long, and would
-    // keep everybody waiting.
+    // Tasks that send blobs take long, so I/O is polled more often than by default.
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
-        .event_interval(TASKS_PER_LOOK)
+        .event_interval(EVENT_INTERVAL)
         .build();
     let runtime = match runtime {
         Ok(runtime) => runtime,
-        Err(error) => return complain(&anyhow::Error::new(error).context("no threads to run on")),
+        Err(error) => {
+            return report_error(
+                &anyhow::Error::new(error).context("cannot start the runtime's threads"),
+            );
+        }
     };
     let code = match command {
         Command::Serve(flags) => {
-            runtime.block_on(serve(&flags)).unwrap_or_else(|error| complain(&error))
+            runtime.block_on(serve(&flags)).unwrap_or_else(|error| report_error(&error))
         }
-        Command::Operator(command) => {
-            runtime.block_on(commands::run(&connection, command, CommandLine::describe))
-        }
+        Command::Database(command) => match runtime.block_on(command.run()) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => report_error(&error.into()),
+        },
+        Command::Operator(command) => runtime.block_on(task_cli::run(
+            &connection,
+            command,
+            CommandLine::describe,
+            check_server,
+        )),
     };
-    runtime.shutdown_timeout(LEFTOVER_PATIENCE);
+    runtime.shutdown_timeout(SHUTDOWN_TIMEOUT);
     code
 }
 
 async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
-    // All that a server keeps is its own: also what SQLite makes beside its database.
+    // All files of the server are private, including those that SQLite makes beside its database.
     umask(Mode::from_bits_truncate(0o077));
     let filter = EnvFilter::try_from_env("TASKD_LOG")
         .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
     let (limits, has_colours) = (LogLimits::default(), std::io::stderr().is_terminal());
     tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(move || OneLineEach::new(std::io::stderr(), has_colours))
+        .with_writer(move || SingleLineWriter::new(std::io::stderr(), has_colours))
         .with_ansi(has_colours)
         .finish()
         .with(limits.clone())
@@ -77,41 +86,45 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
         Ok(allowed) => open_files::fit(&mut config, allowed)?,
         Err(error) => tracing::warn!(%error, "the limit on open files can't be raised"),
     }
-    // Installed before anything is started, so that an early signal stops it softly as well.
+    // Installed before anything is started, so that an early signal stops the server gracefully.
     let mut signals = Signals::install().context("signals can't be caught")?;
     let mut hangup = signal(SignalKind::hangup()).context("signals can't be caught")?;
-    let has_own_broker = config.broker.is_none();
-    let server = Server::start(config, Clock::system()).await?;
-    say_what_next(&server, has_own_broker);
+    let is_broker_embedded = config.broker.is_none();
+    let server = tokio::select! {
+        started = Server::start(config, Clock::system()) => started?,
+        // A standby may wait for weeks, and a server that has not started holds nothing.
+        () = signals.next() => return Ok(ExitCode::SUCCESS),
+    };
+    print_next_steps(&server, is_broker_embedded);
     let code = loop {
         tokio::select! {
             () = signals.next() => break ExitCode::SUCCESS,
             _ = hangup.recv() => reload(&server),
-            seen = server.broken() => {
-                tracing::error!(seen, "the server can't go on, so it ends; start it again");
+            failure = server.failure() => {
+                tracing::error!("{failure}");
                 break ExitCode::FAILURE;
             }
         }
     };
-    tracing::info!("stopping; a second signal ends it at once");
+    tracing::info!("stopping; a second signal exits immediately");
     tokio::select! {
         () = server.stop() => Ok(code),
         () = signals.next() => Ok(ExitCode::FAILURE),
     }
 }
 
-/// SIGHUP: looks for a new certificate now. The server looks by itself every few seconds.
+/// SIGHUP: reloads the certificate now. The server checks for a new one every few seconds.
 fn reload(server: &Server) {
     if let Err(error) = server.reload_certificate() {
         tracing::warn!(
             error = &error as &dyn std::error::Error,
-            "the certificate stays what it was"
+            "the certificate could not be reloaded; the old one stays in use"
         );
     }
 }
 
-/// On stdout: where the server is, and the first three things to do with it.
-fn say_what_next(server: &Server, has_own_broker: bool) {
+/// Prints the server's addresses and the first three commands to stdout.
+fn print_next_steps(server: &Server, is_broker_embedded: bool) {
     let addresses = server.addresses();
     let url = addresses.url();
     let data = server.data().path().display();
@@ -124,7 +137,7 @@ fn say_what_next(server: &Server, has_own_broker: bool) {
          \x20                task-agent enroll --server {url} --token TOKEN\n\
          A first package: taskd push DIR --to '*' --wait --data {data}\n\
          {elsewhere}",
-        mqtt = match has_own_broker {
+        mqtt = match is_broker_embedded {
             true => format!("and MQTT on {}", addresses.mqtt),
             false => format!("and uses the broker at {}", addresses.mqtt),
         },
@@ -134,7 +147,7 @@ fn say_what_next(server: &Server, has_own_broker: bool) {
             .unwrap_or_default(),
         token = token.display(),
     );
-    // Nobody may be reading; the server serves all the same.
+    // A closed stdout does not stop the server.
     let _ = std::io::stdout().write_all(text.as_bytes()).and_then(|()| std::io::stdout().flush());
 }
 
@@ -159,13 +172,13 @@ impl Signals {
     }
 }
 
-/// Says on stderr what went wrong, with all causes. A broken stderr is no reason to panic.
-fn complain(error: &anyhow::Error) -> ExitCode {
+/// Prints the error with all causes to stderr. A closed stderr is no reason to panic.
+fn report_error(error: &anyhow::Error) -> ExitCode {
     let _ = writeln!(std::io::stderr(), "taskd: {error:#}");
     let outcome = if error.is::<ConfigError>() {
-        commands::Outcome::Usage
+        task_cli::Outcome::Usage
     } else {
-        commands::Outcome::Failed
+        task_cli::Outcome::Failed
     };
     outcome.into()
 }

@@ -1,45 +1,47 @@
-// The JSON API as this page uses it. It knows no state and draws nothing.
+// Client of the JSON API. It holds no state and draws nothing.
 
 const BASE = '/api/v1';
-const PATIENCE_MS = 30_000;
+const TIMEOUT_MS = 30_000;
 
-/** The server does not know who is asking: time to sign in. */
+/** The session has ended or the token is invalid: the user has to sign in. */
 export class SignedOut extends Error {}
 
-/** The server refused: `code` is for programs, the message for people. */
-class Refused extends Error {
+/** The server refused the request: `code` is for programs, the message for users. */
+class ApiError extends Error {
   constructor(status, error) {
-    super(error?.message ?? `the server answered ${status}`);
+    super(error?.message ?? `the server responded with status ${status}`);
     this.status = status;
     this.code = error?.code;
   }
 }
 
 /**
- * How often a request is sent that the server has no time for, and what it may ask to be waited in
- * between.
+ * The number of attempts for a request that the server is too busy for, and the longest
+ * `Retry-After` that is followed.
  */
-const TRIES = 4;
-const LONGEST_WAIT_S = 15;
+const MAX_ATTEMPTS = 4;
+const MAX_WAIT_S = 15;
 
 /**
- * Sends a request, again where the server says soon when: it has done nothing of it. Nobody waits
- * for a sign-in that is refused for long.
+ * Sends a request, and repeats it after 429 with a short `Retry-After`: the server has not
+ * processed it then. Longer waits, as after failed sign-ins, are reported at once.
  */
 async function send(url, options) {
-  for (let tried = 1; ; tried += 1) {
-    const response = await fetch(url, { ...options, signal: AbortSignal.timeout(PATIENCE_MS) });
+  for (let attempt = 1; ; attempt += 1) {
+    const response = await fetch(url, { ...options, signal: AbortSignal.timeout(TIMEOUT_MS) });
     const wait = Number(response.headers.get('retry-after') ?? Infinity);
-    if (response.status !== 429 || tried >= TRIES || !(wait <= LONGEST_WAIT_S)) return response;
-    // Not all at once, where many wait.
+    if (response.status !== 429 || attempt >= MAX_ATTEMPTS || !(wait <= MAX_WAIT_S))
+      return response;
+    // With jitter, since many pages may wait.
     await new Promise((resume) => setTimeout(resume, (wait + Math.random()) * 1000));
   }
 }
 
 /**
- * Asks the server; answers the parsed body. Throws `SignedOut` on 401 and `Refused` on the rest.
+ * Sends a request and returns the parsed body. Throws `SignedOut` on 401 and `ApiError` on other
+ * refusals.
  */
-async function ask(method, path, { body, query = {}, headers = {}, revive } = {}) {
+async function request(method, path, { body, query = {}, headers = {}, reviver } = {}) {
   const given = Object.entries(query).filter(
     ([, value]) => value !== undefined && value !== null && value !== '',
   );
@@ -50,42 +52,42 @@ async function ask(method, path, { body, query = {}, headers = {}, revive } = {}
     body: body && JSON.stringify(body),
   });
   if (response.ok)
-    return response.status === 204 ? null : JSON.parse(await response.text(), revive);
-  const said = await response.json().catch(() => null);
-  if (response.status === 401) throw new SignedOut(said?.error?.message);
-  throw new Refused(response.status, said?.error);
+    return response.status === 204 ? null : JSON.parse(await response.text(), reviver);
+  const answer = await response.json().catch(() => null);
+  if (response.status === 401) throw new SignedOut(answer?.error?.message);
+  throw new ApiError(response.status, answer?.error);
 }
 
-export const get = (path, query) => ask('GET', path, { query });
-export const post = (path, body, headers) => ask('POST', path, { body, headers });
-export const patch = (path, body) => ask('PATCH', path, { body });
-export const remove = (path) => ask('DELETE', path);
+export const get = (path, query) => request('GET', path, { query });
+export const post = (path, body, headers) => request('POST', path, { body, headers });
+export const patch = (path, body) => request('PATCH', path, { body });
+export const remove = (path) => request('DELETE', path);
 
 /**
- * Sends a file's bytes, for as long as it takes; answers the parsed body. `told` gets how many have
- * gone. By the older kind of request, because `fetch` does not say that. `signal` breaks it off.
+ * Uploads a file without a time limit and returns the parsed body. `onProgress` gets the number of
+ * bytes sent, which is why this uses XMLHttpRequest and not `fetch`. `signal` cancels the upload.
  */
-export function upload(path, blob, type, { told, signal }) {
+export function upload(path, blob, type, { onProgress, signal }) {
   return new Promise((resolve, reject) => {
     signal.throwIfAborted();
-    const request = new XMLHttpRequest();
-    request.open('POST', BASE + path);
-    request.setRequestHeader('content-type', type);
-    request.upload.onprogress = ({ loaded }) => told(loaded);
-    request.onerror = () => reject(new Error('The connection broke.'));
-    request.onabort = () => reject(new Error('Broken off.'));
-    request.onload = () => {
-      const said = parsed(request.responseText);
-      if (request.status < 300) resolve(said);
-      else if (request.status === 401) reject(new SignedOut(said?.error?.message));
-      else reject(new Refused(request.status, said?.error));
+    const xhr = new XMLHttpRequest();
+    xhr.open('POST', BASE + path);
+    xhr.setRequestHeader('content-type', type);
+    xhr.upload.onprogress = ({ loaded }) => onProgress(loaded);
+    xhr.onerror = () => reject(new Error('Connection lost.'));
+    xhr.onabort = () => reject(new Error('Upload cancelled.'));
+    xhr.onload = () => {
+      const answer = parseJson(xhr.responseText);
+      if (xhr.status < 300) resolve(answer);
+      else if (xhr.status === 401) reject(new SignedOut(answer?.error?.message));
+      else reject(new ApiError(xhr.status, answer?.error));
     };
-    signal.addEventListener('abort', () => request.abort());
-    request.send(blob);
+    signal.addEventListener('abort', () => xhr.abort());
+    xhr.send(blob);
   });
 }
 
-function parsed(text) {
+function parseJson(text) {
   try {
     return JSON.parse(text);
   } catch {
@@ -93,31 +95,28 @@ function parsed(text) {
   }
 }
 
-/**
- * An order that may be sent again without ordering it twice: with the same key as long as the same
- * thing is meant.
- */
-export const order = (path, body, key) => post(path, body, { 'idempotency-key': key });
+/** A POST that may be repeated without a second effect, as long as the key stays the same. */
+export const postIdempotent = (path, body, key) => post(path, body, { 'idempotency-key': key });
 
-/** A key for one order. The browser's own UUIDs need https. */
-export const newKey = () =>
+/** An idempotency key. The browser's own UUIDs need https. */
+export const newIdempotencyKey = () =>
   Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) =>
     byte.toString(16).padStart(2, '0'),
   ).join('');
 
 export const session = () => get('/session');
 /** With `{ user, password }` or `{ token }`. */
-export const signIn = (who) => post('/session', who);
+export const signIn = (credentials) => post('/session', credentials);
 export const signOut = () => remove('/session');
 
-/** The newest deployments, or those after `before`: a page of them. */
+/** One page of deployments: the newest, or those older than `before`. */
 export const deployments = (before) => get('/deployments', { limit: 200, before });
 
 const PAGE = 1_000;
 
-/** All robots, page by page, so that the first are drawn while the rest is on its way. */
+/** All robots in pages, so that the first are drawn while the rest is loading. */
 export async function* robots() {
-  // The first page is what fits the screen, and comes at once.
+  // The first page is short, so that it fills the screen quickly.
   for (let after, limit = 100; ; limit = PAGE) {
     const page = await get('/robots', { limit, after });
     yield page.robots;
@@ -127,8 +126,8 @@ export async function* robots() {
 }
 
 /**
- * Asks a robot something; answers what it answered, read with `revive` as by `JSON.parse`. Throws
- * what it refused.
+ * Sends a query to a robot and returns the answer, parsed with `reviver` as by `JSON.parse`. Throws
+ * if the robot or the server refuses.
  */
-export const askRobot = (robot, question, revive) =>
-  ask('POST', `/robots/${robot}/ask`, { body: question, revive });
+export const askRobot = (robot, query, reviver) =>
+  request('POST', `/robots/${robot}/ask`, { body: query, reviver });

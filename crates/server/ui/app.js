@@ -1,32 +1,26 @@
-// The page: signs in, listens, finds the view of the place somebody is at, and draws it once per
-// frame.
+// The page: signs users in, subscribes to events, selects the view of the current route, and draws
+// it once per frame.
 //
-// A view is a class: `constructor(app)`, `arrive(place)` when its place's query or later parts
-// change, `draw(now)`, which answers a template, and, where it needs them, `drawn()` after the
-// drawing, `hear(event)` for each event of the stream, `refresh()` when the stream has come back
-// and what was fetched may be old, `key(event)` for a key that nothing else takes (answers whether
-// it took it), and `leave()`. What every view may use is `app`, below.
+// A view is a class with `constructor(app)`, `onNavigate(route)` for changes of the query or of
+// later path segments, and `draw(now)`, which returns a template. Optional are `afterDraw()`,
+// `onEvent(event)` for each event of the stream, `refresh()` when the stream is back and fetched
+// data may be stale, `onKey(event)` for otherwise unhandled keys (returns whether it handled the
+// key), `isUnsaved`, and `leave()`. All views share `app`, below.
 
 import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import * as api from './api.js';
-import { holdFocus } from './cursor.js';
-import {
-  close as closeDialog,
-  dialogView,
-  isAsking,
-  settleDialog,
-  takesKey as dialogTakes,
-} from './dialog.js';
+import { preserveFocus } from './cursor.js';
+import { closeDialog, dialogView, isDialogOpen, syncDialog, handleDialogKey } from './dialog.js';
 import { Fleet, Selection } from './fleet.js';
 import { ago, plural } from './format.js';
-import { change, drawWith } from './frame.js';
+import { change, setRenderer } from './frame.js';
 import { showHelp } from './help.js';
-import { listen } from './live.js';
-import { complain, hide as hideNotice, noticeView } from './notice.js';
-import { at, place } from './router.js';
-import { comeBack, ofLink, problemOfProvider, RESTARTED, signInView } from './signin.js';
-import { sign } from './signs.js';
+import { subscribe } from './events.js';
+import { notifyError, hide as hideNotice, noticeView } from './notice.js';
+import { hrefTo, currentRoute } from './router.js';
+import { restorePlace, takeLinkParameters, providerError, signInView } from './sign-in.js';
+import { statusDot } from './status.js';
 import { DeploymentView } from './deployment.js';
 import { DeploymentsView } from './deployments.js';
 import { PackageView } from './package.js';
@@ -38,39 +32,44 @@ import { ServerView } from './server.js';
 import { SettingsView } from './settings.js';
 
 const REFETCH_PAUSE_MS = 2_000;
-const LONGEST_PAUSE_MS = 30_000;
-/** For which server the page was loaded anew, in this tab. */
-const RENEWED = 'taskd.renewed';
+const MAX_PAUSE_MS = 30_000;
+/** The storage key of the server version for which this tab was reloaded. */
+const RELOADED_FOR = 'taskd.renewed';
 
-/** The sections, and the views of what is in them. */
+/** The sections with their views: of the list and of one item. */
 const SECTIONS = [
-  { id: 'robots', title: 'Robots', list: RobotsView, one: RobotView },
-  { id: 'packages', title: 'Packages', list: PackagesView, one: PackageView },
-  { id: 'deployments', title: 'Deployments', list: DeploymentsView, one: DeploymentView },
-  { id: 'server', title: 'Server', list: ServerView },
-  { id: 'settings', title: 'Settings', list: SettingsView },
+  { id: 'robots', title: 'Robots', List: RobotsView, Detail: RobotView },
+  { id: 'packages', title: 'Packages', List: PackagesView, Detail: PackageView },
+  { id: 'deployments', title: 'Deployments', List: DeploymentsView, Detail: DeploymentView },
+  { id: 'server', title: 'Server', List: ServerView },
+  { id: 'settings', title: 'Settings', List: SettingsView },
 ];
 
-/** What every view may use. */
+/** The state and helpers that all views share. */
 const app = {
   fleet: new Fleet(),
-  /** Robots that were chosen, which stay so on the way to other views and back. */
+  /** Selected robots. The selection survives changes of the view. */
   selection: new Selection(),
-  /** Packages on their way to the server. */
+  /** Uploads of packages. */
   uploads: new Uploads(),
-  /** Who is signed in. */
+  /** The signed-in user. */
   me: null,
   /** The server's time. */
   now: () => Date.now() + page.clockAheadMs,
-  /** Whether this person may do it: `read`, `operate`, `publish`, `maintain`, `administer`. */
+  /**
+   * Whether the user has this permission: `read`, `operate`, `publish`, `maintain`, `administer`.
+   */
   can: (permission) => Boolean(app.me?.permissions.includes(permission)),
-  /** Does what may fail, and says so where everybody looks. Answers what `act` did, or nothing. */
-  async attempt(act) {
+  /**
+   * Runs an action that may fail, and shows its error as a notification. Returns the result, or
+   * nothing.
+   */
+  async attempt(action) {
     try {
-      return await act();
+      return await action();
     } catch (error) {
-      if (error instanceof api.SignedOut) lose();
-      else complain(error.message);
+      if (error instanceof api.SignedOut) endSession();
+      else notifyError(error.message);
       return undefined;
     }
   },
@@ -80,46 +79,47 @@ const page = {
   /** `starting`, `signed_out` or `in`. */
   state: 'starting',
   view: null,
-  /** Which view that is: views change when this does. */
+  /** Identifies the view: the view is replaced when this changes. */
   viewKey: null,
   section: SECTIONS[0],
   stream: { state: 'connecting' },
   /**
-   * Heard while the lists are on their way: newer than the lists, or followed by something newer.
+   * Events that arrive while the lists are loading: newer than the lists, or followed by newer
+   * events.
    */
   backlog: null,
-  heardAt: null,
-  /** Another way to sign in, if there is one. */
+  lastEventAt: null,
+  /** The identity provider, if one is configured. */
   provider: null,
-  /** What a link brought to sign in with. */
+  /** The token of a link. */
   token: null,
   clockAheadMs: 0,
-  /** The server's version when this page was loaded, and that of its last answer. */
+  /** The server version when this page was loaded, and the latest reported version. */
   version: null,
   serverVersion: null,
   problem: null,
   isSigningIn: false,
-  /** The lists have to be fetched once more. */
+  /** Whether the lists have to be fetched again. */
   isStale: false,
-  /** How often in a row that failed. */
+  /** The number of consecutive failures of that. */
   failures: 0,
-  /** Ends the pause before that. */
-  hurry: null,
+  /** Ends the pause before the next attempt. */
+  skipPause: null,
 };
 
 let live = null;
 
 // Signing in and out
 
-async function start({ token, problem } = ofLink()) {
+async function start({ token, problem } = takeLinkParameters()) {
   try {
-    const { expires_at_ms: until, provider, ended_by_restart: isRestarted } = await api.session();
+    const { expires_at_ms: until, provider } = await api.session();
     page.provider = provider;
     if (until) {
-      comeBack();
-      enter();
-    } else leave(problem ? problemOfProvider(problem) : isRestarted ? RESTARTED : null);
-    if (token) offer(token);
+      restorePlace();
+      showPage();
+    } else showSignIn(problem ? providerError(problem) : null);
+    if (token) offerToken(token);
   } catch (error) {
     change(() => (page.problem = error.message));
     setTimeout(() => start({ token, problem }), REFETCH_PAUSE_MS);
@@ -127,28 +127,30 @@ async function start({ token, problem } = ofLink()) {
 }
 
 /**
- * Leaves a link's token to who is not in: anybody can make such a link, so it signs nobody in by
- * itself.
+ * Fills in a link's token for a signed-out user. Anyone can make such a link, so it never signs in
+ * by itself.
  */
-function offer(token) {
+function offerToken(token) {
   if (page.state === 'in') return;
   change(() => (page.token = token));
-  // After the drawing that was just asked for.
+  // After the frame that `change` requested.
   requestAnimationFrame(() => document.querySelector('.by-token button')?.focus());
 }
 
-async function signIn(who) {
+async function signIn(credentials) {
   change(() => Object.assign(page, { isSigningIn: true, problem: null }));
   try {
-    await api.signIn(who);
-    enter({ isNew: true });
+    await api.signIn(credentials);
+    showPage({ isNew: true });
   } catch (error) {
-    leave(error.message);
+    showSignIn(error.message);
   }
 }
 
-/** Goes in with the session there is; `isNew` says that it has just begun here. */
-function enter({ isNew = false } = {}) {
+/**
+ * Shows the page for the current session; `isNew` says that the session has just begun in this tab.
+ */
+function showPage({ isNew = false } = {}) {
   live?.stop();
   change(() => {
     Object.assign(page, {
@@ -158,42 +160,39 @@ function enter({ isNew = false } = {}) {
       isSigningIn: false,
       stream: { state: 'connecting' },
     });
-    forget();
-    arrive();
+    reset();
+    openView();
   });
-  live = listen(hear, { isNew });
+  live = subscribe(onStreamMessage, { isNew });
 }
 
-function leave(problem = null) {
+function showSignIn(problem = null) {
   live?.stop();
   live = null;
   change(() => {
     closeDialog();
     Object.assign(page, { state: 'signed_out', problem, isSigningIn: false });
-    forget();
+    reset();
   });
 }
 
-/** The session has ended without anybody's doing here. Says why, where the server knows. */
-async function lose() {
-  leave();
-  const { provider, ended_by_restart: isRestarted } = await api.session().catch(() => ({}));
-  if (page.state !== 'signed_out' || page.isSigningIn) return;
-  change(() =>
-    Object.assign(page, {
-      provider: provider ?? page.provider,
-      problem: page.problem ?? (isRestarted ? RESTARTED : null),
-    }),
-  );
+/**
+ * Handles a session that ended without a sign-out in this tab. The server may have been restarted
+ * with another provider since.
+ */
+async function endSession() {
+  showSignIn();
+  const { provider } = await api.session().catch(() => page);
+  if (page.state === 'signed_out') change(() => (page.provider = provider));
 }
 
-/** Nothing of one person is shown to the next. */
-function forget() {
+/** Clears all data of the user, so that the next user sees none of it. */
+function reset() {
   page.view?.leave?.();
-  page.hurry?.();
+  page.skipPause?.();
   hideNotice();
   app.uploads.stop();
-  Object.assign(page, { view: null, viewKey: null, backlog: null, heardAt: null, failures: 0 });
+  Object.assign(page, { view: null, viewKey: null, backlog: null, lastEventAt: null, failures: 0 });
   Object.assign(app, {
     fleet: new Fleet(),
     selection: new Selection(),
@@ -206,53 +205,54 @@ async function signOut() {
   try {
     await api.signOut();
   } catch (error) {
-    // Whoever loads the page next would be in: scripts can't take the cookie away.
-    if (!(error instanceof api.SignedOut)) return complain(`Signing out failed: ${error.message}`);
+    // The session would still be valid, and scripts cannot remove the cookie.
+    if (!(error instanceof api.SignedOut))
+      return notifyError(`Could not sign out: ${error.message}`);
   }
   live?.signOut();
-  leave();
+  showSignIn();
 }
 
-// Finding the view
+// Navigation
 
-function arrive() {
-  const here = place();
-  const [name, one] = here.path;
+function openView() {
+  const route = currentRoute();
+  const [name, item] = route.path;
   const section = SECTIONS.find(({ id }) => id === name) ?? SECTIONS[0];
-  const View = one && section.one ? section.one : section.list;
-  const key = `${section.id} ${section.one ? (one ?? '') : ''}`;
+  const View = item && section.Detail ? section.Detail : section.List;
+  const key = `${section.id} ${section.Detail ? (item ?? '') : ''}`;
   if (page.viewKey !== key) {
     page.view?.leave?.();
     Object.assign(page, { section, viewKey: key, view: new View(app) });
     scrollTo(0, 0);
   }
-  page.view.arrive(here);
+  page.view.onNavigate(route);
 }
 
 addEventListener('hashchange', ({ oldURL }) => {
-  const { token } = ofLink(oldURL);
-  if (token) offer(token);
-  else if (page.state === 'in') change(arrive);
+  const { token } = takeLinkParameters(oldURL);
+  if (token) offerToken(token);
+  else if (page.state === 'in') change(openView);
 });
 
-// Listening
+// Events
 
-function hear({ state, events, retry_at, problem }) {
+function onStreamMessage({ state, events, retry_at, problem }) {
   if (!live) return;
-  if (state === 'signed_out') return lose();
+  if (state === 'signed_out') return endSession();
   if (state) change(() => (page.stream = { state, retry_at, problem }));
-  if (state === 'open') page.hurry ? page.hurry() : refetch();
-  // Without a stream there is still what the server lists.
+  if (state === 'open') page.skipPause ? page.skipPause() : refetch();
+  // Without a stream the page still shows the lists.
   if (state === 'waiting' && !app.fleet.isLoaded && !page.backlog) refetch();
   if (!events) return;
-  page.heardAt = app.now();
+  page.lastEventAt = app.now();
   if (page.backlog) page.backlog.push(...events);
-  else change(() => take(events));
+  else change(() => applyEvents(events));
 }
 
-function take(events) {
+function applyEvents(events) {
   const stale = events.map((event) => {
-    page.view?.hear?.(event);
+    page.view?.onEvent?.(event);
     return app.fleet.apply(event);
   });
   if (stale.includes(true)) refetch();
@@ -260,97 +260,97 @@ function take(events) {
 
 let refetchedAt = -Infinity;
 
-/** Fetches the lists; asked again meanwhile, it does so once more, but never without a pause. */
+/** Fetches the lists. Calls during a fetch cause one more fetch, after a pause. */
 async function refetch() {
   page.isStale = Boolean(page.backlog);
   if (page.backlog) return;
   page.backlog = [];
   const listener = live;
-  const isMine = () => live === listener && listener;
-  await rest(refetchedAt + pauseAfter(page.failures) - performance.now());
-  if (!isMine()) return;
+  const isCurrent = () => live === listener && listener;
+  await pause(refetchedAt + pauseAfter(page.failures) - performance.now());
+  if (!isCurrent()) return;
   try {
-    await fetchLists(isMine);
-    if (!isMine()) return;
+    await fetchLists(isCurrent);
+    if (!isCurrent()) return;
     page.failures = 0;
     page.view?.refresh?.();
   } catch (error) {
-    if (!isMine()) return;
-    if (error instanceof api.SignedOut) return lose();
+    if (!isCurrent()) return;
+    if (error instanceof api.SignedOut) return endSession();
     Object.assign(page, { problem: error.message, isStale: true, failures: page.failures + 1 });
   }
   refetchedAt = performance.now();
-  const heard = page.backlog;
+  const events = page.backlog;
   page.backlog = null;
-  change(() => take(heard));
+  change(() => applyEvents(events));
   if (page.isStale) refetch();
 }
 
-/** Spread out, so that a server in trouble is not met by every page at once. */
+/** With jitter, so that pages do not all return to a recovering server at once. */
 const pauseAfter = (failures) =>
   failures
-    ? Math.min(REFETCH_PAUSE_MS * 2 ** failures, LONGEST_PAUSE_MS) * (0.5 + Math.random() / 2)
+    ? Math.min(REFETCH_PAUSE_MS * 2 ** failures, MAX_PAUSE_MS) * (0.5 + Math.random() / 2)
     : REFETCH_PAUSE_MS;
 
-/** Waits until then, or until the stream has come back. */
-async function rest(ms) {
+/** Waits this long, or until the stream is back. */
+async function pause(ms) {
   if (ms <= 0) return;
   await new Promise((resume) => {
-    page.hurry = resume;
+    page.skipPause = resume;
     setTimeout(resume, ms);
   });
-  page.hurry = null;
+  page.skipPause = null;
 }
 
-async function fetchLists(isMine) {
+async function fetchLists(isCurrent) {
   const [server, me, deployments] = await Promise.all([
     api.get('/server'),
     api.get('/me'),
     api.deployments(),
   ]);
-  if (!isMine()) return;
+  if (!isCurrent()) return;
   const { fleet } = app;
   app.me = me;
   page.version ??= server.version;
   page.serverVersion = server.version;
   page.clockAheadMs = server.now_ms - Date.now();
-  page.heardAt = app.now();
+  page.lastEventAt = app.now();
   page.problem = null;
-  fleet.renew(deployments);
+  fleet.setDeployments(deployments);
   const ids = new Set();
   for await (const robots of api.robots()) {
-    if (!isMine()) return;
+    if (!isCurrent()) return;
     robots.forEach(({ id }) => ids.add(id));
     change(() => {
       fleet.add(robots);
-      if (!fleet.isLoaded) fleet.order();
+      if (!fleet.isLoaded) fleet.sort();
     });
   }
   change(() => {
-    fleet.keep(ids);
+    fleet.retain(ids);
     fleet.isLoaded = true;
-    fleet.order();
+    fleet.sort();
   });
 }
 
 // Drawing
 
-drawWith((frame) => {
+setRenderer((frame) => {
   if (page.state === 'starting')
     return render(page.problem ? html`<p class="bad">${page.problem}</p>` : nothing, document.body);
   if (page.state === 'signed_out') return render(signInView(page, signIn), document.body);
-  app.fleet.settle(frame);
-  app.selection.keep(app.fleet.robots);
-  const giveFocusBack = holdFocus();
+  app.fleet.sortIfDue(frame);
+  app.selection.retain(app.fleet.robots);
+  const giveFocusBack = preserveFocus();
   render(frameView(app.now()), document.body);
   giveFocusBack();
-  page.view.drawn?.();
-  settleDialog();
-  if (page.serverVersion !== page.version && !isAsking() && !isAtWork()) renew();
+  page.view.afterDraw?.();
+  syncDialog();
+  if (page.serverVersion !== page.version && !isDialogOpen() && !hasUnsavedWork()) reloadOnce();
 });
 
-/** Whether something would be lost: what is typed, or what was chosen to be sent. */
-function isAtWork() {
+/** Whether a reload would lose typed text or uploads. */
+function hasUnsavedWork() {
   const isTyping = document.activeElement?.matches(
     'input:not([type=checkbox], [type=radio]), textarea',
   );
@@ -358,20 +358,20 @@ function isAtWork() {
 }
 
 /**
- * Loads the page that another server brings; once for each, lest two of them behind one address
- * make it load for ever.
+ * Reloads the page after a server upgrade. It does so once per version: two versions behind one
+ * address would cause endless reloads.
  */
-function renew() {
-  if (sessionStorage.getItem(RENEWED) === page.serverVersion) return;
-  sessionStorage.setItem(RENEWED, page.serverVersion);
+function reloadOnce() {
+  if (sessionStorage.getItem(RELOADED_FOR) === page.serverVersion) return;
+  sessionStorage.setItem(RELOADED_FOR, page.serverVersion);
   location.reload();
 }
 
 /**
- * A view gets elements of its own: what the one before has put into them, what listens to them and
- * what was unfolded is not its.
+ * Gives each view its own elements, so that no content, listeners or expanded state of the previous
+ * view remain.
  */
-const ofView = (view, drawn) =>
+const keyedByView = (view, drawn) =>
   repeat(
     [view],
     (one) => one,
@@ -380,47 +380,60 @@ const ofView = (view, drawn) =>
 
 const frameView = (now) => html`
   <header class="top">
-    <a class="skip" href="#main" @click=${skip}>Skip to the content</a>
-    <p class="brand"><a href=${at(['robots'])}>taskd</a></p>
-    <nav aria-label="Sections">${SECTIONS.map(({ id, title }) => html`<a href=${at([id])} aria-current=${page.section.id === id ? 'page' : nothing}>${title}</a>`)}</nav>
-    <p class="stream" role="status">${streamState(now)}</p>
-    <p class="who">${app.me ? whoIsIt(app.me) : ''}</p>
+    <a class="skip" href="#main" @click=${skip}>Skip to content</a>
+    <p class="brand"><a href=${hrefTo(['robots'])}>taskd</a></p>
+    <nav aria-label="Main">${SECTIONS.map(
+      ({ id, title }) =>
+        html`<a href=${hrefTo([id])}
+          aria-current=${page.section.id === id ? 'page' : nothing}>${title}</a>`,
+    )}</nav>
+    <p class="stream" role="status">${streamStatus(now)}</p>
+    <p class="user">${app.me ? userText(app.me) : ''}</p>
     <button class="plain link" @click=${signOut}>Sign out</button>
   </header>
   <main id="main" tabindex="-1">
     ${page.problem ? html`<p class="bad" role="alert">▲ ${page.problem}</p>` : nothing}
-    ${ofView(page.view, page.view.draw(now))}
+    ${keyedByView(page.view, page.view.draw(now))}
   </main>
   ${dialogView()}
   ${noticeView()}`;
 
-/** A link of a page whose addresses all begin with `#`. */
+/** Moves the focus by script, because the hash of the address holds the route. */
 function skip(event) {
   event.preventDefault();
   document.getElementById('main').focus();
 }
 
-/** The person, and which robots they are limited to. */
-const whoIsIt = ({ name, scope }) => (scope.length ? `${name}, ${scope.join(' and ')}` : name);
+/** The user and their scope. */
+const userText = ({ name, scope }) => (scope.length ? `${name}, ${scope.join(' and ')}` : name);
 
-/** What moves on each second is for the eye only: read aloud, it would never stop. */
-function streamState(now) {
+/**
+ * Times that change every second are hidden from screen readers, which would announce each change.
+ */
+function streamStatus(now) {
   const { state, retry_at, problem } = page.stream;
-  if (state === 'open' && app.fleet.isLoaded) return sign(true, 'Live');
-  const since = page.heardAt ? `, shown as of ${ago(page.heardAt, now)}` : '';
+  if (state === 'open' && app.fleet.isLoaded) return statusDot(true, 'Live');
+  const since = page.lastEventAt ? `; last update ${ago(page.lastEventAt, now)}` : '';
   if (state !== 'waiting')
-    return sign(false, html`Connecting<span aria-hidden="true">${since}</span>`);
+    return statusDot(false, html`Connecting<span aria-hidden="true">${since}</span>`);
   const seconds = Math.max(0, Math.ceil((retry_at - Date.now()) / 1000));
-  return sign(
+  return statusDot(
     false,
-    html`<span class="bad">Not live${problem ? ` (${problem})` : ''}<span aria-hidden="true">${since}; trying again in ${plural(seconds, 'second')}</span></span>`,
+    html`<span class="bad">Disconnected${problem ? ` (${problem})` : ''}<span
+      aria-hidden="true">${since}; retrying in ${plural(seconds, 'second')}</span></span>`,
   );
 }
 
 // Keys
 
 addEventListener('keydown', (event) => {
-  if (page.state !== 'in' || event.ctrlKey || event.metaKey || event.altKey || dialogTakes(event))
+  if (
+    page.state !== 'in' ||
+    event.ctrlKey ||
+    event.metaKey ||
+    event.altKey ||
+    handleDialogKey(event)
+  )
     return;
   const isTyping = event.target.matches(
     'input:not([type=checkbox]), textarea, select, [contenteditable]',
@@ -433,12 +446,12 @@ addEventListener('keydown', (event) => {
   } else if (event.key === '?' && !isTyping) {
     event.preventDefault();
     showHelp();
-  } else if ((!isTyping || event.target === search) && page.view?.key?.(event))
+  } else if ((!isTyping || event.target === search) && page.view?.onKey?.(event))
     event.preventDefault();
 });
 
 addEventListener('scroll', () => change(), { passive: true });
 addEventListener('resize', () => change());
-// Times move on, and rows find their places, also while nothing is heard.
+// Relative times and row positions need frames even without events.
 setInterval(() => change(), 1_000);
 start();

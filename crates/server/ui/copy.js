@@ -1,17 +1,19 @@
-// A line to paste into a terminal, with a button that copies it, also on plain http, where browsers
-// offer no clipboard.
+// A command line with a copy button, which also works on plain http, where browsers offer no
+// clipboard.
 
 import { html } from './vendor/lit-html-3.3.3/lit-html.js';
 
 export const command = (text) => html`
   <div class="command">
     <code>${text}</code>
-    <button class="plain" aria-label=${`Copy: ${text}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>
+    <button class="plain" aria-label=${`Copy: ${text}`}
+      @click=${(event) => copy(text, event.currentTarget)}>Copy</button>
   </div>`;
 
-/** A small button that copies a text which is shown in short beside it. */
+/** A small button that copies a text that is shown abbreviated beside it. */
 export const copyButton = (text, what) =>
-  html`<button class="plain link copy" aria-label=${`Copy ${what}`} @click=${(event) => copy(text, event.currentTarget)}>Copy</button>`;
+  html`<button class="plain link copy" aria-label=${`Copy ${what}`}
+    @click=${(event) => copy(text, event.currentTarget)}>Copy</button>`;
 
 async function copy(text, button) {
   const isCopied =
@@ -19,7 +21,7 @@ async function copy(text, button) {
       () => true,
       () => false,
     )) || copyBySelection(text);
-  button.textContent = isCopied ? 'Copied' : 'Select it';
+  button.textContent = isCopied ? 'Copied' : 'Copy failed';
   setTimeout(() => (button.textContent = 'Copy'), 2_000);
 }
 

@@ -1,5 +1,5 @@
-// Going from row to row of a long list by keys: up, down, and Enter, which opens. And staying there
-// while the rows change places.
+// Keyboard navigation in a long list: arrow keys move between rows, Enter opens the row. The focus
+// stays on a row that moves.
 
 import { change } from './frame.js';
 
@@ -7,10 +7,10 @@ const CONTROLS = 'a, button, input, summary';
 const rowOf = (key) => document.querySelector(`[data-key="${CSS.escape(key)}"]`);
 
 /**
- * To be called before each drawing. Answers what gives the focus back after it: a row that is put
- * elsewhere has lost it.
+ * Call this before each drawing. It returns a function that restores the focus after the drawing,
+ * because a moved row loses it.
  */
-export function holdFocus() {
+export function preserveFocus() {
   const held = document.activeElement;
   const key = held?.closest('[data-key]')?.dataset.key;
   if (key === undefined) return () => {};
@@ -23,26 +23,26 @@ export function holdFocus() {
 }
 
 export class Cursor {
-  /** The row that keys go to. */
+  /** The key of the current row. */
   current = null;
-  #rows;
+  #list;
   #open;
   #isFocusDue = false;
 
-  /** `rows` are the list's, `open(key)` is what Enter does. */
-  constructor(rows, open) {
-    this.#rows = rows;
+  /** `list` is the virtual list; Enter calls `open(key)`. */
+  constructor(list, open) {
+    this.#list = list;
     this.#open = open;
   }
 
-  /** The tab key reaches one row of the list, and the arrows the others. */
+  /** Tab reaches one row of the list, arrow keys the others. */
   tabindex(key, index) {
     const isFirst = this.current ? this.current === key : index === 0;
     return isFirst ? 0 : -1;
   }
 
-  /** Whether it took the key. `keys` are the rows', in their order. */
-  key({ key, target }, keys) {
+  /** Returns whether it handled the key. `keys` are the row keys in their order. */
+  onKey({ key, target }, keys) {
     const isSearch = target.matches('input[type=search]');
     if (key === 'ArrowDown' || key === 'ArrowUp')
       return this.#move(isSearch ? 0 : key === 'ArrowDown' ? 1 : -1, keys);
@@ -62,14 +62,14 @@ export class Cursor {
     const from = keys.indexOf(this.current);
     change(() => {
       this.current = by === 0 ? keys[0] : keys[Math.min(keys.length - 1, Math.max(0, from + by))];
-      this.#rows.reveal(this.current);
+      this.#list.reveal(this.current);
       this.#isFocusDue = true;
     });
     return true;
   }
 
-  /** To be called after each drawing. */
-  drawn() {
+  /** Call this after each drawing. */
+  afterDraw() {
     if (!this.#isFocusDue) return;
     this.#isFocusDue = false;
     rowOf(this.current)?.focus({ preventScroll: true });

@@ -1,41 +1,73 @@
-// One deployment: how far it has come as a whole, why some robots failed, and each robot with the
-// phases it went through.
+// The view of a deployment: overall progress, reasons of failures, and the phases of each robot.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
-import { names } from './acts.js';
-import { get, newKey, order, post } from './api.js';
+import { robotNames } from './actions.js';
+import { get, newIdempotencyKey, postIdempotent, post } from './api.js';
 import { Cursor } from './cursor.js';
-import { wordsOf } from './deployments.js';
-import { deliveries, failures } from './deployments/aside.js';
-import { Parts, canRetry, reasonOf } from './deployments/parts.js';
-import { list, steps, strip, tookInAll } from './timeline.js';
-import { open } from './dialog.js';
-import { idsOf } from './fleet.js';
-import { bytes, duration, moment, number, plural, short, size, tone, words } from './format.js';
+import { targetText } from './deployments.js';
+import { deliveryGroups, failureGroups } from './deployments/sidebar.js';
+import { Assignments, canRetry, reasonOf } from './deployments/assignments.js';
+import { timelineList, timelineSteps, timelineBar, totalDuration } from './timeline.js';
+import { openDialog } from './dialog.js';
+import { selectorOf } from './fleet.js';
+import {
+  bytes,
+  duration,
+  moment,
+  number,
+  plural,
+  shortDigest,
+  size,
+  tone,
+  words,
+} from './format.js';
 import { change } from './frame.js';
-import { tell } from './notice.js';
-import { optionsOf } from './push.js';
-import { at, go, restate } from './router.js';
-import { Rows, isNarrow } from './rows.js';
-import { countBar, deploymentState, phaseSign, progressBar, robotState, since } from './signs.js';
+import { notify } from './notice.js';
+import { optionsText } from './push.js';
+import { hrefTo, navigate, replaceQuery } from './router.js';
+import { VirtualList, isNarrow } from './virtual-list.js';
+import {
+  phaseBar,
+  deploymentState,
+  phaseBadge,
+  progressBar,
+  robotState,
+  timeAgo,
+} from './status.js';
 
 // As in deployments.css.
 const ROW = 41;
 const NARROW_ROW = 65;
-// While data streams, rows come and go at most this often.
-const ORDER_PAUSE_MS = 1_000;
-// The whole is fetched anew at most this often, and more seldom where that takes long: ten thousand
-// robots are some megabytes.
+// Minimum interval between updates of the filtered rows.
+const FILTER_PAUSE_MS = 1_000;
+// Minimum interval between fetches of the whole deployment, which is some megabytes for ten
+// thousand robots. The interval grows with the duration of a fetch.
 const REFETCH_PAUSE_MS = 5_000;
 const REFETCH_SHARE = 10;
-// Robots that are named where it is said which are waited for.
+// Number of robots that are named as waiting.
 const AWAITED_NAMES = 5;
 
-/** Phases that always have a place, so that nothing moves when the first robot gets there. */
-const PLACES = ['assigned', 'fetching', 'unpacking', 'building', 'starting', 'running', 'failed'];
-const JOB_PLACES = [...PLACES.slice(0, -1), 'succeeded', 'failed'];
-const LIFE = [
+/** Phases that are always shown, so that the layout is stable when the first robot reaches one. */
+const SHOWN_PHASES = [
+  'assigned',
+  'fetching',
+  'unpacking',
+  'building',
+  'starting',
+  'running',
+  'failed',
+];
+const JOB_PHASES = [...SHOWN_PHASES.slice(0, -1), 'succeeded', 'failed'];
+const HEADS = [
+  'Robot',
+  'State',
+  'Phase',
+  html`<span class="visually-hidden">Details</span>`,
+  'Phases',
+  'Duration',
+];
+const ALL_PHASES = [
   'assigned',
   'deferred',
   'fetching',
@@ -55,27 +87,27 @@ const LIFE = [
 ];
 
 export class DeploymentView {
-  #rows = new Rows();
-  #cursor = new Cursor(this.#rows, (robot) =>
-    this.#look({ robot: this.#place.robot === robot ? '' : robot }),
+  #list = new VirtualList();
+  #cursor = new Cursor(this.#list, (robot) =>
+    this.#setQuery({ robot: this.#query.robot === robot ? '' : robot }),
   );
-  #parts = new Parts();
+  #assignments = new Assignments();
   #deployment = null;
   #problem = null;
-  #orderedBy = null;
-  /** Of the address: which robots are shown, and whose phases. */
-  #place = { phase: '', reason: '', q: '', robot: '' };
-  #shown = [];
-  #shownAt = -Infinity;
+  #author = null;
+  /** The query of the address: the filter, and the expanded robot. */
+  #query = { phase: '', reason: '', q: '', robot: '' };
+  #filtered = [];
+  #filteredAt = -Infinity;
   #detailHeight = 0;
   #fetchedAt = -Infinity;
   #fetchMs = 0;
   /**
-   * The last heard of each robot, and of the deployment, while a list is on its way: newer than the
-   * list, or followed by something newer.
+   * The last event of each robot and of the deployment while a fetch is under way: newer than its
+   * result, or followed by newer events.
    */
-  #heard = null;
-  /** It has to be fetched once more. */
+  #backlog = null;
+  /** Whether another fetch is needed. */
   #isStale = false;
   #timer = null;
   #isGone = false;
@@ -84,17 +116,17 @@ export class DeploymentView {
     this.app = app;
   }
 
-  arrive({ path: [, id], query }) {
+  onNavigate({ path: [, id], query }) {
     const isFirst = !this.id;
     this.id = id;
-    this.#place = {
+    this.#query = {
       phase: query.phase ?? '',
       reason: query.reason ?? '',
       q: query.q ?? '',
       robot: query.robot ?? '',
     };
-    this.#rows.rearrange();
-    this.#shownAt = -Infinity;
+    this.#list.releaseAnchor();
+    this.#filteredAt = -Infinity;
     if (isFirst) this.#fetch();
   }
 
@@ -107,23 +139,27 @@ export class DeploymentView {
     this.#fetch();
   }
 
-  #look(place) {
+  #setQuery(query) {
     change(() => {
-      this.#place = { ...this.#place, ...place };
-      this.#rows.rearrange();
-      this.#shownAt = -Infinity;
-      restate(this.#place);
+      this.#query = { ...this.#query, ...query };
+      this.#list.releaseAnchor();
+      this.#filteredAt = -Infinity;
+      replaceQuery(this.#query);
     });
   }
 
-  // Fetching and hearing.
+  #togglePhase(phase) {
+    this.#setQuery({ phase: this.#query.phase === phase ? '' : phase, reason: '' });
+  }
+
+  // Fetching and events
 
   async #fetch() {
     clearTimeout(this.#timer);
     this.#timer = null;
-    this.#isStale = this.#heard !== null;
+    this.#isStale = this.#backlog !== null;
     if (this.#isStale) return;
-    this.#heard = new Map();
+    this.#backlog = new Map();
     const begun = performance.now();
     this.#fetchedAt = begun;
     try {
@@ -133,27 +169,27 @@ export class DeploymentView {
       if (this.#isGone) return;
       this.#fetchMs = performance.now() - begun;
       change(() => {
-        this.#parts.renew(deployment);
+        this.#assignments.load(deployment);
         this.#deployment = deployment;
         this.#problem = null;
-        this.#shownAt = -Infinity;
+        this.#filteredAt = -Infinity;
       });
-      if (this.#orderedBy === null) this.#askWho();
+      if (this.#author === null) this.#fetchAuthor();
     } catch ({ status, message }) {
       this.#isStale ||= status !== 404;
       change(() => (this.#problem = message));
     }
-    const heard = this.#heard;
-    this.#heard = null;
-    change(() => heard.forEach((event) => this.#take(event)));
+    const events = this.#backlog;
+    this.#backlog = null;
+    change(() => events.forEach((event) => this.#applyEvent(event)));
     if (this.#isStale) this.#fetchSoon();
   }
 
-  /** Fetches once more, some time soon: one fetch for all that is heard meanwhile. */
+  /** Schedules a fetch: one for all events until then. */
   #fetchSoon() {
     if (this.#timer || this.#isGone) return;
     const wait = Math.max(
-      ORDER_PAUSE_MS,
+      FILTER_PAUSE_MS,
       this.#fetchedAt +
         Math.max(REFETCH_PAUSE_MS, REFETCH_SHARE * this.#fetchMs) -
         performance.now(),
@@ -161,56 +197,63 @@ export class DeploymentView {
     this.#timer = setTimeout(() => this.#fetch(), wait);
   }
 
-  /** Who ordered it is written in the audit, which administrators may read. */
-  async #askWho() {
+  /** The author is in the audit log, which administrators may read. */
+  async #fetchAuthor() {
     if (!this.app.can('administer')) return;
     const { records } = await get('/audit', {
       target: this.id,
       act: 'deployment.create',
       limit: 1,
     }).catch(() => ({ records: [] }));
-    change(() => (this.#orderedBy = records[0]?.entry.who ?? ''));
+    change(() => (this.#author = records[0]?.entry.who ?? ''));
   }
 
-  hear(event) {
-    this.#heard?.set(event.robot?.id ?? event.deployment?.id ?? event.id, event);
-    this.#take(event);
+  onEvent(event) {
+    this.#backlog?.set(event.robot?.id ?? event.deployment?.id ?? event.id, event);
+    this.#applyEvent(event);
   }
 
-  #take(event) {
+  #applyEvent(event) {
     const deployment = this.#deployment;
     if (!deployment) return;
-    if (event.type === 'robot' && this.#parts.hear(event.robot, this.id, this.app.now()))
+    if (event.type === 'robot' && this.#assignments.update(event.robot, this.id, this.app.now()))
       this.#fetchSoon();
     if (event.type === 'robot_removed') {
-      this.#parts.remove(event.id);
-      this.#shownAt = -Infinity;
+      this.#assignments.remove(event.id);
+      this.#filteredAt = -Infinity;
     }
     if (event.type !== 'deployment' || event.deployment.id !== this.id) return;
     this.#deployment = { ...deployment, ...event.deployment, assignments: deployment.assignments };
-    if (this.#parts.isBehind(event.deployment.counts, performance.now())) this.#fetchSoon();
+    if (this.#assignments.isBehind(event.deployment.counts, performance.now())) this.#fetchSoon();
   }
 
-  // Drawing.
+  // Drawing
 
   draw(now) {
     if (!this.#deployment)
-      return html`<p class="path"><a href=${at(['deployments'])}>Deployments</a></p><h1>${this.id}</h1><p class=${this.#problem ? 'bad' : 'quiet'}>${this.#problem ?? 'Fetching…'}</p>`;
-    const sum = this.#parts.summary(performance.now());
-    this.#choose();
+      return html`<p class="path"><a href=${hrefTo(['deployments'])}>Deployments</a></p>
+        <h1>${this.id}</h1>
+        <p class=${this.#problem ? 'bad' : 'quiet'}>${this.#problem ?? 'Loading…'}</p>`;
+    const sum = this.#assignments.summary(performance.now());
+    this.#filter();
     return html`
       ${this.#head(now, sum)}
       ${this.#figures(now, sum)}
       <div class="deployment-body">
-        <div class="aside">
-          ${failures(sum.reasons, this.#place.reason, { show: (reason) => this.#look({ reason, phase: '' }), retry: this.app.can('operate') ? (reason, parts) => this.#askRetry(parts, reason) : null })}
-          ${deliveries(sum.ways, this.#deployment.delivery)}
+        <div class="sidebar">
+          ${failureGroups(sum.reasons, this.#query.reason, {
+            show: (reason) => this.#setQuery({ reason, phase: '' }),
+            retry: this.app.can('operate')
+              ? (reason, assignments) => this.#openRetryDialog(assignments, reason)
+              : null,
+          })}
+          ${deliveryGroups(sum.mechanisms, this.#deployment.delivery)}
         </div>
-        <section class="receivers" aria-labelledby="parts">${this.#table(now, sum)}</section>
+        <section class="assignments" aria-labelledby="robots">${this.#table(now, sum)}</section>
       </div>`;
   }
 
-  #head(now, { retried, newer }) {
+  #head(now, { retryable, newer }) {
     const deployment = this.#deployment;
     const {
       package: { name, version, manifest },
@@ -222,24 +265,52 @@ export class DeploymentView {
     } = deployment;
     const isUnsettled = this.#isUnsettled;
     return html`
-      <p class="path"><a href=${at(['deployments'])}>Deployments</a> <span class="quiet">/ <span class="code">${this.id}</span></span></p>
-      <header class="bar-of-tools deployment-head">
-        <h1><a href=${at(['packages', name], { version: manifest.digest })}>${name}<span class="quiet">@${version}</span></a></h1>
+      <p class="path"><a href=${hrefTo(['deployments'])}>Deployments</a>
+        <span class="quiet">/ <span class="code">${this.id}</span></span></p>
+      <header class="toolbar deployment-head">
+        <h1><a href=${hrefTo(['packages', name], { version: manifest.digest })}
+          >${name}<span class="quiet">@${version}</span></a></h1>
         <p class="state">${deploymentState(deployment)}</p>
-        ${outdated ? html`<p class="bad">▲ outdated: ${version} is another package now, this is <span class="code">${short(manifest.digest)}</span></p>` : nothing}
+        ${
+          outdated
+            ? html`<p class="bad">▲ outdated: ${version} is now a different package; this one is
+                <span class="code">${shortDigest(manifest.digest)}</span></p>`
+            : nothing
+        }
         ${
           this.app.can('operate')
-            ? html`<span class="acts">
-          ${state === 'paused' ? html`<button class="primary" @click=${() => this.#askResume()}>Resume…</button>` : nothing}
-          ${retried.size ? html`<button class="quiet-button" @click=${() => this.#askRetry([...this.#parts.all.values()])}>Retry ${plural(retried.size, 'robot')}…</button>` : nothing}
-          ${isUnsettled ? html`<button class="quiet-button danger-text" @click=${() => this.#askCancel()}>Cancel…</button>` : nothing}
+            ? html`<span class="actions">
+          ${
+            state === 'paused'
+              ? html`<button class="primary"
+                  @click=${() => this.#openResumeDialog()}>Resume…</button>`
+              : nothing
+          }
+          ${
+            retryable.size
+              ? html`<button class="quiet-button"
+                  @click=${() => this.#openRetryDialog([...this.#assignments.all.values()])}
+                  >Retry ${plural(retryable.size, 'robot')}…</button>`
+              : nothing
+          }
+          ${
+            isUnsettled
+              ? html`<button class="quiet-button danger-text"
+                  @click=${() => this.#openCancelDialog()}>Cancel…</button>`
+              : nothing
+          }
         </span>`
             : nothing
         }
       </header>
-      <p class="quiet ordered">
-        <span title=${selector ?? nothing}>To ${wordsOf(deployment, this.app.fleet)}</span> · ${optionsOf(deployment)}
-        · ordered ${since(created, now)}${this.#orderedBy ? ` by ${this.#orderedBy}` : ''}${isUnsettled && expires > now ? html` · <span title=${moment(expires)}>expires in ${duration(expires - now)}</span>` : nothing}${this.#relations(newer)}
+      <p class="quiet deployment-meta">
+        <span title=${selector ?? nothing}>To ${targetText(deployment, this.app.fleet)}</span>
+        · ${optionsText(deployment)}
+        · created ${timeAgo(created, now)}${this.#author ? ` by ${this.#author}` : ''}${
+          isUnsettled && expires > now
+            ? html` · <span title=${moment(expires)}>expires in ${duration(expires - now)}</span>`
+            : nothing
+        }${this.#relations(newer)}
       </p>
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}`;
   }
@@ -248,17 +319,18 @@ export class DeploymentView {
     return ['active', 'paused'].includes(this.#deployment.state);
   }
 
-  /** The deployments before and after it. */
+  /** The deployments that this one supersedes and that supersede it. */
   #relations(newer) {
     const { supersedes } = this.#deployment;
     const links = (ids) =>
-      [...ids]
-        .slice(0, 3)
-        .map(
-          (id, index) =>
-            html`${index ? ', ' : ''}<a href=${at(['deployments', id])} title=${id}>${this.#versionOf(id)}</a>`,
-        );
-    return html`${supersedes.length ? html` · supersedes ${links(supersedes)}` : nothing}${newer.size ? html` · superseded by ${links(newer)}` : nothing}`;
+      [...ids].slice(0, 3).map(
+        (id, index) =>
+          html`${index ? ', ' : ''}<a href=${hrefTo(['deployments', id])}
+              title=${id}>${this.#versionOf(id)}</a>`,
+      );
+    return html`${supersedes.length ? html` · supersedes ${links(supersedes)}` : nothing}${
+      newer.size ? html` · superseded by ${links(newer)}` : nothing
+    }`;
   }
 
   #versionOf(id) {
@@ -266,99 +338,141 @@ export class DeploymentView {
     return name ? `${name}@${version}` : id;
   }
 
-  /** The counters, which are the filter as well, and how the bytes come along. */
-  #figures(now, { phases, done, total, awaited, busy, offline }) {
-    const places = this.#deployment.kind === 'job' ? JOB_PLACES : PLACES;
+  /** The counters, which are also the filter, and the transfer. */
+  #figures(now, { phases, done, total, awaitedBytes, busy, offline }) {
+    const phasesShown = this.#deployment.kind === 'job' ? JOB_PHASES : SHOWN_PHASES;
     const shown = [
-      ...places,
-      ...LIFE.filter((phase) => !places.includes(phase) && phases.get(phase)),
+      ...phasesShown,
+      ...ALL_PHASES.filter((phase) => !phasesShown.includes(phase) && phases.get(phase)),
     ];
-    const all = this.#parts.all.size;
-    const rate = this.#parts.throughput(now);
-    const counts = LIFE.filter((phase) => phases.get(phase)).map((phase) => ({
+    const all = this.#assignments.all.size;
+    const rate = this.#assignments.throughput(now);
+    const counts = ALL_PHASES.filter((phase) => phases.get(phase)).map((phase) => ({
       phase,
       count: phases.get(phase),
     }));
     return html`
-      <div class="whole">${countBar(counts)}</div>
-      <div class="strip phases" role="group" aria-label="Show robots that are">
+      <div class="overall">${phaseBar(counts)}</div>
+      <div class="counters phases" role="group" aria-label="Filter by phase">
         ${[
           { id: '', count: all, title: 'All' },
           ...shown.map((id) => ({ id, count: phases.get(id) ?? 0, title: capital(words(id)) })),
         ].map(
           ({ id, count, title }) => html`
-          <button class="counter ${tone(id)}" aria-pressed=${this.#place.phase === id && !this.#place.reason} @click=${() => this.#look({ phase: this.#place.phase === id ? '' : id, reason: '' })}>
+          <button class="counter ${tone(id)}"
+            aria-pressed=${this.#query.phase === id && !this.#query.reason}
+            @click=${() => this.#togglePhase(id)}>
             <span class="figure">${number(count)}</span><span>${title}</span>
-            <svg class="share" viewBox="0 0 100 1" preserveAspectRatio="none" aria-hidden="true"><rect class=${id ? tone(id) : 'done'} width=${id && all ? (100 * count) / all : 0} height="1"></rect></svg>
+            <svg class="share" viewBox="0 0 100 1" preserveAspectRatio="none"
+              aria-hidden="true"><rect class=${id ? tone(id) : 'done'}
+              width=${id && all ? (100 * count) / all : 0} height="1"></rect></svg>
           </button>`,
         )}
       </div>
-      <dl class="travel">
+      <dl class="transfer">
         <div><dt>Transferred</dt><dd>${total ? bytes({ done, total }) : '–'}</dd></div>
         <div><dt>Throughput</dt><dd>${rate ? `${size(rate)}/s` : '–'}</dd></div>
-        <div><dt>Time left</dt><dd>${timeLeft(this.#deployment.state, done, total, awaited, rate)}</dd></div>
-        <div class="awaited"><dt>Waits for</dt><dd>${this.#isUnsettled && busy.length ? someNames(busy) : '–'}</dd></div>
-        <div class="awaited"><dt>Offline</dt><dd>${this.#isUnsettled && offline.length ? html`${someNames(offline)}: ${offline.length === 1 ? 'goes' : 'go'} on when back` : '–'}</dd></div>
+        <div><dt>Time left</dt><dd>${timeLeft(
+          this.#deployment.state,
+          done,
+          total,
+          awaitedBytes,
+          rate,
+        )}</dd></div>
+        <div class="robot-list"><dt>Waiting for</dt><dd>${
+          this.#isUnsettled && busy.length ? firstNames(busy) : '–'
+        }</dd></div>
+        <div class="robot-list"><dt>Offline</dt><dd>${
+          this.#isUnsettled && offline.length
+            ? html`${firstNames(offline)}:
+                ${offline.length === 1 ? 'continues' : 'continue'} when back online`
+            : '–'
+        }</dd></div>
       </dl>`;
   }
 
-  /** Chooses the robots to show, unless that was done a moment ago. */
-  #choose() {
-    if (performance.now() - this.#shownAt < ORDER_PAUSE_MS) return;
-    this.#shownAt = performance.now();
-    const { phase, reason, q } = this.#place;
+  /** Updates the filtered rows, unless that was done a moment ago. */
+  #filter() {
+    if (performance.now() - this.#filteredAt < FILTER_PAUSE_MS) return;
+    this.#filteredAt = performance.now();
+    const { phase, reason, q } = this.#query;
     const text = q.toLowerCase();
-    this.#shown = [...this.#parts.all.values()]
+    this.#filtered = [...this.#assignments.all.values()]
       .filter(
-        (part) =>
-          (!phase || part.phase === phase) &&
-          (!reason || reasonOf(part) === reason) &&
-          (!text || part.name.toLowerCase().includes(text)),
+        (assignment) =>
+          (!phase || assignment.phase === phase) &&
+          (!reason || reasonOf(assignment) === reason) &&
+          (!text || assignment.name.toLowerCase().includes(text)),
       )
       .map(({ robot }) => robot);
   }
 
   #table(now) {
-    const { all } = this.#parts;
-    const keys = this.#shown;
+    const { all } = this.#assignments;
+    const keys = this.#filtered;
     const height = isNarrow ? NARROW_ROW : ROW;
-    const { start, end } = this.#rows.sight(
+    const { start, end } = this.#list.visibleRange(
       keys,
-      (robot) => height + (robot === this.#place.robot ? this.#detailHeight : 0),
-      `${height} ${this.#place.robot} ${this.#detailHeight}`,
+      (robot) => height + (robot === this.#query.robot ? this.#detailHeight : 0),
+      `${height} ${this.#query.robot} ${this.#detailHeight}`,
     );
     const isAll = keys.length === all.size;
     return html`
       <header>
-        <h2 id="parts">Robots <span class="count">${isAll ? number(all.size) : `${number(keys.length)} of ${number(all.size)}`}</span></h2>
-        <input type="search" placeholder="Search" aria-label="Search its robots" aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${this.#place.q} @input=${({ currentTarget }) => this.#look({ q: currentTarget.value })}>
+        <h2 id="robots">Robots <span class="count">${
+          isAll ? number(all.size) : `${number(keys.length)} of ${number(all.size)}`
+        }</span></h2>
+        <input type="search" placeholder="Search" aria-label="Search robots"
+          aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${this.#query.q}
+          @input=${({ currentTarget }) => this.#setQuery({ q: currentTarget.value })}>
       </header>
-      <div class="table parts-table" role="grid" aria-label="Robots of this deployment" aria-rowcount=${keys.length + 1}>
-        <div class="row head" role="row" aria-rowindex="1">${['Robot', 'State', 'Phase', '', 'Phases', 'Took'].map((title, index) => html`<span role="columnheader">${title || html`<span class="unseen">${index === 3 ? 'What is known' : ''}</span>`}</span>`)}</div>
-        <div class="rows" role="rowgroup"><div class="sight" role="presentation">${repeat(
+      <div class="table assignments-table" role="grid" aria-label="Robots of this deployment"
+        aria-rowcount=${keys.length + 1}>
+        <div class="row head" role="row" aria-rowindex="1">${HEADS.map(
+          (title) => html`<span role="columnheader">${title}</span>`,
+        )}</div>
+        <div class="rows" role="rowgroup"><div class="rendered" role="presentation">${repeat(
           keys.slice(start, end),
           (robot) => robot,
           (robot, index) => this.#row(all.get(robot), start + index, now),
         )}</div></div>
       </div>
-      ${keys.length ? nothing : html`<p class="empty quiet">No robot is like that. <button class="plain link" @click=${() => this.#look({ phase: '', reason: '', q: '' })}>Show all</button></p>`}`;
+      ${
+        keys.length
+          ? nothing
+          : html`<p class="empty quiet">No robots match this filter.
+              <button class="plain link"
+                @click=${() => this.#setQuery({ phase: '', reason: '', q: '' })}
+                >Clear filter</button></p>`
+      }`;
   }
 
-  #row(part, index, now) {
-    const { robot, name, timeline } = part;
-    const all = steps(timeline, this.#deployment.kind, now);
-    const took = tookInAll(all);
-    const isOpen = robot === this.#place.robot;
-    const toggle = () => this.#look({ robot: isOpen ? '' : robot });
+  #row(assignment, index, now) {
+    const { robot, name, timeline } = assignment;
+    const all = timelineSteps(timeline, this.#deployment.kind, now);
+    const took = totalDuration(all);
+    const isOpen = robot === this.#query.robot;
+    const toggle = () => this.#setQuery({ robot: isOpen ? '' : robot });
     return html`
-      <div class="row ${isOpen ? 'is-open' : ''}" role="row" tabindex=${this.#cursor.tabindex(robot, index)} aria-rowindex=${index + 2} data-key=${robot} data-part=${name} @focusin=${() => (this.#cursor.current = robot)}>
-        <span class="cell name" role="gridcell"><a href=${at(['robots', name])}>${name}</a></span>
-        <span class="cell state" role="gridcell">${robotState(part)}</span>
-        <span class="cell phase-cell" role="gridcell">${phaseSign(part.phase)}</span>
-        <span class="cell note" role="gridcell">${note(part, this.#deployment)}</span>
-        <span class="cell times" role="gridcell">${strip(all)}</span>
-        <span class="cell took quiet" role="gridcell"><button class="plain" aria-expanded=${isOpen} @click=${toggle}><span class="unseen">Phases of ${name}: </span>${took ? duration(took) : '–'} <span aria-hidden="true">${isOpen ? '▾' : '▸'}</span></button></span>
-        ${isOpen ? html`<div class="detail" role="gridcell">${this.#detail(part, all)}</div>` : nothing}
+      <div class="row ${isOpen ? 'is-open' : ''}" role="row"
+        tabindex=${this.#cursor.tabindex(robot, index)} aria-rowindex=${index + 2}
+        data-key=${robot} data-assignment=${name}
+        @focusin=${() => (this.#cursor.current = robot)}>
+        <span class="cell name" role="gridcell"><a
+          href=${hrefTo(['robots', name])}>${name}</a></span>
+        <span class="cell state" role="gridcell">${robotState(assignment)}</span>
+        <span class="cell phase-cell" role="gridcell">${phaseBadge(assignment.phase)}</span>
+        <span class="cell note" role="gridcell">${note(assignment, this.#deployment)}</span>
+        <span class="cell timeline" role="gridcell">${timelineBar(all)}</span>
+        <span class="cell duration quiet" role="gridcell"><button class="plain"
+          aria-expanded=${isOpen} @click=${toggle}><span
+          class="visually-hidden">Phases of ${name}: </span>${took ? duration(took) : '–'} <span
+          aria-hidden="true">${isOpen ? '▾' : '▸'}</span></button></span>
+        ${
+          isOpen
+            ? html`<div class="detail" role="gridcell">${this.#detail(assignment, all)}</div>`
+            : nothing
+        }
       </div>`;
   }
 
@@ -367,120 +481,149 @@ export class DeploymentView {
       package: { name: task },
     } = this.#deployment;
     return html`
-      ${failure ? html`<p class="bad whole-text">${words(failure.code)}: ${failure.text}</p>` : nothing}
-      ${list(all)}
+      ${
+        failure
+          ? html`<p class="bad full-text">${words(failure.code)}: ${failure.text}</p>`
+          : nothing
+      }
+      ${timelineList(all)}
       <p class="quiet">
-        ${delivery ? html`${words(delivery.mechanism)}${delivery.rule === 'ordered' ? ', as it was ordered' : ` by rule “${delivery.rule}”: ${delivery.because}`}` : 'Nothing has travelled yet'}${attempts > 1 ? ` · ${number(attempts)} tries` : ''}${newer ? html` · superseded by <a href=${at(['deployments', newer])}>${this.#versionOf(newer)}</a>` : nothing}
-        · <a href=${at(['robots', name, 'logs'], { task })}>Its log</a>
+        ${delivery ? deliveryText(delivery) : 'No data transferred yet'}${
+          attempts > 1 ? ` · ${number(attempts)} attempts` : ''
+        }${
+          newer
+            ? html` · superseded by
+                <a href=${hrefTo(['deployments', newer])}>${this.#versionOf(newer)}</a>`
+            : nothing
+        }
+        · <a href=${hrefTo(['robots', name, 'logs'], { task })}>Log</a>
       </p>`;
   }
 
-  drawn() {
-    this.#rows.place();
-    this.#cursor.drawn();
-    // How high an open row is depends on its texts: it is looked up, and the rows below make room.
-    const height = document.querySelector('.parts-table .detail')?.offsetHeight ?? 0;
+  afterDraw() {
+    this.#list.applyLayout();
+    this.#cursor.afterDraw();
+    // The height of an expanded row depends on its texts, so it is measured and the list is laid
+    // out again.
+    const height = document.querySelector('.assignments-table .detail')?.offsetHeight ?? 0;
     if (height === this.#detailHeight) return;
     change(() => (this.#detailHeight = height));
   }
 
-  key(event) {
-    const { phase, reason, q, robot } = this.#place;
+  onKey(event) {
+    const { phase, reason, q, robot } = this.#query;
     if (event.key === 'Escape' && (phase || reason || q || robot)) {
-      this.#look(robot ? { robot: '' } : { phase: '', reason: '', q: '' });
+      this.#setQuery(robot ? { robot: '' } : { phase: '', reason: '', q: '' });
       return true;
     }
-    return this.#cursor.key(event, this.#shown);
+    return this.#cursor.onKey(event, this.#filtered);
   }
 
-  // Acting.
+  // Actions
 
-  #askRetry(parts, reason = null) {
+  #openRetryDialog(assignments, reason = null) {
     const { name, version } = this.#deployment.package;
-    const ids = new Set(parts.filter(canRetry).map(({ robot }) => robot));
-    // A reason without a code is how they ended, which the server does not choose by.
-    const code = reason && parts[0].failure?.code;
-    // Named one by one: whoever fails while the question is open was not in it.
-    const selector = idsOf(ids);
-    const key = newKey();
-    open({
+    const ids = new Set(assignments.filter(canRetry).map(({ robot }) => robot));
+    // A reason without a code is a phase, which the server cannot select by.
+    const code = reason && assignments[0].failure?.code;
+    // The ids are listed: robots that fail while the dialog is open are not included.
+    const selector = selectorOf(ids);
+    const key = newIdempotencyKey();
+    openDialog({
       title: `Retry on ${plural(ids.size, 'robot')}`,
-      action: 'Retry',
+      submitLabel: 'Retry',
       body: () =>
-        html`${names(ids, this.app.fleet)}<p>${name}@${version} is ordered once more in the same way, for those that ended badly${code ? html` with “${words(code)}”` : nothing} and have had no newer order since.</p>`,
-      act: async () => {
-        const { id } = await order(
+        html`${robotNames(ids, this.app.fleet)}<p>Deploys ${name}@${version} again, with the same
+          options, to robots where it
+          ${code ? `failed with “${words(code)}”` : 'failed or was cancelled'}
+          and that have no newer deployment.</p>`,
+      onSubmit: async () => {
+        const { id } = await postIdempotent(
           `/deployments/${this.id}/retry`,
           { code: code || undefined, selector },
           key,
         );
-        go(['deployments', id]);
+        navigate(['deployments', id]);
       },
     });
   }
 
-  #askCancel() {
+  #openCancelDialog() {
     const { name, version } = this.#deployment.package;
-    open({
+    openDialog({
       title: `Cancel ${name}@${version}?`,
-      action: 'Cancel the deployment',
-      dismissal: 'Let it go on',
+      submitLabel: 'Cancel deployment',
+      cancelLabel: 'Keep deployment',
       isDangerous: true,
       body: () =>
-        html`<p>Robots that are not done yet go back to what they had before. A service that runs already goes on.</p>`,
-      act: async () => {
+        html`<p>Robots that are not done return to their previous version. Services that are already
+          running keep running.</p>`,
+      onSubmit: async () => {
         await post(`/deployments/${this.id}/cancel`);
-        tell(`${name}@${version} is cancelled.`);
+        notify(`${name}@${version} cancelled.`);
         this.#fetch();
       },
     });
   }
 
-  #askResume() {
+  #openResumeDialog() {
     const { name, version } = this.#deployment.package;
-    open({
+    openDialog({
       title: `Resume ${name}@${version}?`,
-      action: 'Resume',
-      dismissal: 'Leave it paused',
+      submitLabel: 'Resume',
+      cancelLabel: 'Keep paused',
       body: () =>
-        html`<p>More robots failed than it was told to bear. The failures so far are forgiven, and the next batch begins.</p>`,
-      act: async () => {
+        html`<p>The deployment paused because too many robots failed. Resuming resets the failure
+          count and starts the next batch.</p>`,
+      onSubmit: async () => {
         await post(`/deployments/${this.id}/resume`);
-        tell(`${name}@${version} goes on.`);
+        notify(`${name}@${version} resumed.`);
         this.#fetch();
       },
     });
   }
 }
 
-/** Only of robots that are there: of the others nobody knows. */
-function timeLeft(state, done, total, awaited, rate) {
-  if (state === 'paused') return 'paused: too many failed';
+/** The time left for robots that are online; it is unknown for the others. */
+function timeLeft(state, done, total, awaitedBytes, rate) {
+  if (state === 'paused') return 'paused: too many failures';
   if (state === 'cancelled') return '–';
-  if (awaited) return rate ? `about ${duration((1000 * awaited) / rate)}` : 'not known yet';
-  return done < total ? 'the rest is offline or waits' : '–';
+  if (awaitedBytes) return rate ? `about ${duration((1000 * awaitedBytes) / rate)}` : 'unknown';
+  return done < total ? 'remaining robots are offline or waiting' : '–';
 }
 
-/** The names of the first robots, each a link, and how many more there are. */
-function someNames(parts) {
-  const rest = parts.length - AWAITED_NAMES;
-  return html`${parts.slice(0, AWAITED_NAMES).map(({ name }, index) => html`${index ? ', ' : ''}<a href=${at(['robots', name])}>${name}</a>`)}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
+/** The mechanism and the rule that chose it. */
+const deliveryText = ({ mechanism, rule, because }) =>
+  words(mechanism) + (rule === 'ordered' ? ', as ordered' : ` by rule “${rule}”: ${because}`);
+
+/** Links to the first robots, and the number of the others. */
+function firstNames(assignments) {
+  const rest = assignments.length - AWAITED_NAMES;
+  const links = assignments
+    .slice(0, AWAITED_NAMES)
+    .map(
+      ({ name }, index) =>
+        html`${index ? ', ' : ''}<a href=${hrefTo(['robots', name])}>${name}</a>`,
+    );
+  return html`${links}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
 }
 
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 
-/** What else is known of a robot's part: how far, why not, or what it waits for. */
-function note(part, { package: { name } }) {
-  const { failure, degraded, progress, phase, released } = part;
+/** Details of a robot's assignment: the progress, the failure, or the reason for waiting. */
+function note(assignment, { package: { name } }) {
+  const { failure, degraded, progress, phase, released } = assignment;
   if (failure && tone(phase) !== 'done')
-    return html`<span class=${tone(phase) === 'bad' ? 'bad' : 'quiet'} title=${failure.text}>${words(failure.code)}<span class="quiet">: ${failure.text}</span></span>`;
+    return html`<span class=${tone(phase) === 'bad' ? 'bad' : 'quiet'} title=${failure.text}
+      >${words(failure.code)}<span class="quiet">: ${failure.text}</span></span>`;
   const bar = progressBar({ task: name, phase, progress });
   if (bar) return bar;
   if (degraded)
-    return html`<span class="bad" title=${degraded.text}>▲ degraded: ${words(degraded.code)}</span>`;
-  if (['assigned', 'deferred'].includes(phase) && !part.online)
-    return html`<span class="quiet">begins when the robot is back</span>`;
+    return html`<span class="bad" title=${degraded.text}
+      >▲ degraded: ${words(degraded.code)}</span>`;
+  if (['assigned', 'deferred'].includes(phase) && !assignment.online)
+    return html`<span class="quiet">starts when the robot is back online</span>`;
   if (!released && phase === 'assigned')
-    return html`<span class="quiet">waits for its batch</span>`;
+    return html`<span class="quiet">waiting for its batch</span>`;
   return nothing;
 }

@@ -1,79 +1,77 @@
-// One question at a time, in front of everything else. Whoever asks says what the form holds and
-// what to do with it.
+// The modal dialog. There is one at a time; the caller defines its form and what a submission does.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { SignedOut } from './api.js';
 import { change } from './frame.js';
-import { complain } from './notice.js';
+import { notifyError } from './notice.js';
 
 let current = null;
-/** The question that has the focus. */
-let settled = null;
+/** The dialog that has received the focus. */
+let focused = null;
 /**
- * How often the browser has yet to say that its dialog was closed by us, which it does late: the
- * next question may be open by then.
+ * The number of `close` events still expected for dialogs that were closed by script. The browser
+ * sends them late: the next dialog may be open by then.
  */
-let ownClosings = 0;
+let pendingCloseEvents = 0;
 /**
- * Whether the pointer went down beside the dialog: a click that only ends there has begun within,
- * as when text is selected.
+ * Whether the pointer was pressed outside the dialog. A click that only ends there has begun
+ * inside, as in a text selection.
  */
-let isPressedBeside = false;
+let isPressedOutside = false;
 
 /**
- * Opens a dialog. `question` has a `title`, `body()` (a template, drawn again each frame), the
- * `action`'s words, whether it `isDangerous`, the words to leave it by if `Cancel` would be unclear
- * (`dismissal`), and `act(fields)`, which gets what the form holds and may throw: the dialog stays
- * open and says why, unless the error `isSaid` already. Without an `action` there is only something
- * to read. What is shown but once `isSecret`: only buttons close it, one of them with the words of
- * `dismissal`. Answers the question, by which `isOpen` knows it.
+ * Opens a dialog. `options` has a `title`, a `body()` (a template, drawn every frame), the
+ * `submitLabel`, whether it `isDangerous`, the `cancelLabel` if `Cancel` would be unclear, and
+ * `onSubmit(fields)`, which gets the form fields and may throw: then the dialog stays open and
+ * shows the error, unless the error `isShown` already. Without a `submitLabel` the dialog is only
+ * to read. A dialog that `isSecret` shows a value once: only its buttons close it. Returns the
+ * dialog, for `isCurrentDialog`.
  */
-export function open(question) {
-  const asked = { ...question, problem: null, isBusy: false };
-  change(() => (current = asked));
-  return asked;
+export function openDialog(options) {
+  const dialog = { ...options, problem: null, isBusy: false };
+  change(() => (current = dialog));
+  return dialog;
 }
 
-/** Whether anything is asked. */
-export const isAsking = () => current !== null;
+export const isDialogOpen = () => current !== null;
 
-/** Whether it is still this question that is asked. */
-export const isOpen = (question) => current === question;
+/** Whether this dialog is still the open one. */
+export const isCurrentDialog = (dialog) => current === dialog;
 
-/** At once: the next key is the view's. */
-export function close() {
+/** Closes the dialog synchronously, so that the next key goes to the view. */
+export function closeDialog() {
   change(() => (current = null));
   const element = document.getElementById('dialog');
   if (!element?.open) return;
-  ownClosings += 1;
+  pendingCloseEvents += 1;
   element.close();
 }
 
-/** The browser's dialog was closed: by us, or by a gesture that is the browser's. */
-function closed() {
-  if (ownClosings > 0) ownClosings -= 1;
-  // The next drawing opens it again.
+/** The browser's dialog was closed, by script or by a gesture such as back on a phone. */
+function onClose() {
+  if (pendingCloseEvents > 0) pendingCloseEvents -= 1;
+  // The next drawing reopens it.
   else if (current?.isSecret) change();
-  else close();
+  else closeDialog();
 }
 
 /**
- * Whether a key is the question's. Of Escape the browser would say late that it closed the dialog,
- * and keys in between would be nobody's.
+ * Returns whether the dialog handles the key. Escape is handled here: the browser reports the
+ * closing late, and keys in between would get lost.
  */
-export function takesKey(event) {
+export function handleDialogKey(event) {
   if (!current) return false;
   if (event.key === 'Escape') {
     event.preventDefault();
-    if (!current.isSecret) close();
+    if (!current.isSecret) closeDialog();
   }
   return true;
 }
 
 async function submit(event) {
   event.preventDefault();
-  const question = current;
-  if (question.isBusy) return;
+  const dialog = current;
+  if (dialog.isBusy) return;
   const form = new FormData(event.currentTarget);
   const fields = Object.fromEntries(
     [...new Set(form.keys())].map((name) => [
@@ -81,37 +79,38 @@ async function submit(event) {
       form.getAll(name).length > 1 ? form.getAll(name) : form.get(name),
     ]),
   );
-  change(() => Object.assign(question, { isBusy: true, problem: null }));
+  change(() => Object.assign(dialog, { isBusy: true, problem: null }));
   try {
-    await question.act(fields);
-    if (current === question) close();
+    await dialog.onSubmit(fields);
+    if (current === dialog) closeDialog();
   } catch (error) {
-    if (error instanceof SignedOut) close();
-    else if (current !== question) complain(error.message);
+    if (error instanceof SignedOut) closeDialog();
+    else if (current !== dialog) notifyError(error.message);
     else
       change(() =>
-        Object.assign(question, { isBusy: false, problem: error.isSaid ? null : error.message }),
+        Object.assign(dialog, { isBusy: false, problem: error.isShown ? null : error.message }),
       );
   }
 }
 
-const isBeside = ({ target, currentTarget }) => target === currentTarget;
+const isOutside = ({ target, currentTarget }) => target === currentTarget;
 
-/** A click beside the dialog leaves it. */
-function click(event) {
-  if (isBeside(event) && isPressedBeside && !current?.isSecret) close();
+/** A click outside closes the dialog. */
+function onClick(event) {
+  if (isOutside(event) && isPressedOutside && !current?.isSecret) closeDialog();
 }
 
 export const dialogView = () => html`
-  <dialog id="dialog" aria-labelledby="dialog-title" @close=${closed} @pointerdown=${(event) => (isPressedBeside = isBeside(event))} @click=${click}>
+  <dialog id="dialog" aria-labelledby="dialog-title" @close=${onClose}
+    @pointerdown=${(event) => (isPressedOutside = isOutside(event))} @click=${onClick}>
     ${current ? content(current) : nothing}
   </dialog>`;
 
 const content = ({
   title,
   body,
-  action,
-  dismissal = 'Cancel',
+  submitLabel,
+  cancelLabel = 'Cancel',
   isDangerous,
   isSecret,
   isBusy,
@@ -120,26 +119,37 @@ const content = ({
   <form @submit=${submit}>
     <header>
       <h2 id="dialog-title">${title}</h2>
-      <button type="button" class="plain" aria-label="Close" @click=${close}>✕</button>
+      <button type="button" class="plain" aria-label="Close" @click=${closeDialog}>✕</button>
     </header>
     ${body()}
     <p class="bad" role="alert">${problem ? `▲ ${problem}` : ''}</p>
-    ${action ? html`<footer><button type="button" class="quiet-button" @click=${close}>${dismissal}</button><button class=${isDangerous ? 'danger' : 'primary'} ?disabled=${isBusy}>${action}</button></footer>` : nothing}
-    ${isSecret ? html`<footer><button type="button" class="primary" @click=${close}>${dismissal}</button></footer>` : nothing}
+    ${
+      submitLabel
+        ? html`<footer><button type="button" class="quiet-button"
+            @click=${closeDialog}>${cancelLabel}</button><button
+            class=${isDangerous ? 'danger' : 'primary'}
+            ?disabled=${isBusy}>${submitLabel}</button></footer>`
+        : nothing
+    }
+    ${
+      isSecret
+        ? html`<footer><button type="button" class="primary"
+            @click=${closeDialog}>${cancelLabel}</button></footer>`
+        : nothing
+    }
   </form>`;
 
-/** Opens the browser's own dialog for a new question; to be called after each drawing. */
-export function settleDialog() {
+/** Shows the browser dialog of a new dialog and sets its focus. Call this after each drawing. */
+export function syncDialog() {
   const element = document.getElementById('dialog');
   if (!element) return;
   if (current && !element.open) element.showModal();
-  // Not to the button that closes it, which comes first; where there is nothing to fill in, to what
-  // does no harm.
-  if (current && current !== settled)
+  // Focuses the first field, not the close button; without fields, a harmless button.
+  if (current && current !== focused)
     element
       .querySelector(
         'form :is(input, select, textarea):not([readonly]), form :is(footer, .command) button',
       )
       ?.focus();
-  settled = current;
+  focused = current;
 }

@@ -1,5 +1,5 @@
-// The page of the API's description. What is tried out there is sent as whoever is signed in at the
-// page, by its cookie; a token can be given instead.
+// The API documentation page. Its calls are made as the signed-in user, by the session cookie, or
+// with a given token.
 
 const dark = matchMedia('(prefers-color-scheme: dark)');
 const follow = () => document.documentElement.classList.toggle('dark-mode', dark.matches);
@@ -12,6 +12,6 @@ window.SwaggerUIBundle({
   deepLinking: true,
   docExpansion: 'none',
   defaultModelsExpandDepth: 0,
-  // Documents are checked by nobody else.
+  // No external validator.
   validatorUrl: null,
 });

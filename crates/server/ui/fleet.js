@@ -1,13 +1,13 @@
-// What is known of the fleet, and which robots are shown in which order. It draws nothing and asks
-// nobody.
+// The state of the fleet, and the sorted and filtered list of robots. It draws nothing and sends no
+// requests.
 
 import { tone } from './format.js';
 
-// While data streams, rows change places at most this often: a table that dances can't be read.
-const ORDER_PAUSE_MS = 1_000;
+// Minimum interval between sorts, so that rows do not move constantly.
+const SORT_PAUSE_MS = 1_000;
 
-/** What a robot can be counted under, each with the sign it has in words and shapes. */
-export const STANDINGS = [
+/** The statuses that robots are counted by, each with a symbol. */
+export const STATUSES = [
   { id: 'online', title: 'Online', sign: '●' },
   { id: 'offline', title: 'Offline', sign: '○' },
   { id: 'transferring', title: 'Transferring', sign: '↓' },
@@ -15,7 +15,7 @@ export const STANDINGS = [
   { id: 'attention', title: 'Needs attention', sign: '▲' },
 ];
 
-/** The keys robots can be sorted by. Numbers and texts compare as they are. */
+/** The sort keys. */
 const KEYS = {
   id: (robot) => robot.id,
   name: (robot) => natural(robot.name),
@@ -39,7 +39,7 @@ const min = (one, other) => (other < one ? other : one);
 
 const naturals = new Map();
 
-/** A text whose order is that of its words and numbers: `arm2` before `arm10`. */
+/** A sort key in natural order: `arm2` before `arm10`. */
 function natural(text) {
   let key = naturals.get(text);
   if (key === undefined) {
@@ -50,11 +50,11 @@ function natural(text) {
   return key;
 }
 
-// Sorted by task, what needs a look comes first.
+// Tasks that need attention sort first.
 const urgency = ({ phase }) => ({ bad: 0, busy: 1, waiting: 2, done: 3, gone: 4 })[tone(phase)];
 
-/** Whether it has yet to be approved: until then it gets nothing of what is ordered. */
-export const isWaiting = (robot) =>
+/** Whether the robot awaits approval: until then it gets no orders. */
+export const awaitsApproval = (robot) =>
   Boolean(robot?.conditions.some(({ code }) => code === 'awaits_approval'));
 
 export const labelsOf = ({ labels }) =>
@@ -62,11 +62,11 @@ export const labelsOf = ({ labels }) =>
 
 const versionsOf = ({ tasks }) => tasks.map(({ task, version }) => `${task}@${version}`);
 
-/** What is meant exactly where it is written whole, by the sign in it. */
-const NAMED = { '=': labelsOf, '@': versionsOf };
+/** Search terms with these characters match exactly. */
+const EXACT_TERMS = { '=': labelsOf, '@': versionsOf };
 
-/** Under what a robot is counted. */
-function standingsOf({ online, tasks, conditions }) {
+/** The statuses that apply to a robot. */
+function statusesOf({ online, tasks, conditions }) {
   const isFailed = tasks.some(({ phase }) => tone(phase) === 'bad');
   return {
     online,
@@ -79,24 +79,24 @@ function standingsOf({ online, tasks, conditions }) {
 
 export class Fleet {
   robots = new Map();
-  /** The newest first: all, or those down to `older`. */
+  /** Newest first: all, or those down to `older`. */
   deployments = [];
-  /** What `before` is for the deployments that come after these; absent: there are no more. */
+  /** The `before` parameter of the next older page; undefined if there are no more. */
   older = undefined;
   /** The ids of the robots to show, sorted and filtered. */
   shown = [];
-  /** How many robots there are of each standing. */
-  counts = Object.fromEntries(STANDINGS.map(({ id }) => [id, 0]));
-  /** How often a robot came to need more lines or fewer. */
-  reflows = 0;
-  /** What is shown: `text` that has to occur, a `standing`, and the order. */
-  search = { text: '', standing: '', sort: 'name', isDescending: false };
-  /** Every list was there once. */
+  /** Number of robots by status. */
+  counts = Object.fromEntries(STATUSES.map(({ id }) => [id, 0]));
+  /** Number of changes of row heights. */
+  heightChanges = 0;
+  /** The filter (`text`, `status`) and the order. */
+  search = { text: '', status: '', sort: 'name', isDescending: false };
+  /** Whether all lists have been loaded once. */
   isLoaded = false;
-  #standings = new Map();
+  #statuses = new Map();
   #texts = new WeakMap();
-  #isUnordered = false;
-  #orderedAt = -Infinity;
+  #isUnsorted = false;
+  #sortedAt = -Infinity;
 
   robot(idOrName) {
     if (this.robots.has(idOrName)) return this.robots.get(idOrName);
@@ -108,17 +108,17 @@ export class Fleet {
     return this.deployments.find((deployment) => deployment.id === id);
   }
 
-  /** Takes robots in, as they are now. */
+  /** Adds or replaces robots. */
   add(robots) {
     for (const robot of robots) this.#replaceRobot(robot.id, robot);
   }
 
-  /** Forgets all robots but these. */
-  keep(ids) {
+  /** Drops all robots but these. */
+  retain(ids) {
     for (const id of this.robots.keys()) if (!ids.has(id)) this.#replaceRobot(id, null);
   }
 
-  /** Takes one event in. Answers whether the lists have to be fetched again. */
+  /** Applies an event. Returns whether the lists have to be fetched again. */
   apply(event) {
     switch (event.type) {
       case 'robot':
@@ -137,20 +137,20 @@ export class Fleet {
 
   #replaceRobot(id, robot) {
     const old = this.robots.get(id);
-    const before = this.#standings.get(id);
-    const after = robot && standingsOf(robot);
+    const before = this.#statuses.get(id);
+    const after = robot && statusesOf(robot);
     for (const name of Object.keys(this.counts))
       this.counts[name] += Boolean(after?.[name]) - Boolean(before?.[name]);
     if (robot) {
       this.robots.set(id, robot);
-      this.#standings.set(id, after);
+      this.#statuses.set(id, after);
     } else {
       this.robots.delete(id);
-      this.#standings.delete(id);
+      this.#statuses.delete(id);
     }
-    if (old?.tasks.length !== robot?.tasks.length) this.reflows += 1;
-    // Most news leave a robot where it is, and ten thousand take a while to sort.
-    const { text, standing, sort } = this.search;
+    if (old?.tasks.length !== robot?.tasks.length) this.heightChanges += 1;
+    // Most events leave a robot at its position, and sorting ten thousand takes a while.
+    const { text, status, sort } = this.search;
     const key = KEYS[sort];
     const isInPlace =
       old &&
@@ -158,14 +158,12 @@ export class Fleet {
       !text &&
       old.name === robot.name &&
       key(old) === key(robot) &&
-      (!standing || before[standing] === after[standing]);
-    if (!isInPlace) this.#isUnordered = true;
+      (!status || before[status] === after[status]);
+    if (!isInPlace) this.#isUnsorted = true;
   }
 
-  /**
-   * Takes in the newest deployments, as the server lists them. Older ones that were asked for stay.
-   */
-  renew({ deployments, next }) {
+  /** Replaces the newest deployments and keeps older pages that were loaded. */
+  setDeployments({ deployments, next }) {
     const kept = next
       ? this.deployments.slice(this.deployments.findIndex(({ id }) => id === next) + 1 || Infinity)
       : [];
@@ -173,8 +171,8 @@ export class Fleet {
     this.deployments = [...deployments, ...kept];
   }
 
-  /** Takes in deployments that are older than all that are here. */
-  extend({ deployments, next }) {
+  /** Appends a page of older deployments. */
+  addOlder({ deployments, next }) {
     this.deployments = [
       ...this.deployments,
       ...deployments.filter(({ id }) => !this.deployment(id)),
@@ -192,46 +190,46 @@ export class Fleet {
     else if (!this.older) this.deployments.push(deployment);
   }
 
-  /** Shows what `search` says from now on. */
-  look(search) {
+  /** Changes the filter or the order. */
+  setSearch(search) {
     this.search = { ...this.search, ...search };
     if (!KEYS[this.search.sort]) this.search.sort = 'name';
-    if (!(this.search.standing in this.counts)) this.search.standing = '';
-    this.order();
+    if (!(this.search.status in this.counts)) this.search.status = '';
+    this.sort();
   }
 
-  /** Puts the rows in order again, if they are not and were left in peace for long enough. */
-  settle(now) {
-    if (this.#isUnordered && now - this.#orderedAt >= ORDER_PAUSE_MS) this.order(now);
+  /** Sorts if robots have moved and the last sort was long enough ago. */
+  sortIfDue(now) {
+    if (this.#isUnsorted && now - this.#sortedAt >= SORT_PAUSE_MS) this.sort(now);
   }
 
-  order(now = performance.now()) {
-    const { text, standing, sort, isDescending } = this.search;
-    const tests = text
+  sort(now = performance.now()) {
+    const { text, status, sort, isDescending } = this.search;
+    const matchers = text
       .toLowerCase()
       .split(/\s+/)
       .filter(Boolean)
-      .map((word) => this.#testOf(word));
+      .map((word) => this.#matcherOf(word));
     const rows = [];
     for (const robot of this.robots.values()) {
-      if (standing && !this.#standings.get(robot.id)[standing]) continue;
-      if (!tests.every((isLike) => isLike(robot))) continue;
+      if (status && !this.#statuses.get(robot.id)[status]) continue;
+      if (!matchers.every((matches) => matches(robot))) continue;
       rows.push({ id: robot.id, key: KEYS[sort](robot), name: KEYS.name(robot) });
     }
     const sign = isDescending ? -1 : 1;
     rows.sort((one, other) => sign * compare(one.key, other.key) || compare(one.name, other.name));
     this.shown = rows.map(({ id }) => id);
-    this.#isUnordered = false;
-    this.#orderedAt = now;
+    this.#isUnsorted = false;
+    this.#sortedAt = now;
   }
 
   /**
-   * Whether a robot is found by this word. `key=value` means that label and no longer one,
-   * `name@version` that version, where there are such labels and tasks; all else may occur anywhere
-   * in what a robot is known by.
+   * Returns a predicate for a search term. `key=value` and `name@version` match a label or a
+   * version exactly if such labels or tasks exist; other terms match anywhere in the text of a
+   * robot.
    */
-  #testOf(word) {
-    for (const [sign, namesOf] of Object.entries(NAMED)) {
+  #matcherOf(word) {
+    for (const [sign, namesOf] of Object.entries(EXACT_TERMS)) {
       const [name, value] = word.split(sign, 2);
       const isName = (robot) =>
         namesOf(robot).some((one) => one.toLowerCase().startsWith(`${name}${sign}`));
@@ -241,7 +239,7 @@ export class Fleet {
     return (robot) => this.#textOf(robot).includes(word);
   }
 
-  /** A robot's text is made once. */
+  /** The text of a robot, computed once. */
   #textOf(robot) {
     let text = this.#texts.get(robot);
     if (text === undefined) {
@@ -283,10 +281,10 @@ function textOf(robot) {
     .toLowerCase();
 }
 
-/** Robots that a person has chosen, and how an order names them. */
+/** The selected robots. */
 export class Selection {
   ids = new Set();
-  /** Where a range begins. */
+  /** Start of a range selection. */
   #anchor = null;
 
   has(id) {
@@ -297,7 +295,10 @@ export class Selection {
     return this.ids.size;
   }
 
-  /** Chooses one robot or lets it go; with `isRange` all that are shown between it and the last. */
+  /**
+   * Toggles a robot; with `isRange`, selects all shown robots between the previous one and this
+   * one.
+   */
   toggle(id, shown, isRange = false) {
     const [from, to] = [shown.indexOf(this.#anchor), shown.indexOf(id)].sort(
       (one, other) => one - other,
@@ -307,7 +308,7 @@ export class Selection {
     this.#anchor = id;
   }
 
-  /** Chooses all of these, or none of them if all are chosen already. */
+  /** Selects these robots, or deselects them if all are selected. */
   toggleAll(ids) {
     const isAll = ids.every((id) => this.ids.has(id));
     for (const id of ids) isAll ? this.ids.delete(id) : this.ids.add(id);
@@ -317,14 +318,11 @@ export class Selection {
     this.ids.clear();
   }
 
-  /** Lets go whoever is no longer there. */
-  keep(robots) {
+  /** Deselects robots that no longer exist. */
+  retain(robots) {
     for (const id of this.ids) if (!robots.has(id)) this.ids.delete(id);
   }
 }
 
-/**
- * A selector that names each of them: by what they have in common it would also mean robots that
- * were never shown.
- */
-export const idsOf = (ids) => [...ids].join(',');
+/** A selector that lists the ids: a label would also match robots that were never shown. */
+export const selectorOf = (ids) => [...ids].join(',');

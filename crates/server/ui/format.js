@@ -1,4 +1,4 @@
-// Numbers, times and names of states as people read them.
+// Numbers, times and state names in readable form.
 
 const UNITS = [
   ['d', 86_400],
@@ -7,30 +7,28 @@ const UNITS = [
   ['s', 1],
 ];
 
-/** `12 s ago`; short, because a column of it is read at a glance. */
+/** `12 s ago`: short, since it fills table columns. */
 export function ago(then, now) {
   const seconds = Math.floor((now - then) / 1000);
   const unit = UNITS.find(([, length]) => seconds >= length);
   return unit ? `${Math.floor(seconds / unit[1])} ${unit[0]} ago` : 'now';
 }
 
-/** A robot may say a time that is none. */
+/** Robots may report times out of range. */
 const orUnknown = (write) => (ms) => (Math.abs(ms) <= 8.64e15 ? write(ms) : '?');
 
-/**
- * A way to write moments in milliseconds, made once: that takes longer than drawing a whole row.
- */
+/** Formatters are created once: that takes longer than drawing a row. */
 const written = (locale, options) => orUnknown(new Intl.DateTimeFormat(locale, options).format);
 
 export const moment = written(undefined, { dateStyle: 'medium', timeStyle: 'medium' });
 
-/** The moment's time of day. */
+/** The time of day. */
 export const clock = written(undefined, { timeStyle: 'medium' });
 
 /** `09:05`. */
 export const minute = written(undefined, { hour: '2-digit', minute: '2-digit' });
 
-/** `09:05:01.250`, for what comes many times a second. */
+/** `09:05:01.250`, for log lines. */
 export const instant = written('en-GB', {
   hour: '2-digit',
   minute: '2-digit',
@@ -50,28 +48,30 @@ export const plural = (count, noun) => `${number(count)} ${noun}${count === 1 ? 
 /** `rolled_back` as `rolled back`. */
 export const words = (code) => code.replaceAll('_', ' ');
 
+/** The units of sizes, as in the server's settings: a KB is 1,024 bytes. */
+export const SIZES = [
+  ['GB', 2 ** 30],
+  ['MB', 2 ** 20],
+  ['KB', 2 ** 10],
+  ['B', 1],
+];
+
+const unitOf = (bytes) => SIZES.find(([, length]) => bytes >= length) ?? SIZES.at(-1);
+
 /** `12.4 MB`. */
 export function size(bytes) {
-  const [unit, length] = [
-    ['GB', 1e9],
-    ['MB', 1e6],
-    ['kB', 1e3],
-  ].find(([, length]) => bytes >= length) ?? ['B', 1];
+  const [unit, length] = unitOf(bytes);
   return `${(bytes / length).toFixed(length > 1 ? 1 : 0)} ${unit}`;
 }
 
-/** `12.4 of 48.0 MB`, both in the unit of the whole, so that the text keeps its width. */
+/** `12.4 of 48.0 MB`, both in the unit of the total, so that the width is stable. */
 export function bytes({ done, total }) {
-  const [unit, size] = [
-    ['GB', 1e9],
-    ['MB', 1e6],
-    ['kB', 1e3],
-  ].find(([, size]) => total >= size) ?? ['B', 1];
-  const shown = (value) => (value / size).toFixed(size > 1 ? 1 : 0);
+  const [unit, length] = unitOf(total);
+  const shown = (value) => (value / length).toFixed(length > 1 ? 1 : 0);
   return `${shown(done)} of ${shown(total)} ${unit}`;
 }
 
-/** What a phase means for whoever looks: done, busy, waiting, bad or gone. */
+/** The tone of a phase: done, busy, waiting, bad or gone. */
 export function tone(phase) {
   return TONES[phase] ?? 'busy';
 }
@@ -103,5 +103,5 @@ export function duration(ms) {
   return parts.length ? parts.join(' ') : `${(ms / 1000).toFixed(1)} s`;
 }
 
-/** A digest's first characters: enough to tell versions apart. */
-export const short = (digest) => digest.replace(/^sha256:/, '').slice(0, 12);
+/** The first characters of a digest. */
+export const shortDigest = (digest) => digest.replace(/^sha256:/, '').slice(0, 12);

@@ -1,15 +1,14 @@
-// Drawing: whatever changes the state asks for a frame, and there is one drawing per frame, however
-// much has changed.
+// Drawing: every change of state requests a frame, and each frame is drawn once.
 
 let draw = () => {};
 let isDirty = false;
 
-/** Says what draws. It gets the frame's time. */
-export function drawWith(painter) {
+/** Sets the render function. It gets the timestamp of the frame. */
+export function setRenderer(painter) {
   draw = painter;
 }
 
-/** Changes the state and asks for a frame. */
+/** Changes state and requests a frame. */
 export function change(act = () => {}) {
   act();
   if (!isDirty) requestAnimationFrame(paint);

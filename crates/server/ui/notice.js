@@ -1,18 +1,18 @@
-// What was done, said for a moment at the page's lower edge, and read aloud.
+// Notifications at the lower edge of the page, announced to screen readers.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { change } from './frame.js';
 
 const SHOWN_MS = 6_000;
-// What went wrong stays until somebody has read it.
+// Errors stay until they are closed.
 let current = null;
 let timer;
 
-/** Says that something was done. `link`, if given, is `[address, text]`. */
-export const tell = (text, link) => show({ text, link }, SHOWN_MS);
+/** Shows a success message. `link`, if given, is `[address, text]`. */
+export const notify = (text, link) => show({ text, link }, SHOWN_MS);
 
-/** Says that something failed, until it is closed. */
-export const complain = (text) => show({ text, isBad: true });
+/** Shows an error until it is closed. */
+export const notifyError = (text) => show({ text, isBad: true });
 
 function show(notice, duration) {
   clearTimeout(timer);
@@ -20,14 +20,18 @@ function show(notice, duration) {
   if (duration) timer = setTimeout(hide, duration);
 }
 
-/** Shows nothing any more. */
+/** Hides the notification. */
 export const hide = () => change(() => (current = null));
 
 export const noticeView = () => html`
   <div class="notice" role="status">${
     current
       ? html`<p class=${current.isBad ? 'bad' : ''}>${current.isBad ? '▲ ' : ''}${current.text}
-        ${current.link ? html`<a href=${current.link[0]} @click=${hide}>${current.link[1]}</a>` : nothing}
-        <button class="plain" aria-label="Close the notice" @click=${hide}>✕</button></p>`
+        ${
+          current.link
+            ? html`<a href=${current.link[0]} @click=${hide}>${current.link[1]}</a>`
+            : nothing
+        }
+        <button class="plain" aria-label="Close notification" @click=${hide}>✕</button></p>`
       : nothing
   }</div>`;

@@ -1,91 +1,97 @@
-// The order of a package to robots: which package, which robots, how the bytes travel, how
-// carefully.
+// The push dialog: package, robots, delivery and rollout options of a deployment.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
-import { leftOut, names, receivers, whom } from './acts.js';
-import { get, newKey, order, SignedOut } from './api.js';
-import { close, isOpen, open } from './dialog.js';
-import { idsOf, isWaiting, labelsOf } from './fleet.js';
-import { number, plural, short, size, words } from './format.js';
+import { skippedNote, robotNames, approvedIds, robotsText } from './actions.js';
+import { get, newIdempotencyKey, postIdempotent, SignedOut } from './api.js';
+import { closeDialog, isCurrentDialog, openDialog } from './dialog.js';
+import { selectorOf, awaitsApproval, labelsOf } from './fleet.js';
+import { number, plural, shortDigest, size, words } from './format.js';
 import { change } from './frame.js';
-import { tell } from './notice.js';
-import { go } from './router.js';
+import { notify } from './notice.js';
+import { navigate } from './router.js';
 
 const COUNT_PAUSE_MS = 250;
-// An order for more robots than this wants a word of its own, as the command does.
-const ASK_ABOVE = 10;
-// Robots named after the count of those that a selector means.
-const NAMED = 5;
+// Deployments to more robots need a confirmation, as in the command.
+const CONFIRM_ABOVE = 10;
+// Number of matching robots that are named.
+const NAMED_ROBOTS = 5;
 const SHOWN_LABELS = 6;
-// With more packages than this, one types a name instead of looking through a list.
+// With more packages, the form has a text field in place of a list.
 const LISTED_PACKAGES = 12;
 
-/** What is wrong where nobody sees it would stop the form without a word. */
-const UNFOLD = { handleEvent: ({ currentTarget }) => (currentTarget.open = true), capture: true };
+/**
+ * Expands the options if one of them is invalid: the browser cannot show errors of hidden fields.
+ */
+const EXPAND = { handleEvent: ({ currentTarget }) => (currentTarget.open = true), capture: true };
 
-/** Each way for the bytes, in words. */
+/** The delivery mechanisms. */
 const DELIVERIES = [
-  ['adaptive', 'Adaptive', 'The server’s rules decide, robot by robot.'],
-  ['push-pull', 'Push-pull', 'Announced over MQTT, then pulled over HTTP by each robot.'],
-  ['direct-push', 'Direct push', 'Inside MQTT messages, published once for all robots.'],
-  ['inline', 'Inline', 'Inside the announcement itself; for small packages.'],
-  ['poll', 'Poll', 'Nothing is announced: robots ask on their own timers.'],
+  ['adaptive', 'Adaptive', 'The server’s rules choose a mechanism for each robot.'],
+  ['push-pull', 'Push-pull', 'Announced over MQTT, then downloaded over HTTP by each robot.'],
+  ['direct-push', 'Direct push', 'Sent in MQTT messages, published once for all robots.'],
+  ['inline', 'Inline', 'Sent inside the announcement; for small packages.'],
+  ['poll', 'Poll', 'Not announced; robots poll on their own schedule.'],
 ];
 
 /**
- * Asks what to push. `ids` are the robots, or `null`: then a selector is asked for. `given` may
- * name a `package` and a `manifest` that are chosen already.
+ * Opens the push dialog. `ids` are the robots, or `null` for a selector field. `given` may
+ * preselect a `package` and a `manifest`.
  */
-export async function askPush(app, ids = null, given = {}) {
-  const chosen = ids && receivers(ids, app.fleet);
-  const left = ids ? ids.size - chosen.size : 0;
-  const title = chosen ? `Push to ${whom(chosen, app.fleet)}` : 'New deployment';
-  const waiting = open({ title, body: () => html`<p class="quiet" role="status">Fetching…</p>` });
-  const list = await app.attempt(() => get('/packages'));
-  // Whoever has left it meanwhile, or asks something else, is not disturbed.
-  if (!isOpen(waiting)) return;
-  if (!list) return void close();
-  const question = new Order(app, chosen, list.packages, given);
-  const isPossible = list.packages.length && chosen?.size !== 0;
-  open({
+export async function openPushDialog(app, ids = null, given = {}) {
+  const selected = ids && approvedIds(ids, app.fleet);
+  const skipped = ids ? ids.size - selected.size : 0;
+  const title = selected ? `Push to ${robotsText(selected, app.fleet)}` : 'New deployment';
+  const loading = openDialog({
     title,
-    action: isPossible ? 'Deploy' : null,
-    body: () => html`${question.body()}${leftOut(left)}`,
-    act: () => question.act(),
+    body: () => html`<p class="quiet" role="status">Loading…</p>`,
+  });
+  const list = await app.attempt(() => get('/packages'));
+  // The user may have closed the dialog or opened another.
+  if (!isCurrentDialog(loading)) return;
+  if (!list) return void closeDialog();
+  const form = new DeploymentForm(app, selected, list.packages, given);
+  const isPossible = list.packages.length && selected?.size !== 0;
+  openDialog({
+    title,
+    submitLabel: isPossible ? 'Deploy' : null,
+    body: () => html`${form.body()}${skippedNote(skipped)}`,
+    onSubmit: () => form.submit(),
   });
 }
 
-class Order {
-  #key = newKey();
-  /** What the key was made for: the same order may be sent again with it, another one may not. */
-  #keyed = null;
+class DeploymentForm {
+  #key = newIdempotencyKey();
+  /**
+   * The request that the key was created for: a repetition uses the same key, another request a new
+   * one.
+   */
+  #keyBody = null;
   #timer;
-  #asked = 0;
-  /** What the selector means now: `{ total, some }`, or a `problem`. */
+  #lastRequest = 0;
+  /** The robots that match the selector: `{ total, some }`, or a `problem`. */
   #match = {};
-  /** What the server refused, at its field. */
+  /** Validation errors by field. */
   #problems = {};
-  /** For how many robots it was said that so many are meant. */
+  /** The number of robots that the user has confirmed. */
   #confirmed = 0;
 
   constructor(app, ids, packages, given) {
     Object.assign(this, { app, ids, packages });
     this.names = [...new Set(packages.map(({ package: { name } }) => name))];
-    // What is ordered and of whom is chosen each time: a form that is sent by mistake must order
-    // nothing.
+    // Package and robots are never preset: an accidental submission must not deploy anything.
     this.fields = {
       delivery: 'adaptive',
       batch: '',
       max_failures: '',
       priority: '',
       hours: '',
-      ...remembered(app),
+      ...storedOptions(app),
       restart: false,
       selector: '',
       name: given.package ?? '',
       manifest: given.manifest,
     };
-    this.hasMore = ['batch', 'max_failures', 'priority', 'hours'].some(
+    this.isExpanded = ['batch', 'max_failures', 'priority', 'hours'].some(
       (field) => this.fields[field],
     );
   }
@@ -102,7 +108,7 @@ class Order {
     );
   }
 
-  /** How many robots it is for, where that is known. */
+  /** The number of robots, if known. */
   get #robots() {
     return this.ids ? this.ids.size : this.#match.total;
   }
@@ -114,51 +120,70 @@ class Order {
     });
   }
 
-  // The form.
+  // The form
 
   body() {
     if (!this.packages.length)
-      return html`<p>No package has been pushed yet. Drop one on <a href="#/packages">Packages</a>, or <code>taskd push ./my_pkg</code>.</p>`;
+      return html`<p>No packages yet. Upload one on <a href="#/packages">Packages</a> or run
+        <code>taskd push ./my_pkg</code>.</p>`;
     const { delivery } = this.fields;
     return html`
-      ${this.ids ? names(this.ids, this.app.fleet) : this.#selector()}
+      ${this.ids ? robotNames(this.ids, this.app.fleet) : this.#selector()}
       <div class="fields">
         ${this.#field('name', 'Package', this.#packageInput())}
-        ${this.#field('manifest', 'Version', html`<select id="order-manifest" aria-describedby="order-manifest-problem" @change=${({ currentTarget }) => this.#set('manifest', currentTarget.value)}>${this.#versions.map((one) => html`<option value=${one.package.manifest.digest} .selected=${one === this.#version}>${one.package.version} (${size(one.package.content.size)}, ${short(one.package.manifest.digest)})</option>`)}</select>`)}
+        ${this.#field('manifest', 'Version', this.#versionInput())}
         ${this.#field(
           'delivery',
           'Delivery',
-          html`<select id="order-delivery" aria-describedby="delivery-words order-delivery-problem" @change=${({ currentTarget }) => this.#set('delivery', currentTarget.value)}>${DELIVERIES.map(([id, title]) => html`<option value=${id} .selected=${id === delivery}>${title}</option>`)}</select>
-          <span id="delivery-words" class="hint quiet">${DELIVERIES.find(([id]) => id === delivery)?.[2]}</span>`,
+          html`<select id="order-delivery" aria-describedby="delivery-words order-delivery-problem"
+            @change=${({ currentTarget }) => this.#set('delivery', currentTarget.value)}>
+            ${DELIVERIES.map(
+              ([id, title]) =>
+                html`<option value=${id} .selected=${id === delivery}>${title}</option>`,
+            )}</select>
+          <span id="delivery-words" class="hint quiet">${
+            DELIVERIES.find(([id]) => id === delivery)?.[2]
+          }</span>`,
           'wide',
         )}
       </div>
-      <details class="more" ?open=${this.hasMore} @invalid=${UNFOLD}>
+      <details class="more" ?open=${this.isExpanded} @invalid=${EXPAND}>
         <summary>Batches, priority, expiry, restart</summary>
         <div class="fields">
-          ${this.#number('batch', 'Robots at a time', { min: 1, placeholder: 'all' })}
-          ${this.#number('max_failures', 'Failures to bear before pausing', { min: 0, placeholder: 'any number' })}
+          ${this.#number('batch', 'Batch size', { min: 1, placeholder: 'all' })}
+          ${this.#number('max_failures', 'Failures allowed before pausing', {
+            min: 0,
+            placeholder: 'unlimited',
+          })}
           ${this.#number('priority', 'Priority', { min: -100, max: 100, placeholder: '0' })}
-          ${this.#number('hours', 'Expires after hours', { min: 1, placeholder: 'as the server is set' })}
+          ${this.#number('hours', 'Expires after (hours)', {
+            min: 1,
+            placeholder: 'server default',
+          })}
         </div>
-        <label class="choice"><input type="checkbox" .checked=${this.fields.restart} @change=${({ currentTarget }) => this.#set('restart', currentTarget.checked)}> Run it anew where it runs already</label>
+        <label class="choice"><input type="checkbox" .checked=${this.fields.restart}
+          @change=${({ currentTarget }) => this.#set('restart', currentTarget.checked)}> Restart
+          where it is already running</label>
       </details>
-      <p class="in-words" aria-live="polite">${this.#inWords()}</p>
+      <p class="order-summary" aria-live="polite">${this.#summary()}</p>
       ${this.#confirmation()}`;
   }
 
-  /** Of many robots it is asked whether they are meant. */
+  /** The confirmation for many robots. */
   #confirmation() {
     const robots = this.#robots ?? 0;
-    if (robots <= ASK_ABOVE) return nothing;
-    const whom =
+    if (robots <= CONFIRM_ABOVE) return nothing;
+    const target =
       !this.ids && this.fields.selector.trim() === '*'
         ? `all ${number(robots)} robots`
         : `${number(robots)} robots`;
     return this.#field(
-      'many',
+      'confirmation',
       '',
-      html`<label class="choice"><input id="order-many" type="checkbox" required aria-describedby="order-many-problem" .checked=${this.#confirmed === robots} @change=${({ currentTarget }) => this.#confirm(currentTarget.checked ? robots : 0)}> Yes, order it on ${whom}</label>`,
+      html`<label class="choice"><input id="order-confirmation" type="checkbox" required
+        aria-describedby="order-confirmation-problem" .checked=${this.#confirmed === robots}
+        @change=${({ currentTarget }) => this.#confirm(currentTarget.checked ? robots : 0)}> Yes,
+        deploy to ${target}</label>`,
       'wide',
     );
   }
@@ -166,42 +191,68 @@ class Order {
   #confirm(robots) {
     change(() => {
       this.#confirmed = robots;
-      delete this.#problems.many;
+      delete this.#problems.confirmation;
     });
   }
 
-  /** A field with its label and, below it, what is wrong with it. */
+  /** A field with its label and its error. */
   #field(field, title, input, kind = '') {
     const problem = this.#problems[field];
-    return html`<div class="field ${kind}">${title ? html`<label for=${`order-${field}`}>${title}</label>` : nothing}${input}<p id=${`order-${field}-problem`} class="bad" role="alert" ?hidden=${!problem}>${problem ? `▲ ${problem}` : ''}</p></div>`;
+    return html`<div class="field ${kind}">${
+      title ? html`<label for=${`order-${field}`}>${title}</label>` : nothing
+    }${input}<p id=${`order-${field}-problem`} class="bad" role="alert"
+      ?hidden=${!problem}>${problem ? `▲ ${problem}` : ''}</p></div>`;
   }
 
   #number(field, title, { min, max, placeholder }) {
     return this.#field(
       field,
       title,
-      html`<input id=${`order-${field}`} type="number" inputmode="numeric" min=${min} max=${max ?? nothing} step="1" placeholder=${placeholder} .value=${this.fields[field]}
-      aria-invalid=${field in this.#problems} aria-describedby=${`order-${field}-problem`} @input=${({ currentTarget }) => this.#set(field, currentTarget.value)}>`,
+      html`<input id=${`order-${field}`} type="number" inputmode="numeric" min=${min}
+        max=${max ?? nothing} step="1" placeholder=${placeholder} .value=${this.fields[field]}
+        aria-invalid=${field in this.#problems} aria-describedby=${`order-${field}-problem`}
+        @input=${({ currentTarget }) => this.#set(field, currentTarget.value)}>`,
     );
   }
 
   #packageInput() {
     const { name } = this.fields;
-    const choose = ({ currentTarget }) => {
+    const select = ({ currentTarget }) => {
       this.#set('name', currentTarget.value.trim());
       this.#set('manifest', undefined);
     };
     if (this.names.length <= LISTED_PACKAGES)
-      return html`<select id="order-name" required aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @change=${choose}><option value="" .selected=${!name}>Choose a package</option>${this.names.map((one) => html`<option value=${one} .selected=${one === name}>${one}</option>`)}</select>`;
-    return html`<input id="order-name" list="order-names" required autocomplete="off" autocapitalize="none" spellcheck="false" placeholder=${`one of ${number(this.names.length)}`} .value=${name}
-        aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem" @input=${choose}>
-      <datalist id="order-names">${this.names.map((one) => html`<option value=${one}></option>`)}</datalist>`;
+      return html`<select id="order-name" required aria-invalid=${'name' in this.#problems}
+          aria-describedby="order-name-problem" @change=${select}>
+        <option value="" .selected=${!name}>Select a package</option>
+        ${this.names.map(
+          (one) => html`<option value=${one} .selected=${one === name}>${one}</option>`,
+        )}</select>`;
+    return html`<input id="order-name" list="order-names" required
+        autocomplete="off" autocapitalize="none" spellcheck="false"
+        placeholder=${`one of ${number(this.names.length)}`} .value=${name}
+        aria-invalid=${'name' in this.#problems} aria-describedby="order-name-problem"
+        @input=${select}>
+      <datalist id="order-names">${this.names.map(
+        (one) => html`<option value=${one}></option>`,
+      )}</datalist>`;
+  }
+
+  #versionInput() {
+    const select = ({ currentTarget }) => this.#set('manifest', currentTarget.value);
+    const option = (one) => {
+      const { version, manifest, content } = one.package;
+      return html`<option value=${manifest.digest} .selected=${one === this.#version}>${version}
+        (${size(content.size)}, ${shortDigest(manifest.digest)})</option>`;
+    };
+    return html`<select id="order-manifest" aria-describedby="order-manifest-problem"
+      @change=${select}>${this.#versions.map(option)}</select>`;
   }
 
   #selector() {
     const { total, some, problem } = this.#match;
     const isBad = Boolean(problem) || total === 0;
-    const take = (selector) => {
+    const setSelector = (selector) => {
       this.#set('selector', selector);
       this.#confirmed = 0;
       this.#count();
@@ -210,14 +261,28 @@ class Order {
       'selector',
       'Robots',
       html`
-      <input id="order-selector" class="code" required placeholder="site=lab" .value=${this.fields.selector} autocomplete="off" autocapitalize="none" spellcheck="false" aria-invalid=${isBad} aria-describedby="match order-selector-problem" @input=${({ currentTarget }) => take(currentTarget.value)}>
-      <p id="match" class=${isBad ? 'bad' : 'quiet'} role="status">${problem ?? (total === undefined ? ' ' : matched(total, some))}</p>
-      <p class="suggestions" role="group" aria-label="Robots to choose">${['*', ...this.#labels].map((selector) => html`<button type="button" class="plain link" aria-pressed=${this.fields.selector === selector} @click=${() => take(selector)}>${selector === '*' ? 'all' : selector}</button>`)}</p>
-      <p class="hint quiet">Several with a comma, <code>arm,cart</code>; without one, <code>site=lab,!arm</code>.</p>`,
+      <input id="order-selector" class="code" required placeholder="site=lab"
+        .value=${this.fields.selector} autocomplete="off" autocapitalize="none" spellcheck="false"
+        aria-invalid=${isBad} aria-describedby="match order-selector-problem"
+        @input=${({ currentTarget }) => setSelector(currentTarget.value)}>
+      <p id="match" class=${isBad ? 'bad' : 'quiet'} role="status">${
+        problem ?? (total === undefined ? ' ' : matchText(total, some))
+      }</p>
+      <p class="suggestions" role="group" aria-label="Suggested selectors">${[
+        '*',
+        ...this.#labels,
+      ].map(
+        (selector) =>
+          html`<button type="button" class="plain link"
+            aria-pressed=${this.fields.selector === selector}
+            @click=${() => setSelector(selector)}>${selector === '*' ? 'all' : selector}</button>`,
+      )}</p>
+      <p class="hint quiet">Separate terms by commas: <code>arm,cart</code>. Exclude robots with
+        <code>!</code>: <code>site=lab,!arm</code>.</p>`,
     );
   }
 
-  /** The labels that most robots have. */
+  /** The most frequent labels. */
   get #labels() {
     if (!this.labels) {
       const counts = new Map();
@@ -231,58 +296,59 @@ class Order {
     return this.labels;
   }
 
-  /** What is about to be ordered, in a sentence. */
-  #inWords() {
+  /** A summary of the deployment. */
+  #summary() {
     const version = this.#version?.package;
     if (!this.fields.name)
-      return html`<span class="quiet">Choose a package${this.ids ? '' : ' and its robots'}.</span>`;
-    if (!version) return html`<span class="quiet">There is no package ${this.fields.name}.</span>`;
+      return html`<span class="quiet">Select a package${this.ids ? '' : ' and robots'}.</span>`;
+    if (!version)
+      return html`<span class="quiet">Package ${this.fields.name} does not exist.</span>`;
     const robots = this.#robots;
     const whole = robots
-      ? ` to ${plural(robots, 'robot')}, ${size(robots * version.content.size)} in all`
+      ? ` to ${plural(robots, 'robot')}, ${size(robots * version.content.size)} in total`
       : '';
-    const { batch, max_failures: bears, priority, hours, restart } = this.fields;
-    const options = optionsInWords({
+    const { batch, max_failures: maxFailures, priority, hours, restart } = this.fields;
+    const options = optionsList({
       batch: Number(batch),
-      max_failures: bears === '' ? null : Number(bears),
+      max_failures: maxFailures === '' ? null : Number(maxFailures),
       priority: Number(priority),
     });
     return [
       `${version.name}@${version.version}${whole}`,
       ...options,
       hours && `expires after ${plural(Number(hours), 'hour')}`,
-      restart && 'anew where it runs already',
+      restart && 'restarts where it is already running',
     ]
       .filter(Boolean)
       .join('; ');
   }
 
-  // What the selector means.
+  // The selector
 
-  /** Asks how many robots it means, once typing has paused. */
+  /** Counts the matching robots once typing has paused. */
   #count() {
     clearTimeout(this.#timer);
-    const asked = (this.#asked += 1);
+    const request = (this.#lastRequest += 1);
     const selector = this.fields.selector.trim();
     this.#timer = setTimeout(async () => {
       const match = selector ? await matchOf(selector, this.app.fleet) : {};
-      if (match && asked === this.#asked) change(() => (this.#match = match));
+      if (match && request === this.#lastRequest) change(() => (this.#match = match));
     }, COUNT_PAUSE_MS);
   }
 
-  // Sending it.
+  // Submission
 
-  async act() {
+  async submit() {
     const { name, delivery, selector } = this.fields;
     const version = this.#version;
-    if (!name) this.#refuse('name', 'Choose a package.');
-    if (!version) this.#refuse('name', `There is no package ${name}.`);
+    if (!name) this.#reject('name', 'Select a package.');
+    if (!version) this.#reject('name', `Package ${name} does not exist.`);
     await this.#check(selector.trim());
     const body = {
       package: name,
       manifest: version.package.manifest.digest,
       delivery,
-      selector: this.ids ? idsOf(this.ids) : selector.trim(),
+      selector: this.ids ? selectorOf(this.ids) : selector.trim(),
     };
     const { batch, max_failures, priority, hours } = this.fields;
     for (const [field, value] of Object.entries({
@@ -294,66 +360,70 @@ class Order {
       if (value !== '') body[field] = Number(value);
     if (this.fields.restart) body.restart = true;
     const text = JSON.stringify(body);
-    if (this.#keyed && this.#keyed !== text) this.#key = newKey();
-    this.#keyed = text;
+    if (this.#keyBody && this.#keyBody !== text) this.#key = newIdempotencyKey();
+    this.#keyBody = text;
     try {
-      const { id, assignments = [] } = await order('/deployments', body, this.#key);
-      remember(this.app, this.fields);
+      const { id, assignments = [] } = await postIdempotent('/deployments', body, this.#key);
+      storeOptions(this.app, this.fields);
       const running = assignments.filter(({ phase }) => phase === 'running').length;
       if (running)
-        tell(
-          `${name}@${version.package.version} runs already on ${plural(running, 'robot')}, and goes on there.`,
+        notify(
+          `${name}@${version.package.version} is already running on ${plural(running, 'robot')}.`,
         );
-      go(['deployments', id]);
+      navigate(['deployments', id]);
     } catch (error) {
       const field = fieldOf(error);
-      if (field && (field !== 'selector' || !this.ids)) this.#refuse(field, error.message);
+      if (field && (field !== 'selector' || !this.ids)) this.#reject(field, error.message);
       throw error;
     }
   }
 
-  /** Whom it is for is known before it is sent, and of many it was said that they are meant. */
+  /** Checks before submission that the selector matches and that many robots are confirmed. */
   async #check(selector) {
     if (!this.ids) {
-      if (!selector) this.#refuse('selector', 'Say which robots.');
+      if (!selector) this.#reject('selector', 'Enter a robot selector.');
       const match = await matchOf(selector, this.app.fleet);
       if (!match) throw new SignedOut();
       change(() => (this.#match = match));
-      if (match.problem) this.#refuse('selector', match.problem);
+      if (match.problem) this.#reject('selector', match.problem);
     }
-    if (this.#robots > ASK_ABOVE && this.#confirmed !== this.#robots)
-      this.#refuse('many', `Say that ${number(this.#robots)} robots are meant.`);
+    if (this.#robots > CONFIRM_ABOVE && this.#confirmed !== this.#robots)
+      this.#reject(
+        'confirmation',
+        `Confirm that you want to deploy to ${number(this.#robots)} robots.`,
+      );
   }
 
-  /** Says what is wrong at the field, and goes there. */
-  #refuse(field, message) {
+  /** Shows an error at its field and focuses the field. */
+  #reject(field, message) {
     change(() => {
       this.#problems = { [field]: message.replace(/^[a-z_]+: /, '') };
-      this.hasMore ||= ['batch', 'max_failures', 'priority', 'hours'].includes(field);
+      this.isExpanded ||= ['batch', 'max_failures', 'priority', 'hours'].includes(field);
     });
     requestAnimationFrame(() => document.getElementById(`order-${field}`)?.focus());
-    throw Object.assign(new Error(message), { isSaid: true });
+    throw Object.assign(new Error(message), { isShown: true });
   }
 }
 
-/** `12 robots now: arm, cart and 10 more`. */
-function matched(total, some) {
-  if (!total) return 'No robot is meant.';
+/** `12 robots match: arm, cart and 10 more`. */
+function matchText(total, some) {
+  if (!total) return 'No robots match.';
   const rest = total - some.length;
-  return `${plural(total, 'robot')} now: ${some.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
+  const names = `${some.join(', ')}${rest > 0 ? ` and ${number(rest)} more` : ''}`;
+  return `${plural(total, 'robot')} ${total === 1 ? 'matches' : 'match'}: ${names}`;
 }
 
-/** Whom the selector means of those that get what is ordered. */
+/** The robots that match the selector, without those that await approval. */
 async function matchOf(selector, fleet) {
-  const waiting = [...fleet.robots.values()].filter(isWaiting).map(({ id }) => `!${id}`);
+  const waiting = [...fleet.robots.values()].filter(awaitsApproval).map(({ id }) => `!${id}`);
   try {
     const {
       robots,
       total = robots.length,
       unknown = [],
-    } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED });
-    if (unknown.length) return { problem: `No robot has the name or id ${unknown.join(', ')}.` };
-    return { total, some: robots.slice(0, NAMED).map(({ name }) => name) };
+    } = await get('/robots', { selector: [selector, ...waiting].join(), limit: NAMED_ROBOTS });
+    if (unknown.length) return { problem: `No robot has the name or ID ${unknown.join(', ')}.` };
+    return { total, some: robots.slice(0, NAMED_ROBOTS).map(({ name }) => name) };
   } catch (error) {
     return error instanceof SignedOut ? null : { problem: error.message };
   }
@@ -377,39 +447,41 @@ const FIELD_OF_KEY = {
   expires_in_s: 'hours',
 };
 
-/** The field that a refusal is about. */
+/** The field that a refusal concerns. */
 const fieldOf = ({ code, message }) =>
   FIELD_OF_CODE[code] ?? FIELD_OF_KEY[/^([a-z_]+)(: |\b)/.exec(message)?.[1]];
 
-// How it is to be done is kept for as long as the tab is open, each person's own; what and of whom
-// is not.
+// Delivery and rollout options are stored per user until the tab closes; package and robots are
+// not.
 
-const placeOf = ({ me }) => `taskd.order.${me?.name}`;
+const storageKey = ({ me }) => `taskd.order.${me?.name}`;
 
-function remembered(app) {
+function storedOptions(app) {
   try {
-    return JSON.parse(sessionStorage.getItem(placeOf(app))) ?? {};
+    return JSON.parse(sessionStorage.getItem(storageKey(app))) ?? {};
   } catch {
     return {};
   }
 }
 
-function remember(app, { delivery, batch, max_failures, priority, hours }) {
+function storeOptions(app, { delivery, batch, max_failures, priority, hours }) {
   sessionStorage.setItem(
-    placeOf(app),
+    storageKey(app),
     JSON.stringify({ delivery, batch, max_failures, priority, hours }),
   );
 }
 
-function optionsInWords({ batch, max_failures: bears, priority }) {
+function optionsList({ batch, max_failures: maxFailures, priority }) {
   return [
-    batch && `${number(batch)} at a time`,
-    bears != null &&
-      (bears ? `pauses when more than ${number(bears)} fail` : 'pauses at the first failure'),
+    batch && `in batches of ${number(batch)}`,
+    maxFailures != null &&
+      (maxFailures
+        ? `pauses after more than ${plural(maxFailures, 'failure')}`
+        : 'pauses on the first failure'),
     priority ? `priority ${priority}` : null,
   ].filter(Boolean);
 }
 
-/** What has been ordered beside the robots, in words. */
-export const optionsOf = ({ delivery, ...options }) =>
-  [`${words(delivery)} delivery`, ...optionsInWords(options)].join(' · ');
+/** The options of a deployment in words. */
+export const optionsText = ({ delivery, ...options }) =>
+  [`${words(delivery)} delivery`, ...optionsList(options)].join(' · ');

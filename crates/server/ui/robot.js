@@ -1,16 +1,15 @@
-// The page of one robot: what it is and how it stands above, and below the part somebody has
-// chosen, each in a module of its own.
+// The view of a robot: a header, and tabs in modules of their own.
 //
-// A part is a class: `constructor(page)`, `draw(robot, now)`, and, where it needs them, `enter()`
-// when it comes into sight, `leave()` when it goes, `arrive()` when the place's query has changed,
-// `hear(robot)` when this robot has changed, `refresh()` and `drawn()`. What somebody has typed in
-// a part stays in it while they look at another.
+// A tab is a class with `constructor(page)` and `draw(robot, now)`. Optional are `enter()` and
+// `leave()` when it is shown and hidden, `onNavigate()` for changes of the query, `onEvent(robot)`
+// for changes of this robot, `refresh()` and `afterDraw()`. A tab keeps unsaved input while another
+// one is shown.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 import { labelsOf } from './fleet.js';
 import { words } from './format.js';
-import { at, place, restate } from './router.js';
-import { lastSeen, robotState } from './signs.js';
+import { hrefTo, currentRoute, replaceQuery } from './router.js';
+import { lastSeen, robotState } from './status.js';
 import { Control } from './robot/control.js';
 import { Edit } from './robot/edit.js';
 import { Logs } from './robot/logs.js';
@@ -19,34 +18,34 @@ import { Outputs } from './robot/outputs.js';
 import { Ros } from './robot/ros.js';
 import { Tasks } from './robot/tasks.js';
 
-/** The parts. Those with `needs` are for people who may do one of these. */
-const PARTS = [
-  { id: 'monitor', title: 'Monitor', Part: Monitor },
-  { id: 'ros', title: 'ROS', Part: Ros },
-  { id: 'tasks', title: 'Tasks', Part: Tasks },
-  { id: 'logs', title: 'Logs', Part: Logs },
-  { id: 'outputs', title: 'Outputs', Part: Outputs },
-  { id: 'control', title: 'Control', Part: Control, needs: ['operate', 'maintain'] },
-  { id: 'edit', title: 'Edit', Part: Edit, needs: ['maintain'] },
+/** The tabs. `needs` lists permissions of which the user must have one. */
+const TABS = [
+  { id: 'monitor', title: 'Monitor', Tab: Monitor },
+  { id: 'ros', title: 'ROS', Tab: Ros },
+  { id: 'tasks', title: 'Tasks', Tab: Tasks },
+  { id: 'logs', title: 'Logs', Tab: Logs },
+  { id: 'outputs', title: 'Outputs', Tab: Outputs },
+  { id: 'control', title: 'Control', Tab: Control, needs: ['operate', 'maintain'] },
+  { id: 'edit', title: 'Edit', Tab: Edit, needs: ['maintain'] },
 ];
 
 export class RobotView {
-  /** The place's query. */
+  /** The query of the route. */
   query = {};
   #name;
-  /** Once found, the robot stays the one that is shown, also by a new name. */
+  /** Once found, the same robot stays shown even after a rename. */
   #id = null;
-  #chosen = PARTS[0];
-  /** The parts that were looked at, and which of them is in sight. */
-  #parts = new Map();
+  #selected = TABS[0];
+  /** The tabs that have been created, and the current one. */
+  #tabs = new Map();
   #current = null;
-  #shownPart = null;
+  #shownTab = null;
 
   constructor(app) {
     this.app = app;
   }
 
-  /** The robot as it is now; nothing if there is none. */
+  /** The robot, or nothing if it does not exist. */
   get robot() {
     const { fleet } = this.app;
     const robot = this.#id ? fleet.robots.get(this.#id) : fleet.robot(this.#name);
@@ -55,39 +54,39 @@ export class RobotView {
   }
 
   get #isAllowed() {
-    const { needs } = this.#chosen;
+    const { needs } = this.#selected;
     return !needs || needs.some((permission) => this.app.can(permission));
   }
 
-  arrive({ path: [, name, part], query }) {
+  onNavigate({ path: [, name, tab], query }) {
     this.#name = name;
-    this.#chosen = PARTS.find(({ id }) => id === part) ?? PARTS[0];
+    this.#selected = TABS.find(({ id }) => id === tab) ?? TABS[0];
     this.query = query;
-    if (this.#current?.id === this.#chosen.id) this.#current.part.arrive?.();
+    if (this.#current?.id === this.#selected.id) this.#current.tab.onNavigate?.();
   }
 
-  /** Says in the address what is looked at now. */
-  say(query) {
+  /** Changes the query in the address. */
+  setQuery(query) {
     this.query = { ...this.query, ...query };
-    restate(this.query);
+    replaceQuery(this.query);
   }
 
-  /** What the server said of this robot, with the name that people know it by. */
-  inWords(text) {
+  /** A server message with the name of the robot in place of its id. */
+  withRobotName(text) {
     return this.#id ? text.replaceAll(this.#id, this.robot?.name ?? this.#id) : text;
   }
 
-  /** The address of a part of this robot's page. */
-  at(part, query) {
-    return at(['robots', this.robot?.name ?? this.#name, part], query);
+  /** The address of a tab of this robot. */
+  hrefTo(tab, query) {
+    return hrefTo(['robots', this.robot?.name ?? this.#name, tab], query);
   }
 
-  hear({ type, robot }) {
-    if (type === 'robot' && robot.id === this.#id) this.#current?.part.hear?.(robot);
+  onEvent({ type, robot }) {
+    if (type === 'robot' && robot.id === this.#id) this.#current?.tab.onEvent?.(robot);
   }
 
   refresh() {
-    this.#current?.part.refresh?.();
+    this.#current?.tab.refresh?.();
   }
 
   leave() {
@@ -96,76 +95,106 @@ export class RobotView {
 
   draw(now) {
     const { robot } = this;
-    this.#show(robot && this.app.me && this.#isAllowed ? this.#chosen : null);
-    if (!robot) return this.#noRobot();
-    this.#keepAddress(robot);
+    this.#show(robot && this.app.me && this.#isAllowed ? this.#selected : null);
+    if (!robot) return this.#notFound();
+    this.#updateAddress(robot);
     return html`
       <div class="robot-page">
         ${this.#head(robot, now)}
-        ${this.#current ? this.#current.part.draw(robot, now) : this.app.me ? html`<p class="empty quiet">Your roles do not allow that.</p>` : nothing}
+        ${
+          this.#current
+            ? this.#current.tab.draw(robot, now)
+            : this.app.me
+              ? html`<p class="empty quiet">You do not have permission to view this tab.</p>`
+              : nothing
+        }
       </div>`;
   }
 
-  drawn() {
-    this.#current?.part.drawn?.();
-    if (this.#shownPart === this.#chosen) return;
-    // On a narrow screen its link may be out of sight.
+  afterDraw() {
+    this.#current?.tab.afterDraw?.();
+    if (this.#shownTab === this.#selected) return;
+    // On a narrow screen the link may be scrolled out of view.
     document
-      .querySelector('.parts [aria-current]')
+      .querySelector('.tabs [aria-current]')
       ?.scrollIntoView({ block: 'nearest', inline: 'nearest' });
-    this.#shownPart = this.#current && this.#chosen;
+    this.#shownTab = this.#current && this.#selected;
   }
 
   get isUnsaved() {
-    return [...this.#parts.values()].some(({ isUnsaved }) => isUnsaved);
+    return [...this.#tabs.values()].some(({ isUnsaved }) => isUnsaved);
   }
 
-  #show(chosen) {
-    if (this.#current?.id === chosen?.id) return;
-    this.#current?.part.leave?.();
+  #show(selected) {
+    if (this.#current?.id === selected?.id) return;
+    this.#current?.tab.leave?.();
     this.#current = null;
-    if (!chosen) return;
-    const { id, Part } = chosen;
-    if (!this.#parts.has(id)) this.#parts.set(id, new Part(this));
-    this.#current = { id, part: this.#parts.get(id) };
-    this.#current.part.enter?.();
+    if (!selected) return;
+    const { id, Tab } = selected;
+    if (!this.#tabs.has(id)) this.#tabs.set(id, new Tab(this));
+    this.#current = { id, tab: this.#tabs.get(id) };
+    this.#current.tab.enter?.();
   }
 
-  /** A robot that gets another name keeps a page that can be shared. */
-  #keepAddress({ id, name }) {
+  /** Updates the address after a rename, so that it can be shared. */
+  #updateAddress({ id, name }) {
     if (this.#name === name || this.#name === id) return;
     const {
       path: [section, , ...rest],
       query,
-    } = place();
-    if (section === 'robots') history.replaceState(null, '', at([section, name, ...rest], query));
+    } = currentRoute();
+    if (section === 'robots')
+      history.replaceState(null, '', hrefTo([section, name, ...rest], query));
     this.#name = name;
   }
 
-  #noRobot() {
+  #notFound() {
     if (!this.app.fleet.isLoaded)
-      return html`<div class="robot-page"><header class="robot-head"><h1>${this.#name}</h1></header></div>`;
+      return html`<div class="robot-page"><header class="robot-head">
+        <h1>${this.#name}</h1></header></div>`;
     return html`
       <div class="empty">
         <h1>${this.#name}</h1>
-        <p>${this.#id ? 'This robot has been removed.' : 'There is no robot of this name or id, or none that you may see.'}</p>
-        <p><a href=${at(['robots'])}>All robots</a></p>
+        <p>${
+          this.#id
+            ? 'This robot was deleted.'
+            : 'No robot with this name or ID exists, or you do not have access to it.'
+        }</p>
+        <p><a href=${hrefTo(['robots'])}>All robots</a></p>
       </div>`;
   }
 
   #head(robot, now) {
     const { app } = this;
-    const parts = PARTS.filter(
+    const tabs = TABS.filter(
       ({ needs }) => !needs || needs.some((permission) => app.can(permission)),
     );
     return html`
       <header class="robot-head">
         <h1>${robot.name}</h1>
-        <p>${robotState(robot)}${robot.online ? nothing : html` <span class="quiet">last seen ${lastSeen(robot, now)}</span>`}</p>
+        <p>${robotState(robot)}${
+          robot.online
+            ? nothing
+            : html` <span class="quiet">last seen ${lastSeen(robot, now)}</span>`
+        }</p>
         ${robot.address ? html`<p class="code quiet">${robot.address}</p>` : nothing}
-        ${labelsOf(robot).length ? html`<ul class="labels" aria-label="Labels">${labelsOf(robot).map((label) => html`<li class="code">${label}</li>`)}</ul>` : nothing}
+        ${
+          labelsOf(robot).length
+            ? html`<ul class="labels" aria-label="Labels">${labelsOf(robot).map(
+                (label) => html`<li class="code">${label}</li>`,
+              )}</ul>`
+            : nothing
+        }
       </header>
-      ${robot.conditions.map(({ code, text }) => html`<p class="condition"><span class="bad"><span aria-hidden="true">▲ </span>${words(code)}:</span> ${text}</p>`)}
-      <nav class="parts" aria-label="Parts of this page">${parts.map(({ id, title }) => html`<a href=${this.at(id)} aria-current=${this.#chosen.id === id ? 'page' : nothing}>${title}</a>`)}</nav>`;
+      ${robot.conditions.map(
+        ({ code, text }) =>
+          html`<p class="condition"><span class="bad"><span
+            aria-hidden="true">▲ </span>${words(code)}:</span> ${text}</p>`,
+      )}
+      <nav class="tabs" aria-label="Robot">${tabs.map(
+        ({ id, title }) =>
+          html`<a href=${this.hrefTo(id)}
+            aria-current=${this.#selected.id === id ? 'page' : nothing}>${title}</a>`,
+      )}</nav>`;
   }
 }

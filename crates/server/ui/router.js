@@ -1,8 +1,8 @@
-// Where in the page somebody is: the address bar's `#/robots/atlas/logs?level=warn`, so that it can
-// be shared, kept and gone back from.
+// The route of the page in the address bar, `#/robots/atlas/logs?level=warn`, so that it can be
+// shared and bookmarked.
 
-/** The place: `path`, its parts, and `query`, a plain object of texts. */
-export function place() {
+/** The current route: `path`, a list of segments, and `query`, an object of strings. */
+export function currentRoute() {
   const [path, query] = location.hash.replace(/^#\/?/, '').split('?');
   return {
     path: path.split('/').filter(Boolean).map(decoded),
@@ -18,8 +18,8 @@ function decoded(part) {
   }
 }
 
-/** The address of a place. What is empty or absent in `query` is left out. */
-export function at(path, query = {}) {
+/** The address of a route. Empty values in `query` are left out. */
+export function hrefTo(path, query = {}) {
   const given = Object.entries(query).filter(
     ([, value]) => value !== undefined && value !== null && value !== '',
   );
@@ -27,12 +27,12 @@ export function at(path, query = {}) {
   return `#/${path.map(encodeURIComponent).join('/')}${text ? `?${text}` : ''}`;
 }
 
-/** Goes there; going back leads here again. */
-export function go(path, query) {
-  location.hash = at(path, query);
+/** Navigates to a route, as a new history entry. */
+export function navigate(path, query) {
+  location.hash = hrefTo(path, query);
 }
 
-/** Says what this place is now: a search, an order. Going back does not undo it. */
-export function restate(query) {
-  history.replaceState(null, '', at(place().path, query));
+/** Replaces the query of the current route, without a new history entry. */
+export function replaceQuery(query) {
+  history.replaceState(null, '', hrefTo(currentRoute().path, query));
 }

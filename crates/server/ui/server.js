@@ -1,23 +1,22 @@
-// The server and the network: how it does, site by site, who is connected and listens to what, and
-// what has happened lately.
+// The view of the server and its network: status, sites, MQTT sessions and recent events.
 
 import { html, nothing, svg } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
 import { get } from './api.js';
-import { duration, number, size, words } from './format.js';
+import { duration, number, plural, size, words } from './format.js';
 import { change } from './frame.js';
-import { at } from './router.js';
-import { sign, since } from './signs.js';
+import { hrefTo } from './router.js';
+import { statusDot, timeAgo } from './status.js';
 
-const ASK_PAUSE_MS = 2_000;
-/** What the small curves hold: five minutes. */
-const KEPT_STATUSES = 150;
-const SESSIONS_A_PAGE = 100;
-const KEPT_ENTRIES = 200;
+const POLL_PAUSE_MS = 2_000;
+/** Samples of the sparklines: five minutes. */
+const MAX_STATUSES = 150;
+const SESSIONS_PER_PAGE = 100;
+const MAX_ENTRIES = 200;
 
 export class ServerView {
   #isGone = false;
-  /** The newest last, each with the rates since the one before. */
+  /** Newest last, each with the rates since the previous one. */
   #statuses = [];
   #sessions = [];
   #more = null;
@@ -27,11 +26,11 @@ export class ServerView {
 
   constructor(app) {
     this.app = app;
-    this.#follow();
+    this.#poll();
     this.refresh();
   }
 
-  arrive() {}
+  onNavigate() {}
 
   leave() {
     this.#isGone = true;
@@ -42,25 +41,25 @@ export class ServerView {
     this.#fetchFeed();
   }
 
-  hear({ type, entry }) {
-    if (type === 'feed') this.#take([entry]);
+  onEvent({ type, entry }) {
+    if (type === 'feed') this.#addEntries([entry]);
   }
 
-  /** Asks how it does a while after each answer, as long as somebody looks. */
-  async #follow() {
+  /** Polls the status while the view is shown. */
+  async #poll() {
     while (!this.#isGone) {
-      if (!document.hidden) await this.#ask();
-      await new Promise((resume) => setTimeout(resume, ASK_PAUSE_MS));
+      if (!document.hidden) await this.#fetchStatus();
+      await new Promise((resume) => setTimeout(resume, POLL_PAUSE_MS));
     }
   }
 
-  async #ask() {
+  async #fetchStatus() {
     try {
       const status = await get('/server/status');
       change(() => {
         this.#problem = null;
         this.#statuses = [
-          ...this.#statuses.slice(1 - KEPT_STATUSES),
+          ...this.#statuses.slice(1 - MAX_STATUSES),
           withRates(status, this.#statuses.at(-1)),
         ];
       });
@@ -71,7 +70,7 @@ export class ServerView {
 
   async #fetchSessions(after) {
     const page = await this.app.attempt(() =>
-      get('/server/sessions', { limit: SESSIONS_A_PAGE, after }),
+      get('/server/sessions', { limit: SESSIONS_PER_PAGE, after }),
     );
     if (!page) return;
     change(() => {
@@ -82,25 +81,31 @@ export class ServerView {
   }
 
   async #fetchFeed() {
-    const page = await this.app.attempt(() => get('/feed', { limit: KEPT_ENTRIES }));
-    if (page) change(() => this.#take(page.entries));
+    const page = await this.app.attempt(() => get('/feed', { limit: MAX_ENTRIES }));
+    if (page) change(() => this.#addEntries(page.entries));
   }
 
-  /** Takes entries in, whichever way they come, each once and the newest first. */
-  #take(entries) {
+  /** Adds entries from any source, without duplicates, newest first. */
+  #addEntries(entries) {
     const known = new Set(this.#entries.map(({ number: one }) => one));
-    const fresh = entries.filter(({ number: one }) => !known.has(one));
-    this.#entries = [...fresh, ...this.#entries]
+    const newEntries = entries.filter(({ number: one }) => !known.has(one));
+    this.#entries = [...newEntries, ...this.#entries]
       .sort((one, other) => other.number - one.number)
-      .slice(0, KEPT_ENTRIES);
+      .slice(0, MAX_ENTRIES);
   }
 
   draw(now) {
     const status = this.#statuses.at(-1);
     return html`
-      <header class="bar-of-tools"><h1>Server and network</h1>${status ? html`<p class="quiet">${about(status)}</p>` : nothing}</header>
+      <header class="toolbar"><h1>Server and network</h1>${
+        status ? html`<p class="quiet">${summary(status)}</p>` : nothing
+      }</header>
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem}</p>` : nothing}
-      ${status ? html`<div class="figures">${figures(status).map((figure) => this.#figure(figure))}</div>` : html`<div class="figures waiting"></div>`}
+      ${
+        status
+          ? html`<div class="figures">${figures(status).map((one) => this.#figure(one))}</div>`
+          : html`<div class="figures waiting"></div>`
+      }
       <div class="server-body">
         <div>
           ${status ? sites(status) : nothing}
@@ -114,32 +119,47 @@ export class ServerView {
     return html`
       <section class="figure">
         <h2>${title}</h2>
-        <p class="value ${isBad ? 'bad' : ''}">${isBad ? html`<span aria-hidden="true">▲ </span>` : nothing}${value}</p>
+        <p class="value ${isBad ? 'bad' : ''}">${
+          isBad ? html`<span aria-hidden="true">▲ </span>` : nothing
+        }${value}</p>
         <p class="quiet">${note}</p>
-        ${of ? curve(this.#statuses.map(of)) : nothing}
+        ${of ? sparkline(this.#statuses.map(of)) : nothing}
       </section>`;
   }
 
   #sessionTable(now) {
     const row = ({ robot, name, since_ms: then, address, subscriptions, traffic }) => html`
       <tr data-session=${robot}>
-        <td><a href=${at(['robots', name])}>${name}</a><br><span class="code quiet">${address ?? '–'}</span></td>
-        <td class="code">${subscriptions.map(({ topic_filter: filter, qos }) => html`<div>${filter} <span class="quiet">QoS ${qos}</span></div>`)}</td>
-        <td class="number">${number(traffic.messages_in)} in<br>${number(traffic.messages_out)} out</td>
+        <td><a href=${hrefTo(['robots', name])}>${name}</a><br>
+          <span class="code quiet">${address ?? '–'}</span></td>
+        <td class="code">${subscriptions.map(
+          ({ topic_filter: filter, qos }) =>
+            html`<div>${filter} <span class="quiet">QoS ${qos}</span></div>`,
+        )}</td>
+        <td class="number">${number(traffic.messages_in)} in<br>
+          ${number(traffic.messages_out)} out</td>
         <td class="number">${size(traffic.bytes_in)} in<br>${size(traffic.bytes_out)} out</td>
-        <td>${since(then, now)}</td>
+        <td>${timeAgo(then, now)}</td>
       </tr>`;
     return html`
       <section aria-labelledby="sessions">
-        <header><h2 id="sessions">Subscriptions <span class="count">${number(this.#total)} sessions</span></h2><button class="plain link" @click=${() => this.#fetchSessions()}>Refresh</button></header>
+        <header><h2 id="sessions">Subscriptions
+            <span class="count">${plural(this.#total, 'session')}</span></h2>
+          <button class="plain link" @click=${() => this.#fetchSessions()}>Refresh</button></header>
         ${
           this.#sessions.length
             ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="sessions"><table>
-              <thead><tr><th>Robot</th><th>Topic filters</th><th class="number">Messages</th><th class="number">Bytes</th><th>Connected</th></tr></thead>
+              <thead><tr><th>Robot</th><th>Topic filters</th><th class="number">Messages</th>
+                <th class="number">Bytes</th><th>Connected</th></tr></thead>
               <tbody>${repeat(this.#sessions, ({ robot }) => robot, row)}</tbody>
             </table></div>
-            ${this.#more ? html`<p><button class="quiet-button" @click=${() => this.#fetchSessions(this.#more)}>Show more</button></p>` : nothing}`
-            : html`<p class="quiet">No robot is connected over MQTT.</p>`
+            ${
+              this.#more
+                ? html`<p><button class="quiet-button"
+                    @click=${() => this.#fetchSessions(this.#more)}>Show more</button></p>`
+                : nothing
+            }`
+            : html`<p class="quiet">No robots are connected over MQTT.</p>`
         }
       </section>`;
   }
@@ -155,7 +175,7 @@ export class ServerView {
                 ({ number: one }) => one,
                 (entry) => feedLine(entry, now),
               )}</ol>`
-            : html`<p class="quiet">Nothing has happened since the server started.</p>`
+            : html`<p class="quiet">No events since the server started.</p>`
         }
       </section>`;
   }
@@ -165,14 +185,18 @@ const LEVELS = { warn: '▲ ', error: '✕ ', fatal: '✕ ' };
 
 const feedLine = ({ at_ms: then, level, kind, text, robot_name: robot, deployment }, now) => html`
   <li class="entry ${LEVELS[level] ? 'bad' : ''}">
-    <span class="what"><span aria-hidden="true">${LEVELS[level] ?? ''}</span>${words(kind)}</span>
-    ${robot ? html`<a href=${at(['robots', robot])}>${robot}</a>` : nothing}
-    ${deployment ? html`<a class="code" href=${at(['deployments', deployment])}>${deployment}</a>` : nothing}
-    <span class="when">${since(then, now)}</span>
+    <span class="kind"><span aria-hidden="true">${LEVELS[level] ?? ''}</span>${words(kind)}</span>
+    ${robot ? html`<a href=${hrefTo(['robots', robot])}>${robot}</a>` : nothing}
+    ${
+      deployment
+        ? html`<a class="code" href=${hrefTo(['deployments', deployment])}>${deployment}</a>`
+        : nothing
+    }
+    <span class="time">${timeAgo(then, now)}</span>
     <span class="text">${text}</span>
   </li>`;
 
-/** A status with what went over the wires each second since the one before. */
+/** A status with the rates since the previous one. */
 function withRates(status, before) {
   const seconds = before ? (status.now_ms - before.now_ms) / 1000 : 0;
   const rate = (of) => (seconds > 0 ? Math.max(0, of(status) - of(before)) / seconds : null);
@@ -185,7 +209,7 @@ function withRates(status, before) {
   return { ...status, rates };
 }
 
-const about = ({ version, uptime_s: uptime, listeners }) =>
+const summary = ({ version, uptime_s: uptime, listeners }) =>
   [
     `taskd ${version}`,
     `up ${duration(uptime * 1000)}`,
@@ -194,7 +218,7 @@ const about = ({ version, uptime_s: uptime, listeners }) =>
     ),
   ].join(' · ');
 
-/** What is shown large, and the curve below it. */
+/** The figures with their sparklines. */
 function figures({ robots, rates, transfers, reports, database, disk, broker, mqtt }) {
   const each = (value, unit) =>
     value === null ? '–' : `${value < 10 ? value.toFixed(1) : number(Math.round(value))} ${unit}`;
@@ -230,7 +254,7 @@ function figures({ robots, rates, transfers, reports, database, disk, broker, mq
     {
       title: 'Report latency',
       value: ms(reports.latency_ms_p99),
-      note: `p99; half within ${ms(reports.latency_ms_p50)}, ${each(reports.per_s, '/s')}`,
+      note: `p99; median ${ms(reports.latency_ms_p50)}, ${each(reports.per_s, '/s')}`,
       of: (one) => one.reports.latency_ms_p99,
     },
     {
@@ -249,7 +273,7 @@ function figures({ robots, rates, transfers, reports, database, disk, broker, mq
     },
     {
       title: 'Broker',
-      value: broker.healthy ? 'Healthy' : 'In trouble',
+      value: broker.healthy ? 'Healthy' : 'Unhealthy',
       note: `${broker.kind}: ${broker.detail}`,
       isBad: !broker.healthy,
     },
@@ -257,13 +281,13 @@ function figures({ robots, rates, transfers, reports, database, disk, broker, mq
 }
 
 /**
- * A small curve from nothing to the highest value. It is for the eye: the figure above it says the
- * same.
+ * A sparkline from zero to the maximum. It is hidden from screen readers, since the figure has the
+ * value.
  */
-function curve(values) {
+function sparkline(values) {
   const most = Math.max(...values.map((value) => value ?? 0), 1e-9);
-  const step = 100 / (KEPT_STATUSES - 1);
-  const first = KEPT_STATUSES - values.length;
+  const step = 100 / (MAX_STATUSES - 1);
+  const first = MAX_STATUSES - values.length;
   const points = values
     .map((value, index) =>
       value == null
@@ -271,24 +295,30 @@ function curve(values) {
         : `${((first + index) * step).toFixed(2)},${(19 - (18 * value) / most).toFixed(2)}`,
     )
     .filter(Boolean);
-  return html`<svg class="curve" viewBox="0 0 100 20" preserveAspectRatio="none" aria-hidden="true">${svg`<polyline points=${points.join(' ')}></polyline>`}</svg>`;
+  return html`<svg class="curve" viewBox="0 0 100 20" preserveAspectRatio="none"
+    aria-hidden="true">${svg`<polyline points=${points.join(' ')}></polyline>`}</svg>`;
 }
 
 const sites = ({ sites: list }) => html`
   <section aria-labelledby="sites">
     <header><h2 id="sites">Sites</h2></header>
     <div class="scroll" tabindex="0" role="group" aria-labelledby="sites"><table>
-      <thead><tr><th>Site</th><th class="number">Robots</th><th>State</th><th class="number">Throughput</th><th class="number">RTT</th></tr></thead>
+      <thead><tr><th>Site</th><th class="number">Robots</th><th>State</th>
+        <th class="number">Throughput</th><th class="number">RTT</th></tr></thead>
       <tbody>${list.map(
         ({ site, robots, online, throughput_bytes_per_s: throughput, rtt_ms: rtt }) => html`
         <tr>
-          <td>${site ? html`<a href=${at(['robots'], { q: `site=${site}` })}>${site}</a>` : html`<span class="quiet">without the label site</span>`}</td>
+          <td>${
+            site
+              ? html`<a href=${hrefTo(['robots'], { q: `site=${site}` })}>${site}</a>`
+              : html`<span class="quiet">no site label</span>`
+          }</td>
           <td class="number">${number(robots)}</td>
-          <td>${sign(online > 0, `${number(online)} online`)}</td>
+          <td>${statusDot(online > 0, `${number(online)} online`)}</td>
           <td class="number">${throughput == null ? '–' : `${size(throughput)}/s`}</td>
           <td class="number">${rtt == null ? '–' : `${number(rtt)} ms`}</td>
         </tr>`,
       )}</tbody>
     </table></div>
-    <p class="quiet">Throughput and RTT: the median of what transfers to a site’s robots have shown.</p>
+    <p class="quiet">Throughput and RTT are medians of recent transfers to the robots of a site.</p>
   </section>`;

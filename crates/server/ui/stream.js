@@ -1,48 +1,47 @@
-// One stream of server-sent events, kept alive: it reads, notices silence, and connects again with
-// growing pauses. It is read with fetch and not with EventSource, which hides keep-alives and the
-// status of a refusal.
+// A stream of server-sent events that detects silence and reconnects with backoff. It uses fetch,
+// since EventSource hides keep-alives and the status of refusals.
 
-const URL_OF_EVENTS = '/api/v1/events';
-// The server says something at least every 15 s.
+const EVENTS_URL = '/api/v1/events';
+// The server sends at least a keep-alive every 15 s.
 const SILENCE_MS = 40_000;
 const FIRST_PAUSE_MS = 1_000;
-const LONGEST_PAUSE_MS = 20_000;
-// A line that never ends is not the server's.
-const LONGEST_LINE = 16 * 1024 * 1024;
+const MAX_PAUSE_MS = 20_000;
+// A limit on malformed streams.
+const MAX_LINE_LENGTH = 16 * 1024 * 1024;
 
 /**
- * Opens the stream. `tell` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with
- * `retry_at` and, where the server refused, its words as `problem`) and `signed_out`, after which
- * nothing follows. Returns a function that ends it. `url` is whose events: all there are, or a
- * robot's lines.
+ * Opens the stream. `emit` gets `{events: [...]}` and `{state}`, one of `open`, `waiting` (with
+ * `retry_at` and, if the server refused, its message as `problem`) and `signed_out`, which is the
+ * last message. Returns a function that ends the stream. `url` selects all events or the log lines
+ * of a robot.
  */
-export function openStream(tell, url = URL_OF_EVENTS) {
+export function openStream(emit, url = EVENTS_URL) {
   const end = new AbortController();
-  follow(tell, url, end.signal);
+  follow(emit, url, end.signal);
   return () => end.abort();
 }
 
-async function follow(tell, url, end) {
-  let pause = FIRST_PAUSE_MS;
+async function follow(emit, url, end) {
+  let backoff = FIRST_PAUSE_MS;
   while (!end.aborted) {
     let wasOpen = false;
     const opened = () => {
       wasOpen = true;
-      tell({ state: 'open' });
+      emit({ state: 'open' });
     };
-    const { status, problem } = await read(tell, url, opened, end);
+    const { status, problem } = await read(emit, url, opened, end);
     if (end.aborted) return;
-    if (status === 401) return tell({ state: 'signed_out' });
-    pause = wasOpen ? FIRST_PAUSE_MS : Math.min(pause * 2, LONGEST_PAUSE_MS);
-    // Spread out, so that a restarted server is not met by every page at once.
-    const wait = pause * (0.5 + Math.random() / 2);
-    tell({ state: 'waiting', retry_at: Date.now() + wait, problem });
-    await rest(wait, end);
+    if (status === 401) return emit({ state: 'signed_out' });
+    backoff = wasOpen ? FIRST_PAUSE_MS : Math.min(backoff * 2, MAX_PAUSE_MS);
+    // With jitter, so that pages do not all return to a restarted server at once.
+    const wait = backoff * (0.5 + Math.random() / 2);
+    emit({ state: 'waiting', retry_at: Date.now() + wait, problem });
+    await pause(wait, end);
   }
 }
 
-/** Waits that long, or until the end. */
-const rest = (ms, end) =>
+/** Waits this long, or until the end. */
+const pause = (ms, end) =>
   new Promise((resume) => {
     const done = () => {
       clearTimeout(timer);
@@ -54,10 +53,9 @@ const rest = (ms, end) =>
   });
 
 /**
- * Reads one connection to its end. Answers the HTTP status, if there was one, and why the server
- * refused, if it did.
+ * Reads one connection to its end. Returns the HTTP status, if any, and the message of a refusal.
  */
-async function read(tell, url, opened, end) {
+async function read(emit, url, opened, end) {
   const silence = new AbortController();
   let watchdog = setTimeout(() => silence.abort(), SILENCE_MS);
   try {
@@ -67,7 +65,7 @@ async function read(tell, url, opened, end) {
       cache: 'no-store',
       signal,
     });
-    if (!response.ok) return { status: response.status, problem: await refusal(response) };
+    if (!response.ok) return { status: response.status, problem: await errorText(response) };
     opened();
     let rest = '';
     for await (const text of chunks(response.body)) {
@@ -75,13 +73,12 @@ async function read(tell, url, opened, end) {
       watchdog = setTimeout(() => silence.abort(), SILENCE_MS);
       const lines = (rest + text).split('\n');
       rest = lines.pop();
-      if (rest.length > LONGEST_LINE) throw new Error('the stream is not one of events');
-      // Every event of ours is one line of JSON that names its own type; all else is comments and
-      // keep-alives.
+      if (rest.length > MAX_LINE_LENGTH) throw new Error('a line of the event stream is too long');
+      // Each event is one line of JSON with its type; all other lines are comments and keep-alives.
       const events = lines
         .filter((line) => line.startsWith('data:'))
         .map((line) => JSON.parse(line.slice(5)));
-      if (events.length) tell({ events });
+      if (events.length) emit({ events });
     }
     return { status: response.status };
   } catch {
@@ -92,10 +89,12 @@ async function read(tell, url, opened, end) {
   }
 }
 
-/** `503: too many listen`, in the server's words or in those of whatever stands before it. */
-async function refusal(response) {
-  const said = await response.json().catch(() => null);
-  return [response.status, said?.error?.message ?? response.statusText].filter(Boolean).join(': ');
+/** `503: too many streams`, from the server or a proxy before it. */
+async function errorText(response) {
+  const answer = await response.json().catch(() => null);
+  return [response.status, answer?.error?.message ?? response.statusText]
+    .filter(Boolean)
+    .join(': ');
 }
 
 async function* chunks(body) {

@@ -1,15 +1,14 @@
-// The phases that a robot went through, as a strip whose parts are as long as they took, and as a
-// list.
+// The phases of an assignment, as a bar with proportional parts and as a list.
 
 import { html, nothing, svg } from './vendor/lit-html-3.3.3/lit-html.js';
 import { clock, duration, moment, tone, words } from './format.js';
-import { phaseSign } from './signs.js';
+import { phaseBadge } from './status.js';
 
 /**
- * Each phase with how long it took; the last one lasts until now. One that nobody waits to see the
- * end of, unlike a job that runs, is a rest, and of those only running lasts.
+ * The phases with their durations. The last phase lasts until now. Final phases count as rest, as
+ * does `running` for services; only `running` has a growing duration.
  */
-export function steps(timeline, kind, now) {
+export function timelineSteps(timeline, kind, now) {
   return timeline.map(({ phase, at_ms, attempt }, index) => {
     const next = timeline[index + 1];
     const isRest =
@@ -20,12 +19,12 @@ export function steps(timeline, kind, now) {
   });
 }
 
-/** All of it but the rests. */
-export const tookInAll = (all) =>
+/** The total duration without rest. */
+export const totalDuration = (all) =>
   all.reduce((sum, { took, isRest }) => sum + (isRest ? 0 : took), 0);
 
-/** The strip. Waiting to begin is left out: an hour of it would make all the rest invisible. */
-export function strip(all) {
+/** The bar. It leaves out `assigned`: an hour of waiting would hide all other phases. */
+export function timelineBar(all) {
   const counted = all.filter(({ phase, isRest }) => !isRest && phase !== 'assigned');
   const total = counted.reduce((sum, { took }) => sum + took, 0);
   if (!total) return nothing;
@@ -36,12 +35,15 @@ export function strip(all) {
     return svg`<rect class=${phase} x=${x - width} width=${width} height="1"></rect>`;
   });
   const said = counted.map(({ phase, took }) => `${words(phase)} ${duration(took)}`).join(', ');
-  return html`<svg class="strip-of-time" viewBox="0 0 100 1" preserveAspectRatio="none" role="img" aria-label=${said}><title>${said}</title>${parts}</svg>`;
+  return html`<svg class="timeline-bar" viewBox="0 0 100 1" preserveAspectRatio="none" role="img"
+    aria-label=${said}><title>${said}</title>${parts}</svg>`;
 }
 
-/** The list. */
-export const list = (all) => html`
+export const timelineList = (all) => html`
   <ol class="steps">${all.map(
     ({ phase, at_ms, took, isOver, attempt }) => html`
-    <li><time class="quiet" title=${moment(at_ms)}>${clock(at_ms)}</time> ${phaseSign(phase)} <span class="quiet">${took || !isOver ? `${isOver ? '' : 'for '}${duration(took)}` : ''}${attempt > 1 ? html`, try ${attempt}` : nothing}</span></li>`,
+    <li><time class="quiet" title=${moment(at_ms)}>${clock(at_ms)}</time>
+      ${phaseBadge(phase)} <span class="quiet">${
+        took || !isOver ? `${isOver ? '' : 'for '}${duration(took)}` : ''
+      }${attempt > 1 ? html`, attempt ${attempt}` : nothing}</span></li>`,
   )}</ol>`;

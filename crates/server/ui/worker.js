@@ -1,5 +1,5 @@
-// The shared worker: one stream of events for all tabs of this page, because a browser allows six
-// connections to a server. It passes on what it hears and knows nothing of robots.
+// The shared worker: one event stream for all tabs, since a browser allows six connections per
+// server. It forwards messages without reading them.
 
 import { openStream } from './stream.js';
 
@@ -7,7 +7,7 @@ const tabs = new Set();
 let close = null;
 let state = null;
 
-function tell(message) {
+function broadcast(message) {
   if (message.state) state = message;
   if (message.state === 'signed_out') close = null;
   for (const tab of tabs) tab.postMessage(message);
@@ -17,11 +17,11 @@ function join(tab) {
   tabs.add(tab);
   if (!close) {
     state = null;
-    close = openStream(tell);
+    close = openStream(broadcast);
   } else if (state) tab.postMessage(state);
 }
 
-function hangUp() {
+function disconnect() {
   close?.();
   close = null;
 }
@@ -31,9 +31,9 @@ addEventListener('connect', ({ ports: [tab] }) => {
     if (data === 'join') join(tab);
     if (data === 'leave') tabs.delete(tab);
     if (data === 'sign_out') {
-      hangUp();
-      tell({ state: 'signed_out' });
+      disconnect();
+      broadcast({ state: 'signed_out' });
     }
-    if (!tabs.size) hangUp();
+    if (!tabs.size) disconnect();
   };
 });

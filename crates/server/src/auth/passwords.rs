@@ -12,11 +12,11 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::Instant;
 
 /// Maximum queue length; a further request is refused.
-const MOST_WAITING: usize = 32;
+const MAX_QUEUED: usize = 32;
 /// Minimum password length, in characters.
-const SHORTEST: usize = 12;
+const MIN_CHARS: usize = 12;
 /// Maximum password length, in bytes.
-const LONGEST: usize = 1024;
+const MAX_BYTES: usize = 1024;
 /// The hash of an unknown password, at the costs of new hashes: verified for a user without a
 /// password.
 const DECOY: &str = "$argon2id$v=19$m=19456,t=2,p=1$oiWDNzbpRSZLLWAsLdq6YA$fFQXZmPfKzsmg/2F1msjXUWT4U8aycI1kUvh4FTMccY";
@@ -47,9 +47,9 @@ impl std::fmt::Debug for PasswordHash {
 pub enum PasswordError {
     /// The password is too easy to guess, or too long.
     #[error("{0}")]
-    Unfit(String),
+    Unacceptable(String),
     /// Too many requests are queued.
-    #[error("too many sign-ins at once")]
+    #[error("too many concurrent sign-ins")]
     Busy,
     /// The hash can't be computed, or the stored text is not a hash.
     #[error("a password could not be hashed")]
@@ -59,11 +59,19 @@ pub enum PasswordError {
 /// Hashes and verifies passwords. Clones share the same limits.
 #[derive(Debug, Clone)]
 pub struct Passwords {
-    turns: Arc<Semaphore>,
-    places: Arc<Semaphore>,
+    slots: Arc<Semaphore>,
+    queue: Arc<Semaphore>,
     decoy: PasswordHash,
     /// Duration of the last verification, in microseconds.
-    took_us: Arc<AtomicU64>,
+    last_duration_us: Arc<AtomicU64>,
+}
+
+/// A turn to hash or verify one password. It ends when it is dropped.
+#[derive(Debug)]
+pub struct Turn {
+    requested: Instant,
+    queued: OwnedSemaphorePermit,
+    slot: OwnedSemaphorePermit,
 }
 
 impl Default for Passwords {
@@ -71,17 +79,26 @@ impl Default for Passwords {
         // A quarter of the cores, at half of their time.
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let at_once = (cores / 4).clamp(1, 4);
-        let places = Arc::new(Semaphore::new(at_once + MOST_WAITING));
+        let queue = Arc::new(Semaphore::new(at_once + MAX_QUEUED));
         Self {
-            turns: Arc::new(Semaphore::new(at_once)),
-            places,
+            slots: Arc::new(Semaphore::new(at_once)),
+            queue,
             decoy: PasswordHash(DECOY.to_owned()),
-            took_us: Arc::default(),
+            last_duration_us: Arc::default(),
         }
     }
 }
 
 impl Passwords {
+    /// Waits for a turn. Few have one at a time, so a caller may do its own work of a sign-in in the
+    /// turn as well: the same limit then bounds that work.
+    pub async fn turn(&self) -> Result<Turn, PasswordError> {
+        let requested = Instant::now();
+        let queued = self.queue.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
+        let slot = self.slots.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
+        Ok(Turn { requested, queued, slot })
+    }
+
     /// Hashes a new password of `user`.
     pub async fn hash(
         &self,
@@ -90,51 +107,54 @@ impl Passwords {
     ) -> Result<PasswordHash, PasswordError> {
         check(user, password)?;
         let password = password.to_owned();
-        self.work(move || hashed(&password)).await?
+        self.turn().await?.work(move || hashed(&password)).await?
     }
 
     /// Whether `password` matches the hash. Without a hash the call takes as long, and returns
     /// false.
     pub async fn verify(
         &self,
+        turn: Turn,
         password: &str,
         hash: Option<&PasswordHash>,
     ) -> Result<bool, PasswordError> {
-        if password.len() > LONGEST {
+        if password.len() > MAX_BYTES {
             return Ok(false);
         }
-        let (password, is_there) = (password.to_owned(), hash.is_some());
+        let (password, has_hash) = (password.to_owned(), hash.is_some());
         let hash = hash.unwrap_or(&self.decoy).clone();
-        let begun = Instant::now();
-        let checked = self.work(move || {
+        let requested = turn.requested;
+        let checked = turn.work(move || {
             match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
-                Ok(()) => Ok(is_there),
+                Ok(()) => Ok(has_hash),
                 Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
                 Err(_) => Err(PasswordError::Failed),
             }
         });
         let checked = checked.await?;
-        let took_us = u64::try_from(begun.elapsed().as_micros()).unwrap_or(u64::MAX);
-        self.took_us.store(took_us, Ordering::Relaxed);
+        let last_duration_us = u64::try_from(requested.elapsed().as_micros()).unwrap_or(u64::MAX);
+        self.last_duration_us.store(last_duration_us, Ordering::Relaxed);
         checked
     }
 
-    /// Takes as long as the last verification, without its work.
-    pub async fn pretend(&self) {
-        tokio::time::sleep(Duration::from_micros(self.took_us.load(Ordering::Relaxed))).await;
+    /// Takes as long as the last verification with its turn, without the work.
+    pub async fn simulate_verify(&self) {
+        tokio::time::sleep(Duration::from_micros(self.last_duration_us.load(Ordering::Relaxed)))
+            .await;
     }
+}
 
+impl Turn {
     async fn work<T: Send + 'static>(
-        &self,
+        self,
         work: impl FnOnce() -> T + Send + 'static,
     ) -> Result<T, PasswordError> {
-        let place = self.places.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
-        let turn = self.turns.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
+        let Self { queued, slot, .. } = self;
         let begun = Instant::now();
-        // The work continues if the caller goes away, so its turn must continue too.
+        // The work continues if the caller goes away, so its slot stays taken too.
         let working = tokio::spawn(async move {
             let done = tokio::task::spawn_blocking(work).await;
-            tokio::spawn(rest(begun, turn, place));
+            tokio::spawn(hold_slot(begun, slot, queued));
             done
         });
         match working.await {
@@ -144,10 +164,10 @@ impl Passwords {
     }
 }
 
-/// Holds the turn for as long again as the work took.
-async fn rest(begun: Instant, turn: OwnedSemaphorePermit, place: OwnedSemaphorePermit) {
+/// Holds the slot for as long again as the work took.
+async fn hold_slot(begun: Instant, slot: OwnedSemaphorePermit, queued: OwnedSemaphorePermit) {
     tokio::time::sleep(begun.elapsed()).await;
-    drop((turn, place));
+    drop((slot, queued));
 }
 
 fn hashed(password: &str) -> Result<PasswordHash, PasswordError> {
@@ -160,22 +180,24 @@ fn hashed(password: &str) -> Result<PasswordHash, PasswordError> {
 /// Length is the only requirement for a password, as in NIST SP 800-63B, besides not being an
 /// obvious guess.
 fn check(user: &UserName, password: &str) -> Result<(), PasswordError> {
-    let unfit = |reason: &str| Err(PasswordError::Unfit(reason.to_owned()));
-    if password.chars().count() < SHORTEST {
-        return Err(PasswordError::Unfit(format!("it needs at least {SHORTEST} characters")));
+    let unacceptable = |reason: &str| Err(PasswordError::Unacceptable(reason.to_owned()));
+    if password.chars().count() < MIN_CHARS {
+        return Err(PasswordError::Unacceptable(format!(
+            "must have at least {MIN_CHARS} characters"
+        )));
     }
-    if password.len() > LONGEST {
-        return Err(PasswordError::Unfit(format!("it may have at most {LONGEST} bytes")));
+    if password.len() > MAX_BYTES {
+        return Err(PasswordError::Unacceptable(format!("must have at most {MAX_BYTES} bytes")));
     }
     let lower = password.to_lowercase();
-    if lower.replace(user.as_str(), "").chars().count() < SHORTEST / 2 {
-        return unfit("it is little more than the user's name");
+    if lower.replace(user.as_str(), "").chars().count() < MIN_CHARS / 2 {
+        return unacceptable("too similar to the user's name");
     }
     let mut different: Vec<char> = lower.chars().collect();
     different.sort_unstable();
     different.dedup();
     if different.len() < 5 {
-        return unfit("it has too few different characters");
+        return unacceptable("too few different characters");
     }
     Ok(())
 }
@@ -188,22 +210,30 @@ mod tests {
         "alice".parse().expect("a name")
     }
 
+    async fn verify(
+        passwords: &Passwords,
+        password: &str,
+        hash: Option<&PasswordHash>,
+    ) -> Result<bool, PasswordError> {
+        passwords.verify(passwords.turn().await?, password, hash).await
+    }
+
     #[tokio::test]
-    async fn a_password_is_known_again_and_no_other_is() {
+    async fn password_verifies_and_others_do_not() {
         let passwords = Passwords::default();
         let hash = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
         assert!(hash.as_str().starts_with("$argon2id$v=19$m=19456,t=2,p=1$"), "{}", hash.as_str());
         assert!(!format!("{hash:?}").contains("argon2"));
-        assert!(passwords.verify("correct horse battery", Some(&hash)).await.expect("checked"));
+        assert!(verify(&passwords, "correct horse battery", Some(&hash)).await.expect("checked"));
         for wrong in
-            ["correct horse batterz", "", "Correct horse battery", &"x".repeat(LONGEST + 1)]
+            ["correct horse batterz", "", "Correct horse battery", &"x".repeat(MAX_BYTES + 1)]
         {
-            assert!(!passwords.verify(wrong, Some(&hash)).await.expect("checked"), "{wrong:?}");
+            assert!(!verify(&passwords, wrong, Some(&hash)).await.expect("checked"), "{wrong:?}");
         }
-        assert!(!passwords.verify("correct horse battery", None).await.expect("checked"));
+        assert!(!verify(&passwords, "correct horse battery", None).await.expect("checked"));
         let nonsense = PasswordHash::stored("nonsense".to_owned());
         assert!(matches!(
-            passwords.verify("correct horse battery", Some(&nonsense)).await,
+            verify(&passwords, "correct horse battery", Some(&nonsense)).await,
             Err(PasswordError::Failed)
         ));
         let again = passwords.hash(&alice(), "correct horse battery").await.expect("hashed");
@@ -211,7 +241,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_has_no_password_costs_as_much_as_who_has_one() {
+    async fn verification_without_a_password_costs_as_much() {
         let passwords = Passwords::default();
         let (hash, costs) = (
             passwords.hash(&alice(), "correct horse battery").await.expect("hashed"),
@@ -226,15 +256,15 @@ mod tests {
             ..Passwords::default()
         };
         assert!(matches!(
-            unreadable.verify("correct horse battery", None).await,
+            verify(&unreadable, "correct horse battery", None).await,
             Err(PasswordError::Failed)
         ));
         let fitting = Passwords { decoy: hash, ..Passwords::default() };
-        assert!(!fitting.verify("correct horse battery", None).await.expect("checked"));
+        assert!(!verify(&fitting, "correct horse battery", None).await.expect("checked"));
     }
 
     #[test]
-    fn what_anyone_would_try_is_refused() {
+    fn obvious_passwords_are_refused() {
         for bad in [
             "short",
             "elevenchars",
@@ -243,7 +273,7 @@ mod tests {
             "abababababab",
             &"x1y2z3".repeat(200),
         ] {
-            assert!(matches!(check(&alice(), bad), Err(PasswordError::Unfit(_))), "{bad:?}");
+            assert!(matches!(check(&alice(), bad), Err(PasswordError::Unacceptable(_))), "{bad:?}");
         }
         for good in
             ["correct horse battery", "twelve chars", "pässwörter sind", "alice in chains live"]
@@ -253,13 +283,13 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_flood_is_turned_away_and_the_rest_gets_its_turn() {
+    async fn verification_flood_is_refused_beyond_the_queue() {
         let passwords = Passwords::default();
-        let (places, held) =
-            (passwords.places.available_permits(), passwords.turns.available_permits());
+        let (queue, held) =
+            (passwords.queue.available_permits(), passwords.slots.available_permits());
         assert!(
-            (1..=4).contains(&held) && places == held + MOST_WAITING,
-            "{held} at once, {places} in all"
+            (1..=4).contains(&held) && queue == held + MAX_QUEUED,
+            "{held} at once, {queue} in all"
         );
         let mut flood = tokio::task::JoinSet::new();
         // The running verification is held until all requests have arrived.
@@ -267,25 +297,26 @@ mod tests {
         for _ in 0..held {
             let (passwords, gate) = (passwords.clone(), gate.clone());
             flood.spawn(async move {
-                passwords
-                    .work(move || {
-                        gate.wait();
-                    })
-                    .await
-                    .is_ok()
+                let turn = passwords.turn().await.expect("a turn");
+                let wait = move || {
+                    gate.wait();
+                };
+                turn.work(wait).await.is_ok()
             });
         }
-        while passwords.turns.available_permits() > 0 {
+        while passwords.slots.available_permits() > 0 {
             tokio::task::yield_now().await;
         }
-        for _ in held..places {
+        for _ in held..queue {
             let passwords = passwords.clone();
-            flood.spawn(async move { passwords.work(|| ()).await.is_ok() });
+            flood.spawn(async move {
+                passwords.turn().await.expect("a turn").work(|| ()).await.is_ok()
+            });
         }
-        while passwords.places.available_permits() > 0 {
+        while passwords.queue.available_permits() > 0 {
             tokio::task::yield_now().await;
         }
-        let turned_away = passwords.verify("correct horse battery", None).await;
+        let turned_away = verify(&passwords, "correct horse battery", None).await;
         for _ in 0..held {
             let gate = gate.clone();
             tokio::task::spawn_blocking(move || {
@@ -299,16 +330,17 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_turn_rests_for_as_long_as_it_has_worked() {
+    async fn slot_rests_for_as_long_as_it_has_worked() {
         let passwords = Passwords::default();
-        let all = u32::try_from(passwords.turns.available_permits()).expect("few");
+        let all = u32::try_from(passwords.slots.available_permits()).expect("few");
         let work = || {
             let begun = Instant::now();
             hashed("correct horse battery").expect("hashed");
             (begun.elapsed(), Instant::now())
         };
-        let (worked, done_at) = passwords.work(work).await.expect("a turn");
-        let _every_turn = passwords.turns.acquire_many(all).await.expect("open");
+        let turn = passwords.turn().await.expect("a turn");
+        let (worked, done_at) = turn.work(work).await.expect("done");
+        let _every_slot = passwords.slots.acquire_many(all).await.expect("open");
         assert!(done_at.elapsed() >= worked, "{:?} after {worked:?}", done_at.elapsed());
     }
 }

@@ -2,7 +2,8 @@
 //! in from an address, the pair of both has a separate count, and no other count applies to it. So
 //! neither strangers elsewhere nor neighbours behind the same address can lock the account's owner
 //! out. Every attempt counts as failed until it has succeeded, so concurrent attempts all count.
-//! Memory is bounded. This module never sees a password.
+//! The windows of accounts are kept by the caller; everything else is in memory, which is bounded.
+//! This module never sees a password.
 
 use std::collections::HashMap;
 use std::hash::Hash;
@@ -12,31 +13,30 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use task_proto::UserName;
 
 /// Period for which failures count.
-const WINDOW_MS: u64 = 15 * 60 * 1000;
+pub const WINDOW_MS: u64 = 15 * 60 * 1000;
 /// Maximum failures for one account: from all unfamiliar addresses together, or from one familiar
 /// address.
-const MOST_FOR_ACCOUNT: u32 = 10;
+const MAX_FOR_ACCOUNT: u64 = 10;
 /// Maximum failures from one address, for accounts unfamiliar there. A whole lab may share one
 /// address.
-const MOST_FROM_ADDRESS: u32 = 50;
+const MAX_FROM_ADDRESS: u64 = 50;
 /// Maximum counts of each kind.
-const MOST_COUNTS: usize = 8_192;
+const MAX_COUNTS: usize = 8_192;
 /// Maximum familiar pairs of account and address.
-const MOST_FAMILIAR: usize = 8_192;
+const MAX_FAMILIAR: usize = 8_192;
 
 #[derive(Debug, Default)]
-pub struct SignIns(Mutex<Counts>);
+pub struct SignInLimiter(Mutex<Counts>);
 
 #[derive(Debug, Default)]
 struct Counts {
-    accounts: Windows<UserName>,
-    /// Names without an account: answered like others, but they must not take room from real
-    /// accounts.
-    nobody: Windows<UserName>,
+    /// Names without an account: answered like others, but not stored. Such a name may be a
+    /// password in the wrong field.
+    unknown_names: Windows<UserName>,
     addresses: Windows<IpAddr>,
     /// Attempts of which only the address is known. Wrong passwords don't count here, and these
     /// attempts don't count as wrong passwords.
-    unnamed: Windows<IpAddr>,
+    anonymous: Windows<IpAddr>,
     pairs: Windows<(UserName, IpAddr)>,
     familiar: HashMap<(UserName, IpAddr), u64>,
 }
@@ -47,52 +47,77 @@ pub struct Blocked {
     /// The end of the block.
     pub until_ms: u64,
     /// Whether this is the first refused attempt.
-    pub is_news: bool,
+    pub is_first: bool,
 }
 
-impl SignIns {
-    /// Counts an attempt before it is made. `is_known` tells whether the account exists.
+/// Whether the account has recently signed in from the address of an attempt.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Familiarity {
+    /// The attempt counts for the pair of both alone.
+    Familiar,
+    /// The attempt counts for the address and for the name.
+    Unfamiliar,
+}
+
+impl SignInLimiter {
+    /// Counts an attempt before it is made. The caller counts an unfamiliar one for the name as
+    /// well: in the account's [`Window`], or without an account by [`Self::count_unknown_name`].
     pub fn begin(
         &self,
         user: &UserName,
-        is_known: bool,
         address: IpAddr,
         now_ms: u64,
-    ) -> Result<(), Blocked> {
+    ) -> Result<Familiarity, Blocked> {
         let address = network(address);
         let mut counts = self.lock();
         let pair = (user.clone(), address);
         if counts.familiar.contains_key(&pair) {
-            return counts.pairs.count(pair, MOST_FOR_ACCOUNT, now_ms);
+            counts.pairs.count(pair, MAX_FOR_ACCOUNT, now_ms)?;
+            return Ok(Familiarity::Familiar);
         }
-        counts.addresses.count(address, MOST_FROM_ADDRESS, now_ms)?;
-        let accounts = if is_known { &mut counts.accounts } else { &mut counts.nobody };
-        accounts.count(user.clone(), MOST_FOR_ACCOUNT, now_ms)
+        counts.addresses.count(address, MAX_FROM_ADDRESS, now_ms)?;
+        Ok(Familiarity::Unfamiliar)
+    }
+
+    /// Counts an unfamiliar attempt for a name without an account.
+    pub fn count_unknown_name(&self, name: &UserName, now_ms: u64) -> Result<(), Blocked> {
+        self.lock().unknown_names.count(name.clone(), MAX_FOR_ACCOUNT, now_ms)
+    }
+
+    /// The block of a name without an account.
+    pub fn unknown_name_block(&self, name: &UserName, now_ms: u64) -> Option<Blocked> {
+        self.lock().unknown_names.active_block(name, MAX_FOR_ACCOUNT, now_ms)
     }
 
     /// Counts an attempt of which only the address is known, before it is made.
-    pub fn begin_unnamed(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
-        self.lock().unnamed.count(network(address), MOST_FROM_ADDRESS, now_ms)
+    pub fn begin_anonymous(&self, address: IpAddr, now_ms: u64) -> Result<(), Blocked> {
+        self.lock().anonymous.count(network(address), MAX_FROM_ADDRESS, now_ms)
     }
 
     /// The unnamed attempt has succeeded.
-    pub fn unnamed_succeeded(&self, address: IpAddr) {
-        self.lock().unnamed.take_back(&network(address));
+    pub fn anonymous_succeeded(&self, address: IpAddr) {
+        self.lock().anonymous.decrement(&network(address));
     }
 
     /// The end of the block for unfamiliar names at the address. A wrong password for a familiar
     /// name gets the same answer, so that an attacker can't learn which names are familiar.
     pub fn blocked_at(&self, address: IpAddr, now_ms: u64) -> Option<Blocked> {
-        self.lock().addresses.exceeded(&network(address), MOST_FROM_ADDRESS, now_ms)
+        self.lock().addresses.active_block(&network(address), MAX_FROM_ADDRESS, now_ms)
     }
 
     /// The attempt has succeeded: it no longer counts, and the address is now familiar for the
     /// account.
-    pub fn succeeded(&self, user: &UserName, address: IpAddr, now_ms: u64) {
+    pub fn succeeded(
+        &self,
+        user: &UserName,
+        address: IpAddr,
+        familiarity: Familiarity,
+        now_ms: u64,
+    ) {
         let pair = (user.clone(), network(address));
         let mut counts = self.lock();
-        counts.take_back(&pair, true);
-        if counts.familiar.len() >= MOST_FAMILIAR && !counts.familiar.contains_key(&pair) {
+        counts.decrement(&pair, familiarity);
+        if counts.familiar.len() >= MAX_FAMILIAR && !counts.familiar.contains_key(&pair) {
             let oldest = counts
                 .familiar
                 .iter()
@@ -104,8 +129,8 @@ impl SignIns {
     }
 
     /// The attempt was not made after all.
-    pub fn given_up(&self, user: &UserName, is_known: bool, address: IpAddr) {
-        self.lock().take_back(&(user.clone(), network(address)), is_known);
+    pub fn cancelled(&self, user: &UserName, address: IpAddr, familiarity: Familiarity) {
+        self.lock().decrement(&(user.clone(), network(address)), familiarity);
     }
 
     fn lock(&self) -> MutexGuard<'_, Counts> {
@@ -115,13 +140,10 @@ impl SignIns {
 }
 
 impl Counts {
-    fn take_back(&mut self, pair: &(UserName, IpAddr), is_known: bool) {
-        if self.familiar.contains_key(pair) {
-            self.pairs.take_back(pair);
-        } else {
-            self.addresses.take_back(&pair.1);
-            let accounts = if is_known { &mut self.accounts } else { &mut self.nobody };
-            accounts.take_back(&pair.0);
+    fn decrement(&mut self, pair: &(UserName, IpAddr), familiarity: Familiarity) {
+        match familiarity {
+            Familiarity::Familiar => self.pairs.decrement(pair),
+            Familiarity::Unfamiliar => self.addresses.decrement(&pair.1),
         }
     }
 }
@@ -132,10 +154,52 @@ struct Windows<K> {
     counts: HashMap<K, Window>,
 }
 
-#[derive(Debug)]
-struct Window {
-    began_ms: u64,
-    count: u32,
+/// The attempts of one period.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Window {
+    pub began_ms: u64,
+    /// Attempts that have not succeeded.
+    pub count: u64,
+}
+
+impl Window {
+    /// The latest window with one more attempt; a new window if that one is over.
+    pub fn with_attempt(latest: Option<Self>, now_ms: u64) -> Self {
+        let latest = latest.filter(|latest| !latest.is_over(now_ms));
+        let Self { began_ms, count } = latest.unwrap_or(Self { began_ms: now_ms, count: 0 });
+        Self { began_ms, count: count.saturating_add(1) }
+    }
+
+    /// The window without an attempt that has succeeded.
+    pub fn without_attempt(self) -> Self {
+        Self { count: self.count.saturating_sub(1), ..self }
+    }
+
+    /// Refuses the attempt of an account that was just added, if there are too many.
+    pub fn check_account(self) -> Result<(), Blocked> {
+        self.check(MAX_FOR_ACCOUNT)
+    }
+
+    /// The block of an account; `None`: more attempts are permitted.
+    pub fn account_block(self, now_ms: u64) -> Option<Blocked> {
+        self.block(MAX_FOR_ACCOUNT, now_ms)
+    }
+
+    fn check(self, max: u64) -> Result<(), Blocked> {
+        if self.count <= max {
+            return Ok(());
+        }
+        Err(Blocked { until_ms: self.began_ms + WINDOW_MS, is_first: self.count == max + 1 })
+    }
+
+    fn block(self, max: u64, now_ms: u64) -> Option<Blocked> {
+        let until_ms = self.began_ms + WINDOW_MS;
+        (self.count > max && now_ms < until_ms).then_some(Blocked { until_ms, is_first: false })
+    }
+
+    fn is_over(self, now_ms: u64) -> bool {
+        now_ms.saturating_sub(self.began_ms) >= WINDOW_MS
+    }
 }
 
 impl<K> Default for Windows<K> {
@@ -145,40 +209,28 @@ impl<K> Default for Windows<K> {
 }
 
 impl<K: Eq + Hash> Windows<K> {
-    fn count(&mut self, key: K, most: u32, now_ms: u64) -> Result<(), Blocked> {
-        let is_over = |window: &Window| now_ms.saturating_sub(window.began_ms) >= WINDOW_MS;
-        if self.counts.len() >= MOST_COUNTS && !self.counts.contains_key(&key) {
-            self.counts.retain(|_, window| !is_over(window));
+    fn count(&mut self, key: K, max: u64, now_ms: u64) -> Result<(), Blocked> {
+        if self.counts.len() >= MAX_COUNTS && !self.counts.contains_key(&key) {
+            self.counts.retain(|_, window| !window.is_over(now_ms));
             // An attacker that fills the table with names or addresses gains as many tries as a
             // restart of the server gives.
-            if self.counts.len() >= MOST_COUNTS {
+            if self.counts.len() >= MAX_COUNTS {
                 self.counts.clear();
             }
         }
-        let window = self.counts.entry(key).or_insert(Window { began_ms: now_ms, count: 0 });
-        if is_over(window) {
-            *window = Window { began_ms: now_ms, count: 0 };
-        }
-        window.count = window.count.saturating_add(1);
-        if window.count <= most {
-            return Ok(());
-        }
-        Err(Blocked { until_ms: window.began_ms + WINDOW_MS, is_news: window.count == most + 1 })
+        let window = Window::with_attempt(self.counts.get(&key).copied(), now_ms);
+        self.counts.insert(key, window);
+        window.check(max)
     }
 
     /// The end of the block; `None`: more attempts are permitted.
-    fn exceeded(&self, key: &K, most: u32, now_ms: u64) -> Option<Blocked> {
-        let until_ms = |window: &Window| window.began_ms + WINDOW_MS;
-        let window = self
-            .counts
-            .get(key)
-            .filter(|window| window.count > most && now_ms < until_ms(window))?;
-        Some(Blocked { until_ms: until_ms(window), is_news: false })
+    fn active_block(&self, key: &K, max: u64, now_ms: u64) -> Option<Blocked> {
+        self.counts.get(key)?.block(max, now_ms)
     }
 
-    fn take_back(&mut self, key: &K) {
+    fn decrement(&mut self, key: &K) {
         if let Some(window) = self.counts.get_mut(key) {
-            window.count = window.count.saturating_sub(1);
+            *window = window.without_attempt();
         }
     }
 }
@@ -207,39 +259,64 @@ mod tests {
         IpAddr::from([10, 0, 0, n])
     }
 
-    #[test]
-    fn an_account_is_blocked_for_strangers_and_not_for_its_owner() {
-        let sign_ins = SignIns::default();
-        let alice = user("alice");
-        sign_ins.begin(&alice, true, address(1), NOW_MS).expect("allowed");
-        sign_ins.succeeded(&alice, address(1), NOW_MS);
-        for n in 0..MOST_FOR_ACCOUNT {
-            sign_ins.begin(&alice, true, address(100 + n as u8), NOW_MS).expect("allowed");
+    /// The limiter, and the window of one account as its caller keeps it.
+    #[derive(Default)]
+    struct Account {
+        sign_ins: SignInLimiter,
+        window: Option<Window>,
+    }
+
+    impl Account {
+        fn begin(&mut self, address: IpAddr, now_ms: u64) -> Result<Familiarity, Blocked> {
+            let familiarity = self.sign_ins.begin(&user("alice"), address, now_ms)?;
+            if familiarity == Familiarity::Unfamiliar {
+                let window = Window::with_attempt(self.window, now_ms);
+                self.window = Some(window);
+                window.check_account()?;
+            }
+            Ok(familiarity)
         }
-        let until_ms = NOW_MS + WINDOW_MS;
-        let blocked = |is_news| Err(Blocked { until_ms, is_news });
-        assert_eq!(sign_ins.begin(&alice, true, address(99), NOW_MS + 1), blocked(true));
-        assert_eq!(sign_ins.begin(&alice, true, address(98), NOW_MS + 1), blocked(false));
-        assert_eq!(sign_ins.begin(&user("bob"), true, address(99), NOW_MS), Ok(()));
-        for _ in 0..MOST_FOR_ACCOUNT {
-            sign_ins
-                .begin(&alice, true, address(1), NOW_MS + 2)
-                .expect("the owner's address has its own count");
+
+        fn sign_in(&mut self, address: IpAddr, now_ms: u64) {
+            let familiarity = self.begin(address, now_ms).expect("allowed");
+            self.sign_ins.succeeded(&user("alice"), address, familiarity, now_ms);
+            if familiarity == Familiarity::Unfamiliar {
+                self.window = self.window.map(Window::without_attempt);
+            }
         }
-        assert!(sign_ins.begin(&alice, true, address(1), NOW_MS + 2).is_err());
-        assert_eq!(sign_ins.begin(&alice, true, address(99), until_ms), Ok(()));
     }
 
     #[test]
-    fn an_address_is_blocked_whatever_names_it_tries() {
-        let sign_ins = SignIns::default();
-        for n in 0..MOST_FROM_ADDRESS {
-            sign_ins
-                .begin(&user(&format!("user{n}")), n % 2 == 0, address(1), NOW_MS)
-                .expect("allowed");
+    fn account_is_blocked_for_strangers_and_not_for_its_owner() {
+        let mut alice = Account::default();
+        alice.sign_in(address(1), NOW_MS);
+        for n in 0..MAX_FOR_ACCOUNT {
+            assert_eq!(alice.window.and_then(|window| window.account_block(NOW_MS)), None);
+            alice.begin(address(100 + n as u8), NOW_MS).expect("allowed");
         }
-        assert!(sign_ins.begin(&user("alice"), true, address(1), NOW_MS).is_err());
-        assert_eq!(sign_ins.begin(&user("alice"), true, address(2), NOW_MS), Ok(()));
+        let until_ms = NOW_MS + WINDOW_MS;
+        let blocked = |is_first| Blocked { until_ms, is_first };
+        assert_eq!(alice.begin(address(99), NOW_MS + 1), Err(blocked(true)));
+        assert_eq!(alice.begin(address(98), NOW_MS + 1), Err(blocked(false)));
+        let window = alice.window.expect("attempts were counted");
+        assert_eq!(window.account_block(NOW_MS + 1), Some(blocked(false)));
+        for _ in 0..MAX_FOR_ACCOUNT {
+            alice.begin(address(1), NOW_MS + 2).expect("the owner's address has its own count");
+        }
+        assert!(alice.begin(address(1), NOW_MS + 2).is_err());
+        assert_eq!(window.account_block(until_ms), None);
+        assert_eq!(alice.begin(address(99), until_ms), Ok(Familiarity::Unfamiliar));
+        assert_eq!(alice.window, Some(Window { began_ms: until_ms, count: 1 }));
+    }
+
+    #[test]
+    fn address_is_blocked_across_all_names() {
+        let sign_ins = SignInLimiter::default();
+        for n in 0..MAX_FROM_ADDRESS {
+            sign_ins.begin(&user(&format!("user{n}")), address(1), NOW_MS).expect("allowed");
+        }
+        assert!(sign_ins.begin(&user("alice"), address(1), NOW_MS).is_err());
+        assert!(sign_ins.begin(&user("alice"), address(2), NOW_MS).is_ok());
         // Neighbours in one IPv6 network count as one, and an IPv4 address stays the same when
         // mapped into IPv6.
         let six = |text: &str| network(text.parse().expect("an address"));
@@ -250,66 +327,71 @@ mod tests {
 
     #[test]
     fn account_known_at_an_address_is_not_blocked_by_its_neighbours() {
-        let sign_ins = SignIns::default();
-        let (alice, ghost) = (user("alice"), user("ghost"));
-        sign_ins.begin(&alice, true, address(1), NOW_MS).expect("allowed");
-        sign_ins.succeeded(&alice, address(1), NOW_MS);
-        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS), None);
-        for n in 0..=MOST_FROM_ADDRESS {
-            let _ = sign_ins.begin(&user(&format!("user{n}")), false, address(1), NOW_MS);
+        let mut alice = Account::default();
+        alice.sign_in(address(1), NOW_MS);
+        assert_eq!(alice.sign_ins.blocked_at(address(1), NOW_MS), None);
+        for n in 0..=MAX_FROM_ADDRESS {
+            let _ = alice.sign_ins.begin(&user(&format!("user{n}")), address(1), NOW_MS);
         }
-        let blocked = sign_ins.begin(&ghost, false, address(1), NOW_MS).expect_err("blocked");
-        for _ in 0..MOST_FOR_ACCOUNT {
-            sign_ins.begin(&alice, true, address(1), NOW_MS).expect("she is known there");
+        let blocked =
+            alice.sign_ins.begin(&user("ghost"), address(1), NOW_MS).expect_err("blocked");
+        for _ in 0..MAX_FOR_ACCOUNT {
+            alice.begin(address(1), NOW_MS).expect("she is known there");
         }
         assert_eq!(
-            sign_ins.blocked_at(address(1), NOW_MS),
+            alice.sign_ins.blocked_at(address(1), NOW_MS),
             Some(blocked),
             "her failures are told like theirs"
         );
-        assert_eq!(sign_ins.blocked_at(address(1), NOW_MS + WINDOW_MS), None);
-        sign_ins
-            .begin_unnamed(address(1), NOW_MS)
+        assert_eq!(alice.sign_ins.blocked_at(address(1), NOW_MS + WINDOW_MS), None);
+        alice
+            .sign_ins
+            .begin_anonymous(address(1), NOW_MS)
             .expect("the provider's sign-ins are counted apart");
     }
 
     #[test]
-    fn what_succeeds_or_is_given_up_does_not_count() {
-        let sign_ins = SignIns::default();
-        let alice = user("alice");
-        for n in 0..10 * MOST_FROM_ADDRESS {
-            sign_ins.begin(&alice, true, address(1), NOW_MS).expect("allowed");
-            match n % 2 {
-                0 => sign_ins.succeeded(&alice, address(1), NOW_MS),
-                _ => sign_ins.given_up(&alice, true, address(1)),
-            }
+    fn successful_and_cancelled_attempts_do_not_count() {
+        let mut alice = Account::default();
+        for n in 0..10 * MAX_FROM_ADDRESS {
+            let from = address(n as u8);
+            alice.sign_in(from, NOW_MS);
+            let name = user("bob");
+            let familiarity = alice.sign_ins.begin(&name, from, NOW_MS).expect("allowed");
+            alice.sign_ins.cancelled(&name, from, familiarity);
         }
+        assert_eq!(alice.window.expect("it was used").count, 0);
     }
 
     #[test]
-    fn a_name_that_nobody_has_is_blocked_like_any_other() {
-        let sign_ins = SignIns::default();
-        for n in 0..MOST_FOR_ACCOUNT {
-            sign_ins.begin(&user("ghost"), false, address(n as u8), NOW_MS).expect("allowed");
+    fn unknown_name_is_blocked_like_any_other() {
+        let (sign_ins, ghost) = (SignInLimiter::default(), user("ghost"));
+        for _ in 0..MAX_FOR_ACCOUNT {
+            assert_eq!(sign_ins.unknown_name_block(&ghost, NOW_MS), None);
+            sign_ins.count_unknown_name(&ghost, NOW_MS).expect("allowed");
         }
-        assert!(sign_ins.begin(&user("ghost"), false, address(200), NOW_MS).is_err());
+        let blocked = sign_ins.count_unknown_name(&ghost, NOW_MS).expect_err("too many");
+        assert_eq!(blocked, Blocked { until_ms: NOW_MS + WINDOW_MS, is_first: true });
+        let later = Blocked { is_first: false, ..blocked };
+        assert_eq!(sign_ins.unknown_name_block(&ghost, NOW_MS), Some(later));
+        assert_eq!(sign_ins.unknown_name_block(&user("other"), NOW_MS), None);
     }
 
     #[test]
     fn many_names_and_addresses_take_no_more_memory() {
-        let sign_ins = SignIns::default();
-        for n in 0..2 * MOST_COUNTS as u32 {
+        let sign_ins = SignInLimiter::default();
+        for n in 0..2 * MAX_COUNTS as u32 {
             let (name, from) = (user(&format!("u{n}")), IpAddr::from(n.to_be_bytes()));
-            let _ = sign_ins.begin(&name, n % 2 == 0, from, NOW_MS);
-            sign_ins.succeeded(&name, from, NOW_MS + u64::from(n));
+            let _ = sign_ins.begin(&name, from, NOW_MS);
+            let _ = sign_ins.count_unknown_name(&name, NOW_MS);
+            let at_ms = NOW_MS + u64::from(n);
+            sign_ins.succeeded(&name, from, Familiarity::Unfamiliar, at_ms);
         }
         let counts = sign_ins.lock();
         assert!(
-            counts.addresses.counts.len() <= MOST_COUNTS
-                && counts.accounts.counts.len() <= MOST_COUNTS
-        );
-        assert!(
-            counts.nobody.counts.len() <= MOST_COUNTS && counts.familiar.len() <= MOST_FAMILIAR
+            counts.addresses.counts.len() <= MAX_COUNTS
+                && counts.unknown_names.counts.len() <= MAX_COUNTS
+                && counts.familiar.len() <= MAX_FAMILIAR
         );
     }
 }

@@ -13,7 +13,7 @@ use bytes::Bytes;
 use rustix::io::{Errno, ReadWriteFlags, preadv2};
 use sha2::{Sha256, Sha512};
 use task_proto::Digest;
-use task_proto::digest::Algorithm;
+use task_proto::ids::digest::Algorithm;
 use tokio::sync::Semaphore;
 
 use super::body::BlobBody;
@@ -22,7 +22,7 @@ use super::{BlobError, Shared, on_disk};
 use crate::config::BlobRead;
 
 /// Bytes per read when a range is loaded into the page cache.
-const SCRAP_BYTES: usize = 64 * 1024;
+const READ_AHEAD_BYTES: usize = 64 * 1024;
 /// The suffix of a file that no longer holds its blob.
 const DAMAGED: &str = "damaged";
 
@@ -42,7 +42,7 @@ pub struct Blob {
 
 /// The reader of an answer's bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum BytesFor {
+pub enum BytesConsumer {
     /// The kernel, which copies them to a socket. They may be mapped.
     Socket,
     /// This process, which encrypts them. They are copied from the file.
@@ -85,7 +85,7 @@ impl Blob {
     }
 
     /// The bytes of `range`, which lies inside the blob, as the body of an answer.
-    pub fn body(&self, range: Range<u64>, reader: BytesFor) -> BlobBody {
+    pub fn body(&self, range: Range<u64>, reader: BytesConsumer) -> BlobBody {
         BlobBody::new(self.clone(), range, reader)
     }
 
@@ -141,11 +141,12 @@ impl Blob {
     /// Makes the kernel read these bytes into the page cache. This does not use the mapping: all
     /// threads share its lock, and would wait for the disk with this one.
     pub(super) fn read_ahead(&self, offset: u64, length: usize) -> io::Result<()> {
-        let mut scrap = vec![0; SCRAP_BYTES.min(length)];
+        let mut buffer = vec![0; READ_AHEAD_BYTES.min(length)];
         let end = offset + length as u64;
-        for start in (offset..end).step_by(SCRAP_BYTES) {
-            let length = usize::try_from(end - start).unwrap_or(SCRAP_BYTES).min(SCRAP_BYTES);
-            self.file.read_exact_at(&mut scrap[..length], start)?;
+        for start in (offset..end).step_by(READ_AHEAD_BYTES) {
+            let length =
+                usize::try_from(end - start).unwrap_or(READ_AHEAD_BYTES).min(READ_AHEAD_BYTES);
+            self.file.read_exact_at(&mut buffer[..length], start)?;
         }
         Ok(())
     }
@@ -162,7 +163,7 @@ impl Blob {
             let read = read(&self);
             drop(permit);
             if let Err(error) = &read {
-                self.failed(error);
+                self.check_after_failure(error);
             }
             read
         });
@@ -170,17 +171,17 @@ impl Blob {
     }
 
     /// Starts a check of the blob's file, unless one is running.
-    fn failed(&self, error: &io::Error) {
+    fn check_after_failure(&self, error: &io::Error) {
         let Some(store) = self.store.upgrade() else { return };
         let digest = self.digest;
         store.close(digest);
         if !store.checked.lock().unwrap_or_else(PoisonError::into_inner).insert(digest) {
             return;
         }
-        tracing::error!(%digest, %error, "a blob could not be read; its file is checked");
+        tracing::error!(%digest, %error, "a blob could not be read; checking its file");
         tokio::spawn(async move {
             let file = store.path(digest);
-            let checked = on_disk(move || put_aside_if_damaged(digest, &file)).await;
+            let checked = on_disk(move || quarantine_if_damaged(digest, &file)).await;
             store.close(digest);
             store.checked.lock().unwrap_or_else(PoisonError::into_inner).remove(&digest);
             match checked {
@@ -188,9 +189,9 @@ impl Blob {
                     %digest,
                     "a blob's file is damaged and was renamed to end in .{DAMAGED}: push the package again"
                 ),
-                Ok(false) => tracing::info!(%digest, "a blob's file is as it should be"),
+                Ok(false) => tracing::info!(%digest, "a blob's file is intact"),
                 Err(error) => {
-                    tracing::error!(%digest, error = &error as &dyn std::error::Error, "a blob's file stays unchecked");
+                    tracing::error!(%digest, error = &error as &dyn std::error::Error, "a blob's file could not be checked");
                 }
             }
         });
@@ -199,11 +200,11 @@ impl Blob {
 
 /// Renames a file that does not hold its blob, so that the blob counts as absent and can be pushed
 /// again. Returns true after a rename, and false if the file is sound or gone.
-fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> {
+fn quarantine_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> {
     let failed = |action| BlobError::disk(action, path);
     let before = match fs::metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
-        metadata => metadata.map_err(failed("look at"))?.ino(),
+        metadata => metadata.map_err(failed("inspect"))?.ino(),
     };
     let actual = match digest.algorithm() {
         Algorithm::Sha256 => hash::<Sha256>(path).map(|hash| Digest::from_sha256(hash.into())),
@@ -212,7 +213,7 @@ fn put_aside_if_damaged(digest: Digest, path: &Path) -> Result<bool, BlobError> 
     // A read error is that of a disk sector: the file will not get better.
     let is_sound = actual.is_ok_and(|actual| actual == digest);
     // A push may have put a good file in its place meanwhile.
-    if is_sound || fs::metadata(path).map_err(failed("look at"))?.ino() != before {
+    if is_sound || fs::metadata(path).map_err(failed("inspect"))?.ino() != before {
         return Ok(false);
     }
     fs::rename(path, path.with_extension(DAMAGED)).map_err(failed("rename"))?;
@@ -232,7 +233,7 @@ impl io::Read for BlobReader {
             Ok(0) if left > 0 && !buffer.is_empty() => Err(io::ErrorKind::UnexpectedEof.into()),
             read => read,
         };
-        let count = count.inspect_err(|error| self.blob.failed(error))?;
+        let count = count.inspect_err(|error| self.blob.check_after_failure(error))?;
         self.offset += count as u64;
         Ok(count)
     }
@@ -259,16 +260,16 @@ mod tests {
     }
 
     #[test]
-    fn sound_file_stays_and_a_changed_one_is_put_aside() {
+    fn intact_file_stays_and_a_changed_one_is_quarantined() {
         let data = tempfile::tempdir().expect("a directory");
         for algorithm in Algorithm::ALL {
             let digest = algorithm.digest(b"content");
             let path = data.path().join(digest.hex());
-            assert!(!put_aside_if_damaged(digest, &path).expect("checked"), "there is no file");
+            assert!(!quarantine_if_damaged(digest, &path).expect("checked"), "there is no file");
             fs::write(&path, b"content").expect("written");
-            assert!(!put_aside_if_damaged(digest, &path).expect("checked"));
+            assert!(!quarantine_if_damaged(digest, &path).expect("checked"));
             fs::write(&path, b"cOntent").expect("written");
-            assert!(put_aside_if_damaged(digest, &path).expect("checked"));
+            assert!(quarantine_if_damaged(digest, &path).expect("checked"));
             let aside = data.path().join(format!("{}.damaged", digest.hex()));
             assert_eq!(
                 (path.exists(), fs::read(aside).expect("kept")),

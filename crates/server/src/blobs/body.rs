@@ -12,7 +12,7 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use http_body::{Body, Frame, SizeHint};
 
-use super::{Blob, BytesFor};
+use super::{Blob, BytesConsumer};
 
 const SLICE_BYTES: u64 = 128 * 1024;
 /// The most bytes that one system call checks for presence in memory, and that are read ahead if
@@ -32,17 +32,17 @@ pub struct BlobBody {
     in_memory_until: u64,
     /// Whether the body yields to other tasks before the next slice. A client as fast as memory
     /// would otherwise keep a thread until its last byte.
-    is_turn_over: bool,
+    must_yield: bool,
     /// The next slice, while it is being fetched from the disk.
     pending: Option<BoxFuture<'static, io::Result<Bytes>>>,
 }
 
 impl BlobBody {
-    pub(super) fn new(blob: Blob, range: Range<u64>, reader: BytesFor) -> Self {
+    pub(super) fn new(blob: Blob, range: Range<u64>, reader: BytesConsumer) -> Self {
         debug_assert!(range.end <= blob.size());
-        let mapped = blob.mapped.clone().filter(|_| reader == BytesFor::Socket);
+        let mapped = blob.mapped.clone().filter(|_| reader == BytesConsumer::Socket);
         let in_memory_until = range.start;
-        Self { blob, mapped, in_memory_until, left: range, is_turn_over: false, pending: None }
+        Self { blob, mapped, in_memory_until, left: range, must_yield: false, pending: None }
     }
 
     /// The next slice if it is in memory. Otherwise starts the read.
@@ -92,7 +92,7 @@ impl Body for BlobBody {
         if self.left.is_empty() {
             return Poll::Ready(None);
         }
-        if std::mem::take(&mut self.is_turn_over) {
+        if std::mem::take(&mut self.must_yield) {
             context.waker().wake_by_ref();
             return Poll::Pending;
         }
@@ -107,7 +107,7 @@ impl Body for BlobBody {
             (None, None) => return Poll::Ready(None),
         };
         self.left.start += slice.len() as u64;
-        self.is_turn_over = true;
+        self.must_yield = true;
         Poll::Ready(Some(Ok(Frame::data(slice))))
     }
 

@@ -6,6 +6,7 @@
 use std::time::Duration;
 
 use task_proto::Digest;
+use task_proto::time::millis;
 use tokio_util::sync::CancellationToken;
 
 use super::{BlobError, Blobs};
@@ -58,11 +59,14 @@ pub async fn run(
         match collect(&store, &blobs, clock.now_ms(), grace).await {
             Ok(Collected { uploads: 0, blobs: 0 }) => {}
             Ok(Collected { uploads, blobs }) => {
-                tracing::info!(uploads, blobs, "collected what nobody needs")
+                tracing::info!(uploads, blobs, "deleted unneeded uploads and blobs")
             }
-            Err(CollectError::Store(error)) => error.log("collecting failed"),
+            Err(CollectError::Store(error)) => error.log("garbage collection failed"),
             Err(error) => {
-                tracing::warn!(error = &error as &dyn std::error::Error, "collecting failed")
+                tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    "garbage collection failed"
+                )
             }
         }
     }
@@ -75,15 +79,13 @@ pub async fn collect(
     now_ms: u64,
     grace: Duration,
 ) -> Result<Collected, CollectError> {
-    let before = |grace: Duration| {
-        now_ms.saturating_sub(u64::try_from(grace.as_millis()).unwrap_or(u64::MAX))
-    };
+    let before = |grace: Duration| now_ms.saturating_sub(millis(grace));
     let uploads = blobs.drop_idle_uploads(before(grace)).await?;
     let mut old = blobs.untouched_since(before(grace)).await?;
-    let mut dropped = store.blobs_dropped_by_robots().await?;
+    let mut dropped = store.robot_blobs().dropped().await?;
     // Most blobs are needed, and this look-up blocks no pusher. The remaining candidates are
     // checked once more below.
-    let needed = store.needed_blobs().await?;
+    let needed = store.blobs().referenced().await?;
     old.retain(|digest| !needed.contains(digest));
     dropped.retain(|digest| !needed.contains(digest));
     let removed = remove(store, blobs, &old, before(grace)).await?
@@ -109,7 +111,7 @@ async fn remove(
                 untouched.push(digest);
             }
         }
-        for digest in store.forget_unneeded(untouched).await? {
+        for digest in store.blobs().drop_unreferenced(untouched).await? {
             blobs.delete(digest, &collection).await?;
             removed += 1;
         }

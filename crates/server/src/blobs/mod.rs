@@ -20,16 +20,17 @@ use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
 use task_proto::Digest;
-use task_proto::digest::Algorithm;
+use task_proto::ids::digest::Algorithm;
+use task_proto::size::format_bytes;
+use task_proto::time::millis;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock, Semaphore};
 
-pub use blob::{Blob, BytesFor};
+pub use blob::{Blob, BytesConsumer};
 pub use body::BlobBody;
 use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
 use crate::config::BlobRead;
-use crate::domain::delivery::shown_bytes;
 
 /// Limit of concurrent disk reads for answers. More would not be faster, and would keep the
 /// processor from tasks that wait for something else.
@@ -71,17 +72,17 @@ impl Default for BlobSettings {
 #[derive(Debug, thiserror::Error)]
 pub enum BlobError {
     /// There is no such unfinished upload.
-    #[error("no such upload: it was finished, cancelled or given up")]
+    #[error("no such upload: it was finished, cancelled or dropped")]
     UploadUnknown,
     /// Another request writes to the same upload.
     #[error("another request is writing to this upload")]
     UploadBusy,
     /// [`BlobSettings::max_uploads`] is reached and no upload can be evicted; or a robot has
     /// reached its share.
-    #[error("{max} uploads are unfinished already; finish or cancel one")]
+    #[error("too many unfinished uploads, the limit is {max}; finish or cancel one")]
     TooManyUploads { max: usize },
     /// A chunk does not begin at the upload's offset.
-    #[error("the chunk begins at byte {given}, the upload stands at {offset}")]
+    #[error("the chunk begins at byte {given}, but the upload is at byte {offset}")]
     OutOfOrder {
         /// Where the chunk begins.
         given: u64,
@@ -92,30 +93,30 @@ pub enum BlobError {
     TooLarge { max: u64 },
     /// The robot exceeds its share of the disk.
     #[error(
-        "{kept} bytes of what this robot brought back are on the disk, {max} may be: older ones leave it within hours (robots.output_bytes)"
+        "this robot's outputs take {stored_bytes} bytes of disk space, the limit is {max}: older outputs are deleted within hours (robots.output_bytes)"
     )]
-    TooMuchOfRobot {
+    RobotQuotaExceeded {
         max: u64,
         /// Bytes stored for the robot, including unfinished uploads.
-        kept: u64,
+        stored_bytes: u64,
     },
     /// The bytes do not hash to the announced digest.
-    #[error("the bytes hash to {actual}, not to {expected}")]
+    #[error("the content's digest is {actual}, not {expected}")]
     WrongDigest {
         expected: Box<Digest>,
         /// The digest of the received bytes.
         actual: Box<Digest>,
     },
     /// The body broke off: the sender went away or fell silent.
-    #[error("the upload's body broke off")]
+    #[error("the request body ended early")]
     Interrupted(#[source] Box<dyn std::error::Error + Send + Sync>),
     /// The disk is full.
     #[error("the server's disk is full")]
     DiskFull,
     /// The upload would use the reserved part of the disk.
     #[error(
-        "the server's disk is nearly full: the last {} of it are kept for its database and what robots report \
-         (disk_reserve)", shown_bytes(*reserve)
+        "the server's disk is nearly full: the last {} are reserved for the database and robots' reports \
+         (disk_reserve)", format_bytes(*reserve)
     )]
     DiskReserved {
         /// The reserved disk space, in bytes.
@@ -128,12 +129,12 @@ pub enum BlobError {
 
 impl BlobError {
     /// Whether the error means that there is no room for the bytes.
-    fn is_want_of_room(&self) -> bool {
+    fn is_out_of_space(&self) -> bool {
         matches!(
             self,
             Self::DiskFull
                 | Self::DiskReserved { .. }
-                | Self::TooMuchOfRobot { .. }
+                | Self::RobotQuotaExceeded { .. }
                 | Self::TooLarge { .. }
         )
     }
@@ -167,12 +168,12 @@ struct Shared {
 }
 
 /// While this guard lives, no blob is collected: a caller that found a blob present can rely on it.
-pub struct NoCollection {
+pub struct CollectionHold {
     _guard: OwnedRwLockReadGuard<()>,
 }
 
-/// While this guard lives, there is no [`NoCollection`], so blobs can be deleted.
-pub struct Collection {
+/// While this guard lives, there is no [`CollectionHold`], so blobs can be deleted.
+pub struct CollectionGuard {
     _guard: OwnedRwLockWriteGuard<()>,
 }
 
@@ -205,19 +206,19 @@ impl Blobs {
     }
 
     /// Blocks the collector while the guard lives.
-    pub async fn hold_collection(&self) -> NoCollection {
-        NoCollection { _guard: Arc::clone(&self.shared.collection).read_owned().await }
+    pub async fn hold_collection(&self) -> CollectionHold {
+        CollectionHold { _guard: Arc::clone(&self.shared.collection).read_owned().await }
     }
 
     /// Waits until no caller blocks the collector, and then makes new callers of
     /// [`Self::hold_collection`] wait.
-    pub async fn begin_collection(&self) -> Collection {
-        Collection { _guard: Arc::clone(&self.shared.collection).write_owned().await }
+    pub async fn begin_collection(&self) -> CollectionGuard {
+        CollectionGuard { _guard: Arc::clone(&self.shared.collection).write_owned().await }
     }
 
     /// The blob; `None` if the store does not have it.
     pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
-        if let Some(blob) = self.shared.already_open(digest) {
+        if let Some(blob) = self.shared.find_open(digest) {
             return Ok(Some(blob));
         }
         let shared = self.shared.clone();
@@ -231,7 +232,7 @@ impl Blobs {
     /// Stores small bytes from memory, and returns their digest.
     pub async fn put(&self, algorithm: Algorithm, bytes: Bytes) -> Result<Digest, BlobError> {
         let digest = algorithm.digest(&bytes);
-        let partial = self.shared.uploads.fresh_path();
+        let partial = self.shared.uploads.unused_path();
         let target = self.path(digest);
         on_disk(move || {
             let write = || {
@@ -325,14 +326,18 @@ impl Blobs {
         on_disk(move || match fs::metadata(&path).and_then(|metadata| modified_ms(&metadata)) {
             Ok(modified) => Ok(modified < before_ms),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-            Err(error) => Err(BlobError::disk("look at", &path)(error)),
+            Err(error) => Err(BlobError::disk("inspect", &path)(error)),
         })
         .await
     }
 
     /// Deletes a blob. Only the collector may do so, because it knows that nothing refers to the
     /// blob.
-    pub async fn delete(&self, digest: Digest, _collection: &Collection) -> Result<(), BlobError> {
+    pub async fn delete(
+        &self,
+        digest: Digest,
+        _collection: &CollectionGuard,
+    ) -> Result<(), BlobError> {
         self.shared.close(digest);
         let path = self.path(digest);
         on_disk(move || match fs::remove_file(&path) {
@@ -359,7 +364,7 @@ impl Shared {
     }
 
     /// The blob, if it is open. This makes it the last one to be closed.
-    fn already_open(&self, digest: Digest) -> Option<Blob> {
+    fn find_open(&self, digest: Digest) -> Option<Blob> {
         let mut open = self.open_blobs();
         let at = open.iter().position(|blob| blob.digest == digest)?;
         let blob = open.remove(at)?;
@@ -410,8 +415,7 @@ fn move_into_place(partial: &Path, target: &Path) -> Result<(), BlobError> {
 }
 
 fn modified_ms(metadata: &fs::Metadata) -> io::Result<u64> {
-    let since = metadata.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    Ok(u64::try_from(since.as_millis()).unwrap_or(u64::MAX))
+    Ok(metadata.modified()?.duration_since(SystemTime::UNIX_EPOCH).map_or(0, millis))
 }
 
 #[cfg(test)]

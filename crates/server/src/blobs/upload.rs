@@ -18,18 +18,18 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use futures_util::{Stream, StreamExt as _};
 use sha2::{Digest as _, Sha256, Sha512};
-use task_proto::digest::Algorithm;
-use task_proto::output::owner;
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::output::owner;
 use task_proto::{Digest, RepositoryName, RobotId};
 use tokio::sync::OwnedMutexGuard;
 
 use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
-use crate::system::data_directory::room;
+use crate::system::data_directory::disk_space;
 
 /// Bytes of a body that are gathered before one hash and one write.
-const GATHERED_BYTES: usize = 1024 * 1024;
+const BATCH_BYTES: usize = 1024 * 1024;
 /// Time limit for a silent sender in the middle of a body.
-const SILENCE: Duration = Duration::from_secs(60);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(60);
 /// Uploads that one robot may leave unfinished. A robot sends one file after another and abandons
 /// some on the way.
 const MAX_OF_ROBOT: usize = 8;
@@ -43,7 +43,7 @@ pub struct UploadId(String);
 
 /// The text is not an upload id.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("not the name of an upload")]
+#[error("not a valid upload id")]
 pub struct InvalidUploadId;
 
 impl UploadId {
@@ -69,18 +69,18 @@ impl FromStr for UploadId {
 pub(super) struct Uploads {
     directory: PathBuf,
     settings: BlobSettings,
-    active: Mutex<HashMap<UploadId, Active>>,
+    active: Mutex<HashMap<UploadId, ActiveUpload>>,
 }
 
 /// An upload and its repository.
 #[derive(Clone)]
-struct Active {
+struct ActiveUpload {
     repository: RepositoryName,
     upload: Arc<tokio::sync::Mutex<Upload>>,
     bytes: Arc<AtomicU64>,
 }
 
-impl Active {
+impl ActiveUpload {
     fn new(repository: RepositoryName, upload: Upload) -> Self {
         let bytes = Arc::clone(&upload.bytes);
         Self { repository, upload: Arc::new(tokio::sync::Mutex::new(upload)), bytes }
@@ -136,11 +136,11 @@ impl Upload {
     }
 
     /// The eviction order of uploads without an active writer: first those that were idle for
-    /// [`SILENCE`], empty ones before the rest, and then by the time of the last write, oldest
+    /// [`IDLE_TIMEOUT`], empty ones before the rest, and then by the time of the last write, oldest
     /// first.
-    fn gives_way(&self) -> (bool, bool, Instant) {
-        let is_left = self.written_at.elapsed() >= SILENCE;
-        (!is_left, is_left && self.offset > 0, self.written_at)
+    fn eviction_order(&self) -> (bool, bool, Instant) {
+        let is_idle = self.written_at.elapsed() >= IDLE_TIMEOUT;
+        (!is_idle, is_idle && self.offset > 0, self.written_at)
     }
 
     fn cancel(&mut self) -> Result<(), BlobError> {
@@ -151,7 +151,7 @@ impl Upload {
     fn finish(&mut self, expected: Digest, target: &Path) -> Result<u64, BlobError> {
         self.ended = true;
         // A write that failed half way may have left bytes beyond the offset.
-        self.file.set_len(self.offset).map_err(BlobError::disk("cut", &self.path))?;
+        self.file.set_len(self.offset).map_err(BlobError::disk("truncate", &self.path))?;
         let unreadable = BlobError::disk("read", &self.path);
         let actual = match (expected.algorithm(), &self.hasher) {
             (Algorithm::Sha256, Some(hasher)) => {
@@ -179,7 +179,7 @@ impl Upload {
 /// Hashes a file. This computes SHA-512 digests, which are rare, and the digest of a resumed
 /// upload.
 pub(super) fn hash<D: sha2::Digest>(path: &Path) -> io::Result<sha2::digest::Output<D>> {
-    let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; GATHERED_BYTES]);
+    let (mut file, mut hasher, mut piece) = (File::open(path)?, D::new(), vec![0; BATCH_BYTES]);
     loop {
         match file.read(&mut piece)? {
             0 => return Ok(hasher.finalize()),
@@ -196,7 +196,7 @@ fn file_name(id: &UploadId, repository: &RepositoryName) -> String {
 }
 
 /// Parses the name of an upload's file.
-fn named_by(file_name: &OsStr) -> Option<(UploadId, RepositoryName)> {
+fn parse_file_name(file_name: &OsStr) -> Option<(UploadId, RepositoryName)> {
     let (id, repository) = file_name.to_str()?.split_once('.')?;
     Some((id.parse().ok()?, repository.replace('+', "/").parse().ok()?))
 }
@@ -210,7 +210,7 @@ impl Uploads {
             let mut left = Vec::new();
             for entry in fs::read_dir(&directory)? {
                 let entry = entry?;
-                match named_by(&entry.file_name()) {
+                match parse_file_name(&entry.file_name()) {
                     Some(upload) => {
                         left.push((entry.metadata()?.modified()?, entry.path(), upload))
                     }
@@ -222,7 +222,7 @@ impl Uploads {
                 fs::remove_file(path)?;
             }
             let resumed = left.into_iter().map(|(_, path, (id, repository))| {
-                Ok((id, Active::new(repository, Upload::resume(path)?)))
+                Ok((id, ActiveUpload::new(repository, Upload::resume(path)?)))
             });
             resumed.collect::<io::Result<HashMap<_, _>>>()
         };
@@ -231,11 +231,11 @@ impl Uploads {
     }
 
     /// A file name that is unused in the directory.
-    pub(super) fn fresh_path(&self) -> PathBuf {
+    pub(super) fn unused_path(&self) -> PathBuf {
         self.directory.join(UploadId::random().as_str())
     }
 
-    fn active(&self) -> MutexGuard<'_, HashMap<UploadId, Active>> {
+    fn active(&self) -> MutexGuard<'_, HashMap<UploadId, ActiveUpload>> {
         self.active.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -244,7 +244,7 @@ impl Uploads {
     fn insert(
         &self,
         id: UploadId,
-        active: Active,
+        active: ActiveUpload,
     ) -> Result<Option<OwnedMutexGuard<Upload>>, BlobError> {
         let max = self.settings.max_uploads;
         let mut all = self.active();
@@ -262,7 +262,8 @@ impl Uploads {
         }
         let mut left = None;
         if all.len() >= max {
-            let (other, upload) = left_by_people(&all).ok_or(BlobError::TooManyUploads { max })?;
+            let (other, upload) =
+                eviction_candidate(&all).ok_or(BlobError::TooManyUploads { max })?;
             all.remove(&other);
             left = Some(upload);
         }
@@ -270,16 +271,24 @@ impl Uploads {
         Ok(left)
     }
 
-    /// Checks that a robot may store `bytes` more; `kept` counts its stored bytes.
-    fn check_room_of(&self, robot: &RobotId, bytes: u64, kept: u64) -> Result<(), BlobError> {
-        let is_robots =
-            |active: &&Active| owner(&active.repository).is_some_and(|(owner, _)| owner == *robot);
+    /// Checks that a robot may store `bytes` more; `stored_bytes` counts its stored bytes.
+    fn check_robot_quota(
+        &self,
+        robot: &RobotId,
+        bytes: u64,
+        stored_bytes: u64,
+    ) -> Result<(), BlobError> {
+        let is_robots = |active: &&ActiveUpload| {
+            owner(&active.repository).is_some_and(|(owner, _)| owner == *robot)
+        };
         let unfinished: u64 =
             self.active().values().filter(is_robots).map(|a| a.bytes.load(Ordering::Relaxed)).sum();
-        let (max, kept) =
-            (self.settings.max_robot_bytes.saturating_mul(2), kept.saturating_add(unfinished));
-        if kept.saturating_add(bytes) > max {
-            return Err(BlobError::TooMuchOfRobot { max, kept });
+        let (max, stored_bytes) = (
+            self.settings.max_robot_bytes.saturating_mul(2),
+            stored_bytes.saturating_add(unfinished),
+        );
+        if stored_bytes.saturating_add(bytes) > max {
+            return Err(BlobError::RobotQuotaExceeded { max, stored_bytes });
         }
         self.check_reserve(bytes, self.settings.reserve_bytes.saturating_mul(2))
     }
@@ -287,7 +296,7 @@ impl Uploads {
     /// Checks that `bytes` more leave `reserve` bytes free on the disk.
     fn check_reserve(&self, bytes: u64, reserve: u64) -> Result<(), BlobError> {
         // If the free space is unknown, the disk is full when a write fails.
-        match room(&self.directory) {
+        match disk_space(&self.directory) {
             Some((free, _)) if bytes > 0 && free < reserve.saturating_add(bytes) => {
                 Err(BlobError::DiskReserved { reserve })
             }
@@ -297,11 +306,13 @@ impl Uploads {
 }
 
 /// The first upload in the eviction order among people's uploads without an active writer.
-fn left_by_people(all: &HashMap<UploadId, Active>) -> Option<(UploadId, OwnedMutexGuard<Upload>)> {
+fn eviction_candidate(
+    all: &HashMap<UploadId, ActiveUpload>,
+) -> Option<(UploadId, OwnedMutexGuard<Upload>)> {
     let of_people = all.iter().filter(|(_, active)| owner(&active.repository).is_none());
     let left = of_people
         .filter_map(|(id, active)| Some((id, active.upload.clone().try_lock_owned().ok()?)));
-    let (id, upload) = left.min_by_key(|(_, upload)| upload.gives_way())?;
+    let (id, upload) = left.min_by_key(|(_, upload)| upload.eviction_order())?;
     Some((id.clone(), upload))
 }
 
@@ -311,7 +322,7 @@ impl Blobs {
         let id = UploadId::random();
         let path = self.shared.uploads.directory.join(file_name(&id, repository));
         let created = Upload::create(path.clone()).map_err(BlobError::disk("create", &path))?;
-        let active = Active::new(repository.clone(), created);
+        let active = ActiveUpload::new(repository.clone(), created);
         // Both removals are best effort: an upload that remains gets no more bytes, and the
         // collector drops it.
         match self.shared.uploads.insert(id.clone(), active) {
@@ -334,13 +345,13 @@ impl Blobs {
         Ok(self.lock_upload(repository, id)?.offset)
     }
 
-    /// Checks that `bytes` more would be accepted. `kept` counts the stored bytes of the robot that
+    /// Checks that `bytes` more would be accepted. `stored_bytes` counts the stored bytes of the robot that
     /// owns the repository.
-    pub fn check_room(
+    pub fn check_space(
         &self,
         repository: &RepositoryName,
         bytes: u64,
-        kept: u64,
+        stored_bytes: u64,
     ) -> Result<(), BlobError> {
         let max = self.max_bytes_in(repository);
         if bytes > max {
@@ -348,15 +359,15 @@ impl Blobs {
         }
         let uploads = &self.shared.uploads;
         match owner(repository) {
-            Some((robot, _)) => uploads.check_room_of(&robot, bytes, kept),
+            Some((robot, _)) => uploads.check_robot_quota(&robot, bytes, stored_bytes),
             None => uploads.check_reserve(bytes, uploads.settings.reserve_bytes),
         }
     }
 
     /// Free disk space for people's uploads, in bytes.
-    pub fn room_for_people(&self) -> u64 {
+    pub fn space_for_people(&self) -> u64 {
         let uploads = &self.shared.uploads;
-        room(&uploads.directory)
+        disk_space(&uploads.directory)
             .map_or(u64::MAX, |(free, _)| free.saturating_sub(uploads.settings.reserve_bytes))
     }
 
@@ -372,15 +383,15 @@ impl Blobs {
 
     /// Appends a body that begins at byte `start`, or at the upload's offset if that is absent.
     /// Bytes received before an error, or before the caller gave up, are kept, and the next chunk
-    /// begins after them. The upload only ends if there is no room for the bytes. `kept` is as in
-    /// [`Self::check_room`]. Returns the new offset.
+    /// begins after them. The upload only ends if there is no room for the bytes. `stored_bytes` is as in
+    /// [`Self::check_space`]. Returns the new offset.
     pub async fn append<S, E>(
         &self,
         repository: &RepositoryName,
         id: &UploadId,
         start: Option<u64>,
         body: S,
-        kept: u64,
+        stored_bytes: u64,
     ) -> Result<u64, BlobError>
     where
         S: Stream<Item = Result<Bytes, E>> + Send,
@@ -394,20 +405,20 @@ impl Blobs {
         let max = self.max_bytes_in(repository);
         let mut body = std::pin::pin!(body);
         loop {
-            let (chunks, ended) = gather(&mut body).await;
+            let (chunks, ended) = read_batch(&mut body).await;
             let length: usize = chunks.iter().map(Bytes::len).sum();
             if length > 0 {
                 let is_too_large = upload.offset + length as u64 > max;
-                let room = if is_too_large {
+                let space = if is_too_large {
                     Err(BlobError::TooLarge { max })
                 } else {
-                    self.check_room(repository, length as u64, kept)
+                    self.check_space(repository, length as u64, stored_bytes)
                 };
                 // The lock travels with the work: if the caller is dropped here, the bytes still
                 // count as one piece.
                 let written = on_disk(move || {
-                    let written = room.and_then(|()| upload.write(&chunks));
-                    if written.as_ref().is_err_and(BlobError::is_want_of_room) {
+                    let written = space.and_then(|()| upload.write(&chunks));
+                    if written.as_ref().is_err_and(BlobError::is_out_of_space) {
                         // The partial upload would keep the disk full, for the database as well.
                         // Best effort.
                         let _ = upload.cancel();
@@ -415,7 +426,7 @@ impl Blobs {
                     written.map(|()| upload)
                 });
                 let written = written.await;
-                if written.as_ref().is_err_and(BlobError::is_want_of_room) {
+                if written.as_ref().is_err_and(BlobError::is_out_of_space) {
                     self.shared.uploads.active().remove(id);
                 }
                 upload = written?;
@@ -476,9 +487,9 @@ impl Blobs {
                     return Ok(true);
                 }
                 let metadata =
-                    upload.file.metadata().map_err(BlobError::disk("look at", &upload.path))?;
+                    upload.file.metadata().map_err(BlobError::disk("inspect", &upload.path))?;
                 let modified_ms =
-                    modified_ms(&metadata).map_err(BlobError::disk("look at", &upload.path))?;
+                    modified_ms(&metadata).map_err(BlobError::disk("inspect", &upload.path))?;
                 if modified_ms >= before_ms { Ok(false) } else { upload.cancel().map(|()| true) }
             });
             if is_dropped.await? {
@@ -509,7 +520,7 @@ impl Blobs {
 
 /// Takes chunks from a body until there are enough for one write. Reports the end of the body, and
 /// its error.
-async fn gather<S, E>(
+async fn read_batch<S, E>(
     body: &mut std::pin::Pin<&mut S>,
 ) -> (Vec<Bytes>, Option<Result<(), BlobError>>)
 where
@@ -518,8 +529,8 @@ where
 {
     let mut chunks = Vec::new();
     let mut length = 0;
-    while length < GATHERED_BYTES {
-        match tokio::time::timeout(SILENCE, body.next()).await {
+    while length < BATCH_BYTES {
+        match tokio::time::timeout(IDLE_TIMEOUT, body.next()).await {
             Ok(Some(Ok(chunk))) => {
                 length += chunk.len();
                 chunks.push(chunk);
@@ -540,7 +551,7 @@ mod tests {
     use crate::config::BlobRead;
 
     #[tokio::test]
-    async fn a_full_disk_ends_the_upload_and_frees_what_it_took() {
+    async fn full_disk_ends_the_upload_and_frees_its_space() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { reading: BlobRead::Pread, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -551,7 +562,7 @@ mod tests {
         let id = blobs.begin_upload(&repository).await.expect("begins");
         blobs.append(&repository, &id, None, body(b"some"), 0).await.expect("there is room");
         let full = File::options().write(true).open("/dev/full").expect("Linux has it");
-        blobs.lock_upload(&repository, &id).expect("nobody writes").file = full;
+        blobs.lock_upload(&repository, &id).expect("no writer").file = full;
         let refused = blobs.append(&repository, &id, None, body(b"more"), 0).await;
         assert!(matches!(refused, Err(BlobError::DiskFull)), "{refused:?}");
         let gone = blobs.upload_offset(&repository, &id).await;
@@ -560,7 +571,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn unfinished_uploads_go_on_after_a_restart_within_their_bounds() {
+    async fn unfinished_uploads_resume_after_a_restart_within_their_limits() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 3, ..BlobSettings::default() };
         let body = |bytes: &'static [u8]| {
@@ -616,9 +627,9 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn robots_leave_some_of_the_disk_to_everybody_else() {
+    async fn robots_uploads_leave_twice_the_disk_reserve() {
         let directory = tempfile::tempdir().expect("a directory");
-        let (free, _) = room(directory.path()).expect("a disk");
+        let (free, _) = disk_space(directory.path()).expect("a disk");
         let settings = BlobSettings { reserve_bytes: free / 3 * 2, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
         let push = async |repository: &str| {
@@ -634,7 +645,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn people_leave_some_of_the_disk_to_the_database() {
+    async fn peoples_uploads_leave_the_disk_reserve() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { reserve_bytes: 1 << 60, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -643,7 +654,7 @@ mod tests {
         let body = futures_util::stream::iter([Ok::<_, io::Error>(Bytes::from_static(b"some"))]);
         let refused = blobs.append(&repository, &id, None, body, 0).await.expect_err("refused");
         assert!(refused.to_string().contains("(disk_reserve)"), "{refused}");
-        assert_eq!(blobs.room_for_people(), 0);
+        assert_eq!(blobs.space_for_people(), 0);
         assert_eq!(
             fs::read_dir(&blobs.shared.uploads.directory).expect("there").count(),
             0,
@@ -652,7 +663,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn robots_leave_room_for_each_other_and_for_operators() {
+    async fn robots_uploads_are_limited_per_robot_and_in_total() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 2 * MAX_OF_ROBOT, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -667,13 +678,13 @@ mod tests {
             begun
         };
         assert_eq!(begun(first, MAX_OF_ROBOT + 1).await, MAX_OF_ROBOT);
-        assert_eq!(begun(second, MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2, "a quarter is nobody's");
+        assert_eq!(begun(second, MAX_OF_ROBOT).await, MAX_OF_ROBOT / 2, "a quarter stays free");
         assert_eq!(
             begun("talker", MAX_OF_ROBOT).await,
             MAX_OF_ROBOT,
             "people's give way to people's"
         );
-        let is_peoples = |active: &&Active| owner(&active.repository).is_none();
+        let is_peoples = |active: &&ActiveUpload| owner(&active.repository).is_none();
         assert_eq!(
             blobs.shared.uploads.active().values().filter(is_peoples).count(),
             MAX_OF_ROBOT / 2
@@ -681,7 +692,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_people_left_keeps_no_robot_out() {
+    async fn idle_uploads_of_people_do_not_block_robots() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 4, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -698,7 +709,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_upload_that_was_left_gives_way_and_one_that_is_written_to_never_does() {
+    async fn idle_upload_is_evicted_and_an_active_one_is_not() {
         let directory = tempfile::tempdir().expect("a directory");
         let settings = BlobSettings { max_uploads: 3, ..BlobSettings::default() };
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
@@ -709,7 +720,7 @@ mod tests {
         blobs.append(&repository, &ids[0], None, body, 0).await.expect("there is room");
         ids.push(begin().await.expect("begins"));
         for id in &ids {
-            blobs.lock_upload(&repository, id).expect("there").written_at -= SILENCE;
+            blobs.lock_upload(&repository, id).expect("there").written_at -= IDLE_TIMEOUT;
         }
         // The empty upload is evicted first, then the one with bytes, and only then the recent one.
         for gone in [None, Some(1), Some(0), Some(2)] {

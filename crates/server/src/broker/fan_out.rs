@@ -8,16 +8,17 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rumqttd::protocol::QoS;
-use task_proto::{Digest, RobotId, part};
+use task_proto::messages::part;
+use task_proto::{Digest, RobotId};
 use tokio::time::{Instant, timeout};
 
-use super::external::Crowd;
+use super::external::ExternalFanOut;
 use super::front::{Front, Grant, NotGranted};
 
 /// The largest part, with its header.
 pub const MAX_PART_BYTES: usize = part::MAX_PART_BYTES as usize + part::HEADER_BYTES;
 /// Interval between checks for subscribers that hold up the others.
-const LOOK_INTERVAL: Duration = Duration::from_millis(100);
+const CHECK_INTERVAL: Duration = Duration::from_millis(100);
 
 /// One message of a fan-out: a short header of its own, followed by shared bytes that are never
 /// copied.
@@ -65,38 +66,38 @@ pub enum PartQos {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FanOutError {
     /// This package is already in fan-out.
-    #[error("package {0} is being fanned out already")]
-    UnderWay(Digest),
+    #[error("package {0} is already being fanned out")]
+    AlreadyRunning(Digest),
     /// The maximum number of packages is in fan-out.
-    #[error("as many packages as there may be are being fanned out")]
-    Busy,
+    #[error("the maximum number of packages is being fanned out")]
+    TooMany,
     /// The part does not fit into a message.
     #[error("a part of {0} bytes is larger than {MAX_PART_BYTES}")]
     TooLarge(usize),
     /// There is no session at the external broker, or the broker accepts nothing.
-    #[error("the external broker takes no parts")]
-    BrokerAway,
+    #[error("the external broker does not accept parts")]
+    BrokerUnavailable,
 }
 
 /// A package in fan-out to many robots. Dropping the value ends the fan-out: robots receive no
 /// further part and can't subscribe any more.
-pub struct FanOut(Way);
+pub struct FanOut(Kind);
 
-enum Way {
+enum Kind {
     /// From the embedded broker's front, to permitted robots.
-    Embedded(Granted),
+    Embedded(EmbeddedFanOut),
     /// Through an external broker, to its subscribers.
-    External(Crowd),
+    External(ExternalFanOut),
 }
 
-struct Granted {
+struct EmbeddedFanOut {
     front: Arc<Front>,
     grant: Arc<Grant>,
 }
 
 impl FanOut {
     /// Lets `robots` subscribe to the package.
-    pub(super) fn begin(
+    pub(super) fn embedded(
         front: Arc<Front>,
         digest: Digest,
         settings: FanOutSettings,
@@ -109,81 +110,81 @@ impl FanOut {
         };
         let grant = front.grants().open(digest, settings.part_bytes, qos, robots, Instant::now());
         let grant = grant.map_err(|error| match error {
-            NotGranted::UnderWay => FanOutError::UnderWay(digest),
-            NotGranted::Full => FanOutError::Busy,
+            NotGranted::AlreadyOpen => FanOutError::AlreadyRunning(digest),
+            NotGranted::Full => FanOutError::TooMany,
         })?;
-        Ok(Self(Way::Embedded(Granted { front, grant })))
+        Ok(Self(Kind::Embedded(EmbeddedFanOut { front, grant })))
     }
 
     /// Fans out at an external broker, where only the access control list restricts subscribers.
-    pub(super) fn at(crowd: Crowd) -> Self {
-        Self(Way::External(crowd))
+    pub(super) fn external(external: ExternalFanOut) -> Self {
+        Self(Kind::External(external))
     }
 
     /// Lets further robots subscribe.
     pub fn admit(&self, robots: impl IntoIterator<Item = RobotId>) {
-        if let Way::Embedded(Granted { grant, .. }) = &self.0 {
+        if let Kind::Embedded(EmbeddedFanOut { grant, .. }) = &self.0 {
             grant.admit(robots);
         }
     }
 
     /// Records from a report whether the robot subscribes. The embedded front knows its
     /// subscribers; an external broker does not tell us.
-    pub fn told(&self, robot: &RobotId, is_listening: bool) {
-        if let Way::External(crowd) = &self.0 {
-            crowd.told(robot, is_listening);
+    pub fn note_subscription(&self, robot: &RobotId, is_subscribed: bool) {
+        if let Kind::External(external) = &self.0 {
+            external.note_subscription(robot, is_subscribed);
         }
     }
 
     /// The number of robots that subscribe now.
-    pub fn listeners(&self) -> usize {
+    pub fn subscribers(&self) -> usize {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.listeners(),
-            Way::External(crowd) => crowd.listeners(),
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.subscribers(),
+            Kind::External(external) => external.subscribers(),
         }
     }
 
     /// Whether the robot subscribes now.
-    pub fn is_listening(&self, robot: &RobotId) -> bool {
+    pub fn is_subscribed(&self, robot: &RobotId) -> bool {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.is_listening(robot),
-            Way::External(crowd) => crowd.is_listening(robot),
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.is_subscribed(robot),
+            Kind::External(external) => external.is_subscribed(robot),
         }
     }
 
     /// Waits until a robot has subscribed since the last call. With an external broker only
-    /// [`Self::told`] provides this information.
+    /// [`Self::note_subscription`] provides this information.
     pub async fn joined(&self) {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.joined().await,
-            Way::External(_) => std::future::pending().await,
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.joined().await,
+            Kind::External(_) => std::future::pending().await,
         }
     }
 
     /// Withdraws the robot's permission.
     pub fn withdraw(&self, robot: &RobotId) {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.withdraw(robot, Instant::now()),
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.withdraw(robot, Instant::now()),
             // The robot may stay subscribed, but no longer counts.
-            Way::External(crowd) => crowd.told(robot, false),
+            Kind::External(external) => external.note_subscription(robot, false),
         }
     }
 
     /// Robots that were removed since the last call because they held up the others.
-    pub fn take_put_out(&self) -> Vec<RobotId> {
+    pub fn take_evicted(&self) -> Vec<RobotId> {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.take_put_out(),
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.take_evicted(),
             // The broker drops parts that a slow robot does not take; the robot's report lists
             // them.
-            Way::External(_) => Vec::new(),
+            Kind::External(_) => Vec::new(),
         }
     }
 
     /// The bytes of the parts that are held for subscribers, all subscribers together.
     pub fn queued_bytes(&self) -> usize {
         match &self.0 {
-            Way::Embedded(Granted { grant, .. }) => grant.queued_bytes(),
-            Way::External(crowd) => crowd.queued_bytes(),
+            Kind::Embedded(EmbeddedFanOut { grant, .. }) => grant.queued_bytes(),
+            Kind::External(external) => external.queued_bytes(),
         }
     }
 
@@ -195,8 +196,8 @@ impl FanOut {
             return Err(FanOutError::TooLarge(part.len()));
         }
         match &self.0 {
-            Way::Embedded(granted) => granted.publish(part).await,
-            Way::External(crowd) => return crowd.publish(part).await,
+            Kind::Embedded(embedded) => embedded.publish(part).await,
+            Kind::External(external) => return external.publish(part).await,
         }
         Ok(())
     }
@@ -205,16 +206,16 @@ impl FanOut {
     /// removed, or until `patience` is over.
     pub async fn settle(&mut self, patience: Duration) {
         match &self.0 {
-            Way::Embedded(granted) => granted.settle(patience).await,
-            Way::External(crowd) => crowd.settle(patience).await,
+            Kind::Embedded(embedded) => embedded.settle(patience).await,
+            Kind::External(external) => external.settle(patience).await,
         }
     }
 }
 
-impl Granted {
+impl EmbeddedFanOut {
     async fn publish(&self, part: Part) {
-        while timeout(LOOK_INTERVAL, self.grant.room()).await.is_err() {
-            self.put_out_laggards();
+        while timeout(CHECK_INTERVAL, self.grant.room()).await.is_err() {
+            self.evict_laggards();
         }
         self.grant.send(part, Instant::now());
     }
@@ -222,22 +223,22 @@ impl Granted {
     async fn settle(&self, patience: Duration) {
         let until = Instant::now() + patience;
         while Instant::now() < until {
-            if timeout(LOOK_INTERVAL, self.grant.all_idle()).await.is_ok() {
+            if timeout(CHECK_INTERVAL, self.grant.all_idle()).await.is_ok() {
                 return;
             }
-            self.put_out_laggards();
+            self.evict_laggards();
         }
     }
 
-    fn put_out_laggards(&self) {
-        let robots = self.grant.put_out_laggards(Instant::now());
+    fn evict_laggards(&self) {
+        let robots = self.grant.evict_laggards(Instant::now());
         if !robots.is_empty() {
-            tracing::info!(digest = %self.grant.digest(), ?robots, "robots that did not keep up are put out");
+            tracing::info!(digest = %self.grant.digest(), ?robots, "removed robots that did not keep up from the fan-out");
         }
     }
 }
 
-impl Drop for Granted {
+impl Drop for EmbeddedFanOut {
     fn drop(&mut self) {
         self.front.grants().close(&self.grant);
     }

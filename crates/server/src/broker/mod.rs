@@ -21,16 +21,17 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use task_proto::api::{MqttTraffic, Subscription, Traffic};
-use task_proto::report::MAX_REPORT_BYTES;
-use task_proto::topic::{RobotTopic, TopicPrefix};
+use task_proto::messages::report::MAX_REPORT_BYTES;
+use task_proto::messages::topic::{RobotTopic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 
-use crate::limits::conduct::Conduct;
+use crate::domain::limits::robot_limiter::RobotLimiter;
+use crate::net::proxy_protocol::ProxyProtocol;
 use crate::net::tls::{ClientProof, Tls};
 pub use external::{CANARY_LEVEL, ExternalConfig, external_route};
-use external::{Crowd, External};
+use external::{External, ExternalFanOut};
 pub use fan_out::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use front::Front;
 /// The decoder of clients' bytes; public so that fuzzers can call it with arbitrary input.
@@ -124,9 +125,10 @@ pub trait Inbox: Send + Sync + 'static {
     /// for ever. The future may be dropped half-way.
     fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>>;
 
-    /// A robot's session is live: [`Broker::ring`] reaches the robot from now on, so this is the
-    /// moment to send its state. `connection` grows with every connection of this process. Any
-    /// earlier session of this robot has fully ended. With an external broker the peer is unknown.
+    /// A robot's session is live: [`Broker::send_desired`] reaches the robot from now on, so this
+    /// is the moment to send its state. `connection` grows with every connection of this process.
+    /// Any earlier session of this robot has fully ended. With an external broker the peer is
+    /// unknown.
     fn connected(&self, robot: &RobotId, peer: Option<SocketAddr>, connection: u64);
 
     /// The robot's session with this number has ended. Called exactly once for each `connected`,
@@ -134,9 +136,9 @@ pub trait Inbox: Send + Sync + 'static {
     fn disconnected(&self, robot: &RobotId, connection: u64);
 
     /// The external broker is reachable again, and any robot may already be connected there. Call
-    /// [`Broker::ring`] for each robot, so that connected robots get their state and report their
-    /// presence.
-    fn everyone_may_be_there(&self);
+    /// [`Broker::send_desired`] for each robot, so that connected robots get their state and report
+    /// their presence.
+    fn external_broker_connected(&self);
 }
 
 /// The broker's listener and bounds.
@@ -146,10 +148,12 @@ pub struct BrokerConfig {
     pub listen: SocketAddr,
     /// The TLS configuration, if the listener encrypts.
     pub tls: Option<Tls>,
+    /// The balancers, which begin each connection with the address of its client.
+    pub proxy_protocol: ProxyProtocol,
     /// The prefix of all topics.
     pub prefix: TopicPrefix,
     pub limits: Limits,
-    pub conduct: Arc<Conduct>,
+    pub robot_limiter: Arc<RobotLimiter>,
 }
 
 /// Bounds on every resource that a client can use.
@@ -168,7 +172,8 @@ pub struct Limits {
     pub max_packet_bytes: usize,
     /// Maximum filters that are read from one SUBSCRIBE, and maximum subscriptions of one client.
     pub max_filters: usize,
-    /// Time limit from accepting a connection until its CONNECT is complete.
+    /// Time limit of a proxy's header, and from then, or from accepting a connection, until CONNECT
+    /// is complete.
     pub connect_timeout: Duration,
     /// Time limit of the gatekeeper's decision.
     pub admit_timeout: Duration,
@@ -235,14 +240,14 @@ pub enum BrokerError {
 #[error("the robot is not connected over MQTT")]
 pub struct NotConnected;
 
-/// The reason why a question was not sent.
+/// The reason why a request was not sent.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub enum NotAsked {
+pub enum NotSent {
     /// The robot has no live session here.
     #[error("the robot is not connected over MQTT")]
     NotConnected,
-    /// Too many questions are already queued for the robot.
-    #[error("the robot has not taken the questions before this one")]
+    /// Too many requests are already queued for the robot.
+    #[error("too many requests are already queued for the robot")]
     Busy,
 }
 
@@ -284,15 +289,15 @@ impl Broker {
     /// Sends `payload` on the robot's `desired` topic, QoS 1. Never waits. One undelivered payload
     /// is held for each robot, and a newer one replaces the held one, also before the robot has
     /// subscribed.
-    pub fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
+    pub fn send_desired(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
         match &self.kind {
-            Kind::Embedded(front) => front.ring(robot, payload),
-            Kind::External(external) => external.ring(robot, payload),
+            Kind::Embedded(front) => front.send_desired(robot, payload),
+            Kind::External(external) => external.send_desired(robot, payload),
         }
     }
 
-    /// Whether [`Broker::ring`] may reach the robot. An external broker does not tell us its
-    /// subscribers, so every robot counts as reachable.
+    /// Whether [`Broker::send_desired`] may reach the robot. An external broker does not tell us
+    /// its subscribers, so every robot counts as reachable.
     pub fn may_reach(&self, robot: &RobotId) -> bool {
         match &self.kind {
             Kind::Embedded(front) => front.has_session(robot),
@@ -314,12 +319,12 @@ impl Broker {
         }
     }
 
-    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; questions still queued
+    /// Sends `payload` on the robot's `request` topic, QoS 1. Never waits; requests still queued
     /// when the session ends are lost.
-    pub fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
+    pub fn send_request(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotSent> {
         match &self.kind {
-            Kind::Embedded(front) => front.ask(robot, payload),
-            Kind::External(external) => external.ask(robot, payload),
+            Kind::Embedded(front) => front.send_request(robot, payload),
+            Kind::External(external) => external.send_request(robot, payload),
         }
     }
 
@@ -333,9 +338,9 @@ impl Broker {
         robots: Vec<RobotId>,
     ) -> Result<FanOut, FanOutError> {
         match &self.kind {
-            Kind::Embedded(front) => FanOut::begin(front.clone(), digest, settings, robots),
+            Kind::Embedded(front) => FanOut::embedded(front.clone(), digest, settings, robots),
             Kind::External(external) => {
-                Ok(FanOut::at(Crowd::new(external.clone(), digest, settings.qos)))
+                Ok(FanOut::external(ExternalFanOut::new(external.clone(), digest, settings.qos)))
             }
         }
     }
@@ -360,7 +365,7 @@ impl Broker {
 
     /// Serves a client on a connection that another listener has accepted, once `handshake` ends.
     /// Returns false if the broker is external or has no room.
-    pub fn take_in<S>(
+    pub fn serve_connection<S>(
         &self,
         peer: SocketAddr,
         handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
@@ -369,7 +374,7 @@ impl Broker {
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         match &self.kind {
-            Kind::Embedded(front) => front.take_in(peer, handshake),
+            Kind::Embedded(front) => front.serve_connection(peer, handshake),
             Kind::External(_) => false,
         }
     }

@@ -11,7 +11,7 @@ use bytes::Bytes;
 use rumqttd::local::{LinkBuilder, LinkError, LinkRx, LinkTx};
 use rumqttd::protocol::{Disconnect, DisconnectReasonCode, Packet, Publish, QoS};
 use rumqttd::{Notification, RouterConfig};
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 use tokio::sync::{Notify, oneshot};
 use tokio_util::sync::CancellationToken;
 
@@ -35,12 +35,12 @@ const LINK_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) struct Router {
     everything: String,
     /// The free link names.
-    slots: Mutex<Vec<usize>>,
+    free_slots: Mutex<Vec<usize>>,
     max_links: usize,
-    listeners: AtomicUsize,
+    subscribers: AtomicUsize,
     dropped: AtomicU64,
     current: Mutex<Arc<Running>>,
-    trouble: Notify,
+    failure_observed: Notify,
 }
 
 /// One life of the router's thread.
@@ -57,7 +57,7 @@ type Connect = Arc<dyn Fn(&str) -> Option<(LinkTx, LinkRx)> + Send + Sync>;
 
 /// The topics of a subscriber.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) enum Listening {
+pub(super) enum Topics {
     /// Everything below the prefix.
     Everything,
     Canary,
@@ -65,7 +65,7 @@ pub(super) enum Listening {
 
 /// A message from the router.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Heard {
+pub(super) struct Message {
     pub(super) topic: String,
     pub(super) payload: Bytes,
     pub(super) qos: QoS,
@@ -78,7 +78,7 @@ pub(super) enum RouterError {
     Gone,
     #[error("the router does not answer")]
     Stuck,
-    #[error("as many listeners as there may be")]
+    #[error("the maximum number of subscribers is reached")]
     Full,
 }
 
@@ -86,19 +86,19 @@ impl Router {
     /// Starts the router's thread.
     pub(super) async fn start(
         prefix: &TopicPrefix,
-        max_listeners: usize,
+        max_subscribers: usize,
     ) -> Result<Arc<Self>, RouterError> {
         let everything = format!("{prefix}/#");
-        let max_links = max_listeners + OTHER_LINKS;
+        let max_links = max_subscribers + OTHER_LINKS;
         let running = Running::start(&everything, max_links).await?;
         Ok(Arc::new(Self {
             everything,
-            slots: Mutex::new((0..max_listeners).rev().collect()),
+            free_slots: Mutex::new((0..max_subscribers).rev().collect()),
             max_links,
-            listeners: AtomicUsize::new(0),
+            subscribers: AtomicUsize::new(0),
             dropped: AtomicU64::new(0),
             current: Mutex::new(Arc::new(running)),
-            trouble: Notify::new(),
+            failure_observed: Notify::new(),
         }))
     }
 
@@ -113,16 +113,16 @@ impl Router {
     /// Publishes to all current subscribers. Never waits; messages that a failing router can't take
     /// are dropped, and the watchdog is told.
     pub(super) fn publish(&self, topic: &str, qos: QoS, payload: Bytes) {
-        if topic != CANARY_TOPIC && self.listeners.load(Ordering::Relaxed) == 0 {
+        if topic != CANARY_TOPIC && self.subscribers.load(Ordering::Relaxed) == 0 {
             return;
         }
-        if !self.hand_over(topic, qos, payload) {
+        if !self.enqueue(topic, qos, payload) {
             self.dropped.fetch_add(1, Ordering::Relaxed);
-            tracing::debug!(topic, "the router is behind, a message for listeners is dropped");
+            tracing::debug!(topic, "the router is behind; dropped a message for subscribers");
         }
     }
 
-    fn hand_over(&self, topic: &str, qos: QoS, payload: Bytes) -> bool {
+    fn enqueue(&self, topic: &str, qos: QoS, payload: Bytes) -> bool {
         let running = lock(&self.current).clone();
         let mut publisher = lock(&running.publisher);
         let is_behind = publisher.buffer().len() >= MAX_BACKLOG;
@@ -135,9 +135,9 @@ impl Router {
         }
         // Signals that the buffer is not empty; a full channel already contains many such notes.
         if let Err(LinkError::TrySend(flume::TrySendError::Disconnected(_))) =
-            publisher.try_unsubscribe(NOTHING)
+            publisher.try_unsubscribe(NO_FILTER)
         {
-            self.trouble.notify_one();
+            self.failure_observed.notify_one();
         }
         if is_behind {
             // The note itself must not make the backlog longer.
@@ -152,27 +152,28 @@ impl Router {
     }
 
     /// A new subscriber, which receives messages published from now on.
-    pub(super) async fn listen(
+    pub(super) async fn subscribe(
         self: &Arc<Self>,
-        listening: Listening,
-    ) -> Result<Listener, RouterError> {
+        topics: Topics,
+    ) -> Result<Subscriber, RouterError> {
         let running = lock(&self.current).clone();
-        let (filter, name, place) = match listening {
-            Listening::Everything => {
-                let place = Place::take(self.clone())?;
-                (self.everything.clone(), format!("listener-{}", place.slot), Some(place))
+        let (filter, name, slot) = match topics {
+            Topics::Everything => {
+                let slot = SubscriberSlot::take(self.clone())?;
+                (self.everything.clone(), format!("listener-{}", slot.number), Some(slot))
             }
-            Listening::Canary => (format!("{CANARY_TOPIC}/#"), "canary".to_owned(), None),
+            Topics::Canary => (format!("{CANARY_TOPIC}/#"), "canary".to_owned(), None),
         };
-        let link = Link::open(&running.connect, name, place).await?;
-        let mut listener = Listener { link, replaced: running.replaced.clone(), owes_ready: false };
-        listener.subscribe(filter).await?;
-        Ok(listener)
+        let link = Link::open(&running.connect, name, slot).await?;
+        let mut subscriber =
+            Subscriber { link, replaced: running.replaced.clone(), must_confirm: false };
+        subscriber.subscribe_to(filter).await?;
+        Ok(subscriber)
     }
 
     /// Returns when an observation proves that the router is dead.
-    pub(super) async fn trouble(&self) {
-        self.trouble.notified().await;
+    pub(super) async fn failure_observed(&self) {
+        self.failure_observed.notified().await;
     }
 
     /// Kills the router's thread in the same way as a client once could: by a topic that is not
@@ -185,7 +186,7 @@ impl Router {
 }
 
 /// A filter without subscribers.
-const NOTHING: &str = "";
+const NO_FILTER: &str = "";
 
 impl Running {
     async fn start(everything: &str, max_links: usize) -> Result<Self, RouterError> {
@@ -212,21 +213,21 @@ struct Link {
     tx: Option<LinkTx>,
     rx: LinkRx,
     /// Freed only after the router was told that the link is gone.
-    _place: Option<Place>,
+    _slot: Option<SubscriberSlot>,
 }
 
 impl Link {
     async fn open(
         connect: &Connect,
         name: String,
-        place: Option<Place>,
+        slot: Option<SubscriberSlot>,
     ) -> Result<Self, RouterError> {
         let (reply, answer) = oneshot::channel();
         let connect = connect.clone();
         // A separate thread: if the router dies now, this call waits for ever, and the runtime
         // would wait with it.
         std::thread::spawn(move || {
-            let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _place: place });
+            let link = connect(&name).map(|(tx, rx)| Link { tx: Some(tx), rx, _slot: slot });
             // If the receiver is gone, the link is dropped, and so closed, right here.
             let _ = reply.send(link);
         });
@@ -243,44 +244,45 @@ impl Drop for Link {
         let Some(mut tx) = self.tx.take() else { return };
         let reason_code = DisconnectReasonCode::NormalDisconnection;
         tx.buffer().push_back(Packet::Disconnect(Disconnect { reason_code }, None));
-        if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NOTHING) {
+        if let Err(LinkError::TrySend(flume::TrySendError::Full(_))) = tx.try_unsubscribe(NO_FILTER)
+        {
             // The router is busy and must not miss this: wait in a thread that holds up nothing
             // else.
-            std::thread::spawn(move || tx.unsubscribe(NOTHING).is_ok());
+            std::thread::spawn(move || tx.unsubscribe(NO_FILTER).is_ok());
         }
     }
 }
 
 /// One of the names of subscribers' links, freed when this is dropped.
-struct Place {
+struct SubscriberSlot {
     router: Arc<Router>,
-    slot: usize,
+    number: usize,
 }
 
-impl Place {
+impl SubscriberSlot {
     fn take(router: Arc<Router>) -> Result<Self, RouterError> {
-        let slot = lock(&router.slots).pop().ok_or(RouterError::Full)?;
-        router.listeners.fetch_add(1, Ordering::Relaxed);
-        Ok(Self { router, slot })
+        let number = lock(&router.free_slots).pop().ok_or(RouterError::Full)?;
+        router.subscribers.fetch_add(1, Ordering::Relaxed);
+        Ok(Self { router, number })
     }
 }
 
-impl Drop for Place {
+impl Drop for SubscriberSlot {
     fn drop(&mut self) {
-        self.router.listeners.fetch_sub(1, Ordering::Relaxed);
-        lock(&self.router.slots).push(self.slot);
+        self.router.subscribers.fetch_sub(1, Ordering::Relaxed);
+        lock(&self.router.free_slots).push(self.number);
     }
 }
 
-pub(super) struct Listener {
+pub(super) struct Subscriber {
     link: Link,
     replaced: CancellationToken,
     /// The router waits for the confirmation that its last batch was taken.
-    owes_ready: bool,
+    must_confirm: bool,
 }
 
-impl Listener {
-    async fn subscribe(&mut self, filter: String) -> Result<(), RouterError> {
+impl Subscriber {
+    async fn subscribe_to(&mut self, filter: String) -> Result<(), RouterError> {
         let tx = self.link.tx.as_mut().ok_or(RouterError::Gone)?;
         tx.try_subscribe(filter).map_err(|error| match error {
             LinkError::TrySend(flume::TrySendError::Full(_)) => RouterError::Stuck,
@@ -294,18 +296,18 @@ impl Listener {
     }
 
     /// The next message. Cancel-safe.
-    pub(super) async fn next(&mut self) -> Result<Heard, RouterError> {
+    pub(super) async fn next(&mut self) -> Result<Message, RouterError> {
         loop {
-            if self.owes_ready {
+            if self.must_confirm {
                 self.link.rx.wake().await.map_err(|_| RouterError::Gone)?;
-                self.owes_ready = false;
+                self.must_confirm = false;
             }
             match self.notification().await? {
                 Some(Notification::Forward(forward)) => {
-                    return heard(forward.publish).ok_or(RouterError::Gone);
+                    return original_message(forward.publish).ok_or(RouterError::Gone);
                 }
                 // The last of its batch.
-                Some(Notification::Unschedule) => self.owes_ready = true,
+                Some(Notification::Unschedule) => self.must_confirm = true,
                 _ => {}
             }
         }
@@ -320,10 +322,10 @@ impl Listener {
 }
 
 /// Undoes what [`Router::publish`] did to the topic.
-fn heard(publish: Publish) -> Option<Heard> {
+fn original_message(publish: Publish) -> Option<Message> {
     let (topic, qos) = std::str::from_utf8(&publish.topic).ok()?.rsplit_once('/')?;
     let qos = rumqttd::protocol::qos(qos.parse().ok()?)?;
-    Some(Heard { topic: topic.to_owned(), payload: publish.payload, qos })
+    Some(Message { topic: topic.to_owned(), payload: publish.payload, qos })
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

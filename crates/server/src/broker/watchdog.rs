@@ -11,7 +11,7 @@ use rumqttd::protocol::{
     Connect, ConnectReturnCode, Error, Filter, Login, Packet, Protocol, Publish, QoS,
     RetainForwardRule, Subscribe, v4::V4,
 };
-use task_transport::{DialError, Duplex, Route, dial};
+use task_transport::{DialError, Duplex, Route, connect, secure};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::sync::watch;
 use tokio::time::timeout;
@@ -19,6 +19,7 @@ use tokio::time::timeout;
 use super::front::{CANARY_ID, CanaryPass, Front};
 use super::router::{CANARY_TOPIC, Router};
 use super::{Health, Limits};
+use crate::net::proxy_protocol::{LOCAL_HEADER, ProxyProtocol};
 use crate::net::tls::Tls;
 
 /// Consecutive remedies before the watchdog gives up.
@@ -35,11 +36,12 @@ pub(super) fn start(
     let (sender, receiver) = watch::channel(Health::Serving);
     let watchdog = Watchdog {
         route: route(front),
+        proxy_protocol: front.proxy_protocol().clone(),
         pass: front.canary_pass(),
         router,
         limits: limits.clone(),
         health: sender,
-        flights: 0,
+        probes: 0,
     };
     let stop = front.stop();
     tokio::spawn(async move { stop.run_until_cancelled(watchdog.run()).await });
@@ -48,16 +50,17 @@ pub(super) fn start(
 
 struct Watchdog {
     route: Route,
+    proxy_protocol: ProxyProtocol,
     pass: Arc<CanaryPass>,
     router: Arc<Router>,
     limits: Limits,
     health: watch::Sender<Health>,
-    flights: u64,
+    probes: u64,
 }
 
 /// The reason why a canary did not come back, by its remedy.
 #[derive(Debug, thiserror::Error)]
-enum Lost {
+enum ProbeError {
     /// No remedy helps, if the failure lasts.
     #[error("the MQTT listener does not accept connections")]
     Listener(#[source] DialError),
@@ -66,16 +69,16 @@ enum Lost {
     #[error("the watchdog can't open a connection to the MQTT listener")]
     Dial(#[source] DialError),
     /// Time helps: too many connections, or overload. A new router would only increase the load.
-    #[error("the MQTT front did not let the watchdog in: {0}")]
+    #[error("the MQTT listener did not admit the watchdog: {0}")]
     Front(&'static str),
     /// A new router helps.
     #[error("the message router does not work: {0}")]
     Router(&'static str),
 }
 
-impl Lost {
+impl ProbeError {
     /// Classifies a failed attempt to connect.
-    fn by(error: DialError) -> Self {
+    fn from_dial(error: DialError) -> Self {
         let refused = io::ErrorKind::ConnectionRefused;
         let is_refused =
             matches!(&error, DialError::Connect { source, .. } if source.kind() == refused);
@@ -88,7 +91,7 @@ impl Lost {
     }
 
     /// Whether the failure may end the server, if it lasts.
-    fn is_grave(&self) -> bool {
+    fn is_failure(&self) -> bool {
         matches!(self, Self::Listener(_) | Self::Router(_))
     }
 }
@@ -99,80 +102,92 @@ impl Watchdog {
         loop {
             tokio::select! {
                 () = tokio::time::sleep(self.limits.canary_interval) => {}
-                () = self.router.trouble() => {}
+                () = self.router.failure_observed() => {}
             }
-            let Err(lost) = self.fly().await else {
+            let Err(error) = self.run_probe().await else {
                 failures = 0;
-                self.say(Health::Serving);
+                self.set_health(Health::Serving);
                 continue;
             };
-            let seen = lost.to_string();
-            if lost.is_grave() {
+            let reason = error.to_string();
+            if error.is_failure() {
                 failures += 1;
             }
             if failures > MAX_REMEDIES {
                 tracing::error!(
-                    "the MQTT broker is beyond repair: {:#}",
-                    anyhow::Error::from(lost)
+                    "the MQTT broker could not be recovered: {:#}",
+                    anyhow::Error::from(error)
                 );
-                self.say(Health::Failed(seen));
+                self.set_health(Health::Failed(reason));
                 return;
             }
-            if let Lost::Router(_) = lost {
-                tracing::warn!("{lost}; it is started anew");
+            if let ProbeError::Router(_) = error {
+                tracing::warn!("{error}; restarting it");
                 if let Err(error) = self.router.restart().await {
-                    tracing::error!("the message router did not start anew: {error}");
+                    tracing::error!("failed to restart the message router: {error}");
                 }
             } else {
-                tracing::warn!("{:#}", anyhow::Error::from(lost));
+                tracing::warn!("{:#}", anyhow::Error::from(error));
             }
-            self.say(Health::Recovering(seen));
+            self.set_health(Health::Recovering(reason));
         }
     }
 
-    fn say(&self, finding: Health) {
-        self.health
-            .send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
+    fn set_health(&self, new: Health) {
+        self.health.send_if_modified(|health| std::mem::replace(health, new.clone()) != new);
+    }
+
+    async fn connect(&self) -> Result<Probe, ProbeError> {
+        let mut stream = connect(&self.route).await.map_err(ProbeError::from_dial)?;
+        // A balancer may be at this machine's own address.
+        let is_proxy = |own: SocketAddr| self.proxy_protocol.applies_to(own.ip());
+        if stream.local_addr().is_ok_and(is_proxy) && stream.write_all(&LOCAL_HEADER).await.is_err()
+        {
+            return Err(ProbeError::Front("the connection broke"));
+        }
+        let stream = secure(stream, &self.route).await.map_err(ProbeError::from_dial)?;
+        Probe::log_in(stream, self.pass.renew()).await
     }
 
     /// Sends one canary and waits for its message.
-    async fn fly(&mut self) -> Result<(), Lost> {
-        self.flights += 1;
+    async fn run_probe(&mut self) -> Result<(), ProbeError> {
+        self.probes += 1;
         let patience = self.limits.canary_timeout;
-        let entering = timeout(patience, Bird::enter(&self.route, self.pass.renew())).await;
-        let mut bird = entering.unwrap_or(Err(Lost::Front("no answer in time")))?;
-        let singing = timeout(patience, bird.sing(self.flights.to_string())).await;
-        singing.unwrap_or(Err(Lost::Router("the watchdog did not hear itself in time")))
+        let connecting = timeout(patience, self.connect()).await;
+        let mut probe = connecting.unwrap_or(Err(ProbeError::Front("no answer in time")))?;
+        let echoing = timeout(patience, probe.echo(self.probes.to_string())).await;
+        echoing.unwrap_or(Err(ProbeError::Router(
+            "the watchdog did not receive its own message in time",
+        )))
     }
 }
 
 /// A minimal MQTT client for the canary.
-struct Bird {
+struct Probe {
     stream: Box<dyn Duplex>,
     input: BytesMut,
 }
 
-impl Bird {
-    async fn enter(route: &Route, password: String) -> Result<Self, Lost> {
-        let stream = dial(route).await.map_err(Lost::by)?;
-        let mut bird = Self { stream, input: BytesMut::new() };
+impl Probe {
+    async fn log_in(stream: Box<dyn Duplex>, password: String) -> Result<Self, ProbeError> {
+        let mut probe = Self { stream, input: BytesMut::new() };
         let connect =
             Connect { keep_alive: 30, client_id: CANARY_ID.to_owned(), clean_session: true };
         let login = Login { username: CANARY_ID.to_owned(), password };
-        match bird.ask(Packet::Connect(connect, None, None, None, Some(login))).await {
+        match probe.ask(Packet::Connect(connect, None, None, None, Some(login))).await {
             Some(Packet::ConnAck(ack, _)) => match ack.code {
-                ConnectReturnCode::Success => Ok(bird),
+                ConnectReturnCode::Success => Ok(probe),
                 // The only resource that the front needs for a canary is a link to the router.
                 ConnectReturnCode::ServiceUnavailable => {
-                    Err(Lost::Router("it answers no new link"))
+                    Err(ProbeError::Router("it does not accept new links"))
                 }
-                _ => Err(Lost::Front("it refused the password")),
+                _ => Err(ProbeError::Front("it refused the password")),
             },
-            _ => Err(Lost::Front("the connection broke")),
+            _ => Err(ProbeError::Front("the connection broke")),
         }
     }
 
-    async fn sing(&mut self, song: String) -> Result<(), Lost> {
+    async fn echo(&mut self, text: String) -> Result<(), ProbeError> {
         let filter = Filter {
             path: CANARY_TOPIC.to_owned(),
             qos: QoS::AtMostOnce,
@@ -180,15 +195,15 @@ impl Bird {
             preserve_retain: false,
             retain_forward_rule: RetainForwardRule::Never,
         };
-        let broke = Lost::Router("the watchdog's connection broke");
+        let broke = ProbeError::Router("the watchdog's connection broke");
         let Some(_) =
             self.ask(Packet::Subscribe(Subscribe { pkid: 1, filters: vec![filter] }, None)).await
         else {
             return Err(broke);
         };
-        let publish = Publish::new(CANARY_TOPIC.to_owned(), song.clone(), false);
+        let publish = Publish::new(CANARY_TOPIC.to_owned(), text.clone(), false);
         match self.ask(Packet::Publish(publish, None)).await {
-            Some(Packet::Publish(heard, _)) if heard.payload == song.as_bytes() => Ok(()),
+            Some(Packet::Publish(received, _)) if received.payload == text.as_bytes() => Ok(()),
             _ => Err(broke),
         }
     }
@@ -234,84 +249,96 @@ mod tests {
 
     use futures_util::future::BoxFuture;
     use task_proto::RobotId;
-    use task_proto::topic::TopicPrefix;
+    use task_proto::messages::topic::TopicPrefix;
     use tokio::net::TcpStream;
 
     use super::super::{
         BrokerConfig, Gatekeeper, Inbox, NotStored, Principal, Refusal, RobotMessage,
     };
     use super::*;
-    use crate::limits::conduct::{Conduct, ConductLimits};
+    use crate::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
 
     const PATIENCE: Duration = Duration::from_secs(10);
 
-    struct Nobody;
+    struct NoClients;
 
-    impl Gatekeeper for Nobody {
+    impl Gatekeeper for NoClients {
         fn admit(&self, _: super::super::Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
             Box::pin(async { Err(Refusal::BadCredentials) })
         }
     }
 
-    impl Inbox for Nobody {
+    impl Inbox for NoClients {
         fn receive(&self, _: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
             Box::pin(async { Err(NotStored) })
         }
         fn connected(&self, _: &RobotId, _: Option<SocketAddr>, _: u64) {}
         fn disconnected(&self, _: &RobotId, _: u64) {}
-        fn everyone_may_be_there(&self) {}
+        fn external_broker_connected(&self) {}
     }
 
     async fn watched(
-        change: impl FnOnce(&mut Limits),
+        change: impl FnOnce(&mut BrokerConfig),
     ) -> (Arc<Front>, Arc<Router>, watch::Receiver<Health>) {
-        let mut limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
-        change(&mut limits);
+        let limits = Limits { canary_interval: Duration::from_millis(20), ..Limits::default() };
         let listen = "127.0.0.1:0".parse().expect("an address");
-        let conduct = Conduct::new(ConductLimits::default());
-        let config = BrokerConfig {
+        let robot_limiter = RobotLimiter::new(RobotLimits::default());
+        let mut config = BrokerConfig {
             listen,
             tls: None,
+            proxy_protocol: ProxyProtocol::new(&[]),
             prefix: TopicPrefix::default(),
-            limits: limits.clone(),
-            conduct,
+            limits,
+            robot_limiter,
         };
+        change(&mut config);
+        let limits = config.limits.clone();
         let router = Router::start(&config.prefix, 4).await.expect("a router");
-        let front = Front::start(config, Arc::new(Nobody), Arc::new(Nobody), router.clone())
+        let front = Front::start(config, Arc::new(NoClients), Arc::new(NoClients), router.clone())
             .await
             .expect("a free port");
         let health = start(&front, router.clone(), &limits);
         (front, router, health)
     }
 
-    async fn until(health: &mut watch::Receiver<Health>, wanted: impl FnMut(&Health) -> bool) {
-        timeout(PATIENCE, health.wait_for(wanted))
+    async fn until(health: &mut watch::Receiver<Health>, expected: impl FnMut(&Health) -> bool) {
+        timeout(PATIENCE, health.wait_for(expected))
             .await
             .expect("in time")
             .expect("the watchdog lives");
     }
 
     #[tokio::test]
-    async fn a_killed_router_is_started_anew() {
+    async fn killed_router_is_restarted() {
         let (front, router, mut health) = watched(|_| {}).await;
         for _ in 0..3 {
-            let mut listener =
-                router.listen(super::super::router::Listening::Everything).await.expect("a link");
+            let mut subscriber =
+                router.subscribe(super::super::router::Topics::Everything).await.expect("a link");
             router.kill();
             until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
             until(&mut health, |health| *health == Health::Serving).await;
             assert!(
-                timeout(PATIENCE, listener.next()).await.expect("in time").is_err(),
-                "old listeners learn of it"
+                timeout(PATIENCE, subscriber.next()).await.expect("in time").is_err(),
+                "old subscribers learn of it"
             );
         }
         front.shutdown(PATIENCE).await;
     }
 
     #[tokio::test]
-    async fn a_dead_router_is_noticed_by_whoever_publishes() {
+    async fn watchdog_at_the_address_of_a_proxy_is_admitted() {
+        let proxies = ProxyProtocol::new(&[Ipv4Addr::LOCALHOST.into()]);
+        let (front, router, mut health) = watched(|config| config.proxy_protocol = proxies).await;
+        router.kill();
+        until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
+        until(&mut health, |health| *health == Health::Serving).await;
+        front.shutdown(PATIENCE).await;
+    }
+
+    #[tokio::test]
+    async fn publishing_to_a_dead_router_wakes_the_watchdog() {
         let (_front, router, mut health) =
-            watched(|limits| limits.canary_interval = Duration::from_secs(3600)).await;
+            watched(|config| config.limits.canary_interval = Duration::from_secs(3600)).await;
         router.kill();
         let noticed = async {
             while !health.has_changed().expect("the watchdog lives") {
@@ -321,36 +348,38 @@ mod tests {
         };
         timeout(PATIENCE, noticed).await.expect("in time");
         until(&mut health, |health| matches!(health, Health::Recovering(_))).await;
-        router
-            .listen(super::super::router::Listening::Everything)
-            .await
-            .expect("it was started anew");
+        router.subscribe(super::super::router::Topics::Everything).await.expect("it was restarted");
     }
 
     #[tokio::test]
-    async fn a_crowded_front_is_not_taken_for_a_dead_router() {
-        let (front, _router, mut health) = watched(|limits| limits.max_connections = 1).await;
-        let crowd = TcpStream::connect(front.local_addr()).await.expect("a connection");
-        until(&mut health, |health| matches!(health, Health::Recovering(seen) if seen.contains("let the watchdog in")))
+    async fn full_listener_does_not_restart_the_router() {
+        let (front, _router, mut health) =
+            watched(|config| config.limits.max_connections = 1).await;
+        let other = TcpStream::connect(front.local_addr()).await.expect("a connection");
+        until(&mut health, |health| matches!(health, Health::Recovering(reason) if reason.contains("did not admit the watchdog")))
             .await;
-        drop(crowd);
+        drop(other);
         until(&mut health, |health| *health == Health::Serving).await;
     }
 
     #[test]
-    fn only_a_listener_that_refuses_is_gone() {
-        let lost = |errno| {
+    fn only_a_refused_connection_counts_as_a_dead_listener() {
+        let error = |errno| {
             let source = io::Error::from_raw_os_error(errno);
-            Lost::by(DialError::Connect { host: "127.0.0.1".to_owned(), port: 1883, source })
+            ProbeError::from_dial(DialError::Connect {
+                host: "127.0.0.1".to_owned(),
+                port: 1883,
+                source,
+            })
         };
-        assert!(matches!(lost(libc::ECONNREFUSED), Lost::Listener(_)));
+        assert!(matches!(error(libc::ECONNREFUSED), ProbeError::Listener(_)));
         for errno in [libc::EMFILE, libc::ENFILE, libc::EADDRNOTAVAIL, libc::ENOBUFS] {
-            assert!(!lost(errno).is_grave(), "{errno}");
+            assert!(!error(errno).is_failure(), "{errno}");
         }
     }
 
     #[tokio::test]
-    async fn a_listener_that_is_gone_is_beyond_repair() {
+    async fn dead_listener_ends_in_failed_health() {
         let (front, _router, _) = watched(|_| {}).await;
         let dead = {
             let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.expect("a port");
@@ -363,11 +392,12 @@ mod tests {
             Route { host: dead.ip().to_string(), port: dead.port(), tls: None, websocket: None };
         let watchdog = Watchdog {
             route,
+            proxy_protocol: front.proxy_protocol().clone(),
             pass: front.canary_pass(),
             router,
             limits,
             health: sender,
-            flights: 0,
+            probes: 0,
         };
         watchdog.run().await;
         until(&mut health, |health| matches!(health, Health::Failed(_))).await;

@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 
 use reqwest::Url;
-use task_proto::person::Roles;
-use task_proto::selector::Selector;
+use task_proto::ids::selector::Selector;
+use task_proto::people::roles::Roles;
 
 use super::ConfigError;
 
@@ -89,7 +89,7 @@ impl OidcSettings {
 }
 
 /// An error, and the key below the table.
-pub(super) struct Wrong {
+pub(super) struct TableError {
     pub(super) key: String,
     pub(super) reason: String,
 }
@@ -122,22 +122,22 @@ pub(super) fn public_url(text: &str) -> Result<String, String> {
 }
 
 /// `[[oidc.rules]]`, counted from 1.
-pub(super) fn rules(value: toml::Value) -> Result<Vec<RoleRule>, Wrong> {
-    let wrong = |reason: String| Wrong { key: "rules".to_owned(), reason };
+pub(super) fn rules(value: toml::Value) -> Result<Vec<RoleRule>, TableError> {
+    let error_at = |reason: String| TableError { key: "rules".to_owned(), reason };
     let toml::Value::Array(values) = value else {
-        return Err(wrong("expected [[oidc.rules]], a list of tables".to_owned()));
+        return Err(error_at("expected [[oidc.rules]], a list of tables".to_owned()));
     };
     if values.len() > MAX_RULES {
-        return Err(wrong(format!("{} rules, at most {MAX_RULES} are possible", values.len())));
+        return Err(error_at(format!("{} rules; at most {MAX_RULES} are allowed", values.len())));
     }
-    let below = |at: usize, (key, reason): (String, String)| Wrong {
+    let below = |at: usize, (key, reason): (String, String)| TableError {
         key: format!("rules[{}]{key}", at + 1),
         reason,
     };
     values
         .into_iter()
         .enumerate()
-        .map(|(at, value)| rule(value).map_err(|wrong| below(at, wrong)))
+        .map(|(at, value)| rule(value).map_err(|error| below(at, error)))
         .collect()
 }
 
@@ -147,21 +147,22 @@ fn rule(value: toml::Value) -> Result<RoleRule, (String, String)> {
     };
     let (mut claim, mut wanted, mut roles, mut robots) = (None, None, None, None);
     for (key, value) in table {
-        let wrong = |reason: String| (format!(".{key}"), reason);
+        let error_at = |reason: String| (format!(".{key}"), reason);
         let text = value.as_str().filter(|text| (1..=MAX_TEXT_BYTES).contains(&text.len()));
-        let text =
-            text.ok_or_else(|| wrong(format!("expected a text of 1 to {MAX_TEXT_BYTES} bytes")))?;
+        let text = text
+            .ok_or_else(|| error_at(format!("expected a string of 1 to {MAX_TEXT_BYTES} bytes")))?;
         match key.as_str() {
             "claim" => claim = Some(text.to_owned()),
             "value" => wanted = Some(text.to_owned()),
             "roles" => {
-                roles = Some(text.parse::<Roles>().map_err(|error| wrong(error.to_string()))?)
+                roles = Some(text.parse::<Roles>().map_err(|error| error_at(error.to_string()))?)
             }
             "robots" => {
-                robots = Some(text.parse::<Selector>().map_err(|error| wrong(error.to_string()))?)
+                robots =
+                    Some(text.parse::<Selector>().map_err(|error| error_at(error.to_string()))?)
             }
             _ => {
-                return Err(wrong(
+                return Err(error_at(
                     "there is no such key: expected claim, value, roles or robots".to_owned(),
                 ));
             }
@@ -170,11 +171,9 @@ fn rule(value: toml::Value) -> Result<RoleRule, (String, String)> {
     let missing = |key: &str, what: &str| (format!(".{key}"), format!("missing: {what}"));
     Ok(RoleRule {
         claim: claim
-            .ok_or_else(|| missing("claim", "what the provider says of somebody, like groups"))?,
-        value: wanted.ok_or_else(|| {
-            missing("value", "what the claim has to be, or to have among its values")
-        })?,
-        roles: roles.ok_or_else(|| missing("roles", "what they may do then"))?,
+            .ok_or_else(|| missing("claim", "the name of the claim to match, such as groups"))?,
+        value: wanted.ok_or_else(|| missing("value", "the claim's value, or one of its values"))?,
+        roles: roles.ok_or_else(|| missing("roles", "the roles of matching users"))?,
         robots: robots.filter(|robots| robots.to_string() != "*"),
     })
 }
@@ -204,7 +203,7 @@ mod tests {
     "#;
 
     #[test]
-    fn all_of_the_table_is_read() {
+    fn oidc_table_is_read_completely() {
         let oidc =
             load(&[], &[("TASKD_OIDC_SCOPES", "openid groups")], Some(FILE)).expect("loads").oidc;
         assert_eq!(oidc.redirect_uri(), "https://fleet.example.org/api/v1/oidc/callback");
@@ -227,7 +226,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_or_wrong_is_named() {
+    fn invalid_oidc_settings_are_named() {
         let without = |line: &str| {
             FILE.lines().filter(|given| !given.contains(line)).collect::<Vec<_>>().join("\n")
         };
@@ -248,7 +247,10 @@ mod tests {
                 "oidc.rules[2].valeu in taskd.toml: there is no such",
             ),
             (FILE.replace("value = \"admins\"", ""), "oidc.rules[2].value in taskd.toml: missing"),
-            (FILE.replace("\"admins\"", "1"), "oidc.rules[2].value in taskd.toml: expected a text"),
+            (
+                FILE.replace("\"admins\"", "1"),
+                "oidc.rules[2].value in taskd.toml: expected a string",
+            ),
             (
                 FILE.replace("https://id", "http://id"),
                 "oidc.issuer in taskd.toml: \"http://id.example.org/realms/lab\" is",

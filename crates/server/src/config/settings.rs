@@ -4,11 +4,13 @@
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
 
-use task_proto::part::{MAX_PART_BYTES, MIN_PART_BYTES};
+use task_proto::messages::part::{MAX_PART_BYTES, MIN_PART_BYTES};
+use task_proto::size::format_bytes;
+use task_proto::time::parse_lifetime;
 
 use super::oidc::{private_url, public_url};
-use super::{BlobRead, Config, lifetime};
-use crate::domain::delivery::shown_bytes;
+use super::{BlobRead, Config};
+use crate::domain::database_url;
 
 /// One setting. `topic-prefix` is the flag's name; the file's key is `topic_prefix`, the variable
 /// `TASKD_TOPIC_PREFIX`.
@@ -42,20 +44,20 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "http",
         value_name: "ADDR",
-        help: "Where HTTP listens; port 0 takes a free one [default: 127.0.0.1:8080]",
+        help: "Address of the HTTP listener; port 0 picks a free port [default: 127.0.0.1:8080]",
         set: |config, text| address(text).map(|address| config.http = address),
     },
     Setting {
         name: "mqtt",
         value_name: "ADDR",
-        help: "Where MQTT listens; port 0 takes a free one [default: 127.0.0.1:1883]",
+        help: "Address of the MQTT listener; port 0 picks a free port [default: 127.0.0.1:1883]",
         set: |config, text| address(text).map(|address| config.mqtt = address),
     },
     Setting {
         name: "broker",
         value_name: "URL",
-        help: "mqtt(s)://USER:PASSWORD@HOST[:PORT] of a broker to use instead of the server's own, or several separated by \
-               commas, which are tried in this order; in the file or TASKD_BROKER only, since everybody on the machine \
+        help: "mqtt(s)://USER:PASSWORD@HOST[:PORT] of an external broker, or several separated by commas, \
+               which are tried in this order; only in the file or TASKD_BROKER, because every user of the machine \
                can read this command line [default: embedded]",
         set: |config, text| {
             config.broker = if text == "embedded" { None } else { Some(parsed(text)?) };
@@ -65,38 +67,50 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "broker-pin",
         value_name: "PIN",
-        help: "SHA-256 of the public key of the authority behind the broker's certificate, which the server and robots \
-               then trust alone [default: the systems' roots vouch for it]",
+        help: "SHA-256 of the public key of the broker's certificate authority; the server and robots then trust \
+               only this authority [default: the systems' root certificates]",
         set: |config, text| parsed(text).map(|pin| config.broker_pin = Some(pin)),
     },
     Setting {
         name: "database",
         value_name: "URL",
-        help: "sqlite:PATH or postgres://… [default: SQLite in the data directory]",
-        set: |config, text| database_url(text).map(|url| config.database = Some(url)),
+        help: "sqlite:PATH or postgres://…; several Postgres URLs separated by commas name the servers of one \
+               database, of which the one that takes writes is used [default: SQLite in the data directory]",
+        set: |config, text| {
+            database_url::check(text).map_err(|error| error.to_string())?;
+            config.database = Some(text.to_owned());
+            Ok(())
+        },
+    },
+    Setting {
+        name: "standby",
+        value_name: "BOOL",
+        help: "Wait while another server uses the database, a Postgres, and take over when that server ends; \
+               see docs/cluster.md [default: false]",
+        set: |config, text| boolean(text).map(|standby| config.standby = standby),
     },
     Setting {
         name: "database-check-interval",
         value_name: "TIME",
-        help: "How often a SQLite database is checked in full while it is served [default: 1d]",
-        set: |config, text| lifetime(text).map(|time| config.database_check_interval = time),
+        help: "Interval between full checks of a SQLite database [default: 1d]",
+        set: |config, text| parse_lifetime(text).map(|time| config.database_check_interval = time),
     },
     Setting {
         name: "topic-prefix",
         value_name: "PREFIX",
-        help: "What all MQTT topics start with [default: taskd/v1]",
+        help: "Prefix of all MQTT topics [default: taskd/v1]",
         set: |config, text| parsed(text).map(|prefix| config.topic_prefix = prefix),
     },
     Setting {
         name: "allow-plaintext",
         value_name: "BOOL",
-        help: "Let unencrypted listeners be reached from other machines",
+        help: "Allow unencrypted connections from other machines",
         set: |config, text| boolean(text).map(|allow| config.allow_plaintext = allow),
     },
     Setting {
         name: "tls-certificate",
         value_name: "FILE",
-        help: "Own certificate chain (PEM), for HTTP and MQTT; a file that changes is read again",
+        help: "Certificate chain (PEM) for HTTP and MQTT; reloaded when the file changes",
         set: |config, text| {
             config.tls.certificate = Some(PathBuf::from(non_empty(text)?));
             Ok(())
@@ -105,7 +119,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "tls-key",
         value_name: "FILE",
-        help: "Its private key (PEM)",
+        help: "Private key of the certificate (PEM)",
         set: |config, text| {
             config.tls.key = Some(PathBuf::from(non_empty(text)?));
             Ok(())
@@ -114,38 +128,38 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "tls-private-ca",
         value_name: "BOOL",
-        help: "Encrypt with a certificate by an authority of the server's own, which enrolment tokens tell robots to trust \
-               [default: where other machines reach a listener, without --tls-certificate or --allow-plaintext]",
+        help: "Encrypt with a certificate of the server's private authority, which enrollment tokens pin \
+               [default: if other machines can reach a listener, without --tls-certificate and --allow-plaintext]",
         set: |config, text| boolean(text).map(|private| config.tls.private_ca = Some(private)),
     },
     Setting {
         name: "tls-client-certificates",
         value_name: "BOOL",
-        help: "Ask robots for the key that they registered: without it their tokens open nothing [default: false]",
+        help: "Require robots' registered client certificates: their tokens are then refused without the key [default: false]",
         set: |config, text| boolean(text).map(|asks| config.tls.client_certificates = asks),
     },
     Setting {
         name: "tls-names",
         value_name: "NAME,…",
-        help: "Host names and addresses that its certificate is also good for, beside the machine's own",
+        help: "Additional host names and addresses in the private authority's certificate",
         set: |config, text| host_names(text).map(|names| config.tls.names = names),
     },
     Setting {
         name: "assignment-expiry",
         value_name: "TIME",
-        help: "How long an assignment may stay undone [default: 7d]",
-        set: |config, text| lifetime(text).map(|time| config.assignment_expiry = time),
+        help: "Time after which an unfinished assignment expires [default: 7d]",
+        set: |config, text| parse_lifetime(text).map(|time| config.assignment_expiry = time),
     },
     Setting {
         name: "desired-lifetime",
         value_name: "TIME",
-        help: "How long a signed desired state allows new work to be begun [default: 30d]",
-        set: |config, text| lifetime(text).map(|time| config.desired_lifetime = time),
+        help: "Time for which a signed desired state permits new work [default: 30d]",
+        set: |config, text| parse_lifetime(text).map(|time| config.desired_lifetime = time),
     },
     Setting {
         name: "public-mqtt-host",
         value_name: "HOST",
-        help: "MQTT host that robots are told [default: the host of the URL they use]",
+        help: "MQTT host announced to robots [default: the host of the URL they use]",
         set: |config, text| {
             config.public_mqtt_host = Some(non_empty(text)?);
             Ok(())
@@ -154,7 +168,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "public-mqtt-port",
         value_name: "PORT",
-        help: "MQTT port that robots are told [default: the port that is bound]",
+        help: "MQTT port announced to robots [default: the bound port]",
         set: |config, text| match text.parse() {
             Ok(port) if port > 0 => {
                 config.public_mqtt_port = Some(port);
@@ -166,13 +180,13 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "presence-timeout",
         value_name: "TIME",
-        help: "After how long a silent robot that polls counts as offline [default: 90s]",
-        set: |config, text| lifetime(text).map(|time| config.presence_timeout = time),
+        help: "Silence after which a polling robot counts as offline [default: 90s]",
+        set: |config, text| parse_lifetime(text).map(|time| config.presence_timeout = time),
     },
     Setting {
         name: "blob-read",
         value_name: "mmap|pread",
-        help: "How blobs are read [default: mmap]",
+        help: "How blob files are read [default: mmap]",
         set: |config, text| {
             config.blob_read = match text {
                 "mmap" => BlobRead::Mmap,
@@ -185,13 +199,13 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "blob-grace",
         value_name: "TIME",
-        help: "How long unfinished uploads and unreferenced blobs are kept [default: 1d]",
-        set: |config, text| lifetime(text).map(|time| config.blob_grace = time),
+        help: "Retention of unfinished uploads and unreferenced blobs [default: 1d]",
+        set: |config, text| parse_lifetime(text).map(|time| config.blob_grace = time),
     },
     Setting {
         name: "max-http-connections",
         value_name: "N",
-        help: "Most HTTP connections at once [default: 20000]",
+        help: "Maximum concurrent HTTP connections [default: 20000]",
         set: |config, text| {
             count(text, 1_000_000).map(|n| config.max_http_connections = n as usize)
         },
@@ -199,7 +213,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "max-mqtt-connections",
         value_name: "N",
-        help: "Most MQTT connections at once [default: 20000]",
+        help: "Maximum concurrent MQTT connections [default: 20000]",
         set: |config, text| {
             count(text, 1_000_000).map(|n| config.max_mqtt_connections = n as usize)
         },
@@ -207,7 +221,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "max-silent-per-address",
         value_name: "N",
-        help: "Most connections of one address without a good token so far, over MQTT without CONNECT [default: 2048]",
+        help: "Maximum unauthenticated connections per address [default: 2048]",
         set: |config, text| {
             count(text, 1_000_000).map(|n| config.max_silent_per_address = n as usize)
         },
@@ -215,33 +229,32 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "trusted-proxies",
         value_name: "ADDR,…",
-        help: "Addresses of reverse proxies whose X-Forwarded-For is believed [default: none]",
-        set: |config, text| {
-            let addresses = text.split(',').map(str::trim).filter(|text| !text.is_empty());
-            let parsed = addresses.map(|text| match text.parse::<IpAddr>() {
-                Ok(address) => Ok(address.to_canonical()),
-                Err(_) => Err(format!("{text:?} is not an IP address")),
-            });
-            config.trusted_proxies = parsed.collect::<Result<_, _>>()?;
-            Ok(())
-        },
+        help: "Addresses of reverse proxies whose X-Forwarded-For is trusted [default: none]",
+        set: |config, text| ip_addresses(text).map(|proxies| config.trusted_proxies = proxies),
+    },
+    Setting {
+        name: "proxies",
+        value_name: "ADDR,…",
+        help: "Addresses of balancers that begin each connection, HTTP and MQTT, with a PROXY protocol v2 header; \
+               see docs/tls.md [default: none]",
+        set: |config, text| ip_addresses(text).map(|proxies| config.proxies = proxies),
     },
     Setting {
         name: "oidc-issuer",
         value_name: "URL",
-        help: "OpenID Connect provider by which people may sign in; see docs/people.md [default: none]",
+        help: "OpenID Connect issuer for sign-in; see docs/people.md [default: none]",
         set: |config, text| private_url(text).map(|url| config.oidc.issuer = url),
     },
     Setting {
         name: "oidc-client-id",
         value_name: "ID",
-        help: "What the provider calls this server",
+        help: "Client id of this server at the provider",
         set: |config, text| non_empty(text).map(|id| config.oidc.client_id = id),
     },
     Setting {
         name: "oidc-client-secret-file",
         value_name: "FILE",
-        help: "File with the secret that it gave this server, if it did",
+        help: "File with the client secret, for a confidential client",
         set: |config, text| {
             non_empty(text).map(|path| config.oidc.client_secret_file = Some(PathBuf::from(path)))
         },
@@ -249,43 +262,43 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "oidc-public-url",
         value_name: "URL",
-        help: "Where browsers reach this server, like https://fleet.example.org",
+        help: "Public URL of this server for browsers, such as https://fleet.example.org",
         set: |config, text| public_url(text).map(|url| config.oidc.public_url = url),
     },
     Setting {
         name: "oidc-scopes",
         value_name: "SCOPES",
-        help: "What the provider is asked for [default: openid profile]",
+        help: "Scopes requested from the provider [default: openid profile]",
         set: |config, text| match text.split(' ').any(|scope| scope == "openid") {
             true => {
                 config.oidc.scopes = text.to_owned();
                 Ok(())
             }
-            false => Err(format!("{text:?} lacks openid")),
+            false => Err(format!("{text:?} does not include openid")),
         },
     },
     Setting {
         name: "oidc-name-claim",
         value_name: "CLAIM",
-        help: "Claim that a new user is named by [default: preferred_username]",
+        help: "Claim with a new user's name [default: preferred_username]",
         set: |config, text| non_empty(text).map(|claim| config.oidc.name_claim = claim),
     },
     Setting {
         name: "oidc-title",
         value_name: "TEXT",
-        help: "What the page calls the provider [default: single sign-on]",
+        help: "Name of the provider on the page [default: single sign-on]",
         set: |config, text| non_empty(text).map(|title| config.oidc.title = title),
     },
     Setting {
         name: "max-blob-bytes",
         value_name: "BYTES",
-        help: "Most bytes of one blob [default: 17179869184]",
+        help: "Maximum size of one blob, in bytes [default: 17179869184]",
         set: |config, text| count(text, 1 << 50).map(|n| config.max_blob_bytes = n),
     },
     Setting {
         name: "max-upload-bytes",
         value_name: "SIZE",
-        help: "Most that is unpacked of a package that the page brings as a directory [default: 4 GB]",
+        help: "Maximum unpacked size of a package uploaded from the page [default: 4 GB]",
         set: |config, text| {
             size_within(text, 1, 1 << 50).map(|bytes| config.max_upload_bytes = bytes)
         },
@@ -293,7 +306,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "delivery-part-bytes",
         value_name: "SIZE",
-        help: "Size of a part in direct-push; a smaller package is one message [default: 64 KB]",
+        help: "Size of a part in direct-push; a smaller package travels as one message [default: 64 KB]",
         set: |config, text| {
             let most = u64::from(MAX_PART_BYTES).next_multiple_of(1 << 20);
             let bytes = size_within(text, u64::from(MIN_PART_BYTES), most)?;
@@ -319,7 +332,7 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "delivery-inline-bytes",
         value_name: "SIZE",
-        help: "Most bytes of a package that ride inside an announcement; 0: none do [default: 32 KB]",
+        help: "Maximum size of a package embedded in its announcement; 0 disables it [default: 32 KB]",
         set: |config, text| {
             let bytes = size_within(text, 0, MAX_INLINE_BYTES)?;
             config.delivery.inline_bytes = u32::try_from(bytes).map_err(|_| text.to_owned())?;
@@ -329,19 +342,19 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "delivery-site-label",
         value_name: "LABEL",
-        help: "Label whose value says on which site a robot is [default: site]",
+        help: "Label whose value names a robot's site [default: site]",
         set: |config, text| parsed(text).map(|label| config.delivery.site_label = label),
     },
     Setting {
         name: "transfers-max",
         value_name: "N",
-        help: "Most packages that robots pull at the same time [default: no limit]",
+        help: "Maximum concurrent pulls of packages [default: no limit]",
         set: |config, text| count(text, 1_000_000).map(|n| config.transfers.all.max = Some(n)),
     },
     Setting {
         name: "transfers-bytes-per-s",
         value_name: "SIZE",
-        help: "Most bytes per second that all of them get together [default: no limit]",
+        help: "Maximum bandwidth of all pulls together, per second [default: no limit]",
         set: |config, text| {
             size_within(text, 1024, 1 << 50).map(|n| config.transfers.all.bytes_per_s = Some(n))
         },
@@ -349,27 +362,26 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "enrolment-approval",
         value_name: "BOOL",
-        help: "Let every new robot wait until an administrator approves it",
-        set: |config, text| boolean(text).map(|approval| config.enrolment_approval = approval),
+        help: "Require approval of new robots by an administrator",
+        set: |config, text| boolean(text).map(|approval| config.enrollment_approval = approval),
     },
     Setting {
         name: "enrolment-uses",
         value_name: "N",
-        help: "How many robots an enrolment token is good for if its maker does not say [default: 100]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.enrolment_uses = n),
+        help: "Default number of robots per enrollment token [default: 100]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.enrollment_uses = n),
     },
     Setting {
         name: "enrolment-per-minute",
         value_name: "N",
-        help: "How many robots may enrol in a minute, by one token half of them; ten seconds' worth may come at once \
-               [default: 3000]",
-        set: |config, text| count(text, 1_000_000).map(|n| config.enrolment_per_minute = n),
+        help: "Maximum enrollments per minute, and half as many per token; the burst is ten seconds' worth [default: 3000]",
+        set: |config, text| count(text, 1_000_000).map(|n| config.enrollment_per_minute = n),
     },
     Setting {
         name: "disk-reserve",
         value_name: "SIZE",
-        help: "What people's packages and uploads leave free on the disk for database, logs and reports; what robots bring \
-               back leaves twice as much [default: a fortieth of the disk, 1 GB at most]",
+        help: "Disk space that people's packages and uploads leave free for database, logs and reports; robots' \
+               outputs leave twice as much [default: a fortieth of the disk, at most 1 GB]",
         set: |config, text| {
             size_within(text, 0, 1 << 50).map(|bytes| config.disk_reserve = Some(bytes))
         },
@@ -377,13 +389,13 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "robots-messages-per-s",
         value_name: "N",
-        help: "MQTT messages a second of one robot, beyond which it is slowed; ten seconds' worth may come at once [default: 100]",
+        help: "MQTT messages per second after which a robot is slowed; the burst is ten seconds' worth [default: 100]",
         set: |config, text| count(text, 1_000_000).map(|n| config.robots.messages_per_s = n),
     },
     Setting {
         name: "robots-bytes-per-s",
         value_name: "SIZE",
-        help: "The same in bytes [default: 1 MB]",
+        help: "MQTT bytes per second after which a robot is slowed [default: 1 MB]",
         set: |config, text| {
             size_within(text, 64 << 10, 1 << 40).map(|n| config.robots.bytes_per_s = n)
         },
@@ -391,14 +403,14 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "robots-requests-per-s",
         value_name: "N",
-        help: "The same of reports and questions over HTTP [default: 20]",
+        help: "HTTP requests per second after which a robot is slowed [default: 20]",
         set: |config, text| count(text, 1_000_000).map(|n| config.robots.requests_per_s = n),
     },
     Setting {
         name: "robots-output-bytes",
         value_name: "SIZE",
-        help: "The most that is kept of what one robot brings back: beyond it the oldest goes [default: 40 GB, an eighth of the disk \
-               at most]",
+        help: "Maximum bytes of one robot's outputs; beyond it the oldest is deleted [default: 40 GB, at most an \
+               eighth of the disk]",
         set: |config, text| {
             size_within(text, 64 << 20, 1 << 50).map(|bytes| config.max_robot_bytes = Some(bytes))
         },
@@ -406,27 +418,27 @@ pub(super) const SETTINGS: &[Setting] = &[
     Setting {
         name: "people-requests-per-s",
         value_name: "N",
-        help: "Requests a second of one person, beyond which they wait or get 429; ten seconds' worth may come at once, orders \
-               are counted apart [default: 200]",
+        help: "Requests per second of one person, beyond which they wait or get 429; the burst is ten seconds' worth, \
+               and orders are counted separately [default: 200]",
         set: |config, text| count(text, 1_000_000).map(|n| config.people.requests_per_s = n),
     },
     Setting {
         name: "robots-patience",
         value_name: "TIME",
-        help: "How long a robot is slowed before it is cut off [default: 30s]",
-        set: |config, text| lifetime(text).map(|time| config.robots.patience = time),
+        help: "Time for which a robot is slowed before it is disconnected [default: 30s]",
+        set: |config, text| parse_lifetime(text).map(|time| config.robots.patience = time),
     },
     Setting {
         name: "robots-backoff",
         value_name: "TIME",
-        help: "How long a robot that was cut off has to stay away; doubles up to six times [default: 10s]",
-        set: |config, text| lifetime(text).map(|time| config.robots.backoff = time),
+        help: "Time for which a disconnected robot is refused; doubles up to six times [default: 10s]",
+        set: |config, text| parse_lifetime(text).map(|time| config.robots.backoff = time),
     },
     Setting {
         name: "robots-forgive-after",
         value_name: "TIME",
-        help: "How long it has to behave to be like any other again [default: 10m]",
-        set: |config, text| lifetime(text).map(|time| config.robots.forgive_after = time),
+        help: "Time without violations after which a robot's record is cleared [default: 10m]",
+        set: |config, text| parse_lifetime(text).map(|time| config.robots.penalty_lifetime = time),
     },
 ];
 
@@ -435,7 +447,7 @@ pub(super) const SETTINGS: &[Setting] = &[
 const MAX_INLINE_BYTES: u64 = 64 * 1024;
 
 fn non_empty(text: &str) -> Result<String, String> {
-    if text.is_empty() { Err("it is empty".to_owned()) } else { Ok(text.to_owned()) }
+    if text.is_empty() { Err("must not be empty".to_owned()) } else { Ok(text.to_owned()) }
 }
 
 fn parsed<T: std::str::FromStr<Err: std::fmt::Display>>(text: &str) -> Result<T, String> {
@@ -456,6 +468,15 @@ fn address(text: &str) -> Result<SocketAddr, String> {
     text.to_socket_addrs().ok().and_then(|mut found| found.next()).ok_or_else(expected)
 }
 
+fn ip_addresses(text: &str) -> Result<Vec<IpAddr>, String> {
+    let addresses = text.split(',').map(str::trim).filter(|text| !text.is_empty());
+    let parsed = addresses.map(|text| match text.parse::<IpAddr>() {
+        Ok(address) => Ok(address.to_canonical()),
+        Err(_) => Err(format!("{text:?} is not an IP address")),
+    });
+    parsed.collect()
+}
+
 fn host_names(text: &str) -> Result<Vec<String>, String> {
     let is_name = |name: &str| {
         let is_word = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '-' | '_' | ':');
@@ -465,17 +486,6 @@ fn host_names(text: &str) -> Result<Vec<String>, String> {
     match names.iter().find(|name| !is_name(name)) {
         Some(wrong) => Err(format!("{wrong:?} is neither a host name nor an address")),
         None => Ok(names),
-    }
-}
-
-fn database_url(text: &str) -> Result<String, String> {
-    let known =
-        ["sqlite:", "postgres://", "postgresql://"].iter().any(|scheme| text.starts_with(scheme));
-    // The URL may contain a password, so the message does not repeat the URL.
-    if known {
-        Ok(text.to_owned())
-    } else {
-        Err("expected a URL that starts with sqlite: or postgres://".to_owned())
     }
 }
 
@@ -503,7 +513,7 @@ pub(super) fn size(text: &str) -> Option<u64> {
 
 fn size_within(text: &str, least: u64, most: u64) -> Result<u64, String> {
     let expected =
-        || format!("{text:?} is not a size from {} to {}", shown_bytes(least), shown_bytes(most));
+        || format!("{text:?} is not a size from {} to {}", format_bytes(least), format_bytes(most));
     size(text).filter(|bytes| (least..=most).contains(bytes)).ok_or_else(expected)
 }
 
@@ -542,10 +552,13 @@ mod tests {
         assert_eq!(error, "\"nginx\" is not an IP address");
         assert_eq!((setting.set)(&mut config, ""), Ok(()));
         assert!(config.trusted_proxies.is_empty());
+        let setting = Setting::by_key("proxies").expect("there");
+        assert_eq!((setting.set)(&mut config, "10.0.0.2"), Ok(()));
+        assert_eq!(config.proxies, [IpAddr::from([10, 0, 0, 2])]);
     }
 
     #[test]
-    fn a_part_may_hold_the_largest_message() {
+    fn part_size_allows_the_largest_message() {
         let mut config = Config::with_data(PathBuf::new());
         let setting = Setting::by_key("delivery_part_bytes").expect("there");
         assert_eq!((setting.set)(&mut config, "256 MB"), Ok(()));

@@ -6,11 +6,12 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use task_proto::desired::Delivery;
-use task_proto::id::LabelValue;
+use task_proto::ids::LabelValue;
+use task_proto::time::{millis, parse_duration};
 
-use super::oidc::Wrong;
+use super::oidc::TableError;
 use super::settings::{Setting, size};
-use super::{Config, ConfigError, Origin, nearest, oidc, parse_duration};
+use super::{Config, ConfigError, Origin, oidc, suggestion};
 use crate::domain::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
 
 /// Maximum number of sites with limits of their own.
@@ -52,12 +53,12 @@ pub struct SiteLimits {
 }
 
 /// Minimum bandwidth of a transfer: several times the speed that an agent treats as a stall.
-const LEAST_SHARE_BYTES_PER_S: u64 = 4 << 10;
+const MIN_SHARE_BYTES_PER_S: u64 = 4 << 10;
 
 impl SiteLimits {
     /// Maximum concurrent transfers, such that each has a minimum share of the bandwidth.
-    pub fn most(&self) -> Option<u64> {
-        let with_share = self.bytes_per_s.map(|bytes| (bytes / LEAST_SHARE_BYTES_PER_S).max(1));
+    pub fn max_transfers(&self) -> Option<u64> {
+        let with_share = self.bytes_per_s.map(|bytes| (bytes / MIN_SHARE_BYTES_PER_S).max(1));
         [self.max, with_share].into_iter().flatten().min()
     }
 }
@@ -84,7 +85,7 @@ impl Config {
                 ("transfers", "sites") => sites(value).map(|sites| self.transfers.sites = sites),
                 _ if Setting::by_key(&setting).is_none() => {
                     return Err(ConfigError::Unknown {
-                        hint: nearest(&setting),
+                        hint: suggestion(&setting),
                         origin: origin(key),
                     });
                 }
@@ -93,9 +94,9 @@ impl Config {
                     continue;
                 }
             };
-            read.map_err(|wrong| ConfigError::Value {
-                origin: origin(wrong.key),
-                reason: wrong.reason,
+            read.map_err(|error| ConfigError::Value {
+                origin: origin(error.key),
+                reason: error.reason,
             })?;
         }
         Ok(())
@@ -103,21 +104,21 @@ impl Config {
 }
 
 /// `[[delivery.rules]]`, counted from 1.
-fn rules(value: toml::Value) -> Result<Vec<Rule>, Wrong> {
-    let wrong = |reason: String| Wrong { key: "rules".to_owned(), reason };
+fn rules(value: toml::Value) -> Result<Vec<Rule>, TableError> {
+    let error_at = |reason: String| TableError { key: "rules".to_owned(), reason };
     let toml::Value::Array(values) = value else {
-        return Err(wrong("expected [[delivery.rules]], a list of tables".to_owned()));
+        return Err(error_at("expected [[delivery.rules]], a list of tables".to_owned()));
     };
     if values.len() > MAX_RULES {
-        return Err(wrong(format!("{} rules, at most {MAX_RULES} are possible", values.len())));
+        return Err(error_at(format!("{} rules; at most {MAX_RULES} are allowed", values.len())));
     }
     let mut rules: Vec<Rule> = Vec::with_capacity(values.len());
     for (at, value) in values.into_iter().enumerate() {
-        let below = |wrong: Wrong| {
-            let dot = if wrong.key.is_empty() { "" } else { "." };
-            Wrong { key: format!("rules[{}]{dot}{}", at + 1, wrong.key), reason: wrong.reason }
+        let below = |error: TableError| {
+            let dot = if error.key.is_empty() { "" } else { "." };
+            TableError { key: format!("rules[{}]{dot}{}", at + 1, error.key), reason: error.reason }
         };
-        let own = |key: &str, reason: String| below(Wrong { key: key.to_owned(), reason });
+        let own = |key: &str, reason: String| below(TableError { key: key.to_owned(), reason });
         let toml::Value::Table(table) = value else {
             return Err(own("", "expected a table".to_owned()));
         };
@@ -128,7 +129,7 @@ fn rules(value: toml::Value) -> Result<Vec<Rule>, Wrong> {
         if let Some(last) = rules.last().filter(|last| last.conditions.is_empty()) {
             return Err(own(
                 "",
-                format!("it can never decide: the rule {:?} before it has no condition", last.name),
+                format!("never reached: the rule {:?} before it has no conditions", last.name),
             ));
         }
         rules.push(rule);
@@ -136,25 +137,26 @@ fn rules(value: toml::Value) -> Result<Vec<Rule>, Wrong> {
     Ok(rules)
 }
 
-fn rule(table: toml::Table) -> Result<Rule, Wrong> {
+fn rule(table: toml::Table) -> Result<Rule, TableError> {
     let (mut name, mut mechanism, mut conditions) = (None, None, Vec::new());
     for (key, value) in table {
         let read = match (key.as_str(), Condition::by_key(&key)) {
             ("name", _) => rule_name(&value).map(|read| name = Some(read)),
-            ("use", _) => used(&value).map(|read| mechanism = Some(read)),
+            ("use", _) => mechanism_named(&value).map(|read| mechanism = Some(read)),
             (_, Some(known)) => {
                 condition(known, &value).map(|read| conditions.push((key.clone(), read)))
             }
             _ => Err("there is no such condition; docs/delivery.md lists them".to_owned()),
         };
-        read.map_err(|reason| Wrong { key, reason })?;
+        read.map_err(|reason| TableError { key, reason })?;
     }
-    let missing =
-        |key: &str, what: &str| Wrong { key: key.to_owned(), reason: format!("missing: {what}") };
-    let name =
-        name.ok_or_else(|| missing("name", "what the rule is called where a decision is shown"))?;
+    let missing = |key: &str, what: &str| TableError {
+        key: key.to_owned(),
+        reason: format!("missing: {what}"),
+    };
+    let name = name.ok_or_else(|| missing("name", "the rule's name, shown with its decisions"))?;
     let mechanism =
-        mechanism.ok_or_else(|| missing("use", "what is used where the rule matches"))?;
+        mechanism.ok_or_else(|| missing("use", "the mechanism for matching deliveries"))?;
     check_possible(&conditions)?;
     Ok(Rule {
         name,
@@ -171,10 +173,10 @@ fn rule_name(value: &toml::Value) -> Result<String, String> {
     };
     let name = value.as_str().filter(is_name);
     name.map(str::to_owned)
-        .ok_or_else(|| format!("expected a text of 1 to {MAX_NAME_CHARS} printable characters"))
+        .ok_or_else(|| format!("expected a string of 1 to {MAX_NAME_CHARS} printable characters"))
 }
 
-fn used(value: &toml::Value) -> Result<Delivery, String> {
+fn mechanism_named(value: &toml::Value) -> Result<Delivery, String> {
     let found =
         value.as_str().and_then(|word| MECHANISMS.into_iter().find(|known| known.as_str() == word));
     let words = || MECHANISMS.map(|known| format!("{:?}", known.as_str())).join(", ");
@@ -198,9 +200,7 @@ fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String
             (whole.or_else(|| rate(value.as_str()?)), "a rate, for example \"500 KB/s\"")
         }
         Unit::Milliseconds => {
-            let time = |text: &str| {
-                parse_duration(text).and_then(|time| u64::try_from(time.as_millis()).ok())
-            };
+            let time = |text: &str| parse_duration(text).map(millis);
             (value.as_str().and_then(time), "a time, for example \"100ms\"")
         }
         Unit::Percent => (whole.filter(|percent| *percent <= 100), "a whole number from 0 to 100"),
@@ -211,23 +211,23 @@ fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String
 }
 
 /// Refuses conditions that can never hold, alone or together.
-fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
+fn check_possible(conditions: &[(String, Condition)]) -> Result<(), TableError> {
     let mut ranges: BTreeMap<&str, (u64, u64)> = BTreeMap::new();
     for (key, condition) in conditions {
         let Condition::Measure(quantity, comparison, value) = condition else { continue };
         let most = if quantity.unit() == Unit::Percent { 100 } else { u64::MAX };
-        let known = ranges.entry(quantity.key()).or_insert((least_possible(*quantity), most));
+        let known = ranges.entry(quantity.key()).or_insert((minimum(*quantity), most));
         let range =
             comparison.range(*value).map(|(least, most)| (least.max(known.0), most.min(known.1)));
         match range.filter(|(least, most)| least <= most) {
             Some(range) => *known = range,
             None => {
-                let shown = quantity.unit().show(*value);
+                let shown = quantity.unit().format(*value);
                 let reason = format!(
                     "{shown}: no {} can satisfy this and the rule's other conditions",
                     quantity.key()
                 );
-                return Err(Wrong { key: key.clone(), reason });
+                return Err(TableError { key: key.clone(), reason });
             }
         }
     }
@@ -235,31 +235,31 @@ fn check_possible(conditions: &[(String, Condition)]) -> Result<(), Wrong> {
 }
 
 /// A robot always counts itself in its deployment, batch and site.
-fn least_possible(quantity: Quantity) -> u64 {
+fn minimum(quantity: Quantity) -> u64 {
     u64::from(matches!(quantity, Quantity::Robots | Quantity::Batch | Quantity::SameSite))
 }
 
 /// `[transfers.sites.NAME]`, by the label's value.
-fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, Wrong> {
-    let wrong = |key: String, reason: String| Wrong { key: format!("sites{key}"), reason };
+fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, TableError> {
+    let error_at = |key: String, reason: String| TableError { key: format!("sites{key}"), reason };
     let toml::Value::Table(table) = value else {
-        return Err(wrong(
+        return Err(error_at(
             String::new(),
             "expected [transfers.sites.NAME], tables by the label's value".to_owned(),
         ));
     };
     if table.len() > MAX_SITES {
-        return Err(wrong(
+        return Err(error_at(
             String::new(),
-            format!("{} sites, at most {MAX_SITES} are possible", table.len()),
+            format!("{} sites; at most {MAX_SITES} are allowed", table.len()),
         ));
     }
     let mut sites = BTreeMap::new();
     for (name, value) in table {
         let site: LabelValue =
-            name.parse().map_err(|error| wrong(format!(".{name}"), format!("{error}")))?;
+            name.parse().map_err(|error| error_at(format!(".{name}"), format!("{error}")))?;
         let toml::Value::Table(limits) = value else {
-            return Err(wrong(
+            return Err(error_at(
                 format!(".{name}"),
                 "expected a table with max or bytes_per_s".to_owned(),
             ));
@@ -275,14 +275,14 @@ fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, Wrong> 
                     (&mut read.bytes_per_s, bytes, "a size from 1 KB, for example \"10 MB\"")
                 }
                 _ => {
-                    return Err(wrong(
+                    return Err(error_at(
                         format!(".{name}.{key}"),
                         "there is no such limit".to_owned(),
                     ));
                 }
             };
             *limit = Some(found.ok_or_else(|| {
-                wrong(format!(".{name}.{key}"), format!("{value} is not {expected}"))
+                error_at(format!(".{name}.{key}"), format!("{value} is not {expected}"))
             })?);
         }
         sites.insert(site, read);
@@ -296,7 +296,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_of_both_tables_is_read() {
+    fn delivery_and_transfer_tables_are_read_completely() {
         let file = r#"
             [delivery]
             part_bytes = "1 MB"
@@ -361,14 +361,14 @@ mod tests {
     }
 
     #[test]
-    fn a_wrong_rule_is_refused_by_its_key() {
+    fn invalid_rule_is_refused_by_its_key() {
         let good = "[[delivery.rules]]\nname = \"one\"\nrobots_at_least = 2\nuse = \"poll\"\n[[delivery.rules]]\n";
         for (second, expected) in [
             ("name = \"two\"", "delivery.rules[2].use in taskd.toml: missing"),
             ("use = \"poll\"", "delivery.rules[2].name in taskd.toml: missing"),
             (
                 "name = \"\"\nuse = \"poll\"",
-                "delivery.rules[2].name in taskd.toml: expected a text",
+                "delivery.rules[2].name in taskd.toml: expected a string",
             ),
             (
                 "name = \"one\"\nuse = \"poll\"",
@@ -427,7 +427,7 @@ mod tests {
     }
 
     #[test]
-    fn what_can_never_be_is_refused() {
+    fn impossible_rules_are_refused() {
         let rule = |conditions: &str| {
             format!("[[delivery.rules]]\nname = \"one\"\nuse = \"poll\"\n{conditions}")
         };
@@ -449,9 +449,7 @@ mod tests {
         let dead = format!("{}\n[[delivery.rules]]\nname = \"two\"\nuse = \"poll\"", rule(""));
         let message = load(&[], &[], Some(&dead)).expect_err("never reached");
         assert!(
-            message.starts_with(
-                "delivery.rules[2] in taskd.toml: it can never decide: the rule \"one\""
-            ),
+            message.starts_with("delivery.rules[2] in taskd.toml: never reached: the rule \"one\""),
             "{message}"
         );
         let many: String = (0..=MAX_RULES)
@@ -461,13 +459,13 @@ mod tests {
             .collect();
         let message = load(&[], &[], Some(&many)).expect_err("too many");
         assert!(
-            message.starts_with("delivery.rules in taskd.toml: 65 rules, at most 64"),
+            message.starts_with("delivery.rules in taskd.toml: 65 rules; at most 64"),
             "{message}"
         );
     }
 
     #[test]
-    fn a_wrong_site_is_refused_by_its_key() {
+    fn invalid_site_is_refused_by_its_key() {
         for (file, expected) in [
             (
                 "[transfers]\nsites = 1",

@@ -18,7 +18,7 @@ pub struct TlsSettings {
     /// Whether robots must prove possession of their registered key.
     pub client_certificates: bool,
     /// Interval between checks of the operator's files.
-    pub look_interval: Duration,
+    pub check_interval: Duration,
 }
 
 impl Default for TlsSettings {
@@ -29,7 +29,7 @@ impl Default for TlsSettings {
             private_ca: None,
             names: Vec::new(),
             client_certificates: false,
-            look_interval: Duration::from_secs(10),
+            check_interval: Duration::from_secs(10),
         }
     }
 }
@@ -41,13 +41,13 @@ impl TlsSettings {
     }
 
     /// Whether robots are told to trust only the private authority.
-    pub fn tells_pin(&self) -> bool {
+    pub fn announces_pin(&self) -> bool {
         self.private_ca.unwrap_or(self.certificate.is_none())
     }
 
     /// Whether the listeners encrypt, given whether other machines can reach one of them.
-    pub(super) fn encrypts(&self, is_reached_from_elsewhere: bool, allow_plaintext: bool) -> bool {
-        let by_default = is_reached_from_elsewhere && !allow_plaintext;
+    pub(super) fn encrypts(&self, is_exposed: bool, allow_plaintext: bool) -> bool {
+        let by_default = is_exposed && !allow_plaintext;
         self.certificate.is_some() || self.private_ca.unwrap_or(by_default)
     }
 }

@@ -7,10 +7,12 @@ use std::str::FromStr;
 
 use task_proto::RobotId;
 
+use super::url_text::{percent_decoded, split};
+
 /// The schemes, each with its default port, and whether it is TLS.
 const SCHEMES: [(&str, u16, bool); 2] = [("mqtt://", 1883, false), ("mqtts://", 8883, true)];
-/// More bytes than any name or password needs; MQTT itself allows 64 KiB.
-const MAX_BYTES: usize = 512;
+/// The longest password, in bytes; MQTT itself allows 64 KiB.
+const MAX_PASSWORD_BYTES: usize = 512;
 /// The most brokers in one list. A robot tries them one after another.
 const MAX_BROKERS: usize = 8;
 
@@ -35,21 +37,9 @@ impl FromStr for BrokerUrls {
     type Err = InvalidBrokerUrl;
 
     fn from_str(text: &str) -> Result<Self, InvalidBrokerUrl> {
-        let begins =
-            |text: &str| SCHEMES.iter().any(|(scheme, ..)| text.trim_start().starts_with(scheme));
-        // A password may hold a comma: only a comma followed by a URL separates.
-        let mut ends: Vec<usize> = text
-            .match_indices(',')
-            .map(|(at, _)| at)
-            .filter(|at| begins(&text[at + 1..]))
-            .collect();
-        ends.push(text.len());
-        let mut begin = 0;
-        let mut urls: Vec<BrokerUrl> = Vec::with_capacity(ends.len());
-        for end in ends {
-            urls.push(text[begin..end].trim().parse()?);
-            begin = end + 1;
-        }
+        let schemes = SCHEMES.map(|(scheme, ..)| scheme);
+        let urls: Vec<BrokerUrl> =
+            split(text, &schemes).into_iter().map(str::parse).collect::<Result<_, _>>()?;
         let account = |url: &BrokerUrl| (url.user_name.clone(), url.password.clone());
         match urls.iter().any(|url| account(url) != account(&urls[0])) {
             true => Err(InvalidBrokerUrl::Accounts),
@@ -81,7 +71,7 @@ pub enum InvalidBrokerUrl {
     )]
     Form,
     /// No user or no password. Without them the broker's access control list protects nothing.
-    #[error("it names no user or no password: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
+    #[error("its user name or password is missing: expected mqtt://USER:PASSWORD@HOST[:PORT]")]
     NoCredentials,
     /// The user can't be written into the broker's files, or is a robot's.
     #[error(
@@ -94,7 +84,9 @@ pub enum InvalidBrokerUrl {
     )]
     Password,
     /// No host, or a host that no machine can have.
-    #[error("its host is none: expected a name, an IPv4 address or an IPv6 address in brackets")]
+    #[error(
+        "its host is missing or invalid: expected a name, an IPv4 address or an IPv6 address in brackets"
+    )]
     Host,
     /// Several URLs with different users or passwords.
     #[error(
@@ -136,8 +128,10 @@ impl FromStr for BrokerUrl {
         let (credentials, place) = rest.rsplit_once('@').ok_or(InvalidBrokerUrl::NoCredentials)?;
         let (user_name, password) =
             credentials.split_once(':').ok_or(InvalidBrokerUrl::NoCredentials)?;
-        let user_name = decoded(user_name).ok_or(InvalidBrokerUrl::UserName)?;
-        let password = decoded(password).ok_or(InvalidBrokerUrl::Password)?;
+        let user_name = percent_decoded(user_name).ok_or(InvalidBrokerUrl::UserName)?;
+        let password = percent_decoded(password)
+            .filter(|password| password.len() <= MAX_PASSWORD_BYTES)
+            .ok_or(InvalidBrokerUrl::Password)?;
         if user_name.is_empty() || password.is_empty() {
             return Err(InvalidBrokerUrl::NoCredentials);
         }
@@ -181,26 +175,6 @@ fn host_and_port(place: &str) -> Result<(&str, Option<u16>), InvalidBrokerUrl> {
     }
 }
 
-/// Replaces each `%XX` by its byte.
-fn decoded(text: &str) -> Option<String> {
-    let mut bytes = Vec::with_capacity(text.len());
-    let mut rest = text.as_bytes();
-    while let Some((&first, after)) = rest.split_first() {
-        if first == b'%' {
-            let digits = std::str::from_utf8(after.get(..2)?).ok()?;
-            if !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
-                return None;
-            }
-            bytes.push(u8::from_str_radix(digits, 16).ok()?);
-            rest = &after[2..];
-        } else {
-            bytes.push(first);
-            rest = after;
-        }
-    }
-    String::from_utf8(bytes).ok().filter(|text| text.len() <= MAX_BYTES)
-}
-
 impl fmt::Debug for BrokerUrl {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("BrokerUrl")
@@ -215,7 +189,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_url_is_taken_apart() {
+    fn url_is_parsed() {
         let url: BrokerUrl = "mqtt://taskd:s%40c:r@et@broker.lab:1884".parse().expect("valid");
         assert_eq!((url.user_name.as_str(), url.password.as_str()), ("taskd", "s@c:r@et"));
         assert_eq!(url.address(), "broker.lab:1884");
@@ -246,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_said_without_the_password() {
+    fn invalid_url_is_refused_without_showing_the_password() {
         use InvalidBrokerUrl::{Form, Host, NoCredentials, Password, Port, UserName};
         for (text, expected) in [
             ("", Form),

@@ -1,21 +1,18 @@
 //! Chooses the mechanism that brings a package to a robot: the first matching rule decides. These
-//! are pure functions. [`crate::orders::chooser`] gathers their inputs, and [`crate::config`] reads
-//! the operator's rules.
+//! are pure functions. [`crate::orders::delivery_planner`] gathers their inputs, and
+//! [`crate::config`] reads the operator's rules.
 
 use std::fmt;
 
 use serde::Serialize;
 use task_proto::api::{DeliveryChoice, DeliveryDecision, RuleView};
 use task_proto::desired::Delivery;
+use task_proto::size::{format_bytes, format_rate};
 
 /// The most rules an operator may write.
 pub const MAX_RULES: usize = 64;
-/// The rule name shown when the operator chose the mechanism.
-pub const ORDERED: &str = "ordered";
-/// The rule name shown when a robot that could not be kept up to date was told to pull.
-pub const FELL_BEHIND: &str = "fell behind";
 /// The name of the last resort, which decides when no rule matches.
-const OTHERWISE: &str = "otherwise";
+const DEFAULT_RULE: &str = "otherwise";
 
 /// The facts known when one robot's part of a deployment begins.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
@@ -149,18 +146,18 @@ impl Rules {
 
     /// Describes all rules in their order, with the last resort.
     pub fn views(&self) -> Vec<RuleView> {
-        let said = |rule: &Rule| {
-            rule.conditions.iter().map(Condition::words).collect::<Vec<_>>().join(", ")
+        let describe = |rule: &Rule| {
+            rule.conditions.iter().map(Condition::describe).collect::<Vec<_>>().join(", ")
         };
         let last = Rule {
-            name: OTHERWISE.to_owned(),
+            name: DEFAULT_RULE.to_owned(),
             conditions: Vec::new(),
             mechanism: Delivery::PushPull,
         };
         let view = |(order, rule): (u64, &Rule)| RuleView {
             order,
             name: rule.name.clone(),
-            condition: said(rule),
+            condition: describe(rule),
             mechanism: rule.mechanism,
             own: !Self::is_reserved(&rule.name),
         };
@@ -169,12 +166,12 @@ impl Rules {
 
     /// Whether `name` belongs to a rule that the operator did not write.
     pub fn is_reserved(name: &str) -> bool {
-        [ORDERED, FELL_BEHIND, OTHERWISE].contains(&name)
+        [DeliveryDecision::ORDERED, DeliveryDecision::FELL_BEHIND, DEFAULT_RULE].contains(&name)
             || Self::built_in().iter().any(|rule| rule.name == name)
     }
 
     /// Whether any rule asks for `quantity`.
-    pub fn ask_for(&self, quantity: Quantity) -> bool {
+    pub fn use_quantity(&self, quantity: Quantity) -> bool {
         let asks = |condition: &Condition| matches!(condition, Condition::Measure(asked, ..) if *asked == quantity);
         self.0.iter().any(|rule| rule.conditions.iter().any(asks))
     }
@@ -184,7 +181,8 @@ impl Rules {
 pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> DeliveryDecision {
     if let Some(mechanism) = choice.mechanism() {
         let because = format!("the order says {mechanism}");
-        return DeliveryDecision { mechanism, rule: ORDERED.to_owned(), because };
+        let rule = DeliveryDecision::ORDERED.to_owned();
+        return DeliveryDecision { mechanism, rule, because };
     }
     let matching = rules
         .0
@@ -195,22 +193,24 @@ pub fn choose(rules: &Rules, choice: DeliveryChoice, inputs: &Inputs) -> Deliver
             let rule = &rules.0[at];
             (&rules.0[..at], rule.name.as_str(), rule.mechanism, rule.conditions.as_slice())
         }
-        None => (rules.0.as_slice(), OTHERWISE, Delivery::PushPull, &[][..]),
+        None => (rules.0.as_slice(), DEFAULT_RULE, Delivery::PushPull, &[][..]),
     };
     let decisive: Vec<Condition> = if conditions.is_empty() {
-        in_the_way(before, mechanism, inputs)
+        blocking_conditions(before, mechanism, inputs)
     } else {
         conditions.to_vec()
     };
-    let said: Vec<String> = decisive.iter().map(|condition| condition.said_of(inputs)).collect();
-    let because = if said.is_empty() { "it has no condition".to_owned() } else { said.join(", ") };
+    let reasons: Vec<String> =
+        decisive.iter().map(|condition| condition.describe_with(inputs)).collect();
+    let because =
+        if reasons.is_empty() { "it has no condition".to_owned() } else { reasons.join(", ") };
     DeliveryDecision { mechanism, rule: name.to_owned(), because }
 }
 
 /// The conditions that kept the earlier rules from choosing a mechanism other than `mechanism`: the
 /// first failed condition of each rule. Of several conditions on the same subject, only the last is
 /// kept.
-fn in_the_way(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Condition> {
+fn blocking_conditions(before: &[Rule], mechanism: Delivery, inputs: &Inputs) -> Vec<Condition> {
     let mut found: Vec<Condition> = Vec::new();
     for rule in before.iter().filter(|rule| rule.mechanism != mechanism) {
         if let Some(failed) = rule.conditions.iter().find(|condition| !condition.holds(inputs)) {
@@ -246,20 +246,20 @@ impl Condition {
     }
 
     /// The state of the condition, whether it holds or not: `size 9.7 MB > 256 KB`.
-    fn said_of(&self, inputs: &Inputs) -> String {
+    fn describe_with(&self, inputs: &Inputs) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
                 let Some(found) = quantity.of(inputs) else {
-                    return format!("{} not known", quantity.shown());
+                    return format!("{} not known", quantity.display_name());
                 };
                 let said =
                     if comparison.holds(found, value) { comparison } else { comparison.opposite() };
                 let (mut left, mut right) =
-                    (quantity.unit().show(found), quantity.unit().show(value));
+                    (quantity.unit().format(found), quantity.unit().format(value));
                 if left == right && found != value {
                     (left, right) = (format!("{found} B"), format!("{value} B"));
                 }
-                format!("{} {left} {} {right}", quantity.shown(), said.sign())
+                format!("{} {left} {} {right}", quantity.display_name(), said.sign())
             }
             Self::Flag(flag, _) if flag.of(inputs) => flag.name().to_owned(),
             Self::Flag(flag, _) => format!("not {}", flag.name()),
@@ -267,14 +267,14 @@ impl Condition {
     }
 
     /// The condition in words: `size ≤ 256 KB`.
-    fn words(&self) -> String {
+    fn describe(&self) -> String {
         match *self {
             Self::Measure(quantity, comparison, value) => {
                 format!(
                     "{} {} {}",
-                    quantity.shown(),
+                    quantity.display_name(),
                     comparison.sign(),
-                    quantity.unit().show(value)
+                    quantity.unit().format(value)
                 )
             }
             Self::Flag(flag, true) => flag.name().to_owned(),
@@ -333,7 +333,7 @@ impl Quantity {
         }
     }
 
-    fn shown(self) -> &'static str {
+    fn display_name(self) -> &'static str {
         if self == Self::SameSite { "robots on site" } else { self.key() }
     }
 
@@ -373,28 +373,14 @@ impl Quantity {
 
 impl Unit {
     /// Formats a value for people.
-    pub fn show(self, value: u64) -> String {
+    pub fn format(self, value: u64) -> String {
         match self {
-            Self::Bytes => shown_bytes(value),
-            Self::BytesPerSecond => format!("{}/s", shown_bytes(value)),
+            Self::Bytes => format_bytes(value),
+            Self::BytesPerSecond => format_rate(value),
             Self::Milliseconds => format!("{value} ms"),
             Self::Percent => format!("{value}%"),
             Self::Count => value.to_string(),
         }
-    }
-}
-
-/// Bytes in the units of the configuration: `9.7 MB`.
-pub fn shown_bytes(bytes: u64) -> String {
-    let units = [(1u64 << 30, "GB"), (1 << 20, "MB"), (1 << 10, "KB")];
-    let Some((one, unit)) = units.into_iter().find(|(one, _)| bytes >= *one) else {
-        return format!("{bytes} B");
-    };
-    let tenths = (u128::from(bytes) * 10 + u128::from(one) / 2) / u128::from(one);
-    if tenths.is_multiple_of(10) || tenths >= 1000 {
-        format!("{} {unit}", tenths / 10)
-    } else {
-        format!("{}.{} {unit}", tenths / 10, tenths % 10)
     }
 }
 
@@ -497,7 +483,7 @@ mod tests {
         }
     }
 
-    fn decided(own: &[Rule], inputs: Inputs) -> (Delivery, String, String) {
+    fn decide(own: &[Rule], inputs: Inputs) -> (Delivery, String, String) {
         let decision =
             choose(&Rules::new(own.to_vec(), 32 * KB), DeliveryChoice::Adaptive, &inputs);
         (decision.mechanism, decision.rule, decision.because)
@@ -508,12 +494,12 @@ mod tests {
     #[track_caller]
     fn check(key: &str, value: u64, yes: Inputs, because: &str, no: Inputs) {
         let own = [rule("own", &[(key, value)], Delivery::Poll)];
-        assert_eq!(decided(&own, yes), (Delivery::Poll, "own".to_owned(), because.to_owned()));
-        assert_ne!(decided(&own, no).1, "own", "{key}");
+        assert_eq!(decide(&own, yes), (Delivery::Poll, "own".to_owned(), because.to_owned()));
+        assert_ne!(decide(&own, no).1, "own", "{key}");
     }
 
     #[test]
-    fn every_condition_decides_and_says_so() {
+    fn every_condition_decides_and_is_named_as_the_reason() {
         let of = Inputs::default;
         check(
             "size_above",
@@ -635,7 +621,7 @@ mod tests {
         let expect = |size, mechanism, rule: &str, because: &str| {
             let inputs =
                 Inputs { size, batch: 40, robots: 40, connected: true, ..Inputs::default() };
-            assert_eq!(decided(&[], inputs), (mechanism, rule.to_owned(), because.to_owned()));
+            assert_eq!(decide(&[], inputs), (mechanism, rule.to_owned(), because.to_owned()));
         };
         expect(20 * KB, Delivery::Inline, "tiny", "size 20 KB ≤ 32 KB");
         expect(10_171_187, Delivery::PushPull, "otherwise", "size 9.7 MB > 32 KB");
@@ -650,17 +636,17 @@ mod tests {
         ];
         let far = Inputs { size: 1, rtt_ms: Some(150), ..Inputs::default() };
         let slow = Inputs { throughput_bytes_per_s: Some(KB), ..far };
-        assert_eq!(decided(&own, slow).1, "far and slow");
-        assert_eq!(decided(&own, slow).2, "rtt 150 ms > 100 ms, throughput 1 KB/s < 1 MB/s");
-        assert_eq!(decided(&own, far).1, "far");
+        assert_eq!(decide(&own, slow).1, "far and slow");
+        assert_eq!(decide(&own, slow).2, "rtt 150 ms > 100 ms, throughput 1 KB/s < 1 MB/s");
+        assert_eq!(decide(&own, far).1, "far");
         let because = "rtt not known".to_owned();
         assert_eq!(
-            decided(&own, Inputs::default()),
+            decide(&own, Inputs::default()),
             (Delivery::PushPull, "all others".to_owned(), because)
         );
         let only = [rule("all", &[], Delivery::Poll)];
         assert_eq!(
-            decided(&only, far),
+            decide(&only, far),
             (Delivery::Poll, "all".to_owned(), "it has no condition".to_owned())
         );
     }
@@ -669,14 +655,14 @@ mod tests {
     fn no_rule_makes_an_announcement_too_large() {
         let own = [rule("always inside", &[("robots_at_least", 1)], Delivery::Inline)];
         let inputs = Inputs { size: 32 * KB, robots: 1, ..Inputs::default() };
-        assert_eq!(decided(&own, inputs).1, "always inside");
-        let decision = decided(&own, Inputs { size: 32 * KB + 1, ..inputs });
+        assert_eq!(decide(&own, inputs).1, "always inside");
+        let decision = decide(&own, Inputs { size: 32 * KB + 1, ..inputs });
         assert_eq!((decision.0, decision.1.as_str()), (Delivery::PushPull, "otherwise"));
         assert_eq!(decision.2, "size 32769 B > 32768 B");
     }
 
     #[test]
-    fn what_the_operator_ordered_is_not_discussed() {
+    fn ordered_mechanism_overrides_the_rules() {
         let rules = Rules::new(Vec::new(), 32 * KB);
         let decision = choose(
             &rules,
@@ -685,16 +671,6 @@ mod tests {
         );
         assert_eq!((decision.mechanism, decision.rule.as_str()), (Delivery::DirectPush, "ordered"));
         assert_eq!(decision.because, "the order says direct-push");
-    }
-
-    #[test]
-    fn bytes_are_shown_in_the_units_of_the_configuration() {
-        let shown = [0, 1023, 1024, 1536, 256 * KB, 10_171_187, 100 * MB + 52_429, u64::MAX]
-            .map(shown_bytes);
-        assert_eq!(
-            shown,
-            ["0 B", "1023 B", "1 KB", "1.5 KB", "256 KB", "9.7 MB", "100 MB", "17179869184 GB"]
-        );
     }
 
     proptest! {
@@ -709,11 +685,11 @@ mod tests {
         }
 
         #[test]
-        fn whatever_is_known_something_is_chosen_and_a_reason_given(
+        fn any_inputs_give_a_mechanism_and_a_reason(
             size in 0u64..1_000_000, batch in 0u64..20, losses in 0u64..5, metered in any::<bool>(), connected in any::<bool>(),
         ) {
             let inputs = Inputs { size, batch, losses, metered, connected, ..Inputs::default() };
-            let (mechanism, rule, because) = decided(&[], inputs);
+            let (mechanism, rule, because) = decide(&[], inputs);
             prop_assert!(!because.is_empty() && !rule.is_empty());
             prop_assert!(mechanism != Delivery::Inline || size <= 32 * KB);
             prop_assert!(matches!(mechanism, Delivery::Inline | Delivery::PushPull));

@@ -12,12 +12,12 @@
 
 use task_proto::Generation;
 use task_proto::api::{DeploymentState, PhaseCount};
-use task_proto::manifest::TaskKind;
-use task_proto::report::{Failure, Phase, Progress, TaskReport};
+use task_proto::messages::report::{Failure, Phase, Progress, TaskReport};
+use task_proto::packages::manifest::TaskKind;
 
 /// The state of one assignment.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Standing {
+pub struct AssignmentState {
     /// The number of times that the task was asked to start.
     pub run: u64,
     /// The phase of that run.
@@ -30,10 +30,10 @@ pub struct Standing {
     pub attempts: u32,
 }
 
-impl Standing {
+impl AssignmentState {
     /// The state after the robot's `report`; `None` if the report changes nothing.
     pub fn after(&self, report: &TaskReport) -> Option<Self> {
-        if self.phase.is_final() || report.run != self.run || !is_robots_word(report.phase) {
+        if self.phase.is_final() || report.run != self.run || !is_reportable(report.phase) {
             return None;
         }
         let next = Self {
@@ -55,7 +55,7 @@ impl Standing {
 }
 
 /// Whether a robot may report the phase; only the server sets the others.
-fn is_robots_word(phase: Phase) -> bool {
+fn is_reportable(phase: Phase) -> bool {
     !matches!(phase, Phase::Superseded | Phase::Cancelled | Phase::Expired | Phase::Unknown)
 }
 
@@ -93,8 +93,8 @@ mod tests {
 
     use super::*;
 
-    fn standing(run: u64, phase: Phase) -> Standing {
-        Standing { run, phase, progress: None, failure: None, attempts: 0 }
+    fn assignment(run: u64, phase: Phase) -> AssignmentState {
+        AssignmentState { run, phase, progress: None, failure: None, attempts: 0 }
     }
 
     fn report(run: u64, phase: Phase) -> TaskReport {
@@ -124,32 +124,32 @@ mod tests {
         }
     }
 
-    fn any_phase() -> impl Strategy<Value = Phase> {
+    fn arbitrary_phase() -> impl Strategy<Value = Phase> {
         proptest::sample::select(Phase::ALL.to_vec())
     }
 
     proptest! {
         #[test]
-        fn a_final_phase_is_never_left_by_a_report(from in any_phase(), to in any_phase(), run in 1u64..4, said in 1u64..4) {
-            let next = standing(run, from).after(&report(said, to));
+        fn report_never_leaves_a_final_phase(from in arbitrary_phase(), to in arbitrary_phase(), run in 1u64..4, said in 1u64..4) {
+            let next = assignment(run, from).after(&report(said, to));
             if from.is_final() || run != said {
                 prop_assert_eq!(next, None);
             } else if let Some(next) = next {
                 prop_assert_eq!(next.phase, to);
-                prop_assert!(is_robots_word(to));
+                prop_assert!(is_reportable(to));
             }
         }
 
         #[test]
-        fn absence_stops_only_what_was_removed(from in any_phase(), removed in proptest::option::of(0u64..5), observed in 0u64..5) {
-            let next = standing(1, from).after_absence(removed.map(Generation), Generation(observed));
+        fn absence_stops_only_removed_tasks(from in arbitrary_phase(), removed in proptest::option::of(0u64..5), observed in 0u64..5) {
+            let next = assignment(1, from).after_absence(removed.map(Generation), Generation(observed));
             let gone = !from.is_final() && removed.is_some_and(|removed| removed <= observed);
             prop_assert_eq!(next.map(|next| next.phase), gone.then_some(Phase::Stopped));
         }
     }
 
     #[test]
-    fn the_whole_settles_with_its_last_part() {
+    fn deployment_settles_with_its_last_assignment() {
         let count = |phase, count| PhaseCount { phase, count };
         let open = [count(Phase::Running, 3), count(Phase::Assigned, 1)];
         let done = [count(Phase::Running, 3), count(Phase::Failed, 1)];

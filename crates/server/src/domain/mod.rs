@@ -2,8 +2,11 @@
 //! clock.
 
 pub mod broker_url;
+pub mod database_url;
 pub mod delivery;
 pub mod deployment;
-pub mod happening;
+pub mod fleet_event;
+pub mod limits;
 pub mod person;
 pub mod rollout;
+mod url_text;

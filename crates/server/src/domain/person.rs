@@ -5,9 +5,9 @@ use std::fmt;
 use std::net::IpAddr;
 
 use task_proto::api::TokenOrigin;
-use task_proto::id::Labels;
-use task_proto::person::{Permission, Role, Roles};
-use task_proto::selector::Selector;
+use task_proto::ids::Labels;
+use task_proto::ids::selector::Selector;
+use task_proto::people::roles::{Permission, Role, Roles};
 use task_proto::{RobotId, RobotName, TokenId, UserName};
 
 /// The name that stands for the holder of the first token, the one in the data directory. No user
@@ -113,7 +113,7 @@ mod tests {
     }
 
     #[test]
-    fn what_concerns_everybody_is_not_for_who_is_limited() {
+    fn limited_person_may_not_administer() {
         let mut person = Person::first("0123456789ab".parse().expect("an id"));
         assert!(
             person.is_first()
@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_is_in_a_scope_if_all_of_it_mean_it() {
+    fn scope_covers_robots_that_match_all_its_selectors() {
         let (id, name) = (RobotId::random(), "atlas".parse().expect("a name"));
         let labels: Labels =
             [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();

@@ -30,7 +30,7 @@ pub struct Rollout {
 
 /// The progress of a robot with an unsettled assignment.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Standing {
+pub enum RobotProgress {
     /// The robot's batch has not begun.
     Waiting,
     /// The robot's batch has begun, and the robot has not begun to work on the package.
@@ -56,13 +56,13 @@ pub enum Part {
 
 impl Part {
     /// The part of a robot that has been offline for `offline_ms`; `None`: the robot is online.
-    pub fn of(standing: Standing, offline_ms: Option<u64>) -> Self {
-        match (standing, offline_ms) {
-            (Standing::Waiting, None) => Self::Ready,
-            (Standing::Waiting, Some(_)) => Self::Offline,
-            (Standing::Released, Some(OFFLINE_GRACE_MS..)) => Self::Ignored,
-            (Standing::Begun, Some(LOST_AFTER_MS..)) => Self::Lost,
-            (Standing::Released | Standing::Begun, _) => Self::Busy,
+    pub fn of(progress: RobotProgress, offline_ms: Option<u64>) -> Self {
+        match (progress, offline_ms) {
+            (RobotProgress::Waiting, None) => Self::Ready,
+            (RobotProgress::Waiting, Some(_)) => Self::Offline,
+            (RobotProgress::Released, Some(OFFLINE_GRACE_MS..)) => Self::Ignored,
+            (RobotProgress::Begun, Some(LOST_AFTER_MS..)) => Self::Lost,
+            (RobotProgress::Released | RobotProgress::Begun, _) => Self::Busy,
         }
     }
 }
@@ -147,18 +147,18 @@ mod tests {
         fails: bool,
         /// Offline from the first minute until the second.
         offline: Option<(u64, u64)>,
-        standing: Standing,
+        progress: RobotProgress,
         has_settled: bool,
     }
 
-    fn any_robot() -> impl Strategy<Value = Robot> {
+    fn arbitrary_robot() -> impl Strategy<Value = Robot> {
         let offline = proptest::option::of(
             (0u64..60, 1u64..120).prop_map(|(from, minutes)| (from, from + minutes)),
         );
         (any::<bool>(), offline).prop_map(|(fails, offline)| Robot {
             fails,
             offline,
-            standing: Standing::Waiting,
+            progress: RobotProgress::Waiting,
             has_settled: false,
         })
     }
@@ -171,7 +171,7 @@ mod tests {
         }
 
         fn part(&self, minute: u64) -> Option<Part> {
-            (!self.has_settled).then(|| Part::of(self.standing, self.offline_ms(minute)))
+            (!self.has_settled).then(|| Part::of(self.progress, self.offline_ms(minute)))
         }
     }
 
@@ -184,7 +184,7 @@ mod tests {
         /// A whole rollout, minute by minute: each online robot takes a step.
         #[test]
         fn batches_of_online_robots_never_overlap_and_failures_stop_them(
-            mut robots in proptest::collection::vec(any_robot(), 1..40),
+            mut robots in proptest::collection::vec(arbitrary_robot(), 1..40),
             batch in proptest::option::of(1u64..9),
             max_failures in proptest::option::of(0u64..6),
         ) {
@@ -202,7 +202,7 @@ mod tests {
                                 Some(_) => robot.part(minute) == Some(Part::Ready),
                                 None => !robot.has_settled,
                             });
-                            waiting.take(count as usize).for_each(|robot| robot.standing = Standing::Released);
+                            waiting.take(count as usize).for_each(|robot| robot.progress = RobotProgress::Released);
                         }
                         Move::Pause => {
                             prop_assert!(max_failures.is_some_and(|most| now.failures() > most));
@@ -219,11 +219,11 @@ mod tests {
                     }
                 }
                 for robot in &mut robots {
-                    match robot.standing {
+                    match robot.progress {
                         _ if robot.has_settled || robot.offline_ms(minute).is_some() => {}
-                        Standing::Waiting => {}
-                        Standing::Released => robot.standing = Standing::Begun,
-                        Standing::Begun => robot.has_settled = true,
+                        RobotProgress::Waiting => {}
+                        RobotProgress::Released => robot.progress = RobotProgress::Begun,
+                        RobotProgress::Begun => robot.has_settled = true,
                     }
                 }
             }
@@ -243,8 +243,8 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_is_waited_for_until_it_is_away_for_long() {
-        use Standing::{Begun, Released, Waiting};
+    fn rollout_waits_for_a_robot_until_it_is_offline_for_long() {
+        use RobotProgress::{Begun, Released, Waiting};
         let cases = [
             (Waiting, None, Part::Ready),
             (Waiting, Some(0), Part::Offline),
@@ -255,13 +255,13 @@ mod tests {
             (Begun, Some(LOST_AFTER_MS - 1), Part::Busy),
             (Begun, Some(LOST_AFTER_MS), Part::Lost),
         ];
-        for (standing, offline_ms, part) in cases {
-            assert_eq!(Part::of(standing, offline_ms), part, "{standing:?}, {offline_ms:?}");
+        for (progress, offline_ms, part) in cases {
+            assert_eq!(Part::of(progress, offline_ms), part, "{progress:?}, {offline_ms:?}");
         }
     }
 
     #[test]
-    fn a_lost_robot_counts_as_a_failure() {
+    fn lost_robot_counts_as_a_failure() {
         let rollout = Rollout { batch: Some(2), max_failures: Some(0), forgiven: 0, paused: false };
         let tally = Tally { ready: 5, lost: 1, ..Tally::default() };
         assert_eq!(next_move(&rollout, &tally), Move::Pause);
@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resumed_rollout_bears_as_many_failures_again() {
+    fn resumed_rollout_tolerates_max_failures_again() {
         let rollout = Rollout { batch: Some(2), max_failures: Some(1), forgiven: 2, paused: false };
         let tally = Tally { ready: 5, failed: 3, ..Tally::default() };
         assert_eq!(next_move(&rollout, &tally), Move::Release(2));

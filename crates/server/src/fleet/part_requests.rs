@@ -5,68 +5,71 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use task_proto::part::{MAX_MISSING_RANGES, PartRange};
-use task_proto::report::Report;
+use task_proto::messages::part::{MAX_MISSING_RANGES, PartRange};
+use task_proto::messages::report::Report;
 use task_proto::{Digest, RobotId};
 use tokio::sync::Notify;
 
-/// Receives reports. Clones feed the same listeners.
+/// Receives reports. Clones feed the same subscribers.
 #[derive(Debug, Clone, Default)]
-pub struct PartRequests(Arc<Mutex<HashMap<Digest, Arc<Desk>>>>);
+pub struct PartRequests(Arc<Mutex<HashMap<Digest, Arc<Subscriber>>>>);
 
 #[derive(Debug, Default)]
-struct Desk {
+struct Subscriber {
     requests: Mutex<HashMap<RobotId, Vec<PartRange>>>,
-    news: Notify,
+    added: Notify,
 }
 
 /// One package's requests; dropping this ends the collection.
 #[derive(Debug)]
-pub struct Listening {
+pub struct PartSubscription {
     digest: Digest,
-    desk: Arc<Desk>,
-    desks: PartRequests,
+    subscriber: Arc<Subscriber>,
+    subscribers: PartRequests,
 }
 
 impl PartRequests {
-    /// Collects requests for the content with this digest, for one listener.
-    pub fn listen(&self, digest: Digest) -> Listening {
-        let desk = Arc::<Desk>::default();
-        lock(&self.0).insert(digest, desk.clone());
-        Listening { digest, desk, desks: self.clone() }
+    /// Collects requests for the content with this digest, for one subscriber.
+    pub fn subscribe(&self, digest: Digest) -> PartSubscription {
+        let subscriber = Arc::<Subscriber>::default();
+        lock(&self.0).insert(digest, subscriber.clone());
+        PartSubscription { digest, subscriber, subscribers: self.clone() }
     }
 
     /// Reads a report that has been stored.
-    pub fn hear(&self, report: &Report) {
+    pub fn record(&self, report: &Report) {
         for task in &report.tasks {
             let Some(missing) = &task.missing_parts else { continue };
-            let Some(desk) = lock(&self.0).get(&task.package.content.digest).cloned() else {
+            let Some(subscriber) = lock(&self.0).get(&task.package.content.digest).cloned() else {
                 continue;
             };
             let missing = missing.iter().take(MAX_MISSING_RANGES).copied().collect();
-            lock(&desk.requests).insert(report.robot_id.clone(), missing);
-            desk.news.notify_one();
+            lock(&subscriber.requests).insert(report.robot_id.clone(), missing);
+            subscriber.added.notify_one();
         }
     }
 }
 
-impl Listening {
+impl PartSubscription {
     /// All requests since the last call.
     pub fn take(&self) -> HashMap<RobotId, Vec<PartRange>> {
-        std::mem::take(&mut *lock(&self.desk.requests))
+        std::mem::take(&mut *lock(&self.subscriber.requests))
     }
 
     /// Waits until there is a request. Cancel-safe.
-    pub async fn news(&self) {
-        self.desk.news.notified().await;
+    pub async fn added(&self) {
+        self.subscriber.added.notified().await;
     }
 }
 
-impl Drop for Listening {
+impl Drop for PartSubscription {
     fn drop(&mut self) {
-        let mut desks = lock(&self.desks.0);
-        if desks.get(&self.digest).is_some_and(|desk| Arc::ptr_eq(desk, &self.desk)) {
-            desks.remove(&self.digest);
+        let mut subscribers = lock(&self.subscribers.0);
+        if subscribers
+            .get(&self.digest)
+            .is_some_and(|subscriber| Arc::ptr_eq(subscriber, &self.subscriber))
+        {
+            subscribers.remove(&self.digest);
         }
     }
 }

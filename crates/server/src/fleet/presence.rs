@@ -16,7 +16,7 @@ pub const DUPLICATE_WINDOW_MS: u64 = 10 * 60 * 1000;
 /// often.
 pub const HANDOVER_SILENCE_MS: u64 = 30 * 1000;
 /// How long we show that another instance has appeared and waits.
-const WAITING_SHOWN_MS: u64 = 60 * 1000;
+const WAIT_DISPLAY_MS: u64 = 60 * 1000;
 /// Maximum robots in memory; beyond the limit, the longest silent robots are forgotten.
 const MAX_ROBOTS: usize = 100_000;
 /// Maximum instance changes in memory for each robot.
@@ -27,15 +27,15 @@ pub struct Presence {
     window_ms: u64,
     /// Robots not seen since then count as offline since then.
     started_ms: u64,
-    robots: Mutex<HashMap<RobotId, Sightings>>,
+    robots: Mutex<HashMap<RobotId, PresenceRecord>>,
 }
 
 /// The presence of one robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Sighting {
+pub struct RobotPresence {
     /// Connected over MQTT, or heard over HTTP within the window.
     pub online: bool,
-    /// The last known address, if any.
+    /// The last known address, if any. Port 0: the client of a trusted proxy, with an unknown port.
     pub address: Option<SocketAddr>,
     /// Start of the MQTT connection, if connected.
     pub connected_since_ms: Option<u64>,
@@ -46,12 +46,22 @@ pub struct Sighting {
     /// Two instances of the robot keep displacing each other.
     pub duplicate: bool,
     /// Another instance has appeared recently, and waits for the known instance to fall silent.
-    pub waits: bool,
+    pub has_waiting_instance: bool,
+}
+
+impl RobotPresence {
+    /// The address for people: `ip:port`, or the IP address alone if the port is unknown.
+    pub fn address_text(&self) -> Option<String> {
+        self.address.map(|address| match address.port() {
+            0 => address.ip().to_string(),
+            _ => address.to_string(),
+        })
+    }
 }
 
 /// An agent's statement about itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Claim {
+pub struct AgentIdentity {
     /// The instance, which is one start of the agent.
     pub instance: InstanceId,
     /// The place where the agent runs; absent from older agents.
@@ -60,16 +70,16 @@ pub struct Claim {
 
 /// The result of an agent's statement about itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Standing {
+pub struct Admission {
     /// Whether this instance serves the robot's work; otherwise the instance waits.
-    pub is_served: bool,
+    pub is_serving: bool,
     /// Whether the instance begins to serve now, or its session has just become known: send it the
     /// desired state.
-    pub is_news: bool,
+    pub needs_state: bool,
 }
 
 #[derive(Default)]
-struct Sightings {
+struct PresenceRecord {
     address: Option<SocketAddr>,
     connection: Option<Connection>,
     /// `None`: the robot is only remembered.
@@ -79,11 +89,11 @@ struct Sightings {
     polled_ms: Option<u64>,
     instances: InstanceHistory,
     /// The instance that serves the robot's work, and the time of its last message or request.
-    served: Option<(Claim, u64)>,
+    serving: Option<(AgentIdentity, u64)>,
     /// The instance that owns the MQTT session, once the agent has stated it.
-    speaker: Option<InstanceId>,
+    session_instance: Option<InstanceId>,
     /// When another instance was last told to wait.
-    waited_ms: Option<u64>,
+    last_wait_ms: Option<u64>,
 }
 
 #[derive(Clone, Copy)]
@@ -107,90 +117,91 @@ impl Presence {
         now_ms: u64,
     ) {
         let mut robots = self.robots();
-        let sightings = heard(&mut robots, robot, address, now_ms);
-        if sightings.connection.is_none_or(|known| known.number < connection) {
-            sightings.session_ended(now_ms);
-            sightings.connection = Some(Connection { number: connection, since_ms: now_ms });
-            sightings.address = address.or(sightings.address);
+        let record = touch(&mut robots, robot, address, now_ms);
+        if record.connection.is_none_or(|known| known.number < connection) {
+            record.session_ended(now_ms);
+            record.connection = Some(Connection { number: connection, since_ms: now_ms });
+            record.address = address.or(record.address);
         }
     }
 
     /// The robot's MQTT session number `connection` ended. An end that arrives after the next
     /// session has begun changes nothing.
     pub fn disconnected(&self, robot: &RobotId, connection: u64, now_ms: u64) {
-        if let Some(sightings) = self.robots().get_mut(robot)
-            && sightings.connection.is_some_and(|known| known.number == connection)
+        if let Some(record) = self.robots().get_mut(robot)
+            && record.connection.is_some_and(|known| known.number == connection)
         {
-            sightings.session_ended(now_ms);
-            sightings.connection = None;
-            sightings.polled_ms = None;
-            sightings.last_seen_ms = sightings.last_seen_ms.max(Some(now_ms));
+            record.session_ended(now_ms);
+            record.connection = None;
+            record.polled_ms = None;
+            record.last_seen_ms = record.last_seen_ms.max(Some(now_ms));
         }
     }
 
     /// The robot sent an HTTP request.
     pub fn seen(&self, robot: &RobotId, address: SocketAddr, now_ms: u64) {
-        heard(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
+        touch(&mut self.robots(), robot, Some(address), now_ms).polled_ms = Some(now_ms);
     }
 
     /// The robot's agent identified itself, in the MQTT session number `connection` if in a
     /// session. An instance that does not serve the robot's work waits until the serving instance
     /// ends or falls silent.
-    pub fn claimed(
+    pub fn identify(
         &self,
         robot: &RobotId,
         address: Option<SocketAddr>,
         connection: Option<u64>,
-        claim: Claim,
+        agent: AgentIdentity,
         now_ms: u64,
-    ) -> Standing {
+    ) -> Admission {
         let mut robots = self.robots();
-        let sightings = heard(&mut robots, robot, address, now_ms);
-        sightings.instances.observe(&claim.instance, now_ms);
-        let is_its_session =
-            connection.is_some() && connection == sightings.connection.map(|known| known.number);
-        let is_first_word = is_its_session && sightings.speaker.as_ref() != Some(&claim.instance);
-        if is_its_session {
-            sightings.speaker = Some(claim.instance.clone());
+        let record = touch(&mut robots, robot, address, now_ms);
+        record.instances.observe(&agent.instance, now_ms);
+        let is_current_session =
+            connection.is_some() && connection == record.connection.map(|known| known.number);
+        let is_first_in_session =
+            is_current_session && record.session_instance.as_ref() != Some(&agent.instance);
+        if is_current_session {
+            record.session_instance = Some(agent.instance.clone());
         }
-        if !sightings.gives_way_to(&claim, now_ms) {
-            sightings.waited_ms = Some(now_ms);
-            return Standing { is_served: false, is_news: false };
+        if !record.hands_over_to(&agent, now_ms) {
+            record.last_wait_ms = Some(now_ms);
+            return Admission { is_serving: false, needs_state: false };
         }
         let is_known =
-            sightings.served.as_ref().is_some_and(|(served, _)| served.instance == claim.instance);
+            record.serving.as_ref().is_some_and(|(serving, _)| serving.instance == agent.instance);
         // The session of an older agent gets its state without identifying itself.
-        let is_news = claim.place.is_some() && (is_first_word || !is_known);
-        sightings.served = Some((claim, now_ms));
-        Standing { is_served: true, is_news }
+        let needs_state = agent.place.is_some() && (is_first_in_session || !is_known);
+        record.serving = Some((agent, now_ms));
+        Admission { is_serving: true, needs_state }
     }
 
     /// Remembers an agent that was seen before this process started, and may appear again.
-    pub fn remember(&self, robot: &RobotId, claim: Claim, now_ms: u64) {
-        entry(&mut self.robots(), robot).served.get_or_insert((claim, now_ms));
+    pub fn remember(&self, robot: &RobotId, agent: AgentIdentity, now_ms: u64) {
+        entry(&mut self.robots(), robot).serving.get_or_insert((agent, now_ms));
     }
 
     /// Whether requests in the robot's name must identify their agent, because the robot's agent
     /// does.
-    pub fn takes_a_claim(&self, robot: &RobotId) -> bool {
-        self.robots().get(robot).is_some_and(Sightings::takes_a_claim)
+    pub fn requires_identity(&self, robot: &RobotId) -> bool {
+        self.robots().get(robot).is_some_and(PresenceRecord::requires_identity)
     }
 
     /// Whether the robot's MQTT session belongs to the agent that serves its work, as far as its
     /// agents have identified themselves.
-    pub fn may_be_told(&self, robot: &RobotId) -> bool {
+    pub fn accepts_downlink(&self, robot: &RobotId) -> bool {
         self.robots()
             .get(robot)
-            .is_none_or(|sightings| !sightings.takes_a_claim() || sightings.has_session())
+            .is_none_or(|record| !record.requires_identity() || record.has_session())
     }
 
     /// The agent instance that serves the robot's work.
     pub fn instance(&self, robot: &RobotId) -> Option<InstanceId> {
-        self.robots().get(robot)?.served.as_ref().map(|(served, _)| served.instance.clone())
+        self.robots().get(robot)?.serving.as_ref().map(|(serving, _)| serving.instance.clone())
     }
 
     /// The presence of the robot; `None` if this process has not seen the robot.
-    pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<Sighting> {
+    pub fn get(&self, robot: &RobotId, now_ms: u64) -> Option<RobotPresence> {
         self.robots().get(robot)?.view(self.window_ms, now_ms)
     }
 
@@ -209,8 +220,7 @@ impl Presence {
         let known = self.robots();
         let offline_ms = |robot: &RobotId| {
             let since_ms =
-                match known.get(robot).and_then(|sightings| sightings.view(self.window_ms, now_ms))
-                {
+                match known.get(robot).and_then(|record| record.view(self.window_ms, now_ms)) {
                     Some(sighting) if sighting.online => return None,
                     Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
                     None => self.started_ms,
@@ -222,17 +232,17 @@ impl Presence {
 
     /// Whether the robot is connected over MQTT.
     pub fn is_connected(&self, robot: &RobotId) -> bool {
-        self.robots().get(robot).is_some_and(|sightings| sightings.connection.is_some())
+        self.robots().get(robot).is_some_and(|record| record.connection.is_some())
     }
 
     /// Robots without a connection that were online at `since_ms` and are offline at `now_ms`,
     /// because the window passed without a request.
-    pub fn fell_silent(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
+    pub fn timed_out(&self, since_ms: u64, now_ms: u64) -> Vec<RobotId> {
         let robots = self.robots();
-        let fell = robots.iter().filter(|(_, sightings)| {
+        let fell = robots.iter().filter(|(_, record)| {
             let ends_ms =
-                sightings.polled_ms.map(|polled_ms| polled_ms.saturating_add(self.window_ms));
-            sightings.connection.is_none()
+                record.polled_ms.map(|polled_ms| polled_ms.saturating_add(self.window_ms));
+            record.connection.is_none()
                 && ends_ms.is_some_and(|ends_ms| since_ms < ends_ms && ends_ms <= now_ms)
         });
         fell.map(|(robot, _)| robot.clone()).collect()
@@ -240,14 +250,14 @@ impl Presence {
 
     /// Whether two instances of the robot keep displacing each other.
     pub fn is_duplicate(&self, robot: &RobotId, now_ms: u64) -> bool {
-        self.robots().get(robot).is_some_and(|sightings| sightings.instances.is_duplicate(now_ms))
+        self.robots().get(robot).is_some_and(|record| record.instances.is_duplicate(now_ms))
     }
 
     /// The robot's other tokens have ended, so no other client is admitted by them any more.
-    pub fn ended_others(&self, robot: &RobotId) {
-        if let Some(sightings) = self.robots().get_mut(robot) {
-            sightings.instances = InstanceHistory::default();
-            (sightings.served, sightings.speaker, sightings.waited_ms) = (None, None, None);
+    pub fn end_other_instances(&self, robot: &RobotId) {
+        if let Some(record) = self.robots().get_mut(robot) {
+            record.instances = InstanceHistory::default();
+            (record.serving, record.session_instance, record.last_wait_ms) = (None, None, None);
         }
     }
 
@@ -256,31 +266,34 @@ impl Presence {
         self.robots().remove(robot);
     }
 
-    fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, Sightings>> {
+    fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, PresenceRecord>> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
         self.robots.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn heard<'a>(
-    robots: &'a mut HashMap<RobotId, Sightings>,
+fn touch<'a>(
+    robots: &'a mut HashMap<RobotId, PresenceRecord>,
     robot: &RobotId,
     address: Option<SocketAddr>,
     now_ms: u64,
-) -> &'a mut Sightings {
-    let sightings = entry(robots, robot);
+) -> &'a mut PresenceRecord {
+    let record = entry(robots, robot);
     let is_elsewhere =
-        address.map(|address| address.ip()) != sightings.address.map(|address| address.ip());
+        address.map(|address| address.ip()) != record.address.map(|address| address.ip());
     // During a session the port is that of the session: each HTTP request may have another port.
-    if address.is_some() && (sightings.connection.is_none() || is_elsewhere) {
-        sightings.address = address;
+    if address.is_some() && (record.connection.is_none() || is_elsewhere) {
+        record.address = address;
     }
-    sightings.last_seen_ms = sightings.last_seen_ms.max(Some(now_ms));
-    sightings
+    record.last_seen_ms = record.last_seen_ms.max(Some(now_ms));
+    record
 }
 
-fn entry<'a>(robots: &'a mut HashMap<RobotId, Sightings>, robot: &RobotId) -> &'a mut Sightings {
+fn entry<'a>(
+    robots: &'a mut HashMap<RobotId, PresenceRecord>,
+    robot: &RobotId,
+) -> &'a mut PresenceRecord {
     if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
         make_room(robots);
     }
@@ -288,12 +301,10 @@ fn entry<'a>(robots: &'a mut HashMap<RobotId, Sightings>, robot: &RobotId) -> &'
 }
 
 /// Forgets the longest silent sixteenth of the robots, so that the next scan is far off.
-fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
+fn make_room(robots: &mut HashMap<RobotId, PresenceRecord>) {
     let mut silent: Vec<(bool, Option<u64>, RobotId)> = robots
         .iter()
-        .map(|(robot, sightings)| {
-            (sightings.connection.is_some(), sightings.last_seen_ms, robot.clone())
-        })
+        .map(|(robot, record)| (record.connection.is_some(), record.last_seen_ms, robot.clone()))
         .collect();
     silent.sort_unstable();
     for (_, _, robot) in silent.into_iter().take(MAX_ROBOTS / 16) {
@@ -301,41 +312,43 @@ fn make_room(robots: &mut HashMap<RobotId, Sightings>) {
     }
 }
 
-impl Sightings {
+impl PresenceRecord {
     /// Whether this agent serves the robot's work. That is true for the agent that already serves,
     /// for an agent that could only start after the serving one had ended, and once the serving one
     /// has been silent for long enough. An older agent does not state its place, so a restart looks
     /// like a copy. In that case the next instance takes over at once, as in earlier versions.
-    fn gives_way_to(&self, claim: &Claim, now_ms: u64) -> bool {
-        let Some((served, heard_ms)) = &self.served else { return true };
-        let Some(place) = served.place else { return true };
+    fn hands_over_to(&self, agent: &AgentIdentity, now_ms: u64) -> bool {
+        let Some((serving, active_ms)) = &self.serving else { return true };
+        let Some(place) = serving.place else { return true };
         let is_silent =
-            !self.has_session() && now_ms.saturating_sub(*heard_ms) >= HANDOVER_SILENCE_MS;
-        served.instance == claim.instance || claim.place == Some(place) || is_silent
+            !self.has_session() && now_ms.saturating_sub(*active_ms) >= HANDOVER_SILENCE_MS;
+        serving.instance == agent.instance || agent.place == Some(place) || is_silent
     }
 
-    fn takes_a_claim(&self) -> bool {
-        self.served.as_ref().is_some_and(|(served, _)| served.place.is_some())
+    fn requires_identity(&self) -> bool {
+        self.serving.as_ref().is_some_and(|(serving, _)| serving.place.is_some())
     }
 
     /// Whether the serving agent also owns the robot's session.
     fn has_session(&self) -> bool {
-        let speaks = |(served, _): &(Claim, u64)| self.speaker.as_ref() == Some(&served.instance);
-        self.connection.is_some() && self.served.as_ref().is_some_and(speaks)
+        let speaks = |(serving, _): &(AgentIdentity, u64)| {
+            self.session_instance.as_ref() == Some(&serving.instance)
+        };
+        self.connection.is_some() && self.serving.as_ref().is_some_and(speaks)
     }
 
     /// The owner of the session was present until now.
     fn session_ended(&mut self, now_ms: u64) {
         if self.has_session()
-            && let Some((_, heard_ms)) = &mut self.served
+            && let Some((_, active_ms)) = &mut self.serving
         {
-            *heard_ms = now_ms;
+            *active_ms = now_ms;
         }
-        self.speaker = None;
+        self.session_instance = None;
     }
 
-    fn view(&self, window_ms: u64, now_ms: u64) -> Option<Sighting> {
-        Some(Sighting {
+    fn view(&self, window_ms: u64, now_ms: u64) -> Option<RobotPresence> {
+        Some(RobotPresence {
             online: self.connection.is_some()
                 || self
                     .polled_ms
@@ -345,9 +358,9 @@ impl Sightings {
             connection: self.connection.map(|connection| connection.number),
             last_seen_ms: self.last_seen_ms?,
             duplicate: self.instances.is_duplicate(now_ms),
-            waits: self
-                .waited_ms
-                .is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < WAITING_SHOWN_MS),
+            has_waiting_instance: self
+                .last_wait_ms
+                .is_some_and(|at_ms| now_ms.saturating_sub(at_ms) < WAIT_DISPLAY_MS),
         })
     }
 }
@@ -405,9 +418,9 @@ mod tests {
         "127.0.0.1:4000".parse().expect("an address")
     }
 
-    fn history(sightings: &[(&InstanceId, u64)]) -> InstanceHistory {
+    fn history(observed: &[(&InstanceId, u64)]) -> InstanceHistory {
         let mut history = InstanceHistory::default();
-        for (instance, at_ms) in sightings {
+        for (instance, at_ms) in observed {
             history.observe(instance, *at_ms);
         }
         history
@@ -455,7 +468,7 @@ mod tests {
     }
 
     #[test]
-    fn a_connection_or_a_recent_poll_is_online() {
+    fn connected_or_recently_polling_robot_is_online() {
         let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
         assert_eq!(presence.get(&robot, 0), None);
@@ -467,7 +480,7 @@ mod tests {
         assert!(sighting.online);
         assert_eq!((sighting.connection, sighting.connected_since_ms), (Some(7), Some(2000)));
         presence.disconnected(&robot, 7, 100_000);
-        assert!(!presence.is_online(&robot, 100_000), "who hangs up is away at once");
+        assert!(!presence.is_online(&robot, 100_000), "a disconnected robot is offline at once");
         presence.connected(&robot, None, 8, 100_000);
         let sighting = presence.get(&robot, 100_000).expect("seen");
         assert_eq!(
@@ -483,7 +496,7 @@ mod tests {
     }
 
     #[test]
-    fn an_absence_is_counted_from_the_last_word_or_the_start() {
+    fn absence_is_counted_from_the_last_sign_of_life_or_the_start() {
         let presence = Presence::new(1000, 500);
         let (unseen, polls, hung_up) = (RobotId::random(), RobotId::random(), RobotId::random());
         presence.seen(&polls, address(), 600);
@@ -495,131 +508,132 @@ mod tests {
     }
 
     #[test]
-    fn a_duplicate_ends_when_only_one_is_let_in() {
+    fn duplicate_ends_when_the_other_tokens_end() {
         let presence = Presence::new(1000, 0);
         let (robot, a, b) = (RobotId::random(), InstanceId::random(), InstanceId::random());
         for instance in [&a, &b, &a, &b] {
-            presence.claimed(
+            presence.identify(
                 &robot,
                 None,
                 None,
-                Claim { instance: instance.clone(), place: None },
+                AgentIdentity { instance: instance.clone(), place: None },
                 1,
             );
         }
         assert!(presence.is_duplicate(&robot, 2));
-        presence.ended_others(&robot);
-        presence.claimed(&robot, None, None, claim(1), 2);
+        presence.end_other_instances(&robot);
+        presence.identify(&robot, None, None, agent(1), 2);
         assert!(!presence.is_duplicate(&robot, 2));
     }
 
     /// A new instance in this place.
-    fn claim(place: u8) -> Claim {
-        Claim { instance: InstanceId::random(), place: Some(Digest::of(&[place])) }
+    fn agent(place: u8) -> AgentIdentity {
+        AgentIdentity { instance: InstanceId::random(), place: Some(Digest::of(&[place])) }
     }
 
     #[test]
-    fn another_instance_waits_until_the_one_that_is_served_was_silent() {
+    fn second_instance_waits_until_the_serving_one_is_silent() {
         let (presence, robot, original, copy) =
-            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
-        let polls =
-            |claim: &Claim, now_ms| presence.claimed(&robot, None, None, claim.clone(), now_ms);
-        assert!(!presence.takes_a_claim(&robot), "nothing is known of it");
+            (Presence::new(1000, 0), RobotId::random(), agent(1), agent(2));
+        let polls = |agent: &AgentIdentity, now_ms| {
+            presence.identify(&robot, None, None, agent.clone(), now_ms)
+        };
+        assert!(!presence.requires_identity(&robot), "the robot is unknown");
         let first = polls(&original, 0);
-        assert!(first.is_served && first.is_news && presence.takes_a_claim(&robot));
-        assert!(!polls(&original, 5).is_news);
-        assert!(!polls(&copy, 10).is_served);
+        assert!(first.is_serving && first.needs_state && presence.requires_identity(&robot));
+        assert!(!polls(&original, 5).needs_state);
+        assert!(!polls(&copy, 10).is_serving);
         assert_eq!(presence.instance(&robot).as_ref(), Some(&original.instance));
-        assert!(presence.get(&robot, 10).expect("seen").waits);
-        assert!(!polls(&copy, 4 + HANDOVER_SILENCE_MS).is_served);
-        assert!(polls(&original, 4 + HANDOVER_SILENCE_MS).is_served, "it was only away");
-        assert!(!polls(&copy, 5 + HANDOVER_SILENCE_MS).is_served);
+        assert!(presence.get(&robot, 10).expect("seen").has_waiting_instance);
+        assert!(!polls(&copy, 4 + HANDOVER_SILENCE_MS).is_serving);
+        assert!(polls(&original, 4 + HANDOVER_SILENCE_MS).is_serving, "the original was only away");
+        assert!(!polls(&copy, 5 + HANDOVER_SILENCE_MS).is_serving);
         let silent_ms = 4 + 2 * HANDOVER_SILENCE_MS;
-        assert!(polls(&copy, silent_ms).is_news, "as a robot that was started again");
-        assert!(!polls(&original, silent_ms + 1).is_served);
+        assert!(polls(&copy, silent_ms).needs_state, "like a restarted robot");
+        assert!(!polls(&original, silent_ms + 1).is_serving);
     }
 
     #[test]
-    fn restart_in_the_same_place_is_served_at_once() {
+    fn restart_in_the_same_place_serves_at_once() {
         let (presence, robot) = (Presence::new(1000, 0), RobotId::random());
         for now_ms in 0..5 {
-            assert!(presence.claimed(&robot, None, None, claim(1), now_ms).is_news);
+            assert!(presence.identify(&robot, None, None, agent(1), now_ms).needs_state);
         }
-        presence.remember(&robot, claim(2), 6);
+        presence.remember(&robot, agent(2), 6);
         assert!(
-            presence.claimed(&robot, None, None, claim(1), 6).is_served,
+            presence.identify(&robot, None, None, agent(1), 6).is_serving,
             "what is known is newer"
         );
     }
 
     #[test]
-    fn instance_that_was_known_before_a_restart_of_the_server_is_waited_for() {
+    fn remembered_instance_keeps_its_work_after_a_server_restart() {
         let (presence, robot, original, copy) =
-            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
+            (Presence::new(1000, 0), RobotId::random(), agent(1), agent(2));
         presence.remember(&robot, original.clone(), 1000);
-        assert_eq!(presence.get(&robot, 1000), None, "it was not seen by this process");
-        assert!(!presence.claimed(&robot, None, None, copy, 1001).is_served);
-        assert!(presence.claimed(&robot, None, None, original, 1002).is_served);
+        assert_eq!(presence.get(&robot, 1000), None, "this process has not seen the robot");
+        assert!(!presence.identify(&robot, None, None, copy, 1001).is_serving);
+        assert!(presence.identify(&robot, None, None, original, 1002).is_serving);
     }
 
     #[test]
-    fn session_is_told_once_its_agent_has_said_that_it_is_the_one() {
+    fn session_accepts_downlink_once_its_agent_is_serving() {
         let (presence, robot, original, copy) =
-            (Presence::new(1000, 0), RobotId::random(), claim(1), claim(2));
-        let says = |claim: &Claim, connection, now_ms| {
-            presence.claimed(&robot, None, Some(connection), claim.clone(), now_ms).is_served
+            (Presence::new(1000, 0), RobotId::random(), agent(1), agent(2));
+        let says = |agent: &AgentIdentity, connection, now_ms| {
+            presence.identify(&robot, None, Some(connection), agent.clone(), now_ms).is_serving
         };
         presence.connected(&robot, None, 1, 0);
-        assert!(presence.may_be_told(&robot), "nobody has said yet that it says so");
-        assert!(says(&original, 1, 0) && presence.may_be_told(&robot));
+        assert!(presence.accepts_downlink(&robot), "no agent has identified itself yet");
+        assert!(says(&original, 1, 0) && presence.accepts_downlink(&robot));
         // A copy takes over the session. The earlier instance was last heard when its session
         // ended.
         let later_ms = 10 * MINUTE_MS;
         presence.disconnected(&robot, 1, later_ms);
         presence.connected(&robot, None, 2, later_ms);
-        assert!(!presence.may_be_told(&robot), "it has not said who it is");
-        assert!(!says(&copy, 2, later_ms) && !presence.may_be_told(&robot));
+        assert!(!presence.accepts_downlink(&robot), "the session has not identified itself");
+        assert!(!says(&copy, 2, later_ms) && !presence.accepts_downlink(&robot));
         assert!(
-            !says(&original, 1, later_ms + 1) || !presence.may_be_told(&robot),
+            !says(&original, 1, later_ms + 1) || !presence.accepts_downlink(&robot),
             "said in a session that is over"
         );
         presence.disconnected(&robot, 2, later_ms + 2);
         presence.connected(&robot, None, 3, later_ms + 2);
-        assert!(says(&original, 3, later_ms + 3) && presence.may_be_told(&robot));
+        assert!(says(&original, 3, later_ms + 3) && presence.accepts_downlink(&robot));
         // An instance with a live session is not silent.
-        assert!(!presence.claimed(&robot, None, None, copy, later_ms + MINUTE_MS).is_served);
+        assert!(!presence.identify(&robot, None, None, copy, later_ms + MINUTE_MS).is_serving);
     }
 
     #[test]
     fn older_agents_follow_each_other_at_once() {
         let (presence, robot) = (Presence::new(1000, 0), RobotId::random());
         for now_ms in 0..5 {
-            let older = Claim { instance: InstanceId::random(), place: None };
-            assert!(presence.claimed(&robot, None, None, older, now_ms).is_served);
-            assert!(!presence.takes_a_claim(&robot));
+            let older = AgentIdentity { instance: InstanceId::random(), place: None };
+            assert!(presence.identify(&robot, None, None, older, now_ms).is_serving);
+            assert!(!presence.requires_identity(&robot));
         }
         assert!(
-            presence.claimed(&robot, None, None, claim(1), 6).is_served,
+            presence.identify(&robot, None, None, agent(1), 6).is_serving,
             "an agent that was brought up to date"
         );
-        let older = Claim { instance: InstanceId::random(), place: None };
-        assert!(!presence.claimed(&robot, None, None, older, 7).is_served);
+        let older = AgentIdentity { instance: InstanceId::random(), place: None };
+        assert!(!presence.identify(&robot, None, None, older, 7).is_serving);
     }
 
     #[test]
-    fn silence_is_noticed_once_and_only_of_robots_that_poll() {
+    fn silence_of_a_polling_robot_is_reported_once() {
         let presence = Presence::new(1000, 0);
         let (polls, connected) = (RobotId::random(), RobotId::random());
         presence.seen(&polls, address(), 500);
         presence.seen(&connected, address(), 500);
         presence.connected(&connected, Some(address()), 1, 600);
-        assert!(presence.fell_silent(0, 1499).is_empty());
-        assert_eq!(presence.fell_silent(1499, 1500), [polls]);
-        assert!(presence.fell_silent(1500, 9000).is_empty());
+        assert!(presence.timed_out(0, 1499).is_empty());
+        assert_eq!(presence.timed_out(1499, 1500), [polls]);
+        assert!(presence.timed_out(1500, 9000).is_empty());
     }
 
     #[test]
-    fn a_late_end_of_the_old_connection_leaves_the_new_one() {
+    fn late_disconnect_of_the_old_session_keeps_the_new_one() {
         let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
         presence.connected(&robot, Some(address()), 2, 0);
@@ -629,10 +643,10 @@ mod tests {
     }
 
     #[test]
-    fn a_sessions_port_stays_while_requests_come_from_others() {
+    fn session_port_is_kept_when_requests_use_other_ports() {
         let presence = Presence::new(1000, 0);
         let robot = RobotId::random();
-        let shown = || presence.get(&robot, 0)?.address.map(|address| address.to_string());
+        let shown = || presence.get(&robot, 0)?.address_text();
         presence.seen(&robot, "10.0.0.7:5000".parse().expect("valid"), 0);
         presence.connected(&robot, "10.0.0.7:4000".parse().ok(), 1, 0);
         presence.seen(&robot, "10.0.0.7:5001".parse().expect("valid"), 0);
@@ -651,12 +665,22 @@ mod tests {
     }
 
     #[test]
+    fn address_of_a_proxys_client_has_no_port() {
+        let (presence, robot) = (Presence::new(0, 0), RobotId::random());
+        for (peer, shown) in [("192.0.2.7:0", "192.0.2.7"), ("[2001:db8::7]:0", "2001:db8::7")] {
+            presence.seen(&robot, peer.parse().expect("valid"), 0);
+            let address = presence.get(&robot, 0).and_then(|presence| presence.address_text());
+            assert_eq!(address.as_deref(), Some(shown));
+        }
+    }
+
+    #[test]
     fn memory_is_bounded() {
         let mut robots = HashMap::new();
         let silent = RobotId::random();
-        heard(&mut robots, &silent, Some(address()), 1);
+        touch(&mut robots, &silent, Some(address()), 1);
         for at_ms in 2..=MAX_ROBOTS as u64 + 1 {
-            heard(&mut robots, &RobotId::random(), Some(address()), at_ms);
+            touch(&mut robots, &RobotId::random(), Some(address()), at_ms);
         }
         assert!(robots.len() <= MAX_ROBOTS);
         assert!(!robots.contains_key(&silent));

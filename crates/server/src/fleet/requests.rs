@@ -7,15 +7,18 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use task_proto::RobotId;
-use task_proto::envelope::Envelope;
-use task_proto::id::RequestId;
-use task_proto::request::{Action, Answer, Ask, MAX_TTL_MS, Outcome, Refusal, Reply, Request};
+use task_proto::ids::RequestId;
+use task_proto::messages::request::{
+    Action, Answer, Ask, MAX_TTL_MS, Outcome, Refusal, Reply, Request,
+};
+use task_proto::time::millis;
+use task_proto::trust::envelope::Envelope;
 use tokio::sync::oneshot;
 
-use crate::broker::{Broker, NotAsked};
+use crate::broker::{Broker, NotSent};
 
 /// Maximum pending requests to all robots together.
-const MAX_UNDER_WAY: usize = 1024;
+const MAX_PENDING: usize = 1024;
 
 /// The reason why there is no answer.
 #[derive(Debug, thiserror::Error)]
@@ -24,129 +27,130 @@ pub enum RequestError {
     #[error("the robot is not connected over MQTT, so it can't be asked")]
     NotConnected,
     /// The robot, or the server, has too many pending requests.
-    #[error("too many questions are under way; try again")]
+    #[error("too many requests are pending; try again")]
     Busy,
     /// The robot did not answer in time.
-    #[error("the robot did not answer within {} s", .patience.as_secs_f64())]
-    TimedOut { patience: Duration },
+    #[error("the robot did not answer within {} s", .timeout.as_secs_f64())]
+    TimedOut { timeout: Duration },
     /// The robot refused, with a reason.
     #[error("{}", .0.text)]
     Refused(Refusal),
     /// The request could not be serialized.
-    #[error("the question can't be written")]
-    Unwritable(#[from] serde_json::Error),
+    #[error("the request can't be serialized")]
+    Unserializable(#[from] serde_json::Error),
 }
 
 /// The pending requests; clones share them.
 #[derive(Clone, Default)]
 pub struct Requests {
-    waiting: Arc<Mutex<HashMap<RequestId, Waiting>>>,
+    pending: Arc<Mutex<HashMap<RequestId, ReplySlot>>>,
 }
 
-struct Waiting {
+struct ReplySlot {
     robot: RobotId,
     reply: oneshot::Sender<Outcome>,
 }
 
 impl Requests {
-    /// Sends a request to `robot` and waits for the answer, at most for `patience` or the
+    /// Sends a request to `robot` and waits for the answer, at most for `timeout` or the
     /// protocol's limit.
-    pub async fn ask(
+    pub async fn send(
         &self,
         broker: &Broker,
         robot: &RobotId,
         ask: Ask,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Answer, RequestError> {
         let request =
-            Request { id: RequestId::random(), ttl_ms: ttl_ms(patience), ask, signed: None };
-        self.put(broker, robot, request, patience).await
+            Request { id: RequestId::random(), ttl_ms: ttl_ms(timeout), ask, signed: None };
+        self.deliver(broker, robot, request, timeout).await
     }
 
     /// Like `ask`, for a signed request that changes something.
-    pub async fn act(
+    pub async fn send_signed(
         &self,
         broker: &Broker,
         action: Action,
         signed: Envelope,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Answer, RequestError> {
         let Action { robot_id, id, ask, .. } = action;
-        let request = Request { id, ttl_ms: ttl_ms(patience), ask, signed: Some(signed) };
-        self.put(broker, &robot_id, request, patience).await
+        let request = Request { id, ttl_ms: ttl_ms(timeout), ask, signed: Some(signed) };
+        self.deliver(broker, &robot_id, request, timeout).await
     }
 
-    async fn put(
+    async fn deliver(
         &self,
         broker: &Broker,
         robot: &RobotId,
         request: Request,
-        patience: Duration,
+        timeout: Duration,
     ) -> Result<Answer, RequestError> {
-        let patience = patience.min(Duration::from_millis(MAX_TTL_MS));
+        let timeout = timeout.min(Duration::from_millis(MAX_TTL_MS));
         let payload = serde_json::to_vec(&request)?;
-        let (place, reply) = self.expect(robot, request.id)?;
-        broker.ask(robot, payload.into()).map_err(|error| match error {
-            NotAsked::NotConnected => RequestError::NotConnected,
-            NotAsked::Busy => RequestError::Busy,
+        let (pending_request, reply) = self.register(robot, request.id)?;
+        broker.send_request(robot, payload.into()).map_err(|error| match error {
+            NotSent::NotConnected => RequestError::NotConnected,
+            NotSent::Busy => RequestError::Busy,
         })?;
-        let outcome = tokio::time::timeout(patience, reply).await;
-        drop(place);
+        let outcome = tokio::time::timeout(timeout, reply).await;
+        drop(pending_request);
         match outcome {
             Ok(Ok(Outcome::Answer(answer))) => Ok(answer),
             Ok(Ok(Outcome::Refusal(refusal))) => Err(RequestError::Refused(refusal)),
-            Ok(Err(_)) | Err(_) => Err(RequestError::TimedOut { patience }),
+            Ok(Err(_)) | Err(_) => Err(RequestError::TimedOut { timeout }),
         }
     }
 
     /// Handles a reply from `robot`. A reply without a pending request is dropped: it is late,
     /// duplicate or forged.
-    pub fn replied(&self, robot: &RobotId, reply: Reply) {
-        let mut waiting = self.waiting();
+    pub fn handle_reply(&self, robot: &RobotId, reply: Reply) {
+        let mut pending = self.pending();
         // Another robot can't answer in this robot's place, even with a guessed id.
-        if waiting.get(&reply.id).is_some_and(|waiting| waiting.robot == *robot)
-            && let Some(waiting) = waiting.remove(&reply.id)
+        if pending.get(&reply.id).is_some_and(|pending| pending.robot == *robot)
+            && let Some(pending) = pending.remove(&reply.id)
         {
             // The caller may have gone.
-            let _ = waiting.reply.send(reply.outcome);
+            let _ = pending.reply.send(reply.outcome);
         }
     }
 
-    fn expect(
+    fn register(
         &self,
         robot: &RobotId,
         id: RequestId,
-    ) -> Result<(Place, oneshot::Receiver<Outcome>), RequestError> {
-        let mut waiting = self.waiting();
-        if waiting.len() >= MAX_UNDER_WAY {
+    ) -> Result<(PendingRequest, oneshot::Receiver<Outcome>), RequestError> {
+        let mut pending = self.pending();
+        if pending.len() >= MAX_PENDING {
             return Err(RequestError::Busy);
         }
         let (sender, receiver) = oneshot::channel();
-        waiting.insert(id.clone(), Waiting { robot: robot.clone(), reply: sender });
-        drop(waiting);
-        Ok((Place { requests: self.clone(), id }, receiver))
+        pending.insert(id.clone(), ReplySlot { robot: robot.clone(), reply: sender });
+        drop(pending);
+        Ok((PendingRequest { requests: self.clone(), id }, receiver))
     }
 
-    fn waiting(&self) -> MutexGuard<'_, HashMap<RequestId, Waiting>> {
+    fn pending(&self) -> MutexGuard<'_, HashMap<RequestId, ReplySlot>> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
-        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-fn ttl_ms(patience: Duration) -> u64 {
-    u64::try_from(patience.as_millis()).unwrap_or(MAX_TTL_MS).min(MAX_TTL_MS)
+fn ttl_ms(timeout: Duration) -> u64 {
+    millis(timeout).min(MAX_TTL_MS)
 }
 
-/// A pending request's place. It is freed whenever the wait ends, also when the caller hangs up.
-struct Place {
+/// Guards a pending request. Its entry is removed whenever the wait ends, also when the caller
+/// hangs up.
+struct PendingRequest {
     requests: Requests,
     id: RequestId,
 }
 
-impl Drop for Place {
+impl Drop for PendingRequest {
     fn drop(&mut self) {
-        self.requests.waiting().remove(&self.id);
+        self.requests.pending().remove(&self.id);
     }
 }
 
@@ -167,23 +171,23 @@ mod tests {
         let requests = Requests::default();
         let (asked, other) = (RobotId::random(), RobotId::random());
         let id = RequestId::random();
-        let (_place, receiver) = requests.expect(&asked, id.clone()).expect("room");
-        requests.replied(&other, reply(&id, &asked));
-        requests.replied(&asked, reply(&RequestId::random(), &asked));
-        requests.replied(&asked, reply(&id, &asked));
-        requests.replied(&asked, reply(&id, &asked));
+        let (_pending_request, receiver) = requests.register(&asked, id.clone()).expect("room");
+        requests.handle_reply(&other, reply(&id, &asked));
+        requests.handle_reply(&asked, reply(&RequestId::random(), &asked));
+        requests.handle_reply(&asked, reply(&id, &asked));
+        requests.handle_reply(&asked, reply(&id, &asked));
         assert_eq!(receiver.await.expect("answered"), Outcome::Answer(Answer::Following));
     }
 
     #[test]
-    fn places_are_bounded_and_free_again_when_nobody_waits() {
+    fn pending_requests_are_bounded_and_freed_on_drop() {
         let requests = Requests::default();
         let robot = RobotId::random();
-        let places: Vec<_> = (0..MAX_UNDER_WAY)
-            .map(|_| requests.expect(&robot, RequestId::random()).expect("room"))
+        let pending: Vec<_> = (0..MAX_PENDING)
+            .map(|_| requests.register(&robot, RequestId::random()).expect("room"))
             .collect();
-        assert!(matches!(requests.expect(&robot, RequestId::random()), Err(RequestError::Busy)));
-        drop(places);
-        assert!(requests.waiting().is_empty());
+        assert!(matches!(requests.register(&robot, RequestId::random()), Err(RequestError::Busy)));
+        drop(pending);
+        assert!(requests.pending().is_empty());
     }
 }

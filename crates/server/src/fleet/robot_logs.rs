@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use task_proto::RobotId;
-use task_proto::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES, MAX_LINE_BYTES};
+use task_proto::telemetry::log::{LogBatch, LogLevel, LogLine, MAX_BATCH_LINES, MAX_LINE_BYTES};
 use tokio::sync::{Notify, broadcast};
 
 /// Maximum lines in memory for one robot.
@@ -30,15 +30,15 @@ pub struct RobotLogs {
 
 #[derive(Default)]
 struct State {
-    robots: HashMap<RobotId, Kept>,
+    robots: HashMap<RobotId, LineBuffer>,
     bytes: usize,
-    followed: HashMap<RobotId, Followed>,
+    followed: HashMap<RobotId, FollowedRobot>,
     followers: u64,
 }
 
 /// One robot's last lines.
 #[derive(Default)]
-struct Kept {
+struct LineBuffer {
     lines: VecDeque<LogLine>,
     bytes: usize,
     /// The robot's clock and ours when the last batch arrived.
@@ -52,7 +52,7 @@ struct Kept {
 
 /// The robot's lines that the server holds in memory.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Remembered {
+pub struct LogSnapshot {
     pub lines: Vec<LogLine>,
     /// The robot's clock when the lines arrived.
     pub robot_ms: u64,
@@ -64,7 +64,7 @@ pub struct Remembered {
 
 /// An event for followers.
 #[derive(Debug, Clone)]
-pub enum Told {
+pub enum FollowEvent {
     /// The robot has confirmed that it publishes.
     Following {
         /// Publishing had stopped for a while, so lines may be missing.
@@ -75,8 +75,8 @@ pub enum Told {
     Lines(Arc<LogBatch>),
 }
 
-struct Followed {
-    told: broadcast::Sender<Told>,
+struct FollowedRobot {
+    events: broadcast::Sender<FollowEvent>,
     levels: BTreeMap<u64, LogLevel>,
     changed: Arc<Notify>,
 }
@@ -88,11 +88,11 @@ pub struct Follower {
     number: u64,
 }
 
-/// A new follower's place, and the follow-up work.
-pub struct Joined {
+/// The place of a new follower, and its events.
+pub struct Subscription {
     pub follower: Follower,
     /// The events for the follower.
-    pub told: broadcast::Receiver<Told>,
+    pub events: broadcast::Receiver<FollowEvent>,
     /// Whether this is the first follower. Then the caller must request publishing from the robot,
     /// for as long as there are followers.
     pub is_first: bool,
@@ -107,35 +107,35 @@ impl RobotLogs {
     /// Whether `robot` may publish this many bytes now. Ask before reading them.
     pub fn admits(&self, robot: &RobotId, bytes: usize, now_ms: u64) -> bool {
         let mut state = self.state();
-        let kept = state.robots.entry(robot.clone()).or_insert_with(|| Kept {
+        let buffer = state.robots.entry(robot.clone()).or_insert_with(|| LineBuffer {
             budget_bytes: BURST_BYTES,
             budget_ms: now_ms,
-            ..Kept::default()
+            ..LineBuffer::default()
         });
-        let earned = now_ms.saturating_sub(kept.budget_ms).saturating_mul(BYTES_PER_S) / 1000;
-        kept.budget_bytes = kept.budget_bytes.saturating_add(earned).min(BURST_BYTES);
-        kept.budget_ms = now_ms;
-        let left = kept.budget_bytes.checked_sub(bytes as u64);
-        kept.budget_bytes = left.unwrap_or(kept.budget_bytes);
+        let earned = now_ms.saturating_sub(buffer.budget_ms).saturating_mul(BYTES_PER_S) / 1000;
+        buffer.budget_bytes = buffer.budget_bytes.saturating_add(earned).min(BURST_BYTES);
+        buffer.budget_ms = now_ms;
+        let left = buffer.budget_bytes.checked_sub(bytes as u64);
+        buffer.budget_bytes = left.unwrap_or(buffer.budget_bytes);
         left.is_some()
     }
 
     /// Stores a robot's batch, and hands it to the followers.
-    pub fn take(&self, mut batch: LogBatch, now_ms: u64) {
+    pub fn record(&self, mut batch: LogBatch, now_ms: u64) {
         batch.lines.truncate(MAX_BATCH_LINES);
         batch.lines.iter_mut().for_each(|line| line.text = one_line(&line.text));
         let mut state = self.state();
         let share = self.max_bytes / state.robots.len().max(1);
-        let kept = state.robots.entry(batch.robot_id.clone()).or_default();
-        let before = kept.bytes;
-        (kept.robot_ms, kept.received_ms) = (batch.now_ms, now_ms);
-        kept.suppressed = kept.suppressed.saturating_add(batch.suppressed);
+        let buffer = state.robots.entry(batch.robot_id.clone()).or_default();
+        let before = buffer.bytes;
+        (buffer.robot_ms, buffer.received_ms) = (batch.now_ms, now_ms);
+        buffer.suppressed = buffer.suppressed.saturating_add(batch.suppressed);
         for line in &batch.lines {
-            kept.bytes += size(line);
-            kept.lines.push_back(line.clone());
+            buffer.bytes += size(line);
+            buffer.lines.push_back(line.clone());
         }
-        kept.shrink(share);
-        let after = kept.bytes;
+        buffer.shrink(share);
+        let after = buffer.bytes;
         state.bytes = state.bytes + after - before;
         if state.bytes > self.max_bytes {
             // Frees more than needed, or the next line would cause the same work again.
@@ -143,17 +143,17 @@ impl RobotLogs {
         }
         if let Some(followed) = state.followed.get(&batch.robot_id) {
             // The followers may just have left.
-            let _ = followed.told.send(Told::Lines(Arc::new(batch)));
+            let _ = followed.events.send(FollowEvent::Lines(Arc::new(batch)));
         }
     }
 
     /// The lines of `robot` in memory.
-    pub fn remembered(&self, robot: &RobotId) -> Option<Remembered> {
+    pub fn snapshot(&self, robot: &RobotId) -> Option<LogSnapshot> {
         let state = self.state();
-        let kept = state.robots.get(robot).filter(|kept| kept.received_ms > 0)?;
-        let Kept { robot_ms, received_ms, suppressed, .. } = *kept;
-        Some(Remembered {
-            lines: kept.lines.iter().cloned().collect(),
+        let buffer = state.robots.get(robot).filter(|buffer| buffer.received_ms > 0)?;
+        let LineBuffer { robot_ms, received_ms, suppressed, .. } = *buffer;
+        Some(LogSnapshot {
+            lines: buffer.lines.iter().cloned().collect(),
             robot_ms,
             received_ms,
             suppressed,
@@ -163,7 +163,7 @@ impl RobotLogs {
     /// Forgets a removed robot. The streams of its followers end.
     pub fn forget(&self, robot: &RobotId) {
         let mut state = self.state();
-        let bytes = state.robots.remove(robot).map_or(0, |kept| kept.bytes);
+        let bytes = state.robots.remove(robot).map_or(0, |buffer| buffer.bytes);
         state.bytes -= bytes;
         if let Some(followed) = state.followed.remove(robot) {
             // The task that sends requests to the robot has no robot any more.
@@ -172,29 +172,29 @@ impl RobotLogs {
     }
 
     /// Follows `robot`: lines of `level` and above.
-    pub fn follow(&self, robot: &RobotId, level: LogLevel) -> Joined {
+    pub fn follow(&self, robot: &RobotId, level: LogLevel) -> Subscription {
         let mut state = self.state();
         state.followers += 1;
         let number = state.followers;
         let is_first = !state.followed.contains_key(robot);
-        let followed = state.followed.entry(robot.clone()).or_insert_with(|| Followed {
-            told: broadcast::Sender::new(BACKLOG),
+        let followed = state.followed.entry(robot.clone()).or_insert_with(|| FollowedRobot {
+            events: broadcast::Sender::new(BACKLOG),
             levels: BTreeMap::new(),
             changed: Arc::default(),
         });
         followed.levels.insert(number, level);
         followed.changed.notify_one();
-        let told = followed.told.subscribe();
-        Joined {
+        let events = followed.events.subscribe();
+        Subscription {
             follower: Follower { logs: self.clone(), robot: robot.clone(), number },
-            told,
+            events,
             is_first,
         }
     }
 
     /// The lowest level that the followers of `robot` want; `None` without followers. The task that
     /// sends requests to the robot then ends, and the next follower is a first one.
-    pub fn wanted(&self, robot: &RobotId) -> Option<LogLevel> {
+    pub fn requested_level(&self, robot: &RobotId) -> Option<LogLevel> {
         let mut state = self.state();
         let level = state.followed.get(robot)?.levels.values().min().copied();
         if level.is_none() {
@@ -216,10 +216,10 @@ impl RobotLogs {
     }
 
     /// Sends an event to the followers of `robot`.
-    pub fn tell(&self, robot: &RobotId, told: Told) {
+    pub fn notify_followers(&self, robot: &RobotId, event: FollowEvent) {
         if let Some(followed) = self.state().followed.get(robot) {
             // The followers may just have left.
-            let _ = followed.told.send(told);
+            let _ = followed.events.send(event);
         }
     }
 
@@ -238,12 +238,12 @@ impl Default for RobotLogs {
 
 impl State {
     fn shrink(&mut self, share: usize) {
-        self.robots.values_mut().for_each(|kept| kept.shrink(share));
-        self.bytes = self.robots.values().map(|kept| kept.bytes).sum();
+        self.robots.values_mut().for_each(|buffer| buffer.shrink(share));
+        self.bytes = self.robots.values().map(|buffer| buffer.bytes).sum();
     }
 }
 
-impl Kept {
+impl LineBuffer {
     fn shrink(&mut self, share: usize) {
         while self.lines.len() > MAX_ROBOT_LINES || self.bytes > share {
             let Some(oldest) = self.lines.pop_front() else { break };
@@ -280,7 +280,7 @@ fn one_line(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use task_proto::log::LogSource;
+    use task_proto::telemetry::log::LogSource;
 
     fn batch(robot: &RobotId, texts: impl IntoIterator<Item = String>) -> LogBatch {
         let line = |text| LogLine {
@@ -300,36 +300,37 @@ mod tests {
     }
 
     fn texts(logs: &RobotLogs, robot: &RobotId) -> Vec<String> {
-        logs.remembered(robot)
-            .map_or_else(Vec::new, |kept| kept.lines.into_iter().map(|line| line.text).collect())
+        logs.snapshot(robot).map_or_else(Vec::new, |buffer| {
+            buffer.lines.into_iter().map(|line| line.text).collect()
+        })
     }
 
     #[test]
     fn the_newest_lines_of_each_robot_are_remembered() {
         let (logs, robot) = (RobotLogs::new(), RobotId::random());
-        assert_eq!(logs.remembered(&robot), None);
+        assert_eq!(logs.snapshot(&robot), None);
         for number in 0..3 {
-            logs.take(batch(&robot, (0..100).map(|line| format!("{number} {line}"))), 9);
+            logs.record(batch(&robot, (0..100).map(|line| format!("{number} {line}"))), 9);
         }
-        let kept = logs.remembered(&robot).expect("remembered");
-        assert_eq!((kept.robot_ms, kept.received_ms, kept.suppressed), (5, 9, 3));
-        assert_eq!((kept.lines.len(), kept.lines[0].text.as_str()), (MAX_ROBOT_LINES, "1 0"));
+        let buffer = logs.snapshot(&robot).expect("remembered");
+        assert_eq!((buffer.robot_ms, buffer.received_ms, buffer.suppressed), (5, 9, 3));
+        assert_eq!((buffer.lines.len(), buffer.lines[0].text.as_str()), (MAX_ROBOT_LINES, "1 0"));
         logs.forget(&robot);
         assert_eq!((texts(&logs, &robot).len(), logs.state().bytes), (0, 0));
     }
 
     #[test]
-    fn all_robots_together_have_a_bound_and_each_its_share() {
+    fn total_memory_is_bounded_and_shared_by_all_robots() {
         let logs = RobotLogs { max_bytes: 100_000, ..RobotLogs::new() };
         let robots: Vec<RobotId> = (0..50).map(|_| RobotId::random()).collect();
         for robot in &robots {
-            logs.take(batch(robot, (0..100).map(|line| format!("line {line}"))), 9);
+            logs.record(batch(robot, (0..100).map(|line| format!("line {line}"))), 9);
             assert!(logs.state().bytes <= 100_000);
         }
         for robot in &robots {
-            logs.take(batch(robot, ["the last".to_owned()]), 9);
+            logs.record(batch(robot, ["the last".to_owned()]), 9);
         }
-        let bytes: usize = logs.state().robots.values().map(|kept| kept.bytes).sum();
+        let bytes: usize = logs.state().robots.values().map(|buffer| buffer.bytes).sum();
         assert_eq!(bytes, logs.state().bytes);
         assert!(
             robots
@@ -338,23 +339,20 @@ mod tests {
         );
         assert!(
             robots.iter().all(|robot| texts(&logs, robot).len() > 1),
-            "nobody is left with nothing"
+            "each robot keeps some lines"
         );
-        let has_room = |kept: &Kept| kept.lines.capacity() > 2 * kept.lines.len();
-        assert!(
-            !logs.state().robots.values().any(has_room),
-            "room that no line needs is given back"
-        );
+        let has_room = |buffer: &LineBuffer| buffer.lines.capacity() > 2 * buffer.lines.len();
+        assert!(!logs.state().robots.values().any(has_room), "unused capacity is released");
     }
 
     #[test]
-    fn what_a_robot_publishes_is_bounded_and_made_harmless() {
+    fn published_lines_are_bounded_and_sanitized() {
         let (logs, robot) = (RobotLogs::new(), RobotId::random());
         let burst = (0..).take_while(|_| logs.admits(&robot, 100 * 1024, 1000)).count();
         assert_eq!(burst as u64, BURST_BYTES / (100 * 1024));
         assert!(!logs.admits(&robot, 100 * 1024, 1100) && logs.admits(&robot, 100 * 1024, 1500));
-        assert_eq!(logs.remembered(&robot), None, "nothing was published yet");
-        logs.take(batch(&robot, ["a\u{1b}[31mb\nc".to_owned(), "é".repeat(MAX_LINE_BYTES)]), 9);
+        assert_eq!(logs.snapshot(&robot), None, "nothing was published yet");
+        logs.record(batch(&robot, ["a\u{1b}[31mb\nc".to_owned(), "é".repeat(MAX_LINE_BYTES)]), 9);
         let shown = texts(&logs, &robot);
         assert_eq!(shown[0], "a\u{fffd}[31mb\u{fffd}c");
         assert!(shown[1].len() <= MAX_LINE_BYTES);
@@ -363,32 +361,38 @@ mod tests {
     #[tokio::test]
     async fn following_ends_with_the_robot() {
         let (logs, robot) = (RobotLogs::new(), RobotId::random());
-        let mut joined = logs.follow(&robot, LogLevel::Info);
+        let mut subscription = logs.follow(&robot, LogLevel::Info);
         let changed = logs.changed(&robot).expect("followed");
         logs.forget(&robot);
-        assert!(matches!(joined.told.recv().await, Err(broadcast::error::RecvError::Closed)));
+        assert!(matches!(
+            subscription.events.recv().await,
+            Err(broadcast::error::RecvError::Closed)
+        ));
         changed.notified().await;
-        assert_eq!(logs.wanted(&robot), None, "whoever asks it stops");
-        drop(joined);
+        assert_eq!(logs.requested_level(&robot), None, "the requesting task stops");
+        drop(subscription);
         assert!(logs.state().followed.is_empty());
     }
 
     #[test]
-    fn one_follower_asks_the_robot_for_all() {
+    fn first_follower_requests_lines_for_all() {
         let (logs, robot) = (RobotLogs::new(), RobotId::random());
         let mut first = logs.follow(&robot, LogLevel::Warn);
         let second = logs.follow(&robot, LogLevel::Debug);
         assert!(first.is_first && !second.is_first);
-        assert_eq!(logs.wanted(&robot), Some(LogLevel::Debug));
+        assert_eq!(logs.requested_level(&robot), Some(LogLevel::Debug));
         drop(second);
-        assert_eq!(logs.wanted(&robot), Some(LogLevel::Warn));
-        logs.take(batch(&robot, ["x".to_owned()]), 9);
+        assert_eq!(logs.requested_level(&robot), Some(LogLevel::Warn));
+        logs.record(batch(&robot, ["x".to_owned()]), 9);
         assert!(
-            matches!(first.told.try_recv(), Ok(Told::Lines(batch)) if batch.lines[0].text == "x")
+            matches!(first.events.try_recv(), Ok(FollowEvent::Lines(batch)) if batch.lines[0].text == "x")
         );
         drop(first.follower);
-        assert!(!logs.follow(&robot, LogLevel::Info).is_first, "whoever asks has not noticed yet");
-        assert_eq!(logs.wanted(&robot), None);
+        assert!(
+            !logs.follow(&robot, LogLevel::Info).is_first,
+            "the requesting task has not noticed yet"
+        );
+        assert_eq!(logs.requested_level(&robot), None);
         assert!(logs.follow(&robot, LogLevel::Info).is_first);
     }
 }

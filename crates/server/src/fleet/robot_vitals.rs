@@ -6,24 +6,24 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use task_proto::RobotId;
-use task_proto::vitals::Vitals;
+use task_proto::telemetry::vitals::Vitals;
 
 /// Retention of a sample.
-const KEPT_MS: u64 = 60 * 60 * 1000;
+const RETENTION_MS: u64 = 60 * 60 * 1000;
 /// Maximum samples of a robot.
 const MAX_SAMPLES: usize = 60;
 /// Samples with a shorter distance to the previous one are shown and not stored: the samples must
 /// span an hour.
-const LEAST_GAP_MS: u64 = KEPT_MS / MAX_SAMPLES as u64 * 9 / 10;
+const MIN_GAP_MS: u64 = RETENTION_MS / MAX_SAMPLES as u64 * 9 / 10;
 /// Maximum robots in memory; beyond the limit, the longest silent robots are forgotten.
 const MAX_ROBOTS: usize = 50_000;
 
 /// The vitals of all robots; clones share them.
 #[derive(Clone, Default)]
-pub struct RobotVitals(Arc<Mutex<HashMap<RobotId, Kept>>>);
+pub struct RobotVitals(Arc<Mutex<HashMap<RobotId, VitalsHistory>>>);
 
 #[derive(Default)]
-struct Kept {
+struct VitalsHistory {
     newest: Vitals,
     /// When the last sample arrived.
     sampled_ms: u64,
@@ -53,7 +53,7 @@ const _: () = assert!(size_of::<Sample>() == 16, "the last hour of ten thousand 
 /// The encoding of "unknown".
 const NONE: u16 = u16::MAX;
 const NONE_8: u8 = u8::MAX;
-const COLDEST_C: f32 = -50.0;
+const MIN_TEMPERATURE_C: f32 = -50.0;
 
 /// Bytes per second, to a precision of a thousandth: eleven bits, and the number of bits by which
 /// they are shifted.
@@ -62,47 +62,47 @@ struct Rate(u16);
 
 impl RobotVitals {
     /// Stores a robot's vitals, and returns them as displayed.
-    pub fn take(&self, robot: &RobotId, said: Vitals, now_ms: u64) -> Vitals {
+    pub fn record(&self, robot: &RobotId, reported: Vitals, now_ms: u64) -> Vitals {
         let mut robots = self.robots();
         if robots.len() >= MAX_ROBOTS && !robots.contains_key(robot) {
             make_room(&mut robots);
         }
-        let kept = robots.entry(robot.clone()).or_default();
-        kept.newest = Vitals { at_ms: now_ms, ..sound(said) };
-        if now_ms < kept.sampled_ms {
+        let history = robots.entry(robot.clone()).or_default();
+        history.newest = Vitals { at_ms: now_ms, ..sanitized(reported) };
+        if now_ms < history.sampled_ms {
             // This machine's clock was set back, so the stored samples lie in the future.
-            kept.samples.clear();
+            history.samples.clear();
         }
-        let gap_ms = now_ms.saturating_sub(kept.sampled_ms);
-        if kept.samples.is_empty() || gap_ms >= LEAST_GAP_MS {
-            if kept.samples.len() >= MAX_SAMPLES {
-                kept.samples.pop_front();
+        let gap_ms = now_ms.saturating_sub(history.sampled_ms);
+        if history.samples.is_empty() || gap_ms >= MIN_GAP_MS {
+            if history.samples.len() >= MAX_SAMPLES {
+                history.samples.pop_front();
             }
             let after_s = u16::try_from(gap_ms / 1000).unwrap_or(u16::MAX);
-            kept.samples.push_back(Sample::pack(&kept.newest, after_s));
-            kept.sampled_ms = now_ms;
+            history.samples.push_back(Sample::pack(&history.newest, after_s));
+            history.sampled_ms = now_ms;
         }
-        kept.newest
+        history.newest
     }
 
     pub fn newest(&self, robot: &RobotId) -> Option<Vitals> {
-        self.robots().get(robot).map(|kept| kept.newest)
+        self.robots().get(robot).map(|history| history.newest)
     }
 
     /// The vitals of the last hour, the oldest first.
     pub fn last_hour(&self, robot: &RobotId, now_ms: u64) -> Vec<Vitals> {
         let robots = self.robots();
-        let Some(kept) = robots.get(robot) else { return Vec::new() };
-        let mut at_ms = kept.sampled_ms;
-        let mut samples = Vec::with_capacity(kept.samples.len() + 1);
-        if kept.newest.at_ms > kept.sampled_ms {
-            samples.push(kept.newest);
+        let Some(history) = robots.get(robot) else { return Vec::new() };
+        let mut at_ms = history.sampled_ms;
+        let mut samples = Vec::with_capacity(history.samples.len() + 1);
+        if history.newest.at_ms > history.sampled_ms {
+            samples.push(history.newest);
         }
-        for sample in kept.samples.iter().rev() {
-            samples.push(sample.unpack(at_ms, &kept.newest));
+        for sample in history.samples.iter().rev() {
+            samples.push(sample.unpack(at_ms, &history.newest));
             at_ms = at_ms.saturating_sub(u64::from(sample.after_s) * 1000);
         }
-        samples.retain(|sample| now_ms.saturating_sub(sample.at_ms) <= KEPT_MS);
+        samples.retain(|sample| now_ms.saturating_sub(sample.at_ms) <= RETENTION_MS);
         samples.reverse();
         samples
     }
@@ -112,7 +112,7 @@ impl RobotVitals {
         self.robots().remove(robot);
     }
 
-    fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, Kept>> {
+    fn robots(&self) -> MutexGuard<'_, HashMap<RobotId, VitalsHistory>> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
@@ -120,9 +120,9 @@ impl RobotVitals {
 }
 
 /// Forgets the longest silent sixteenth of the robots, so that the next scan is far off.
-fn make_room(robots: &mut HashMap<RobotId, Kept>) {
+fn make_room(robots: &mut HashMap<RobotId, VitalsHistory>) {
     let mut silent: Vec<(u64, RobotId)> =
-        robots.iter().map(|(robot, kept)| (kept.newest.at_ms, robot.clone())).collect();
+        robots.iter().map(|(robot, history)| (history.newest.at_ms, robot.clone())).collect();
     silent.sort_unstable();
     for (_, robot) in silent.into_iter().take(MAX_ROBOTS / 16) {
         robots.remove(&robot);
@@ -130,7 +130,7 @@ fn make_room(robots: &mut HashMap<RobotId, Kept>) {
 }
 
 /// Removes impossible figures: a robot's data is not trusted.
-fn sound(said: Vitals) -> Vitals {
+fn sanitized(reported: Vitals) -> Vitals {
     let used = |used: Option<u64>, total: Option<u64>| {
         used.zip(total).map(|(used, total)| used.min(total))
     };
@@ -138,13 +138,13 @@ fn sound(said: Vitals) -> Vitals {
         value.filter(|value| value.is_finite()).map(|value| value.clamp(least, most))
     };
     Vitals {
-        cpu_percent: finite(said.cpu_percent, 0.0, 100.0),
-        memory_used_bytes: used(said.memory_used_bytes, said.memory_total_bytes),
-        disk_used_bytes: used(said.disk_used_bytes, said.disk_total_bytes),
-        load_1m: finite(said.load_1m, 0.0, 100_000.0),
-        battery_percent: said.battery_percent.map(|percent| percent.min(100)),
-        temperature_c: finite(said.temperature_c, COLDEST_C, 200.0),
-        ..said
+        cpu_percent: finite(reported.cpu_percent, 0.0, 100.0),
+        memory_used_bytes: used(reported.memory_used_bytes, reported.memory_total_bytes),
+        disk_used_bytes: used(reported.disk_used_bytes, reported.disk_total_bytes),
+        load_1m: finite(reported.load_1m, 0.0, 100_000.0),
+        battery_percent: reported.battery_percent.map(|percent| percent.min(100)),
+        temperature_c: finite(reported.temperature_c, MIN_TEMPERATURE_C, 200.0),
+        ..reported
     }
 }
 
@@ -159,7 +159,8 @@ impl Sample {
         let hundredths = |value: Option<f32>| {
             value.map_or(NONE, |value| (value * 100.0).round().min(65_534.0) as u16)
         };
-        let above_coldest = |celsius: f32| (celsius - COLDEST_C).round().clamp(0.0, 254.0) as u8;
+        let above_minimum =
+            |celsius: f32| (celsius - MIN_TEMPERATURE_C).round().clamp(0.0, 254.0) as u8;
         Self {
             after_s,
             cpu: hundredths(vitals.cpu_percent),
@@ -169,7 +170,7 @@ impl Sample {
             network_out: Rate::pack(vitals.network_out_bytes_per_s),
             load: hundredths(vitals.load_1m),
             battery: vitals.battery_percent.unwrap_or(NONE_8),
-            temperature: vitals.temperature_c.map_or(NONE_8, above_coldest),
+            temperature: vitals.temperature_c.map_or(NONE_8, above_minimum),
         }
     }
 
@@ -194,7 +195,7 @@ impl Sample {
             load_1m: hundredths(self.load),
             battery_percent: (self.battery != NONE_8).then_some(self.battery),
             temperature_c: (self.temperature != NONE_8)
-                .then(|| f32::from(self.temperature) + COLDEST_C),
+                .then(|| f32::from(self.temperature) + MIN_TEMPERATURE_C),
         }
     }
 }
@@ -208,9 +209,9 @@ impl Rate {
             return Self(NONE);
         };
         let shift = (u64::BITS - bytes_per_s.leading_zeros()).saturating_sub(Self::BITS);
-        let kept = bytes_per_s >> shift;
+        let bits = bytes_per_s >> shift;
         // At most 11 bits above 5, so the value fits.
-        Self(u16::try_from(kept << 5 | u64::from(shift)).unwrap_or(NONE))
+        Self(u16::try_from(bits << 5 | u64::from(shift)).unwrap_or(NONE))
     }
 
     fn unpack(self) -> Option<u64> {
@@ -241,10 +242,10 @@ mod tests {
     }
 
     #[test]
-    fn the_last_hour_is_kept_and_no_more() {
+    fn only_the_last_hour_is_kept() {
         let (all, robot) = (RobotVitals::default(), RobotId::random());
         for minute in 0..100 {
-            all.take(&robot, vitals(minute as f32), minute * MINUTE_MS);
+            all.record(&robot, vitals(minute as f32), minute * MINUTE_MS);
         }
         let shown = all.last_hour(&robot, 99 * MINUTE_MS);
         let of = |sample: &Vitals| (sample.at_ms / MINUTE_MS, sample.cpu_percent);
@@ -257,24 +258,24 @@ mod tests {
     }
 
     #[test]
-    fn a_clock_that_is_set_back_begins_anew() {
+    fn clock_set_back_restarts_the_samples() {
         let (robots, robot) = (RobotVitals::default(), RobotId::random());
-        robots.take(&robot, vitals(10.0), 7_200_000);
-        robots.take(&robot, vitals(20.0), 60_000);
-        robots.take(&robot, vitals(30.0), 120_000);
+        robots.record(&robot, vitals(10.0), 7_200_000);
+        robots.record(&robot, vitals(20.0), 60_000);
+        robots.record(&robot, vitals(30.0), 120_000);
         let hour: Vec<_> = robots
             .last_hour(&robot, 120_000)
             .iter()
-            .map(|said| (said.at_ms, said.cpu_percent))
+            .map(|reported| (reported.at_ms, reported.cpu_percent))
             .collect();
         assert_eq!(hour, [(60_000, Some(20.0)), (120_000, Some(30.0))]);
     }
 
     #[test]
-    fn who_says_it_every_two_seconds_gets_no_more_room() {
+    fn frequent_samples_take_no_more_memory() {
         let (all, robot) = (RobotVitals::default(), RobotId::random());
         for second in 0..1800 {
-            all.take(&robot, vitals(1.0), second * 2000);
+            all.record(&robot, vitals(1.0), second * 2000);
         }
         let shown = all.last_hour(&robot, 3_599_000);
         assert!((60..=MAX_SAMPLES + 1).contains(&shown.len()), "{}", shown.len());
@@ -283,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_packed_is_nearly_the_same() {
+    fn packed_sample_keeps_its_values() {
         let given = vitals(12.34);
         let packed = Sample::pack(&given, 60).unpack(9, &given);
         let near = |one: Option<u64>, other: Option<u64>| {
@@ -305,8 +306,8 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_may_say_anything() {
-        let said = Vitals {
+    fn impossible_values_are_clamped() {
+        let reported = Vitals {
             cpu_percent: Some(f32::INFINITY),
             memory_used_bytes: Some(u64::MAX),
             memory_total_bytes: Some(0),
@@ -318,7 +319,7 @@ mod tests {
             ..Vitals::default()
         };
         let (all, robot) = (RobotVitals::default(), RobotId::random());
-        let newest = all.take(&robot, said, 5);
+        let newest = all.record(&robot, reported, 5);
         assert_eq!(
             (newest.cpu_percent, newest.memory_used_bytes, newest.disk_used_bytes),
             (None, Some(0), None)

@@ -11,7 +11,8 @@ use task_proto::api;
 
 use crate::blobs::BlobError;
 use crate::domain::person::Person;
-use crate::orders::actions::ActionError;
+use crate::orders::actions::{DeploymentError, OrderError, PersonError, RobotError};
+use crate::orders::desired_states::DesiredStateError;
 use crate::orders::report_writer::ReportError;
 use crate::store::{Fault, StoreError};
 
@@ -53,15 +54,14 @@ impl ApiError {
 
     /// 401: the robot was revoked.
     pub fn robot_revoked() -> Self {
-        let message =
-            "this robot was revoked: it comes back only by an enrolment with a token made for it";
+        let message = "this robot was revoked: enroll it again with a token made for it";
         Self::new(StatusCode::UNAUTHORIZED, ROBOT_REVOKED, message)
     }
 
     /// 403: the robot waits to be approved.
     pub fn awaits_approval() -> Self {
         let message =
-            "this robot waits to be approved: an administrator does that with taskd robot approve";
+            "this robot waits for approval: an administrator approves it with taskd robot approve";
         Self::new(StatusCode::FORBIDDEN, api::AWAITS_APPROVAL, message)
     }
 
@@ -103,7 +103,7 @@ impl ApiError {
         Self::new(
             StatusCode::INTERNAL_SERVER_ERROR,
             "internal",
-            "the server failed; its log says why",
+            "internal error; see the server's log",
         )
     }
 
@@ -177,11 +177,13 @@ impl From<Fault> for ApiError {
     fn from(fault: Fault) -> Self {
         match fault {
             Fault::Corrupt => {
-                let message = "the server's database is corrupt, so nothing is changed until it is mended; taskd doctor says more";
+                let message = "the server's database is corrupt and accepts no changes until it is repaired; run taskd doctor";
                 Self::new(StatusCode::SERVICE_UNAVAILABLE, DATABASE_CORRUPT, message)
             }
             Fault::Full => Self::disk_full(),
-            Fault::Away => Self::unavailable("the server's database does not answer; try again"),
+            Fault::Unreachable => {
+                Self::unavailable("the server's database does not answer; try again")
+            }
             Fault::Busy => Self::unavailable("the server's database is busy; try again"),
         }
     }
@@ -199,55 +201,101 @@ impl From<StoreError> for ApiError {
     }
 }
 
-impl From<ActionError> for ApiError {
-    fn from(error: ActionError) -> Self {
-        let status = match error {
-            ActionError::Store(error) => return error.into(),
-            ActionError::PasswordFailed => return Self::internal(&error),
-            ActionError::Invalid { .. } | ActionError::InvalidIdempotencyKey => {
-                StatusCode::BAD_REQUEST
-            }
-            ActionError::TokenRefused | ActionError::SignInRefused => StatusCode::UNAUTHORIZED,
-            ActionError::TokenForOther { .. }
-            | ActionError::OutOfScope { .. }
-            | ActionError::NotPermitted(_)
-            | ActionError::NoRole { .. }
-            | ActionError::NoName => StatusCode::FORBIDDEN,
-            ActionError::TooManyEnrolments { seconds } => {
-                return Self { retry_after_s: seconds, ..Self::too_many(error.to_string()) };
-            }
-            ActionError::SignInBlocked { .. }
-            | ActionError::TooManySignIns
-            | ActionError::TooManyPending(_) => StatusCode::TOO_MANY_REQUESTS,
-            ActionError::RobotNotFound(_)
-            | ActionError::DeploymentNotFound(_)
-            | ActionError::PackageNotFound(..)
-            | ActionError::UserNotFound(_)
-            | ActionError::TokenNotFound(_)
-            | ActionError::EnrolmentNotFound(_) => StatusCode::NOT_FOUND,
-            ActionError::UnknownRobots(_) => StatusCode::NOT_FOUND,
-            ActionError::TooLargeForInline { .. } => StatusCode::UNPROCESSABLE_ENTITY,
-            ActionError::NoRobotsMatch(_)
-            | ActionError::IdempotencyKeyReused(_)
-            | ActionError::MacKnown { .. }
-            | ActionError::NameTaken(_)
-            | ActionError::EnrolledAnew(_)
-            | ActionError::NotPending(_)
-            | ActionError::DeploymentCancelled(_)
-            | ActionError::NotPaused { .. }
-            | ActionError::NothingToCancel(_)
-            | ActionError::NothingToRetry(_)
-            | ActionError::NothingToRollBack(_)
-            | ActionError::UserExists(_)
-            | ActionError::OfProvider(_)
-            | ActionError::LastAdministrator(_)
-            | ActionError::Diverged(_) => StatusCode::CONFLICT,
+impl From<OrderError> for ApiError {
+    fn from(error: OrderError) -> Self {
+        let (status, code) = match error {
+            OrderError::Store(error) => return error.into(),
+            OrderError::Invalid { .. } => return Self::invalid(error.to_string()),
+            OrderError::NoRobotsMatch(_) => (StatusCode::CONFLICT, "no_robots_match"),
+            OrderError::UnknownRobots(_) => (StatusCode::NOT_FOUND, "unknown_robots"),
+            OrderError::OutOfScope { .. } => (StatusCode::FORBIDDEN, "out_of_scope"),
+            OrderError::IdempotencyKeyReused(_) => (StatusCode::CONFLICT, "idempotency_key_reused"),
         };
-        let retry_after_s = match &error {
-            ActionError::SignInBlocked { seconds } => *seconds,
-            _ => RETRY_AFTER_S,
+        Self::new(status, code, error.to_string())
+    }
+}
+
+impl From<RobotError> for ApiError {
+    fn from(error: RobotError) -> Self {
+        let message = error.to_string();
+        let code = match error {
+            RobotError::Order(error) => return error.into(),
+            RobotError::NotFound(_) | RobotError::EnrollmentTokenNotFound(_) => {
+                return Self::not_found(message);
+            }
+            RobotError::TokenRefused => return Self::unauthorized(message),
+            RobotError::TokenForOther { .. } => {
+                return Self::new(StatusCode::FORBIDDEN, "token_for_other_robot", message);
+            }
+            RobotError::TooManyPending(_) => return Self::too_many(message),
+            RobotError::TooManyEnrollments { seconds } => {
+                return Self { retry_after_s: seconds, ..Self::too_many(message) };
+            }
+            RobotError::NameTaken(_) => "name_taken",
+            RobotError::MacKnown { .. } => "mac_known",
+            RobotError::EnrolledAgain(_) => "enrolled_anew",
+            RobotError::NotPending(_) => "not_pending",
         };
-        Self { retry_after_s, ..Self::new(status, error.code(), error.to_string()) }
+        Self::conflict(code, message)
+    }
+}
+
+impl From<DeploymentError> for ApiError {
+    fn from(error: DeploymentError) -> Self {
+        let message = error.to_string();
+        let code = match error {
+            DeploymentError::Order(error) => return error.into(),
+            DeploymentError::NotFound(_) => return Self::not_found(message),
+            DeploymentError::PackageNotFound(..) => {
+                return Self::new(StatusCode::NOT_FOUND, "package_not_found", message);
+            }
+            DeploymentError::TooLargeForInline { .. } => {
+                return Self::new(StatusCode::UNPROCESSABLE_ENTITY, "package_too_large", message);
+            }
+            DeploymentError::Cancelled(_) => "deployment_cancelled",
+            DeploymentError::NothingToCancel(_) => "nothing_to_cancel",
+            DeploymentError::NotPaused { .. } => "not_paused",
+            DeploymentError::NothingToRetry(_) => "nothing_to_retry",
+            DeploymentError::NothingToRollBack(_) => "nothing_to_roll_back",
+        };
+        Self::conflict(code, message)
+    }
+}
+
+impl From<PersonError> for ApiError {
+    fn from(error: PersonError) -> Self {
+        let message = error.to_string();
+        let code = match error {
+            PersonError::Order(error) => return error.into(),
+            PersonError::PasswordFailed => return Self::internal(&error),
+            PersonError::UserNotFound(_) | PersonError::TokenNotFound(_) => {
+                return Self::not_found(message);
+            }
+            PersonError::SignInRefused => return Self::unauthorized(message),
+            PersonError::NotPermitted(_) => return Self::forbidden(message),
+            PersonError::NoRole { .. } => {
+                return Self::new(StatusCode::FORBIDDEN, "no_role", message);
+            }
+            PersonError::NoName => return Self::new(StatusCode::FORBIDDEN, "no_name", message),
+            PersonError::TooManySignIns => return Self::too_many(message),
+            PersonError::SignInBlocked { seconds } => {
+                return Self { retry_after_s: seconds, ..Self::too_many(message) };
+            }
+            PersonError::UserExists(_) => "user_exists",
+            PersonError::ManagedByProvider(_) => "of_provider",
+            PersonError::LastAdministrator(_) => "last_administrator",
+        };
+        Self::conflict(code, message)
+    }
+}
+
+impl From<DesiredStateError> for ApiError {
+    fn from(error: DesiredStateError) -> Self {
+        match error {
+            DesiredStateError::RobotNotFound(_) => Self::not_found(error.to_string()),
+            DesiredStateError::Diverged(_) => Self::conflict("diverged", error.to_string()),
+            DesiredStateError::Store(error) => error.into(),
+        }
     }
 }
 

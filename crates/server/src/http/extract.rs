@@ -11,10 +11,10 @@ use http::{HeaderValue, StatusCode, header};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
-use task_proto::api::MOST_ON_A_PAGE;
+use task_proto::api::MAX_PAGE_ENTRIES;
 
 use super::error::ApiError;
-use crate::orders::actions::IdempotencyKey;
+use crate::orders::actions::{IdempotencyKey, InvalidIdempotencyKey};
 
 /// A JSON body from an operator. Unknown fields are refused: an order with an ignored field would
 /// be carried out only in part.
@@ -94,11 +94,11 @@ fn refuse_unknown_fields<T: Serialize>(body: &[u8], value: &T) -> Result<(), Api
 fn unknown_field(given: &serde_json::Map<String, Value>, known: &Value) -> Option<String> {
     given.iter().find_map(|(key, value)| {
         let Some(known) = known.get(key) else { return Some(key.clone()) };
-        let says_something = |(_, value): &(&String, &Value)| {
+        let is_present = |(_, value): &(&String, &Value)| {
             !value.is_null() && value.as_object().is_none_or(|o| !o.is_empty())
         };
-        let said = value.as_object()?.iter().filter(says_something);
-        let given = said.map(|(key, value)| (key.clone(), value.clone())).collect();
+        let present = value.as_object()?.iter().filter(is_present);
+        let given = present.map(|(key, value)| (key.clone(), value.clone())).collect();
         Some(format!("{key}.{}", unknown_field(&given, known)?))
     })
 }
@@ -160,18 +160,19 @@ impl<S: Send + Sync, T: DeserializeOwned> FromRequestParts<S> for QueryParams<T>
 /// Checks the number of entries per page.
 pub fn page_limit(limit: Option<u32>) -> Result<Option<u32>, ApiError> {
     match limit {
-        None | Some(1..=MOST_ON_A_PAGE) => Ok(limit),
+        None | Some(1..=MAX_PAGE_ENTRIES) => Ok(limit),
         Some(other) => {
-            Err(ApiError::invalid(format!("limit: expected 1 to {MOST_ON_A_PAGE}, not {other}")))
+            Err(ApiError::invalid(format!("limit: expected 1 to {MAX_PAGE_ENTRIES}, not {other}")))
         }
     }
 }
 
 /// Parses the key that makes an order safe to repeat.
 pub fn idempotency_key(value: Option<&HeaderValue>) -> Result<IdempotencyKey, ApiError> {
-    let value =
-        value.ok_or_else(|| ApiError::invalid("Idempotency-Key: an order needs this header"))?;
-    Ok(value.to_str().unwrap_or_default().parse()?)
+    let value = value
+        .ok_or_else(|| ApiError::invalid("Idempotency-Key: the header is required for an order"))?;
+    let key = value.to_str().unwrap_or_default().parse();
+    key.map_err(|error: InvalidIdempotencyKey| ApiError::invalid(error.to_string()))
 }
 
 #[cfg(test)]
@@ -180,7 +181,7 @@ mod tests {
     use task_proto::api::CreateDeployment;
 
     #[test]
-    fn a_body_that_does_not_fit_names_the_field() {
+    fn invalid_body_names_the_field() {
         let digest = task_proto::Digest::of(b"x");
         let body = |rest: &str| {
             format!(r#"{{"package": "talker", "manifest": "{digest}", "selector": "*"{rest}}}"#)

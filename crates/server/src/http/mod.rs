@@ -13,7 +13,7 @@ mod orders;
 pub mod registry;
 pub mod server;
 pub mod shared_lists;
-mod views;
+pub mod views;
 
 use std::net::IpAddr;
 use std::ops::Deref;
@@ -28,33 +28,42 @@ use axum::middleware;
 use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodFilter, MethodRouter, any, on};
 use http::{HeaderValue, Method, StatusCode, header};
-use task_proto::CaPin;
-use task_proto::envelope::PublicKey;
-use task_proto::person::Permission;
-use task_proto::selector::MAX_SELECTOR_BYTES;
+use task_proto::ids::selector::MAX_SELECTOR_BYTES;
+use task_proto::people::roles::Permission;
 use tokio_util::sync::CancellationToken;
+use utoipa::OpenApi;
 
+use self::accounts::session::{PageCookies, PageSignIn};
+use self::events::EventStreams;
+use self::fleet::broker::BrokerAccounts;
+use self::fleet::live_robots::LiveRobots;
+use self::registry::Registry;
+use self::registry::archives::ArchiveReaders;
+use self::registry::upload::UploadSpace;
+use self::server::gauges::Gauges;
 use self::server::readiness::Readiness;
 use self::server::server_facts::ServerFacts;
+use self::shared_lists::SharedLists;
+use self::views::Views;
 use crate::auth::oidc::Provider;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
+use crate::domain::limits::robot_limiter::RobotLimiter;
 use crate::fleet::presence::Presence;
 use crate::fleet::requests::Requests;
 use crate::fleet::robot_logs::RobotLogs;
 use crate::fleet::robot_vitals::RobotVitals;
-use crate::limits::conduct::Conduct;
 use crate::link::mqtt_access::MqttAccess;
 use crate::link::transfers::Transfers;
 use crate::net::http_connections::HttpConnections;
-use crate::orders::actions::Actions;
+use crate::orders::actions::{Actions, DeploymentActions, PersonActions, RobotActions};
 use crate::orders::changes::Changes;
-use crate::orders::feed::Feed;
+use crate::orders::desired_states::DesiredStates;
 use crate::orders::report_writer::ReportWriter;
 use crate::store::Store;
 use crate::system::clock::Clock;
 use accounts::{oidc, people, session};
-use auth::{Access, Gate, guard};
+use auth::{Access, GuardState, guard};
 use error::ApiError;
 use fleet::{ask, broker, bulk, enroll, feed, history, logs, mqtt, outputs, robots, vitals};
 use openapi::{Describe as _, Draft};
@@ -71,6 +80,7 @@ pub struct AppParts {
     pub clock: Clock,
     pub store: Store,
     pub actions: Actions,
+    pub desired_states: DesiredStates,
     pub changes: Changes,
     /// The writer that stores reports.
     pub reports: ReportWriter,
@@ -88,33 +98,29 @@ pub struct AppParts {
     /// Scheduler of package transfers.
     pub transfers: Transfers,
     /// Workspace in which uploaded directories are packed.
-    pub uploads: registry::upload::UploadSpace,
-    /// Sessions of the web page.
-    pub sessions: Arc<accounts::session::Sessions>,
+    pub uploads: UploadSpace,
+    /// Readers of whole archives.
+    pub readers: ArchiveReaders,
+    /// The form of the page's cookies.
+    pub cookies: PageCookies,
     /// Robots' HTTP requests under way.
     pub http_connections: Arc<HttpConnections>,
     /// Rate-limit state of the robots.
-    pub conduct: Arc<Conduct>,
+    pub robot_limiter: Arc<RobotLimiter>,
     /// The OpenID provider, if one is configured.
     pub provider: Option<Arc<Provider>>,
     /// Request limits per person.
     pub people: Arc<auth::person_limits::PersonLimits>,
     /// Failed authentications by address.
     pub attempts: Arc<auth::attempts::FailedAttempts>,
-    /// The feed of recent events.
-    pub feed: Feed,
     /// Facts that are fixed while the server runs.
     pub facts: Arc<ServerFacts>,
     /// Cached figures that are slow to compute.
-    pub slow_figures: Arc<server::status::SlowFigures>,
+    pub slow_figures: Arc<server::gauges::SlowFigures>,
     /// Long lists being rendered.
-    pub lists: Arc<shared_lists::SharedLists>,
+    pub lists: Arc<SharedLists>,
     /// The source of the event stream.
     pub events: events::EventFeed,
-    /// The key that verifies desired states.
-    pub key: PublicKey,
-    /// The pin of the private authority, if the listeners encrypt.
-    pub ca_pin: Option<CaPin>,
     /// Robots' MQTT address and password.
     pub mqtt: Arc<MqttAccess>,
     /// The addresses of reverse proxies with a trusted `X-Forwarded-For`.
@@ -142,17 +148,59 @@ impl Deref for App {
     }
 }
 
-impl FromRef<App> for registry::oci::Registry {
-    fn from_ref(app: &App) -> Self {
-        Self {
-            store: app.store.clone(),
-            blobs: app.blobs.clone(),
-            clock: app.clock.clone(),
-            transfers: app.transfers.clone(),
-            changes: app.changes.clone(),
-            readers: app.uploads.readers.clone(),
+/// The parts that handlers name in place of the whole state, as in `State<Store>`.
+macro_rules! parts {
+    ($($field:ident $(.$inner:ident)?: $part:ty),* $(,)?) => { $(
+        impl FromRef<App> for $part {
+            fn from_ref(app: &App) -> Self {
+                app.$field$(.$inner)?.clone()
+            }
         }
+    )* };
+}
+
+parts! {
+    actions.deployments: DeploymentActions,
+    actions.people: PersonActions,
+    actions.robots: RobotActions,
+    broker: Broker,
+    clock: Clock,
+    desired_states: DesiredStates,
+    facts: Arc<ServerFacts>,
+    lists: Arc<SharedLists>,
+    mqtt: Arc<MqttAccess>,
+    readiness: Readiness,
+    reports: ReportWriter,
+    stop: CancellationToken,
+    store: Store,
+    uploads: UploadSpace,
+    vitals: RobotVitals,
+}
+
+/// Parts that consist of several fields of the state, which handlers always use together.
+macro_rules! composite_parts {
+    ($($part:ident { $($field:ident),* $(,)? })*) => { $(
+        impl FromRef<App> for $part {
+            fn from_ref(app: &App) -> Self {
+                Self { $($field: app.$field.clone()),* }
+            }
+        }
+    )* };
+}
+
+composite_parts! {
+    BrokerAccounts { mqtt, store }
+    EventStreams { changes, clock, events, stop, store }
+    Gauges {
+        blobs, broker, clock, data, facts, http_traffic, presence, reports, robot_limiter,
+        slow_figures, store, transfers,
     }
+    LiveRobots {
+        broker, changes, clock, desired_states, http_connections, logs, presence, requests, vitals,
+    }
+    PageSignIn { changes, clock, cookies, provider, store }
+    Registry { blobs, changes, clock, readers, store, transfers }
+    Views { clock, presence, robot_limiter, store, vitals }
 }
 
 /// The body limit of most routes, in bytes.
@@ -160,7 +208,7 @@ const SMALL_BODY_BYTES: usize = 64 * 1024;
 /// The body limit of orders, in bytes: an order has one selector.
 const ORDER_BODY_BYTES: usize = MAX_SELECTOR_BYTES + SMALL_BODY_BYTES;
 /// The largest report, in bytes.
-pub const REPORT_BODY_BYTES: usize = task_proto::report::MAX_REPORT_BYTES;
+pub const REPORT_BODY_BYTES: usize = task_proto::messages::report::MAX_REPORT_BYTES;
 /// Time limit from a request's head to its answer.
 const DEADLINE: Duration = Duration::from_secs(30);
 
@@ -253,12 +301,15 @@ macro_rules! route {
     (any $path:literal, $access:expr, $module:ident::$handler:ident) => {
         Route::any($path, $access, $module::$handler, route!(describe $module::$handler))
     };
-    (describe $module:ident::$handler:ident) => { pastey::paste! {
+    (describe $module:ident::$handler:ident) => {
         |draft| {
-            draft.begin::<$module::[<__path_ $handler>]>(stringify!([<$module _ $handler>]));
+            #[derive(OpenApi)]
+            #[openapi(paths($module::$handler))]
+            struct Attribute;
+            draft.begin(concat!(stringify!($module), "_", stringify!($handler)), Attribute::openapi());
             $module::$handler.describe(draft);
         }
-    } };
+    };
     ($method:ident $path:literal, $access:expr, $module:ident::$handler:ident) => {
         Route::new(Method::$method, $path, $access, $module::$handler, route!(describe $module::$handler))
     };
@@ -266,7 +317,7 @@ macro_rules! route {
 
 /// Every route, with its access. The server serves no other path.
 pub fn routes() -> Vec<Route> {
-    use Access::{Anyone, Enrolment, OwnRobot, Person};
+    use Access::{Anyone, Enrollment, OwnRobot, Person};
     use Permission::{Administer, Maintain, Read};
     let mut routes = vec![
         route!(GET "/healthz", Anyone, health::healthz),
@@ -295,7 +346,7 @@ pub fn routes() -> Vec<Route> {
         route!(POST "/api/v1/tokens", Person(Read), people::create_token),
         route!(DELETE "/api/v1/tokens/{token}", Person(Read), people::revoke_token),
         route!(GET "/api/v1/audit", Person(Administer), people::audit),
-        route!(POST "/api/v1/enroll", Enrolment, enroll::enroll),
+        route!(POST "/api/v1/enroll", Enrollment, enroll::enroll),
         route!(GET "/api/v1/enrollment-tokens", Person(Administer), enroll::tokens),
         route!(POST "/api/v1/enrollment-tokens", Person(Administer), enroll::create_token),
         route!(DELETE "/api/v1/enrollment-tokens/{enrollment}", Person(Administer), enroll::revoke_token),
@@ -322,12 +373,12 @@ pub fn routes() -> Vec<Route> {
         route!(POST "/api/v1/robots/{robot}/ask", Person(Read), ask::ask).waiting_for_robot(),
         route!(GET "/api/v1/robots/{robot}/logs", Person(Read), logs::show).streaming(),
     ];
-    routes.extend(routes_of_work());
+    routes.extend(order_routes());
     routes
 }
 
 /// Routes for orders on robots, and for callers other than people and the page.
-fn routes_of_work() -> Vec<Route> {
+fn order_routes() -> Vec<Route> {
     use Access::{Anyone, Person, PersonOrRobot};
     use Permission::{Operate, Publish, Read};
     vec![
@@ -335,9 +386,9 @@ fn routes_of_work() -> Vec<Route> {
         route!(POST "/api/v1/packages", Person(Publish), upload::package).streaming(),
         route!(GET "/api/v1/packages/{package}", Person(Read), packages::show),
         route!(GET "/api/v1/packages/{package}/diff", Person(Read), packages::diff)
-            .within(archives::READING),
+            .within(archives::READ_TIMEOUT),
         route!(GET "/api/v1/packages/{package}/{version}/files", Person(Read), packages::files)
-            .within(archives::READING),
+            .within(archives::READ_TIMEOUT),
         route!(DELETE "/api/v1/packages/{package}/{version}", Person(Publish), packages::remove),
         route!(GET "/api/v1/outputs", Person(Read), outputs::list),
         route!(GET "/api/v1/deployments", Person(Read), deployments::list),
@@ -376,8 +427,8 @@ pub fn router(app: App) -> Router {
     let (mut router, trusted) = (Router::new(), app.trusted_proxies.clone());
     for route in routes() {
         let Route { access, deadline, waits_for_robot, .. } = route;
-        let gate = Gate { app: app.clone(), access, deadline, waits_for_robot };
-        let guard = middleware::from_fn_with_state(gate, guard);
+        let state = GuardState { app: app.clone(), access, deadline, waits_for_robot };
+        let guard = middleware::from_fn_with_state(state, guard);
         let limit = DefaultBodyLimit::max(route.body_bytes);
         let handler = match route.method {
             // The guard is not needed before the "method not allowed" answer.
@@ -387,25 +438,27 @@ pub fn router(app: App) -> Router {
         router = router.route(route.path, handler);
     }
     let router = router
-        .fallback(nothing_here)
+        .fallback(path_not_found)
         .method_not_allowed_fallback(method_not_allowed)
         .layer(middleware::map_response(harden))
         .layer(middleware::map_request(connection::drain::drain_unread));
     // Without trusted proxies we skip this layer, so that requests pay nothing.
     let router = match trusted.is_empty() {
         true => router,
-        false => router
-            .layer(middleware::map_request_with_state(trusted, connection::proxy::see_through)),
+        false => router.layer(middleware::map_request_with_state(
+            trusted,
+            connection::proxy::resolve_client_address,
+        )),
     };
     router.with_state(app)
 }
 
-async fn nothing_here() -> ApiError {
+async fn path_not_found() -> ApiError {
     ApiError::not_found("there is nothing at this path")
 }
 
 async fn method_not_allowed(request: Request) -> Response {
-    let message = format!("{} is not possible at this path", request.method());
+    let message = format!("{} is not allowed at this path", request.method());
     ApiError::new(StatusCode::METHOD_NOT_ALLOWED, "method_not_allowed", message).into_response()
 }
 

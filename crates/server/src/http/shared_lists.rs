@@ -81,11 +81,11 @@ impl SharedLists {
         key: ListKey,
         render: impl Future<Output = Result<T, ApiError>>,
     ) -> Result<SharedJson<T>, ApiError> {
-        let came = Instant::now();
+        let arrived_at = Instant::now();
         let share = self.share(key);
         let mut last = share.list.lock().await;
         let body = match &*last {
-            Some(rendering) if rendering.begun > came => rendering.body.clone(),
+            Some(rendering) if rendering.begun > arrived_at => rendering.body.clone(),
             _ => {
                 let _permit = self.renderings.acquire().await;
                 let begun = Instant::now();

@@ -1,78 +1,184 @@
-//! Views for the operator: the store's rows, completed with data from presence.
+//! Views for the operator: each is built here once, from a row of the store and the state in
+//! memory.
 
 use std::collections::HashSet;
+use std::sync::Arc;
 
-use task_proto::RobotId;
-use task_proto::api::{DeploymentState, DeploymentView, MatchedRobot, PhaseCount, RobotView};
-use task_proto::report::{Condition, Phase};
+use task_proto::api::{
+    AWAITS_APPROVAL, DeploymentView, MatchedRobot, MatchedRobots, MqttConnection, PhaseCount,
+    RobotView,
+};
+use task_proto::messages::report::{Condition, Phase};
+use task_proto::{DeploymentId, RobotId};
 
-use crate::domain::deployment;
-use crate::fleet::presence::Presence;
+use super::error::ApiError;
+use crate::domain::limits::robot_limiter::RobotLimiter;
+use crate::domain::person::Person;
+use crate::fleet::presence::{Presence, RobotPresence};
 use crate::fleet::robot_vitals::RobotVitals;
-use crate::limits::conduct::Conduct;
+use crate::orders::actions::SelectedRobot;
+use crate::store::{AssignmentRow, DeploymentRow, KnownRobot, RobotRow, Store};
+use crate::system::clock::Clock;
 
-/// Adds a robot's presence, behavior, vitals and identity problems.
-pub fn complete_robot(
-    view: &mut RobotView,
-    presence: &Presence,
-    conduct: &Conduct,
-    vitals: &RobotVitals,
-    now_ms: u64,
-) {
-    view.vitals = vitals.newest(&view.id);
-    if let Some(text) = conduct.trouble(&view.id) {
-        view.conditions.insert(0, Condition { code: "misbehaves".to_owned(), text });
+/// The sources of views.
+#[derive(Clone)]
+pub struct Views {
+    pub store: Store,
+    pub presence: Arc<Presence>,
+    pub robot_limiter: Arc<RobotLimiter>,
+    pub vitals: RobotVitals,
+    pub clock: Clock,
+}
+
+impl Views {
+    /// A robot, with its MQTT connection where the view shows it; an error if there is none.
+    pub async fn robot(
+        &self,
+        id: &RobotId,
+        mqtt: Option<MqttConnection>,
+    ) -> Result<RobotView, ApiError> {
+        let found = self.store.robots().get(id).await?;
+        let row = found.ok_or_else(|| ApiError::not_found(format!("there is no robot {id}")))?;
+        Ok(RobotView { mqtt, ..self.of_robot(row) })
     }
-    let Some(sighting) = presence.get(&view.id, now_ms) else { return };
-    view.online = sighting.online;
-    view.address = sighting.address.map(|address| address.to_string());
-    view.last_seen_ms = view.last_seen_ms.max(Some(sighting.last_seen_ms));
-    if sighting.waits {
-        let text = "another agent came with this robot's identity, and gets no work before the one that is known was \
-                    silent for 30 s: the robot was started again, or its identity is used elsewhere";
-        view.conditions
-            .insert(0, Condition { code: "instance_waits".to_owned(), text: text.to_owned() });
+
+    /// The view of a robot's row, without its MQTT connection.
+    pub(super) fn of_robot(&self, row: RobotRow) -> RobotView {
+        let (id, now_ms) = (&row.robot.id, self.clock.now_ms());
+        let (presence, vitals) = (self.presence.get(id, now_ms), self.vitals.newest(id));
+        let conditions = server_conditions(&row, presence.as_ref(), self.robot_limiter.penalty(id));
+        let KnownRobot { id, name, mac, labels } = row.robot;
+        let mut host = row.host;
+        let effective_settings = host.as_mut().and_then(|host| host.settings.take());
+        RobotView {
+            id,
+            name,
+            mac,
+            labels,
+            online: presence.as_ref().is_some_and(|presence| presence.online),
+            address: presence.as_ref().and_then(RobotPresence::address_text),
+            last_seen_ms: row.last_seen_ms.max(presence.map(|presence| presence.last_seen_ms)),
+            enrolled_at_ms: row.enrolled_at_ms,
+            generation: row.generation,
+            observed_generation: row.observed_generation,
+            conditions: conditions.into_iter().chain(row.conditions).collect(),
+            host,
+            link: row.link,
+            tasks: row.tasks,
+            mqtt: None,
+            vitals,
+            settings: row.settings,
+            effective_settings,
+        }
     }
-    if sighting.duplicate {
-        let text = "two agents use this robot's identity and keep displacing each other; enrol one of them again";
-        let condition = Condition { code: "duplicate_identity".to_owned(), text: text.to_owned() };
-        view.conditions.insert(0, condition);
+
+    /// The part of a deployment that concerns the person, with its assignments.
+    pub async fn deployment(
+        &self,
+        by: &Person,
+        id: &DeploymentId,
+        with_timelines: bool,
+    ) -> Result<DeploymentView, ApiError> {
+        let found = self.store.deployments().get(id, with_timelines).await?;
+        let (mut deployment, mut assignments) =
+            found.ok_or_else(|| ApiError::not_found(format!("there is no deployment {id}")))?;
+        if !by.scope.is_everything() {
+            let robots = self.store.robots().ids_in(&by.scope).await?.into_iter().collect();
+            (deployment, assignments) = narrowed(deployment, assignments, &robots)
+                .ok_or_else(|| ApiError::out_of_scope(format!("deployment {id}"), by))?;
+        }
+        let now_ms = self.clock.now_ms();
+        let view = |row: AssignmentRow| {
+            let online = self.presence.is_online(&row.robot, now_ms);
+            row.into_view(online)
+        };
+        Ok(deployment.into_view(Some(assignments.into_iter().map(view).collect())))
+    }
+
+    /// The robots that an order selected.
+    pub(super) fn matched(&self, robots: Vec<SelectedRobot>) -> MatchedRobots {
+        let now_ms = self.clock.now_ms();
+        let view = |SelectedRobot { id, name }| {
+            let online = self.presence.is_online(&id, now_ms);
+            MatchedRobot { id, name, online }
+        };
+        MatchedRobots { robots: robots.into_iter().map(view).collect() }
     }
 }
 
-/// Adds the presence of a deployment's robots.
-pub fn complete_deployment(view: &mut DeploymentView, presence: &Presence, now_ms: u64) {
-    for assignment in view.assignments.iter_mut().flatten() {
-        assignment.online = presence.is_online(&assignment.robot, now_ms);
-    }
+/// The conditions that the server has seen by itself.
+fn server_conditions(
+    row: &RobotRow,
+    presence: Option<&RobotPresence>,
+    penalty: Option<String>,
+) -> Vec<Condition> {
+    let (generation, observed) = (row.generation, row.observed_generation);
+    let has = |holds: bool, text: &str| holds.then(|| text.to_owned());
+    let conditions = [
+        (
+            "duplicate_identity",
+            has(
+                presence.is_some_and(|presence| presence.duplicate),
+                "two agents use this robot's identity and keep displacing each other; enroll one of them again",
+            ),
+        ),
+        (
+            "instance_waits",
+            has(
+                presence.is_some_and(|presence| presence.has_waiting_instance),
+                "another agent uses this robot's identity and gets no work until the known agent has been \
+                 silent for 30 s: the robot was restarted, or its identity is used elsewhere",
+            ),
+        ),
+        ("misbehaves", penalty),
+        (
+            "revoked",
+            has(
+                row.is_revoked,
+                "its tokens were revoked; enroll it again with a token made for it, or remove it",
+            ),
+        ),
+        (
+            AWAITS_APPROVAL,
+            has(
+                row.awaits_approval,
+                "waiting for approval by an administrator (taskd robot approve)",
+            ),
+        ),
+        (
+            "diverged",
+            (observed > generation).then(|| {
+                format!(
+                    "its generation {observed} is ahead of this server's {generation}; left alone until its next order"
+                )
+            }),
+        ),
+    ];
+    let condition = |(code, text): (&str, Option<String>)| {
+        Some(Condition { code: code.to_owned(), text: text? })
+    };
+    conditions.into_iter().filter_map(condition).collect()
 }
 
-/// Narrows a deployment with its assignments to these robots; `None` if no assignment is left.
-pub fn narrowed(mut view: DeploymentView, robots: &HashSet<RobotId>) -> Option<DeploymentView> {
-    let assignments = view.assignments.as_mut()?;
+/// Narrows a deployment to its assignments to these robots; `None` if there are none.
+pub(super) fn narrowed(
+    deployment: DeploymentRow,
+    mut assignments: Vec<AssignmentRow>,
+    robots: &HashSet<RobotId>,
+) -> Option<(DeploymentRow, Vec<AssignmentRow>)> {
     assignments.retain(|assignment| robots.contains(&assignment.robot));
     if assignments.is_empty() {
         return None;
     }
-    let count = |phase: &Phase| {
-        assignments.iter().filter(|assignment| assignment.phase == *phase).count() as u64
+    let count = |phase| PhaseCount {
+        phase,
+        count: assignments.iter().filter(|assignment| assignment.phase == phase).count() as u64,
     };
-    let counts = Phase::ALL.iter().map(|phase| PhaseCount { phase: *phase, count: count(phase) });
-    view.counts = counts.filter(|counted| counted.count > 0).collect();
-    let (is_cancelled, is_paused) =
-        (view.state == DeploymentState::Cancelled, view.state == DeploymentState::Paused);
-    view.state = deployment::state(view.kind, is_cancelled, is_paused, &view.counts);
-    Some(without_others(view))
+    let counts = Phase::ALL.into_iter().map(count).filter(|counted| counted.count > 0).collect();
+    Some((without_others(DeploymentRow { counts, ..deployment }), assignments))
 }
 
 /// Removes the fields that could name robots and deployments outside the person's scope.
-pub fn without_others(view: DeploymentView) -> DeploymentView {
-    DeploymentView { selector: None, supersedes: Vec::new(), ..view }
-}
-
-/// Adds the presence of the matched robots.
-pub fn complete_matched(robots: &mut [MatchedRobot], presence: &Presence, now_ms: u64) {
-    for robot in robots {
-        robot.online = presence.is_online(&robot.id, now_ms);
-    }
+pub(super) fn without_others(deployment: DeploymentRow) -> DeploymentRow {
+    DeploymentRow { selector: None, supersedes: Vec::new(), ..deployment }
 }

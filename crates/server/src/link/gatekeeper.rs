@@ -7,8 +7,8 @@ use std::sync::Arc;
 use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use task_proto::RobotId;
-use task_proto::person::Permission;
-use task_proto::token::Token;
+use task_proto::people::roles::Permission;
+use task_proto::trust::token::Token;
 
 use crate::broker::{Gatekeeper, Login, Principal, Refusal};
 use crate::fleet::presence::Presence;
@@ -42,20 +42,30 @@ impl StoreGatekeeper {
     async fn decide(&self, login: Login) -> Result<Principal, Refusal> {
         let password = login.password.as_deref().ok_or(Refusal::BadCredentials)?;
         let token: Token = password.parse().map_err(|_| Refusal::BadCredentials)?;
-        let unchecked = |error: StoreError| {
+        let unavailable = |error: StoreError| {
             error.log("a login over MQTT could not be checked");
             Refusal::Unavailable
         };
-        let admitted =
-            self.store.admit(&token, &login.proof, self.clock.now_ms()).await.map_err(unchecked)?;
+        let admitted = self
+            .store
+            .tokens()
+            .admit(&token, &login.proof, self.clock.now_ms())
+            .await
+            .map_err(unavailable)?;
         let Some(Admitted { holder, is_first_use }) = admitted else {
-            let is_revoked = self.store.is_of_revoked_robot(&token).await.map_err(unchecked)?;
+            let is_revoked =
+                self.store.tokens().belongs_to_revoked_robot(&token).await.map_err(unavailable)?;
             return Err(if is_revoked { Refusal::NotAuthorised } else { Refusal::BadCredentials });
         };
         match holder {
             TokenHolder::Robot { robot, token_number, .. } => {
                 if is_first_use {
-                    ended_others(&self.presence, &self.http_connections, &self.changes, &robot);
+                    announce_new_token(
+                        &self.presence,
+                        &self.http_connections,
+                        &self.changes,
+                        &robot,
+                    );
                 }
                 Ok(Principal::Robot { robot, token_number, is_first_use })
             }
@@ -66,7 +76,7 @@ impl StoreGatekeeper {
             {
                 Ok(Principal::Operator(person.name))
             }
-            TokenHolder::Person(_) | TokenHolder::Enrolment | TokenHolder::Pending { .. } => {
+            TokenHolder::Person(_) | TokenHolder::Enrollment | TokenHolder::Pending { .. } => {
                 Err(Refusal::NotAuthorised)
             }
         }
@@ -82,14 +92,14 @@ impl Gatekeeper for StoreGatekeeper {
 /// The robot has used a token for the first time, which ended its other tokens. Its HTTP
 /// connections are cut, no other instance can displace the robot any more, and the robot receives
 /// its state. The broker ends its MQTT session.
-pub fn ended_others(
+pub fn announce_new_token(
     presence: &Presence,
     http_connections: &HttpConnections,
     changes: &Changes,
     robot: &RobotId,
 ) {
-    presence.ended_others(robot);
+    presence.end_other_instances(robot);
     http_connections.end(robot);
     changes.announce(Change::Robot(robot.clone()));
-    changes.ring([robot.clone()]);
+    changes.notify_robots([robot.clone()]);
 }

@@ -16,9 +16,9 @@ use hmac::{Hmac, KeyInit as _, Mac as _};
 use sha2::Sha256;
 use task_proto::CaPin;
 use task_proto::api::{
-    BrokerCheck, BrokerFiles, ExternalBroker, MqttEndpoint, MqttPlace, NatsFile,
+    BrokerAddress, BrokerCheck, BrokerFiles, ExternalBroker, MqttEndpoint, NatsFile,
 };
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 use task_transport::{MqttLogin, displaces};
 use tokio::time::timeout;
 
@@ -27,7 +27,7 @@ use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
 use crate::store::BrokerCredential;
 
 /// Time limit for the test of one broker.
-const CHECK_PATIENCE: Duration = Duration::from_secs(8);
+const CHECK_TIMEOUT: Duration = Duration::from_secs(8);
 
 /// The MQTT endpoints for robots.
 pub struct MqttAccess {
@@ -41,7 +41,7 @@ struct External {
     secret: [u8; 32],
     brokers: BrokerUrls,
     /// The address at which robots reach each broker.
-    places: Vec<MqttPlace>,
+    places: Vec<BrokerAddress>,
     /// The broker that the server was connected to last.
     current: Arc<AtomicUsize>,
     /// The authority behind the brokers' certificates, unless systems already trust it.
@@ -91,15 +91,15 @@ impl MqttAccess {
         prefix: TopicPrefix,
         secret: [u8; 32],
     ) -> Self {
-        let place = |url: &BrokerUrl| MqttPlace {
+        let place = |url: &BrokerUrl| BrokerAddress {
             // A loopback host is this machine: robots elsewhere reach the broker at the server's
             // host.
             host: host.clone().or_else(|| (!url.is_loopback()).then(|| url.host.clone())),
             port: port.unwrap_or(url.port),
             tls: url.tls,
         };
-        let places: Vec<MqttPlace> = brokers.all().iter().map(place).collect();
-        let MqttPlace { host, port, tls } = place(brokers.first());
+        let places: Vec<BrokerAddress> = brokers.all().iter().map(place).collect();
+        let BrokerAddress { host, port, tls } = place(brokers.first());
         let endpoint =
             MqttEndpoint { host, port, prefix, tls, external: None, alternatives: Vec::new() };
         let checking = tokio::sync::Mutex::default();
@@ -114,7 +114,7 @@ impl MqttAccess {
         let Some(external) = &self.external else { return self.endpoint.clone() };
         let mut places = external.places.clone();
         let current = external.current.load(Ordering::Relaxed).min(places.len() - 1);
-        let MqttPlace { host, port, tls } = places.remove(current);
+        let BrokerAddress { host, port, tls } = places.remove(current);
         let account = ExternalBroker {
             password: external.password_of(credential),
             client_id: Some(external.client_id_of(credential)),
@@ -166,7 +166,7 @@ impl MqttAccess {
     /// client id exist only for this test.
     pub async fn check(&self) -> Option<Vec<BrokerCheck>> {
         let external = self.external.as_ref()?;
-        let _turn = external.checking.lock().await;
+        let _guard = external.checking.lock().await;
         let probes = external.probes();
         let logins = [0, 1].map(|at: usize| MqttLogin {
             user_name: &probes[at].user_name,
@@ -176,14 +176,14 @@ impl MqttAccess {
             let client_id = format!("{}-{:016x}", probes[0].user_name, rand::random::<u64>());
             let route = external_route(url, external.pin);
             let (displaces, problem) =
-                match timeout(CHECK_PATIENCE, displaces(&route, &client_id, logins)).await {
+                match timeout(CHECK_TIMEOUT, displaces(&route, &client_id, logins)).await {
                     Ok(Ok(displaces)) => (Some(displaces), None),
                     Ok(Err(error)) => (None, Some(error.to_string())),
                     Err(_) => (
                         None,
                         Some(format!(
                             "the broker does not answer within {} s",
-                            CHECK_PATIENCE.as_secs()
+                            CHECK_TIMEOUT.as_secs()
                         )),
                     ),
                 };
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn a_password_is_one_robots_until_it_enrols_anew() {
+    fn password_is_unique_per_robot_and_enrollment() {
         let password = |secret, robot, number| {
             let endpoint = access(secret).endpoint_of(&credential(robot, number));
             endpoint.external.expect("external").password
@@ -284,22 +284,22 @@ mod tests {
     }
 
     #[test]
-    fn a_broker_on_this_machine_is_where_the_server_is() {
+    fn loopback_broker_is_reached_at_the_servers_host() {
         let endpoint = access(1).endpoint_of(&credential("r00000000000000a1", 0));
         assert_eq!((endpoint.host, endpoint.port), (None, 1884));
         let url = "mqtt://server:hunter2@broker.lab";
         let (host, port) = (Some("wifi.lab".to_owned()), Some(1999));
         let named = external(url, None, None, 1);
-        let told = external(url, host.clone(), port, 1);
+        let configured = external(url, host.clone(), port, 1);
         assert_eq!(
             (named.endpoint.host.as_deref(), named.endpoint.port),
             (Some("broker.lab"), 1883)
         );
-        assert_eq!((told.endpoint.host, told.endpoint.port), (host, 1999));
+        assert_eq!((configured.endpoint.host, configured.endpoint.port), (host, 1999));
     }
 
     #[test]
-    fn the_files_are_the_same_until_a_password_changes() {
+    fn broker_files_change_only_with_a_password() {
         let robots = [credential("r00000000000000a1", 0), credential("r00000000000000b2", 3)];
         let files = access(1).files(&robots).expect("external");
         assert_eq!(access(1).files(&robots).expect("external").passwd, files.passwd);
@@ -326,7 +326,7 @@ mod tests {
     }
 
     #[test]
-    fn client_id_follows_from_the_secret_and_the_enrolment() {
+    fn client_id_depends_on_secret_and_enrollment() {
         let id = |secret, robot, number| {
             let endpoint = access(secret).endpoint_of(&credential(robot, number));
             endpoint.external.expect("external").client_id.expect("a client id")
@@ -343,7 +343,7 @@ mod tests {
     }
 
     #[test]
-    fn current_broker_is_the_first_place_that_robots_are_told() {
+    fn current_broker_is_the_first_endpoint_of_robots() {
         let brokers =
             "mqtt://server:x@one.lab,mqtts://server:x@two.lab,mqtt://server:x@127.0.0.1:7";
         let current = Arc::new(AtomicUsize::new(0));
@@ -357,10 +357,12 @@ mod tests {
             TopicPrefix::default(),
             [1; 32],
         );
-        let told = || {
+        let endpoints = || {
             let endpoint = access.endpoint_of(&credential("r00000000000000a1", 0));
-            let first = MqttPlace { host: endpoint.host, port: endpoint.port, tls: endpoint.tls };
-            let places: Vec<MqttPlace> = [first].into_iter().chain(endpoint.alternatives).collect();
+            let first =
+                BrokerAddress { host: endpoint.host, port: endpoint.port, tls: endpoint.tls };
+            let places: Vec<BrokerAddress> =
+                [first].into_iter().chain(endpoint.alternatives).collect();
             places
                 .into_iter()
                 .map(|place| (place.host.unwrap_or_default(), place.port, place.tls))
@@ -368,9 +370,9 @@ mod tests {
         };
         let [one, two, three] = [("one.lab", 1883, false), ("two.lab", 8883, true), ("", 7, false)]
             .map(|(h, p, t)| (h.to_owned(), p, t));
-        assert_eq!(told(), [one.clone(), two.clone(), three.clone()]);
+        assert_eq!(endpoints(), [one.clone(), two.clone(), three.clone()]);
         current.store(1, Ordering::Relaxed);
-        assert_eq!(told(), [two, one, three]);
+        assert_eq!(endpoints(), [two, one, three]);
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Robots' messages over MQTT: reports go to the writer, replies to their requesters, log lines and
 //! vitals to memory, connections to presence. The broker has authenticated the sender; the content
 //! is checked here. This module never answers by itself: a robot with an outdated state is put on
-//! the list of robots to ring.
+//! the list of robots to notify.
 
 use std::collections::HashMap;
 use std::net::SocketAddr;
@@ -11,15 +11,15 @@ use futures_util::FutureExt as _;
 use futures_util::future::BoxFuture;
 use serde::de::DeserializeOwned;
 use task_proto::RobotId;
-use task_proto::log::{LogBatch, MAX_BATCH_BYTES};
-use task_proto::report::{MAX_REPORT_BYTES, Report, Status};
-use task_proto::request::{MAX_REPLY_BYTES, Reply};
-use task_proto::topic::RobotTopic;
-use task_proto::vitals::{MAX_TELEMETRY_BYTES, Telemetry};
+use task_proto::messages::report::{MAX_REPORT_BYTES, Report, Status};
+use task_proto::messages::request::{MAX_REPLY_BYTES, Reply};
+use task_proto::messages::topic::RobotTopic;
+use task_proto::telemetry::log::{LogBatch, MAX_BATCH_BYTES};
+use task_proto::telemetry::vitals::{MAX_TELEMETRY_BYTES, Telemetry};
 
 use crate::broker::{Inbox, NotStored, RobotMessage};
-use crate::domain::happening::Happening;
-use crate::fleet::presence::{Claim, Presence};
+use crate::domain::fleet_event::FleetEvent;
+use crate::fleet::presence::{AgentIdentity, Presence};
 use crate::fleet::requests::Requests;
 use crate::fleet::robot_logs::RobotLogs;
 use crate::fleet::robot_vitals::RobotVitals;
@@ -29,9 +29,9 @@ use crate::system::clock::Clock;
 
 /// Maximum size of a status.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
-/// Minimum interval between rings of a robot with an outdated state. Without it a robot that
-/// refuses its state would be rung for each report.
-const RING_AGAIN_MS: u64 = 5_000;
+/// Minimum interval between notifications of a robot with an outdated state. Without it a robot
+/// that refuses its state would be notified for each report.
+const RENOTIFY_INTERVAL_MS: u64 = 5_000;
 
 /// Receives the broker's messages.
 pub struct Uplink {
@@ -42,9 +42,9 @@ pub struct Uplink {
     presence: Arc<Presence>,
     changes: Changes,
     clock: Clock,
-    /// When connected robots were last rung for an outdated state; an entry ends with the
+    /// When connected robots were last notified about an outdated state; an entry ends with the
     /// connection.
-    reminded_ms: Mutex<HashMap<RobotId, u64>>,
+    notified_ms: Mutex<HashMap<RobotId, u64>>,
 }
 
 impl Uplink {
@@ -66,23 +66,24 @@ impl Uplink {
             presence,
             changes,
             clock,
-            reminded_ms: Mutex::default(),
+            notified_ms: Mutex::default(),
         }
     }
 
     async fn take_report(&self, message: &RobotMessage) -> Result<(), NotStored> {
         let Some(report) = parsed::<Report>(message, MAX_REPORT_BYTES) else { return Ok(()) };
         if report.robot_id != message.robot {
-            tracing::warn!(robot = %message.robot, claimed = %report.robot_id, "a report in another robot's name is dropped");
+            tracing::warn!(robot = %message.robot, claimed = %report.robot_id, "a report with another robot's id is dropped");
             return Ok(());
         }
         let Some(token_number) = message.token_number else {
-            tracing::warn!(robot = %message.robot, "a report that no token vouches for is dropped");
+            tracing::warn!(robot = %message.robot, "a report from a session without a token is dropped");
             return Ok(());
         };
-        if !self
-            .hear_claim(message, Claim { instance: report.instance.clone(), place: report.place })
-        {
+        if !self.record_session_agent(
+            message,
+            AgentIdentity { instance: report.instance.clone(), place: report.place },
+        ) {
             // This agent waits for the serving agent, and its reports are not the robot's.
             return Err(NotStored);
         }
@@ -93,7 +94,7 @@ impl Uplink {
         match self.reports.submit(report, token_number).await {
             Ok(reply) => {
                 if reply.generation > observed {
-                    self.remind(&message.robot);
+                    self.notify_again(&message.robot);
                 }
                 Ok(())
             }
@@ -112,20 +113,23 @@ impl Uplink {
         let Some(status) = parsed::<Status>(message, MAX_STATUS_BYTES) else { return };
         // A robot goes offline by the end of its connection, which can't be forged or late.
         if status.online {
-            self.hear_claim(message, Claim { instance: status.instance, place: status.place });
+            self.record_session_agent(
+                message,
+                AgentIdentity { instance: status.instance, place: status.place },
+            );
         }
     }
 
-    fn take_lines(&self, message: &RobotMessage) {
+    fn take_log(&self, message: &RobotMessage) {
         let now_ms = self.clock.now_ms();
         if !self.logs.admits(&message.robot, message.payload.len(), now_ms) {
-            tracing::debug!(robot = %message.robot, "it publishes more lines than a robot may; they are dropped");
+            tracing::debug!(robot = %message.robot, "the robot exceeds its limit of log lines; lines are dropped");
             return;
         }
         match parsed::<LogBatch>(message, MAX_BATCH_BYTES) {
-            Some(batch) if batch.robot_id == message.robot => self.logs.take(batch, now_ms),
+            Some(batch) if batch.robot_id == message.robot => self.logs.record(batch, now_ms),
             Some(batch) => {
-                tracing::warn!(robot = %message.robot, claimed = %batch.robot_id, "lines in another robot's name are dropped");
+                tracing::warn!(robot = %message.robot, claimed = %batch.robot_id, "log lines with another robot's id are dropped");
             }
             None => {}
         }
@@ -134,38 +138,40 @@ impl Uplink {
     fn take_telemetry(&self, message: &RobotMessage) {
         match parsed::<Telemetry>(message, MAX_TELEMETRY_BYTES) {
             Some(said) if said.robot_id == message.robot => {
-                self.vitals.take(&message.robot, said.vitals, self.clock.now_ms());
+                self.vitals.record(&message.robot, said.vitals, self.clock.now_ms());
                 self.changes.announce(Change::Robot(said.robot_id));
             }
             Some(said) => {
-                tracing::warn!(robot = %message.robot, claimed = %said.robot_id, "vitals in another robot's name are dropped");
+                tracing::warn!(robot = %message.robot, claimed = %said.robot_id, "vitals with another robot's id are dropped");
             }
             None => {}
         }
     }
 
     /// Records the agent of the session. Returns whether it serves the robot's work.
-    fn hear_claim(&self, message: &RobotMessage, claim: Claim) -> bool {
+    fn record_session_agent(&self, message: &RobotMessage, agent: AgentIdentity) -> bool {
         let (robot, connection) = (&message.robot, Some(message.connection));
-        claimed(
+        record_agent(
             &self.presence,
             &self.changes,
             robot,
             (message.peer, connection),
-            claim,
+            agent,
             self.clock.now_ms(),
         )
     }
 
-    fn remind(&self, robot: &RobotId) {
+    fn notify_again(&self, robot: &RobotId) {
         let now_ms = self.clock.now_ms();
-        let mut reminded_ms = self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner);
-        if reminded_ms.get(robot).is_some_and(|at_ms| now_ms.saturating_sub(*at_ms) < RING_AGAIN_MS)
+        let mut notified_ms = self.notified_ms.lock().unwrap_or_else(PoisonError::into_inner);
+        if notified_ms
+            .get(robot)
+            .is_some_and(|at_ms| now_ms.saturating_sub(*at_ms) < RENOTIFY_INTERVAL_MS)
         {
             return;
         }
-        reminded_ms.insert(robot.clone(), now_ms);
-        self.changes.ring([robot.clone()]);
+        notified_ms.insert(robot.clone(), now_ms);
+        self.changes.notify_robots([robot.clone()]);
     }
 }
 
@@ -177,10 +183,10 @@ impl Inbox for Uplink {
                 RobotTopic::Status => self.take_status(&message),
                 RobotTopic::Reply => {
                     if let Some(reply) = parsed::<Reply>(&message, MAX_REPLY_BYTES) {
-                        self.requests.replied(&message.robot, reply);
+                        self.requests.handle_reply(&message.robot, reply);
                     }
                 }
-                RobotTopic::Log => self.take_lines(&message),
+                RobotTopic::Log => self.take_log(&message),
                 RobotTopic::Telemetry => self.take_telemetry(&message),
                 RobotTopic::Desired | RobotTopic::Request => {}
             }
@@ -194,56 +200,56 @@ impl Inbox for Uplink {
         self.presence.connected(robot, peer, connection, self.clock.now_ms());
         self.changes.announce(Change::Robot(robot.clone()));
         if !was_online {
-            self.changes.happened(Happening::Presence(robot.clone(), true));
+            self.changes.announce_event(FleetEvent::Presence(robot.clone(), true));
         }
-        self.changes.ring([robot.clone()]);
+        self.changes.notify_robots([robot.clone()]);
         self.logs.connected(robot);
     }
 
     fn disconnected(&self, robot: &RobotId, connection: u64) {
         self.presence.disconnected(robot, connection, self.clock.now_ms());
-        self.reminded_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
+        self.notified_ms.lock().unwrap_or_else(PoisonError::into_inner).remove(robot);
         self.changes.announce(Change::Robot(robot.clone()));
-        self.changes.happened(Happening::Presence(
+        self.changes.announce_event(FleetEvent::Presence(
             robot.clone(),
             self.presence.is_online(robot, self.clock.now_ms()),
         ));
     }
 
-    fn everyone_may_be_there(&self) {
-        self.changes.ring_everyone();
+    fn external_broker_connected(&self) {
+        self.changes.notify_all_robots();
     }
 }
 
 /// Records an agent's claim, in a session if any. Returns whether the agent serves the robot's
 /// work, and tells the agent so.
-pub fn claimed(
+pub fn record_agent(
     presence: &Presence,
     changes: &Changes,
     robot: &RobotId,
     (peer, connection): (Option<SocketAddr>, Option<u64>),
-    claim: Claim,
+    agent: AgentIdentity,
     now_ms: u64,
 ) -> bool {
     let shown = || {
         presence
             .get(robot, now_ms)
-            .map(|sighting| (sighting.duplicate, sighting.waits))
+            .map(|sighting| (sighting.duplicate, sighting.has_waiting_instance))
             .unwrap_or_default()
     };
     let before = shown();
-    let standing = presence.claimed(robot, peer, connection, claim, now_ms);
+    let admission = presence.identify(robot, peer, connection, agent, now_ms);
     if shown() != before {
         changes.announce(Change::Robot(robot.clone()));
     }
-    if standing.is_news {
-        changes.ring([robot.clone()]);
+    if admission.needs_state {
+        changes.notify_robots([robot.clone()]);
     }
-    standing.is_served
+    admission.is_serving
 }
 
 /// Records a robot's HTTP request; if the robot was offline, that is news.
-pub fn heard(
+pub fn record_http_request(
     presence: &Presence,
     changes: &Changes,
     robot: &RobotId,
@@ -254,7 +260,7 @@ pub fn heard(
     presence.seen(robot, peer, now_ms);
     if !was_online {
         changes.announce(Change::Robot(robot.clone()));
-        changes.happened(Happening::Presence(robot.clone(), true));
+        changes.announce_event(FleetEvent::Presence(robot.clone(), true));
     }
 }
 

@@ -1,7 +1,7 @@
 //! The authenticated HTTP connections by holder: the person, robot or enrollment token. All
 //! connections of a holder can be cut at once, when a robot is revoked. When connections run out, a
 //! holder with more than its share loses its oldest one. Unauthenticated connections belong to the
-//! `Anteroom`.
+//! `unauthenticated` module.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn only_the_robots_own_connections_are_cut_and_nothing_is_kept() {
+    fn revoked_robot_loses_only_its_own_connections() {
         let all = Arc::new(HttpConnections::default());
         let [one, other] = [(); 2].map(|()| RobotId::random());
         let own = connected(&all, &Holder::Robot(one.clone()), 2);
@@ -262,7 +262,7 @@ mod tests {
     }
 
     #[test]
-    fn robot_put_out_while_its_token_is_looked_up_is_looked_up_again() {
+    fn revocation_during_token_lookup_repeats_the_lookup() {
         let (all, robot) = (Arc::new(HttpConnections::default()), RobotId::random());
         assert!(all.arrival().identified(&Holder::Robot(robot.clone()), &Connection::default()));
         let arrival = all.arrival();
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn connection_whose_token_is_looked_up_is_judged_afterwards() {
+    async fn authentication_check_waits_for_a_pending_lookup() {
         let connection = Connection::default();
         assert!(!connection.is_authenticated_after_lookup().await);
         let lookup = connection.lookup().await;

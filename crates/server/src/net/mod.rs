@@ -1,8 +1,10 @@
-//! Owns how connections come in: TLS, the listener's backlog and how many there may be; it never
-//! reads what is said on them.
+//! Owns incoming connections: TLS, headers of the PROXY protocol, the listener's backlog and the
+//! connection limits; it never reads their content.
 
-pub mod anteroom;
 pub mod backlog;
 pub mod http_connections;
 pub mod open_files;
+pub mod proxy_protocol;
+pub mod refusal_log;
 pub mod tls;
+pub mod unauthenticated;

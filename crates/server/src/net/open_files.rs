@@ -7,7 +7,7 @@ use crate::config::Config;
 /// Open files besides connections: the database, blobs in transfer, the operating system's own.
 pub const OTHER_FILES: usize = 500;
 /// Minimum limit: with fewer files, too few connections remain to be useful.
-pub const LEAST_FILES: usize = 1024;
+pub const MIN_FILES: usize = 1024;
 
 /// The operating system grants too few open files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
@@ -23,15 +23,15 @@ pub struct TooFewFiles {
 /// Raises the process's limit to the maximum that the operating system grants, and returns it.
 /// Usually only 1,024 are available without raising.
 pub fn raise() -> nix::Result<usize> {
-    let (allowed, most) = getrlimit(Resource::RLIMIT_NOFILE)?;
-    if allowed < most {
-        setrlimit(Resource::RLIMIT_NOFILE, most, most)?;
+    let (allowed, max) = getrlimit(Resource::RLIMIT_NOFILE)?;
+    if allowed < max {
+        setrlimit(Resource::RLIMIT_NOFILE, max, max)?;
     }
-    Ok(usize::try_from(most).unwrap_or(usize::MAX))
+    Ok(usize::try_from(max).unwrap_or(usize::MAX))
 }
 
 /// The number of files needed for all connections that the settings permit.
-pub fn wanted(config: &Config) -> usize {
+pub fn files_needed(config: &Config) -> usize {
     config
         .max_http_connections
         .saturating_add(config.max_mqtt_connections)
@@ -40,7 +40,7 @@ pub fn wanted(config: &Config) -> usize {
 
 /// Refuses a limit with which the server could serve hardly any client.
 pub fn check(config: &Config, allowed: usize) -> Result<(), TooFewFiles> {
-    let needed = wanted(config).min(LEAST_FILES);
+    let needed = files_needed(config).min(MIN_FILES);
     if allowed < needed { Err(TooFewFiles { allowed, needed }) } else { Ok(()) }
 }
 
@@ -48,7 +48,7 @@ pub fn check(config: &Config, allowed: usize) -> Result<(), TooFewFiles> {
 /// come and go.
 pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
     check(config, allowed)?;
-    if wanted(config) <= allowed {
+    if files_needed(config) <= allowed {
         return Ok(());
     }
     let room = allowed - OTHER_FILES;
@@ -60,7 +60,7 @@ pub fn fit(config: &mut Config, allowed: usize) -> Result<(), TooFewFiles> {
         files = allowed,
         http,
         mqtt,
-        "so few files may be open that fewer connections are allowed; see ulimit -n"
+        "the limit on open files is low, so fewer connections are allowed; see ulimit -n"
     );
     Ok(())
 }

@@ -18,7 +18,7 @@ use rustls::server::{ClientHello, ResolvesServerCert};
 use rustls::sign::CertifiedKey;
 use rustls::{ClientConfig, ServerConfig};
 use task_proto::CaPin;
-use task_proto::pin::PINNED_PROTOCOL;
+use task_proto::trust::pin::PINNED_PROTOCOL;
 use task_transport::Trust;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_rustls::TlsAcceptor;
@@ -32,6 +32,7 @@ use self::files::Files;
 use crate::config::TlsSettings;
 use crate::system::clock::Clock;
 use crate::system::data_directory::{DataDirectory, DataError};
+use crate::system::host::host_name;
 
 /// Interval at which the authority issues new certificates, to include names and addresses that the
 /// machine has gained meanwhile.
@@ -70,7 +71,7 @@ pub struct Tls(Arc<Parts>);
 
 struct Parts {
     acceptor: TlsAcceptor,
-    shown: Arc<Shown>,
+    resolver: Arc<CertificateResolver>,
     authority: Authority,
     own: Option<Mutex<Files>>,
     settings: TlsSettings,
@@ -78,7 +79,7 @@ struct Parts {
 }
 
 #[derive(Debug)]
-struct Shown(RwLock<Certificates>);
+struct CertificateResolver(RwLock<Certificates>);
 
 #[derive(Debug, Clone)]
 struct Certificates {
@@ -88,12 +89,12 @@ struct Certificates {
     common: Arc<CertifiedKey>,
 }
 
-impl ResolvesServerCert for Shown {
+impl ResolvesServerCert for CertificateResolver {
     fn resolve(&self, hello: ClientHello<'_>) -> Option<Arc<CertifiedKey>> {
-        let asks_for_pinned =
+        let requests_pinned =
             hello.alpn().is_some_and(|mut asked| asked.any(|protocol| protocol == PINNED_PROTOCOL));
         let certificates = self.0.read().unwrap_or_else(PoisonError::into_inner);
-        Some(if asks_for_pinned {
+        Some(if requests_pinned {
             certificates.pinned.clone()
         } else {
             certificates.common.clone()
@@ -113,20 +114,20 @@ impl Tls {
         let mut own = settings.own_files().map(|(certificate, key)| Files::new(certificate, key));
         let now_ms = clock.now_ms();
         let names = names_of_this_machine(&settings.names);
-        let common = match own.as_mut().map(Files::read_news).transpose()?.flatten() {
+        let common = match own.as_mut().map(Files::read_if_changed).transpose()?.flatten() {
             Some(own) => own,
             None => authority.issue(Audience::Browsers, &names, now_ms)?,
         };
         let pinned = authority.issue(Audience::Robots, &names, now_ms)?;
         let certificates = Certificates { pinned: Arc::new(pinned), common: Arc::new(common) };
-        let shown = Arc::new(Shown(RwLock::new(certificates)));
+        let resolver = Arc::new(CertificateResolver(RwLock::new(certificates)));
         let builder = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()));
         let builder = builder.with_safe_default_protocol_versions().map_err(TlsError::Unusable)?;
         let builder = match settings.client_certificates {
             true => builder.with_client_cert_verifier(AnyKey::new()),
             false => builder.with_no_client_auth(),
         };
-        let mut config = builder.with_cert_resolver(shown.clone());
+        let mut config = builder.with_cert_resolver(resolver.clone());
         // When all robots reconnect at once, resumption halves the work of a handshake, and tickets
         // need no memory on the server.
         config.ticketer = ring::Ticketer::new().map_err(TlsError::Unusable)?;
@@ -134,7 +135,7 @@ impl Tls {
         let acceptor = TlsAcceptor::from(Arc::new(config));
         Ok(Self(Arc::new(Parts {
             acceptor,
-            shown,
+            resolver,
             authority,
             own: own.map(Mutex::new),
             settings,
@@ -150,7 +151,7 @@ impl Tls {
         let stream = self.0.acceptor.accept(stream).await?;
         let proof = match self.0.settings.client_certificates {
             true => ClientProof::of(stream.get_ref().1.peer_certificates()),
-            false => ClientProof::NotAsked,
+            false => ClientProof::NotRequested,
         };
         Ok((stream, proof))
     }
@@ -162,8 +163,8 @@ impl Tls {
 
     /// The pin that is announced to robots; `None` if the system's root certificates vouch for the
     /// operator's own certificate.
-    pub fn told_pin(&self) -> Option<CaPin> {
-        self.0.settings.tells_pin().then(|| self.pin())
+    pub fn announced_pin(&self) -> Option<CaPin> {
+        self.0.settings.announces_pin().then(|| self.pin())
     }
 
     /// The configuration with which this process connects to itself.
@@ -174,10 +175,10 @@ impl Tls {
     /// Loads changes of the operator's files. On an error the certificates stay unchanged.
     pub fn reload(&self) -> Result<(), TlsError> {
         let Some(own) = &self.0.own else { return Ok(()) };
-        let news = own.lock().unwrap_or_else(PoisonError::into_inner).read_news()?;
-        if let Some(news) = news {
-            self.0.shown.write().common = Arc::new(news);
-            tracing::info!("new connections are shown the certificate that was put in place");
+        let changed = own.lock().unwrap_or_else(PoisonError::into_inner).read_if_changed()?;
+        if let Some(changed) = changed {
+            self.0.resolver.write().common = Arc::new(changed);
+            tracing::info!("loaded the new certificate; new connections use it");
         }
         Ok(())
     }
@@ -191,17 +192,17 @@ impl Tls {
             Some(_) => None,
             None => Some(Arc::new(authority.issue(Audience::Browsers, &names, now_ms)?)),
         };
-        let mut shown = self.0.shown.write();
-        shown.pinned = pinned;
+        let mut certificates = self.0.resolver.write();
+        certificates.pinned = pinned;
         if let Some(common) = common {
-            shown.common = common;
+            certificates.common = common;
         }
         Ok(())
     }
 
     /// Checks for new files, and renews the authority's certificates, until `stop`.
     pub async fn keep_current(self, stop: CancellationToken) {
-        let mut looks = tokio::time::interval(self.0.settings.look_interval);
+        let mut looks = tokio::time::interval(self.0.settings.check_interval);
         let mut renewals = tokio::time::interval(RENEWAL);
         looks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
         // The first tick comes at once, and all certificates are new at that time.
@@ -215,18 +216,18 @@ impl Tls {
             let tls = self.clone();
             let outcome = tokio::task::spawn_blocking(move || task(&tls)).await;
             if let Ok(Err(error)) = outcome {
-                self.complain(&error);
+                self.log_error(&error);
             }
         }
     }
 
-    fn complain(&self, error: &TlsError) {
+    fn log_error(&self, error: &TlsError) {
         let error = error as &dyn std::error::Error;
-        tracing::warn!(error, "the certificate stays what it was");
+        tracing::warn!(error, "the certificate could not be reloaded; the old one stays in use");
     }
 }
 
-impl Shown {
+impl CertificateResolver {
     fn write(&self) -> std::sync::RwLockWriteGuard<'_, Certificates> {
         self.0.write().unwrap_or_else(PoisonError::into_inner)
     }
@@ -242,8 +243,7 @@ impl fmt::Debug for Tls {
 /// client that trusts a pin does not check names.
 fn names_of_this_machine(further: &[String]) -> Vec<String> {
     let mut names = vec!["localhost".to_owned()];
-    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
-    names.extend(Some(host.trim().to_owned()).filter(|host| !host.is_empty()));
+    names.extend(host_name());
     let interfaces = nix::ifaddrs::getifaddrs().into_iter().flatten();
     names.extend(interfaces.filter_map(|interface| {
         let address = interface.address?;

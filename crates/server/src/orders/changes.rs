@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex, PoisonError};
 use task_proto::{DeploymentId, RobotId, TaskName};
 use tokio::sync::{Notify, broadcast, watch};
 
-use crate::domain::happening::Happening;
+use crate::domain::fleet_event::FleetEvent;
 use crate::fleet::part_requests::PartRequests;
 use crate::store::KnownRobot;
 
-/// Capacity of a notice channel: a listener that falls further behind misses notices.
-const NOTICES: usize = 16 * 1024;
+/// Capacity of a channel: a receiver that falls further behind misses entries.
+const CHANNEL_CAPACITY: usize = 16 * 1024;
 
 /// One created, changed or removed object. The listener reads the current value from the store.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -27,54 +27,54 @@ pub enum Change {
     Deployment(DeploymentId),
     /// A package was pushed or deleted.
     Package(TaskName),
-    /// The feed has an entry with this number.
-    Feed(u64),
+    /// The feed has entries with these numbers.
+    Feed { first: u64, last: u64 },
 }
 
 /// Changes of a write, collected on the way and announced after its commit.
 #[derive(Debug, Default)]
-pub struct Consequences {
+pub struct PendingNotifications {
     /// Robots that have changed as the operator sees them.
     pub robots: BTreeSet<RobotId>,
     /// Robots whose desired state is new.
-    pub rings: BTreeSet<RobotId>,
+    pub to_notify: BTreeSet<RobotId>,
     /// Deployments that are new or have changed.
     pub deployments: BTreeSet<DeploymentId>,
     /// Events for the feed.
-    pub happenings: Vec<Happening>,
+    pub fleet_events: Vec<FleetEvent>,
 }
 
 /// Where changes are announced. Clones announce to the same listeners.
 #[derive(Debug, Clone)]
 pub struct Changes {
     notices: broadcast::Sender<Change>,
-    happenings: broadcast::Sender<Happening>,
-    bells: Arc<Bells>,
+    fleet_events: broadcast::Sender<FleetEvent>,
+    wake_queue: Arc<WakeQueue>,
     rights: Arc<watch::Sender<()>>,
     part_requests: PartRequests,
 }
 
 /// Robots to notify: a set, so a robot waits here once however often its desired state changes.
 #[derive(Debug, Default)]
-struct Bells {
-    waiting: Mutex<Rings>,
-    rung: Notify,
+struct WakeQueue {
+    waiting: Mutex<RobotsToNotify>,
+    added: Notify,
 }
 
 /// The robots to notify.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub struct Rings {
+pub struct RobotsToNotify {
     /// Whether all robots are to be notified.
-    pub everyone: bool,
+    pub all: bool,
     pub robots: BTreeSet<RobotId>,
 }
 
 impl Changes {
     pub fn new() -> Self {
         Self {
-            notices: broadcast::Sender::new(NOTICES),
-            happenings: broadcast::Sender::new(NOTICES),
-            bells: Arc::default(),
+            notices: broadcast::Sender::new(CHANNEL_CAPACITY),
+            fleet_events: broadcast::Sender::new(CHANNEL_CAPACITY),
+            wake_queue: Arc::default(),
             rights: Arc::new(watch::Sender::new(())),
             part_requests: PartRequests::default(),
         }
@@ -106,53 +106,53 @@ impl Changes {
     }
 
     /// Tells the feed about an event; no listener is fine.
-    pub fn happened(&self, happening: Happening) {
-        let _ = self.happenings.send(happening);
+    pub fn announce_event(&self, event: FleetEvent) {
+        let _ = self.fleet_events.send(event);
     }
 
     /// Everything that happens from now on.
-    pub fn happenings(&self) -> broadcast::Receiver<Happening> {
-        self.happenings.subscribe()
+    pub fn fleet_events(&self) -> broadcast::Receiver<FleetEvent> {
+        self.fleet_events.subscribe()
     }
 
     /// Announces all that a write has changed. To be called after its commit.
-    pub fn publish(&self, consequences: Consequences) {
-        for robot in consequences.robots.union(&consequences.rings) {
+    pub fn publish(&self, notifications: PendingNotifications) {
+        for robot in notifications.robots.union(&notifications.to_notify) {
             self.announce(Change::Robot(robot.clone()));
         }
-        for deployment in consequences.deployments {
+        for deployment in notifications.deployments {
             self.announce(Change::Deployment(deployment));
         }
-        consequences.happenings.into_iter().for_each(|happening| self.happened(happening));
-        self.ring(consequences.rings);
+        notifications.fleet_events.into_iter().for_each(|event| self.announce_event(event));
+        self.notify_robots(notifications.to_notify);
     }
 
     /// Queues notifications to `robots` about their new desired state.
-    pub fn ring(&self, robots: impl IntoIterator<Item = RobotId>) {
-        let mut waiting = self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+    pub fn notify_robots(&self, robots: impl IntoIterator<Item = RobotId>) {
+        let mut waiting = self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         waiting.robots.extend(robots);
         if !waiting.robots.is_empty() {
-            self.bells.rung.notify_one();
+            self.wake_queue.added.notify_one();
         }
     }
 
     /// Queues notifications to all robots about their desired state.
-    pub fn ring_everyone(&self) {
-        self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner).everyone = true;
-        self.bells.rung.notify_one();
+    pub fn notify_all_robots(&self) {
+        self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner).all = true;
+        self.wake_queue.added.notify_one();
     }
 
     /// Waits until robots are queued and takes them all. Made for one caller, the downlink;
     /// dropping the future loses none.
-    pub async fn take_rings(&self) -> Rings {
+    pub async fn take_robots_to_notify(&self) -> RobotsToNotify {
         loop {
             let taken = std::mem::take(
-                &mut *self.bells.waiting.lock().unwrap_or_else(PoisonError::into_inner),
+                &mut *self.wake_queue.waiting.lock().unwrap_or_else(PoisonError::into_inner),
             );
-            if taken != Rings::default() {
+            if taken != RobotsToNotify::default() {
                 return taken;
             }
-            self.bells.rung.notified().await;
+            self.wake_queue.added.notified().await;
         }
     }
 }
@@ -168,24 +168,24 @@ mod tests {
     use super::*;
 
     #[tokio::test]
-    async fn a_robot_rung_twice_is_taken_once() {
+    async fn robot_queued_twice_is_taken_once() {
         let changes = Changes::new();
         let robot = RobotId::random();
-        changes.ring([robot.clone()]);
-        changes.ring([robot.clone()]);
-        assert_eq!(changes.take_rings().await.robots, BTreeSet::from([robot.clone()]));
+        changes.notify_robots([robot.clone()]);
+        changes.notify_robots([robot.clone()]);
+        assert_eq!(changes.take_robots_to_notify().await.robots, BTreeSet::from([robot.clone()]));
         let waiting = tokio::spawn({
             let changes = changes.clone();
-            async move { changes.take_rings().await }
+            async move { changes.take_robots_to_notify().await }
         });
-        changes.ring([robot.clone()]);
+        changes.notify_robots([robot.clone()]);
         let taken = waiting.await.expect("no panic");
-        assert_eq!(taken, Rings { everyone: false, robots: BTreeSet::from([robot.clone()]) });
-        changes.ring_everyone();
-        changes.ring([robot.clone()]);
+        assert_eq!(taken, RobotsToNotify { all: false, robots: BTreeSet::from([robot.clone()]) });
+        changes.notify_all_robots();
+        changes.notify_robots([robot.clone()]);
         assert_eq!(
-            changes.take_rings().await,
-            Rings { everyone: true, robots: BTreeSet::from([robot]) }
+            changes.take_robots_to_notify().await,
+            RobotsToNotify { all: true, robots: BTreeSet::from([robot]) }
         );
     }
 }

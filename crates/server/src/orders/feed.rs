@@ -1,149 +1,152 @@
-//! The feed: the latest noteworthy events of the fleet, in memory. Similar events are gathered for
-//! a moment and reported together, so that a restart of the server is one line and not ten
-//! thousand. The feed decides nothing, and events that must not be lost are in the audit.
+//! The feed: the latest noteworthy events of the fleet, as rows of the database. Similar events are
+//! gathered for a moment and reported together, so that a restart of the server is one line and not
+//! ten thousand. Gathering never waits for the database to store an entry: what the database does
+//! not take in time is dropped and counted. Events that must not be lost are in the audit.
 
 mod pending;
 
-use std::collections::VecDeque;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use task_proto::api::{FeedEntry, FeedKind, MAX_FEED_ENTRIES};
-use task_proto::log::LogLevel;
-use task_proto::{DeploymentId, RobotId, RobotName};
+use task_proto::api::FeedKind;
+use task_proto::telemetry::log::LogLevel;
 use tokio::sync::broadcast::error::RecvError;
+use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
 use self::pending::Pending;
 use super::changes::{Change, Changes};
 use crate::broker::{Broker, Health};
-use crate::store::{KnownRobot, Store};
+use crate::store::{FeedAudience, NewFeedEntry, Store};
 use crate::system::clock::Clock;
-use crate::system::data_directory::room;
+use crate::system::data_directory::disk_space;
 
 /// Interval between two passes over the gathered events.
-const TURN: Duration = Duration::from_secs(1);
-/// Interval between checks of the disk, in turns.
-const DISK_TURNS: u64 = 60;
-/// Of a longer text the rest is left out.
-const MOST_CHARACTERS: usize = 500;
+const TICK: Duration = Duration::from_secs(1);
+/// Interval between checks of the disk, in ticks.
+const DISK_TICKS: u64 = 60;
+/// The most batches that wait to be stored: those of a minute.
+const MAX_BATCHES: usize = 60;
+/// Longer texts are cut.
+const MAX_CHARACTERS: usize = 500;
 /// Below this share of free space, in percent, the disk is nearly full.
-const LEAST_FREE_PERCENT: u64 = 5;
-
-/// The users who may see an entry.
-#[derive(Debug, Clone)]
-pub enum FeedAudience {
-    Everybody,
-    /// Users who may see every robot: the entry counts robots.
-    Unlimited,
-    /// Users who may see this robot.
-    Robot(Arc<KnownRobot>),
-}
-
-/// The latest entries. Clones share them.
-#[derive(Clone)]
-pub struct Feed(Arc<Mutex<Entries>>);
-
-struct Entries {
-    kept: VecDeque<(FeedEntry, FeedAudience)>,
-    next: u64,
-}
+const MIN_FREE_PERCENT: u64 = 5;
 
 /// Inputs of the feed.
 pub struct FeedSource {
-    /// The database, for names.
+    /// The database, for names and for the entries.
     pub store: Store,
     /// The broker, for its health.
     pub broker: Broker,
     pub clock: Clock,
-    /// On the disk that is looked at.
+    /// A directory on the monitored disk.
     pub data: PathBuf,
 }
 
-/// An entry without its number and time.
-struct Said {
-    kind: FeedKind,
-    level: LogLevel,
-    robot: Option<(RobotId, RobotName)>,
-    deployment: Option<DeploymentId>,
-    text: String,
-    audience: FeedAudience,
+/// Gathers events and reports them, until `stop`. Then the entries that still wait are stored.
+pub async fn run(source: FeedSource, changes: Changes, stop: CancellationToken) {
+    let (queue, batches) = queue();
+    let store = source.store.clone();
+    tokio::join!(gather(source, queue, &changes, stop), store_batches(batches, &store, &changes));
 }
 
-impl Feed {
-    /// Nothing happened yet. Numbers go on growing over restarts, as the clock does.
-    pub fn new(now_ms: u64) -> Self {
-        Self(Arc::new(Mutex::new(Entries { kept: VecDeque::new(), next: now_ms })))
-    }
-
-    /// The entry with this number, if the feed still holds it.
-    pub fn get(&self, number: u64) -> Option<(FeedEntry, FeedAudience)> {
-        self.entries().kept.iter().rev().find(|(entry, _)| entry.number == number).cloned()
-    }
-
-    /// The entries after `number`, the oldest first.
-    pub fn after(&self, number: u64) -> Vec<(FeedEntry, FeedAudience)> {
-        self.entries().kept.iter().filter(|(entry, _)| entry.number > number).cloned().collect()
-    }
-
-    fn say(&self, said: Said, at_ms: u64) -> u64 {
-        let mut entries = self.entries();
-        let number = entries.next;
-        entries.next += 1;
-        if entries.kept.len() >= MAX_FEED_ENTRIES {
-            entries.kept.pop_front();
-        }
-        let Said { kind, level, robot, deployment, text, audience } = said;
-        let (robot, robot_name) = robot.unzip();
-        let text = one_line(&text);
-        let entry = FeedEntry { number, at_ms, kind, level, robot, robot_name, deployment, text };
-        entries.kept.push_back((entry, audience));
-        number
-    }
-
-    fn entries(&self) -> MutexGuard<'_, Entries> {
-        // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
-        // half-done.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Gathers events and reports them, until `stop`.
-    pub async fn run(self, source: FeedSource, changes: Changes, stop: CancellationToken) {
-        let (mut happenings, mut notices) = (changes.happenings(), changes.subscribe());
-        let mut health = source.broker.health();
-        let (mut pending, mut turns) = (Pending::default(), 0u64);
-        let (mut was_well, mut had_room) = (true, true);
-        let mut ticks = tokio::time::interval(TURN);
-        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        loop {
-            let mut said = Vec::new();
-            tokio::select! {
-                () = stop.cancelled() => return,
-                happening = happenings.recv() => match happening {
-                    Ok(happening) => pending.take(happening),
-                    // Events beyond the channel's capacity are too many to read.
-                    Err(RecvError::Lagged(_)) => {}
-                    Err(RecvError::Closed) => return,
-                },
-                notice = notices.recv() => match notice {
-                    Ok(Change::Deployment(id)) => pending.deployment(id),
-                    Ok(Change::RobotRemoved(robot)) => pending.removed(*robot),
-                    Err(RecvError::Closed) => return,
-                    Ok(_) | Err(RecvError::Lagged(_)) => {}
-                },
-                Ok(()) = health.changed() => said.extend(about_broker(&health.borrow_and_update(), &mut was_well)),
-                _ = ticks.tick() => {
-                    turns += 1;
-                    if turns % DISK_TURNS == 1 {
-                        said.extend(about_disk(&source, &mut had_room));
-                    }
-                    said.extend(pending.due(&source.store, source.clock.now_ms()).await);
+async fn gather(
+    source: FeedSource,
+    queue: BatchSender,
+    changes: &Changes,
+    stop: CancellationToken,
+) {
+    let (mut events, mut notices) = (changes.fleet_events(), changes.subscribe());
+    let mut health = source.broker.health();
+    let (mut pending, mut tick_count) = (Pending::default(), 0u64);
+    let (mut was_healthy, mut had_space) = (true, true);
+    let mut ticks = tokio::time::interval(TICK);
+    ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        let mut entries = Vec::new();
+        tokio::select! {
+            () = stop.cancelled() => return,
+            event = events.recv() => match event {
+                Ok(event) => pending.take(event),
+                // Events beyond the channel's capacity are too many to read.
+                Err(RecvError::Lagged(_)) => {}
+                Err(RecvError::Closed) => return,
+            },
+            notice = notices.recv() => match notice {
+                Ok(Change::Deployment(id)) => pending.deployment(id),
+                Ok(Change::RobotRemoved(robot)) => pending.removed(*robot),
+                Err(RecvError::Closed) => return,
+                Ok(_) | Err(RecvError::Lagged(_)) => {}
+            },
+            Ok(()) = health.changed() => entries.extend(broker_entry(&health.borrow_and_update(), &mut was_healthy)),
+            _ = ticks.tick() => {
+                tick_count += 1;
+                if tick_count % DISK_TICKS == 1 {
+                    entries.extend(disk_entry(&source, &mut had_space));
                 }
+                entries.extend(pending.due(&source.store, source.clock.now_ms()).await);
             }
-            for said in said {
-                let number = self.say(said, source.clock.now_ms());
-                changes.announce(Change::Feed(number));
+        }
+        queue.send(entries, source.clock.now_ms());
+    }
+}
+
+/// Entries of one moment.
+struct Batch {
+    entries: Vec<NewFeedEntry>,
+    at_ms: u64,
+}
+
+/// The end of the queue that takes batches, and never waits.
+struct BatchSender {
+    batches: mpsc::Sender<Batch>,
+    dropped: Arc<AtomicU64>,
+}
+
+/// The end of the queue that the writer reads.
+struct BatchReceiver {
+    batches: mpsc::Receiver<Batch>,
+    /// The number of entries dropped since the database last stored some.
+    dropped: Arc<AtomicU64>,
+}
+
+fn queue() -> (BatchSender, BatchReceiver) {
+    let ((sender, receiver), dropped) = (mpsc::channel(MAX_BATCHES), Arc::<AtomicU64>::default());
+    let sender = BatchSender { batches: sender, dropped: dropped.clone() };
+    (sender, BatchReceiver { batches: receiver, dropped })
+}
+
+impl BatchSender {
+    /// Queues entries of the time `at_ms`. A full queue drops them.
+    fn send(&self, mut entries: Vec<NewFeedEntry>, at_ms: u64) {
+        if entries.is_empty() {
+            return;
+        }
+        entries.iter_mut().for_each(|entry| entry.text = one_line(&entry.text));
+        let count = entries.len() as u64;
+        if self.batches.try_send(Batch { entries, at_ms }).is_err() {
+            self.dropped.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Stores batches and announces their numbers, until the queue has ended.
+async fn store_batches(mut queue: BatchReceiver, store: &Store, changes: &Changes) {
+    while let Some(Batch { entries, at_ms }) = queue.batches.recv().await {
+        match store.feed().append(&entries, at_ms).await {
+            Ok(numbers) => {
+                let dropped = queue.dropped.swap(0, Ordering::Relaxed);
+                if dropped > 0 {
+                    tracing::warn!(dropped, "the database did not store entries of the feed");
+                }
+                let (first, last) = numbers.into_inner();
+                changes.announce(Change::Feed { first, last });
+            }
+            Err(error) => {
+                queue.dropped.fetch_add(entries.len() as u64, Ordering::Relaxed);
+                error.log("entries of the feed could not be stored");
             }
         }
     }
@@ -152,67 +155,104 @@ impl Feed {
 /// A text that may come from a robot, as one line of limited length.
 fn one_line(text: &str) -> String {
     let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
-    let line: String = characters.by_ref().take(MOST_CHARACTERS).collect();
+    let line: String = characters.by_ref().take(MAX_CHARACTERS).collect();
     if characters.next().is_some() { line + "…" } else { line }
 }
 
-fn about_broker(health: &Health, was_well: &mut bool) -> Option<Said> {
-    let (is_well, text) = match health {
-        Health::Serving => (true, "the MQTT broker is back".to_owned()),
+fn broker_entry(health: &Health, was_healthy: &mut bool) -> Option<NewFeedEntry> {
+    let (is_healthy, text) = match health {
+        Health::Serving => (true, "the MQTT broker works again".to_owned()),
         Health::Recovering(seen) | Health::Failed(seen) => {
-            (false, format!("the MQTT broker: {seen}"))
+            (false, format!("the MQTT broker has a problem: {seen}"))
         }
     };
-    (std::mem::replace(was_well, is_well) != is_well)
-        .then(|| about_server(FeedKind::Broker, is_well, text))
+    (std::mem::replace(was_healthy, is_healthy) != is_healthy)
+        .then(|| server_entry(FeedKind::Broker, is_healthy, text))
 }
 
-fn about_disk(source: &FeedSource, had_room: &mut bool) -> Option<Said> {
-    let (free, all) = room(&source.data)?;
+fn disk_entry(source: &FeedSource, had_space: &mut bool) -> Option<NewFeedEntry> {
+    let (free, all) = disk_space(&source.data)?;
     let percent = free.saturating_mul(100).checked_div(all)?;
-    let has_room = percent >= LEAST_FREE_PERCENT;
-    let text = format!("{percent}% of the server's disk are free");
-    (std::mem::replace(had_room, has_room) != has_room)
-        .then(|| about_server(FeedKind::Disk, has_room, text))
+    let has_space = percent >= MIN_FREE_PERCENT;
+    let text = format!("{percent}% of the server's disk is free");
+    (std::mem::replace(had_space, has_space) != has_space)
+        .then(|| server_entry(FeedKind::Disk, has_space, text))
 }
 
-fn about_server(kind: FeedKind, is_well: bool, text: String) -> Said {
-    let level = if is_well { LogLevel::Info } else { LogLevel::Error };
-    Said { kind, level, robot: None, deployment: None, text, audience: FeedAudience::Everybody }
+fn server_entry(kind: FeedKind, is_healthy: bool, text: String) -> NewFeedEntry {
+    let level = if is_healthy { LogLevel::Info } else { LogLevel::Error };
+    let (robot, deployment, audience) = (None, None, FeedAudience::Everybody);
+    NewFeedEntry { kind, level, robot, deployment, text, audience }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::store::sqlite_url;
 
-    #[test]
-    fn the_feed_is_bounded_and_its_numbers_grow() {
-        let feed = Feed::new(1000);
-        for number in 0..=MAX_FEED_ENTRIES as u64 {
-            assert_eq!(
-                feed.say(about_server(FeedKind::Disk, true, String::new()), 7),
-                1000 + number
-            );
+    #[tokio::test]
+    async fn entries_beyond_the_queue_are_dropped_and_counted() {
+        let (sender, mut receiver) = queue();
+        let entries = || vec![server_entry(FeedKind::Disk, true, "one\ntwo".to_owned()); 3];
+        sender.send(Vec::new(), 0);
+        for at_ms in 0..MAX_BATCHES as u64 + 2 {
+            sender.send(entries(), at_ms);
         }
-        assert_eq!(feed.after(0).len(), MAX_FEED_ENTRIES);
-        assert!(feed.get(1000).is_none() && feed.get(1001).is_some());
-        assert_eq!(feed.after(1000 + MAX_FEED_ENTRIES as u64 - 1).len(), 1);
+        assert_eq!(receiver.dropped.load(Ordering::Relaxed), 6);
+        drop(sender);
+        let mut kept = Vec::new();
+        while let Some(Batch { entries, at_ms }) = receiver.batches.recv().await {
+            assert!(entries.iter().all(|entry| entry.text == "one two"));
+            kept.push(at_ms);
+        }
+        assert_eq!(kept, (0..MAX_BATCHES as u64).collect::<Vec<_>>());
+    }
+
+    #[tokio::test]
+    async fn entries_that_the_database_refuses_are_dropped_and_counted() {
+        let directory = tempfile::tempdir().expect("a directory");
+        let url = sqlite_url(&directory.path().join("taskd.db"));
+        let refusing = Store::open(&url).await.expect("opens");
+        refusing.close().await;
+        let ((sender, receiver), changes) = (queue(), Changes::new());
+        let (dropped, mut notices) = (receiver.dropped.clone(), changes.subscribe());
+        let entry = |text: &str| server_entry(FeedKind::Disk, true, text.to_owned());
+        sender.send(vec![entry("one"), entry("two")], 7);
+        sender.send(vec![entry("three")], 8);
+        drop(sender);
+        store_batches(receiver, &refusing, &changes).await;
+        assert_eq!(dropped.load(Ordering::Relaxed), 3);
+
+        let ((sender, receiver), store) = (queue(), Store::open(&url).await.expect("opens"));
+        let dropped = receiver.dropped.clone();
+        dropped.store(3, Ordering::Relaxed);
+        sender.send(vec![entry("four"), entry("five")], 9);
+        drop(sender);
+        store_batches(receiver, &store, &changes).await;
+        assert_eq!(dropped.load(Ordering::Relaxed), 0, "it was logged");
+        assert_eq!(notices.try_recv(), Ok(Change::Feed { first: 9, last: 10 }));
+        let stored = store.feed().after(0).await.expect("reads");
+        assert_eq!(
+            stored.iter().map(|(entry, _)| &*entry.text).collect::<Vec<_>>(),
+            ["four", "five"]
+        );
+        store.close().await;
     }
 
     #[test]
-    fn trouble_is_told_once_and_so_is_its_end() {
-        let mut was_well = true;
-        assert!(about_broker(&Health::Serving, &mut was_well).is_none());
-        let trouble = Health::Recovering("no canary".to_owned());
+    fn failure_and_recovery_are_reported_once_each() {
+        let mut was_healthy = true;
+        assert!(broker_entry(&Health::Serving, &mut was_healthy).is_none());
+        let recovering = Health::Recovering("no canary".to_owned());
         assert_eq!(
-            about_broker(&trouble, &mut was_well).map(|said| said.level),
+            broker_entry(&recovering, &mut was_healthy).map(|entry| entry.level),
             Some(LogLevel::Error)
         );
         assert!(
-            about_broker(&Health::Recovering("still none".to_owned()), &mut was_well).is_none()
+            broker_entry(&Health::Recovering("still none".to_owned()), &mut was_healthy).is_none()
         );
         assert_eq!(
-            about_broker(&Health::Serving, &mut was_well).map(|said| said.level),
+            broker_entry(&Health::Serving, &mut was_healthy).map(|entry| entry.level),
             Some(LogLevel::Info)
         );
     }

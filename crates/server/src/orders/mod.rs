@@ -2,9 +2,10 @@
 //! HTTP or MQTT and holds no SQL.
 
 pub mod actions;
-pub mod advance;
 pub mod changes;
-pub mod chooser;
+pub mod delivery_planner;
+pub mod desired_states;
 pub mod feed;
 pub mod report_meter;
 pub mod report_writer;
+pub mod rollout;

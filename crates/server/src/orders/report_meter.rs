@@ -84,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_last_minute_counts_and_what_is_older_does_not() {
+    fn meter_counts_only_the_last_minute() {
         let began = Instant::now();
         let meter = ReportMeter::new(began);
         assert_eq!(meter.read(began), ReportStatus::default());

@@ -5,16 +5,16 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::token::Token;
+use task_proto::trust::token::Token;
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 
-use crate::fleet::presence::{Claim, Presence};
-use crate::store::{Fault, ReportedBy, Store, StoreError};
+use crate::fleet::presence::{AgentIdentity, Presence};
+use crate::store::{Fault, ReportingAgent, Store, StoreError};
 use crate::system::clock::Clock;
 
 /// The first and the longest pause before an unavailable database is tried again.
-const PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
+const RETRY_PAUSES: [Duration; 2] = [Duration::from_millis(250), Duration::from_secs(5)];
 
 /// The first operator, whose token exists on every server.
 pub struct FirstOperator {
@@ -37,27 +37,23 @@ pub struct Database {
 }
 
 impl Database {
-    /// Opens the database at `url`. If Postgres is away or has no connection left, [`Self::attend`]
-    /// waits for it.
+    /// Opens the database of `store`. If Postgres is away or has no connection left,
+    /// [`Self::supervise`] waits for it.
     pub async fn open(
-        url: &str,
+        store: Store,
         operator: FirstOperator,
         presence: Arc<Presence>,
         clock: Clock,
     ) -> Result<Self, StoreError> {
-        let store = match Store::open(url).await {
-            Err(error) if passes(&error) && url.starts_with("postgres") => {
-                let error = &error as &dyn std::error::Error;
-                tracing::warn!(error, "the database can't be opened now; the server waits for it");
-                Store::unopened(url)
-            }
-            opened => opened?,
-        };
         let unusable = watch::Sender::default();
         let mut database = Self { store, operator, presence, is_ready: false, clock, unusable };
-        match database.make_ready().await {
-            Err(error) if error.fault() == Some(Fault::Away) => {}
-            made => made?,
+        match database.prepare().await {
+            Err(error) if is_transient(&error) && !database.store.state().is_open() => {
+                let error = &error as &dyn std::error::Error;
+                tracing::warn!(error, "the database is unavailable; waiting for it");
+            }
+            Err(error) if error.fault() == Some(Fault::Unreachable) => {}
+            prepared => prepared?,
         }
         Ok(database)
     }
@@ -72,52 +68,54 @@ impl Database {
     }
 
     /// Waits for the database whenever it is away, until `stop`.
-    pub async fn attend(mut self, stop: CancellationToken) {
+    pub async fn supervise(mut self, stop: CancellationToken) {
         tokio::select! {
             () = stop.cancelled() => {}
-            () = self.wait_whenever_away() => {}
+            () = self.reconnect_whenever_away() => {}
         }
     }
 
-    async fn wait_whenever_away(&mut self) {
-        let [first, longest] = PAUSES;
+    async fn reconnect_whenever_away(&mut self) {
+        let [first, longest] = RETRY_PAUSES;
         loop {
             let mut pause = first;
-            while !self.store.state().is_there() || !self.is_ready {
+            while !self.store.state().is_available() || !self.is_ready {
                 tokio::time::sleep(pause).await;
                 pause = longest.min(pause * 2);
-                let Err(error) = self.bring_up().await else { continue };
-                if !passes(&error) {
+                let Err(error) = self.reconnect().await else { continue };
+                if !is_transient(&error) {
                     let error = anyhow::Error::new(error);
                     self.unusable.send_replace(Some(format!("{error:#}")));
                     return;
                 }
             }
-            self.store.state().away().await;
+            self.store.state().unavailable().await;
         }
     }
 
     /// Checks that the database answers, and performs the first-use steps if not yet done.
-    async fn bring_up(&mut self) -> Result<(), StoreError> {
-        if !self.store.state().is_open() {
-            self.store.prepare().await?;
-        }
+    async fn reconnect(&mut self) -> Result<(), StoreError> {
         if !self.is_ready {
-            return self.make_ready().await;
+            return self.prepare().await;
         }
         // With any other answer the database is available.
         match self.store.ping().await {
-            Err(error) if error.fault() == Some(Fault::Away) => Err(error),
+            Err(error) if error.fault() == Some(Fault::Unreachable) => Err(error),
             _ => Ok(()),
         }
     }
 
     /// Performs, once, the steps that precede the first use.
-    async fn make_ready(&mut self) -> Result<(), StoreError> {
+    async fn prepare(&mut self) -> Result<(), StoreError> {
+        if !self.store.state().is_open() {
+            self.store.prepare().await?;
+        }
         self.register_operator().await?;
         let now_ms = self.clock.now_ms();
-        for (robot, ReportedBy { instance, place }) in self.store.last_agents().await? {
-            self.presence.remember(&robot, Claim { instance, place }, now_ms);
+        for (robot, ReportingAgent { instance, place }) in
+            self.store.reports().last_agents().await?
+        {
+            self.presence.remember(&robot, AgentIdentity { instance, place }, now_ms);
         }
         self.is_ready = true;
         Ok(())
@@ -127,12 +125,12 @@ impl Database {
     /// restored.
     async fn register_operator(&self) -> Result<(), StoreError> {
         let (now_ms, FirstOperator { token, path }) = (self.clock.now_ms(), &self.operator);
-        if self.store.token_holder(token, now_ms).await?.is_some() {
+        if self.store.tokens().holder(token, now_ms).await?.is_some() {
             return Ok(());
         }
-        match self.store.create_operator_token(token, now_ms).await {
+        match self.store.tokens().create_first(token, now_ms).await {
             Err(error) if error.is_unique_violation() => {
-                tracing::warn!("the token in {} was revoked and stays so", path.display());
+                tracing::warn!("the token in {} was revoked and stays revoked", path.display());
                 Ok(())
             }
             created => created,
@@ -141,12 +139,17 @@ impl Database {
 }
 
 /// Whether the error is transient.
-fn passes(error: &StoreError) -> bool {
-    matches!(error.fault(), Some(Fault::Away | Fault::Busy))
+pub(super) fn is_transient(error: &StoreError) -> bool {
+    matches!(error.fault(), Some(Fault::Unreachable | Fault::Busy))
 }
 
 /// Checks the database in full at once and then at this interval, until `stop`.
-pub async fn keep_checked(store: Store, clock: Clock, interval: Duration, stop: CancellationToken) {
+pub async fn check_periodically(
+    store: Store,
+    clock: Clock,
+    interval: Duration,
+    stop: CancellationToken,
+) {
     let mut ticks = tokio::time::interval(interval);
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
     loop {

@@ -12,11 +12,10 @@ use tokio::sync::broadcast::{
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::sync::CancellationToken;
 
-use crate::domain::happening::Happening;
+use crate::domain::fleet_event::FleetEvent;
 use crate::http::App;
-use crate::orders::actions::ActionError;
 use crate::orders::changes::Change;
-use crate::orders::chooser::ServerLoad;
+use crate::orders::delivery_planner::ServerLoad;
 
 /// Interval between checks for expired assignments.
 const EXPIRY_INTERVAL: Duration = Duration::from_secs(30);
@@ -27,7 +26,7 @@ const ROLLOUT_INTERVAL: Duration = Duration::from_secs(10);
 /// Minimum interval between checks of rollouts, however many robots come meanwhile.
 const ROLLOUT_PAUSE: Duration = Duration::from_millis(250);
 /// Interval between checks for robots whose violations have expired.
-const FORGIVING_INTERVAL: Duration = Duration::from_secs(1);
+const VIOLATION_INTERVAL: Duration = Duration::from_secs(1);
 /// Interval between measurements of the server's load.
 const LOAD_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -38,13 +37,7 @@ pub(super) async fn expire_assignments(app: App) {
         match app.actions.expire().await {
             // Clients reconnect with a valid token, if they have one.
             Ok(users) => users.iter().for_each(|user| app.broker.disconnect_person(user)),
-            Err(ActionError::Store(error)) => {
-                error.log("assignments could not be looked through for expired ones")
-            }
-            Err(error) => tracing::error!(
-                error = &error as &dyn std::error::Error,
-                "assignments could not be looked through for expired ones"
-            ),
+            Err(error) => error.log("expired assignments could not be processed"),
         }
     }
 }
@@ -53,17 +46,17 @@ pub(super) async fn expire_assignments(app: App) {
 /// rollouts directly.
 pub(super) async fn advance_rollouts(app: App) {
     let mut ticks = ticks(ROLLOUT_INTERVAL);
-    let mut happenings = app.changes.happenings();
+    let mut fleet_events = app.changes.fleet_events();
     while !app.stop.is_cancelled() {
         tokio::select! {
             () = app.stop.cancelled() => return,
             _ = ticks.tick() => {}
-            () = robot_came(&mut happenings) => {}
+            () = robot_connected(&mut fleet_events) => {}
         }
-        if let Err(error) = app.actions.advance_rollouts().await {
+        if let Err(error) = app.actions.deployments.advance_rollouts().await {
             tracing::error!(
                 error = &error as &dyn std::error::Error,
-                "rollouts could not be moved on"
+                "rollouts could not be advanced"
             );
         }
         // Robots that come online together, as after a restart, are handled together.
@@ -75,33 +68,33 @@ pub(super) async fn advance_rollouts(app: App) {
 }
 
 /// Waits until a robot has come online. Consumes all pending events.
-async fn robot_came(happenings: &mut broadcast::Receiver<Happening>) {
-    let mut came = false;
-    while !came {
-        came = match happenings.recv().await {
-            Ok(happening) => matches!(happening, Happening::Presence(_, true)),
+async fn robot_connected(fleet_events: &mut broadcast::Receiver<FleetEvent>) {
+    let mut is_connected = false;
+    while !is_connected {
+        is_connected = match fleet_events.recv().await {
+            Ok(event) => matches!(event, FleetEvent::Presence(_, true)),
             Err(RecvError::Lagged(_)) => true,
             Err(RecvError::Closed) => std::future::pending().await,
         };
     }
-    while !matches!(happenings.try_recv(), Err(TryRecvError::Empty | TryRecvError::Closed)) {}
+    while !matches!(fleet_events.try_recv(), Err(TryRecvError::Empty | TryRecvError::Closed)) {}
 }
 
 /// Displays that robots violate their limits, and when they no longer do.
-pub(super) async fn show_conduct(app: App) {
-    let mut ticks = ticks(FORGIVING_INTERVAL);
+pub(super) async fn announce_violations(app: App) {
+    let mut ticks = ticks(VIOLATION_INTERVAL);
     loop {
         let news = tokio::select! {
             () = app.stop.cancelled() => return,
             _ = ticks.tick() => {
-                app.conduct.forgive(tokio::time::Instant::now());
+                app.robot_limiter.expire_penalties(tokio::time::Instant::now());
                 continue;
             }
-            news = app.conduct.news() => news,
+            news = app.robot_limiter.changed() => news,
         };
         for robot in news {
-            if let Some(text) = app.conduct.trouble(&robot) {
-                app.changes.happened(Happening::Robot(
+            if let Some(text) = app.robot_limiter.penalty(&robot) {
+                app.changes.announce_event(FleetEvent::Robot(
                     robot.clone(),
                     FeedKind::RobotMisbehaved,
                     text,
@@ -113,22 +106,22 @@ pub(super) async fn show_conduct(app: App) {
 }
 
 /// Measures the server's load, which influences the choice of deliveries.
-pub(super) async fn watch_load(app: App, load: Arc<ServerLoad>) {
+pub(super) async fn sample_load(app: App, load: Arc<ServerLoad>) {
     let mut ticks = ticks(LOAD_INTERVAL);
     while next_tick(&mut ticks, &app.stop).await {
-        app.transfers.look();
+        app.transfers.sample();
         load.set(app.transfers.running(), app.broker.queued_part_bytes() as u64);
     }
 }
 
 /// Announces robots that have fallen silent.
-pub(super) async fn notice_silence(app: App) {
+pub(super) async fn announce_silent_robots(app: App) {
     let mut ticks = ticks(SILENCE_INTERVAL);
     let mut since_ms = app.clock.now_ms();
     while next_tick(&mut ticks, &app.stop).await {
         let now_ms = app.clock.now_ms();
-        for robot in app.presence.fell_silent(since_ms, now_ms) {
-            app.changes.happened(Happening::Presence(robot.clone(), false));
+        for robot in app.presence.timed_out(since_ms, now_ms) {
+            app.changes.announce_event(FleetEvent::Presence(robot.clone(), false));
             app.changes.announce(Change::Robot(robot));
         }
         since_ms = now_ms;

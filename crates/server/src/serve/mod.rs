@@ -1,43 +1,54 @@
-//! Owns the start and stop of the server's parts, in an order that loses nothing; it never decides
-//! what a part could decide.
+//! Owns the command line of `taskd`, and the start and stop of the server's parts in an order that
+//! loses nothing; it never decides what a part could decide.
 
+pub mod command_line;
 pub mod database;
 mod jobs;
+pub mod log_limits;
+mod standby;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::AtomicUsize;
 use std::time::Duration;
 
+use axum::extract::FromRef;
 use task_proto::CaPin;
 use task_proto::api::ListenerView;
+use task_proto::data_directory::Addresses;
+use task_proto::time::millis;
+use task_proto::trust::envelope::PublicKey;
+use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use self::database::{Database, FirstOperator, keep_checked};
-use self::jobs::{advance_rollouts, expire_assignments, notice_silence, show_conduct, watch_load};
-use crate::auth::oidc::{OidcSetUpError, Provider};
+use self::database::{Database, FirstOperator, check_periodically};
+use self::jobs::{
+    advance_rollouts, announce_silent_robots, announce_violations, expire_assignments, sample_load,
+};
+use crate::auth::oidc::{OidcSetupError, Provider};
 use crate::blobs::collector;
 use crate::blobs::{BlobError, BlobSettings, Blobs};
 use crate::broker::{
     Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits,
 };
 use crate::config::{Config, TlsSettings};
+use crate::domain::limits::robot_limiter::RobotLimiter;
 use crate::fleet::presence::Presence;
 use crate::fleet::requests::Requests;
 use crate::fleet::robot_logs::RobotLogs;
 use crate::fleet::robot_vitals::RobotVitals;
+use crate::http::accounts::session::PageCookies;
 use crate::http::auth::person_limits::PersonLimits;
 use crate::http::connection::listener;
-use crate::http::connection::traffic::HttpTotals;
-use crate::http::events::{EventFeed, EventSource};
+use crate::http::events::EventFeed;
+use crate::http::registry::archives::ArchiveReaders;
 use crate::http::registry::upload::UploadSpace;
 use crate::http::server::readiness::{DiskProbe, Readiness, ReadinessCheck};
 use crate::http::server::server_facts::ServerFacts;
 use crate::http::{App, AppParts};
-use crate::limits::conduct::Conduct;
 use crate::link::downlink::Downlink;
 use crate::link::fan_out::FanOutWorker;
 use crate::link::gatekeeper::StoreGatekeeper;
@@ -46,25 +57,28 @@ use crate::link::transfers::Transfers;
 use crate::link::uplink::Uplink;
 use crate::net::backlog::listen;
 use crate::net::http_connections::HttpConnections;
+use crate::net::proxy_protocol::ProxyProtocol;
 use crate::net::tls::{Tls, TlsError};
 use crate::orders::actions::{ActionSettings, Actions};
 use crate::orders::changes::Changes;
-use crate::orders::chooser::{Chooser, ServerLoad};
-use crate::orders::feed::{Feed, FeedSource};
+use crate::orders::delivery_planner::{DeliveryPlanner, ServerLoad};
+use crate::orders::desired_states::DesiredStates;
+use crate::orders::feed::{self, FeedSource};
 use crate::orders::report_writer::ReportWriter;
-use crate::store::{Store, StoreError, sqlite_url};
+use crate::store::{ServerIdentity, Store, StoreError, sqlite_url};
 use crate::system::clock::Clock;
-use crate::system::data_directory::{Addresses, DataDirectory, DataError, room};
+use crate::system::data_directory::{DataDirectory, DataError, disk_space};
+use crate::system::host::host_name;
 
 /// Time limit for running requests at a stop; the whole stop must take less than ten seconds.
-const REQUEST_PATIENCE: Duration = Duration::from_secs(5);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time limit for MQTT sessions, at the same time.
-const SESSION_PATIENCE: Duration = Duration::from_secs(5);
+const SESSION_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time limit for storing the received reports, afterwards.
-const WRITER_PATIENCE: Duration = Duration::from_secs(3);
+const WRITER_TIMEOUT: Duration = Duration::from_secs(3);
 /// Time limit for closing the database's connections, last.
-const DATABASE_PATIENCE: Duration = Duration::from_secs(1);
-/// Time limit of the TLS handshake before an HTTP request.
+const DATABASE_TIMEOUT: Duration = Duration::from_secs(1);
+/// Time limit of a proxy's header and of the TLS handshake before an HTTP request, each.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Default disk reserve that people must leave free: this share of the disk, up to an absolute
 /// maximum in bytes.
@@ -93,7 +107,7 @@ pub enum ServeError {
     Broker(#[from] BrokerError),
     /// The OpenID provider can't be used.
     #[error(transparent)]
-    Oidc(#[from] OidcSetUpError),
+    Oidc(#[from] OidcSetupError),
     /// HTTP can't be served.
     #[error("cannot listen for HTTP on {address}")]
     Listen {
@@ -101,6 +115,17 @@ pub enum ServeError {
         /// The operating system's error.
         source: std::io::Error,
     },
+}
+
+/// The reason why a server ends by itself.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// The broker or the database has failed for good.
+    #[error("{0}; the server stops: start it again")]
+    Broken(String),
+    /// The database belongs to another server now.
+    #[error("{successor} has taken over the database; this server stops")]
+    TakenOver { successor: String },
 }
 
 /// A server that runs until it is stopped. Dropped without [`Server::stop`], its tasks end with the
@@ -122,27 +147,34 @@ impl Server {
     /// Starts all parts. On return, both listeners accept and their addresses are published.
     pub async fn start(config: Config, clock: Clock) -> Result<Self, ServeError> {
         let data = DataDirectory::open(&config.data)?;
-        let key = data.signing_key()?;
+        let key = Arc::new(data.signing_key()?);
         let public_key = key.public_key();
         let tls = config
             .encrypts()
             .then(|| Tls::open(tls_settings(&config), &data, clock.clone()))
             .transpose()?;
-        let presence =
-            Arc::new(Presence::new(milliseconds(config.presence_timeout), clock.now_ms()));
-        let database = open_database(&config, &data, presence.clone(), clock.clone()).await?;
+        let (stop, tasks) = (CancellationToken::new(), TaskTracker::new());
+        if let Some(tls) = tls.clone() {
+            tasks.spawn(tls.keep_current(stop.clone()));
+        }
+        let presence = Arc::new(Presence::new(millis(config.presence_timeout), clock.now_ms()));
+        let store = open_store(&config, &data, &public_key).await?;
+        let listening = standby::wait(&config, &data, &store, tls.as_ref()).await?;
+        let database = open_database(store, &data, presence.clone(), clock.clone()).await?;
         let (store, unusable) = (database.store().clone(), database.unusable());
         let blobs = Blobs::open(data.path(), blob_settings(&config))?;
-        let http = listen(config.http)
-            .map_err(|source| ServeError::Listen { address: config.http, source })?;
-        let http_address = http
-            .local_addr()
-            .map_err(|source| ServeError::Listen { address: config.http, source })?;
+        let (http, http_address) = listening.map_or_else(|| listen_for_http(config.http), Ok)?;
 
         let changes = Changes::new();
         let (load, http_connections) =
             (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
-        let chooser = Chooser::new(&config.delivery, presence.clone(), load.clone());
+        let planner = DeliveryPlanner::new(&config.delivery, presence.clone(), load.clone());
+        let desired_states = DesiredStates::new(
+            store.clone(),
+            clock.clone(),
+            key.clone(),
+            millis(config.desired_lifetime),
+        );
         let settings = action_settings(&config, tls.as_ref());
         let actions = Actions::new(
             store.clone(),
@@ -150,51 +182,27 @@ impl Server {
             changes.clone(),
             key,
             settings,
-            chooser.clone(),
+            planner.clone(),
         );
-        let (writer, reports) =
-            ReportWriter::start(store.clone(), clock.clone(), changes.clone(), chooser);
-        let (requests, logs, vitals) =
-            (Requests::default(), RobotLogs::new(), RobotVitals::default());
-        let (heard, said, done, told) =
-            (requests.clone(), logs.clone(), vitals.clone(), changes.clone());
-        let uplink = Uplink::new(
-            writer.clone(),
-            heard,
-            said,
-            done,
-            presence.clone(),
-            changes.clone(),
-            clock.clone(),
-        );
-        let gatekeeper = StoreGatekeeper::new(
-            store.clone(),
-            clock.clone(),
-            presence.clone(),
-            http_connections.clone(),
-            told,
-        );
-        let conduct = Conduct::new(config.robots);
-        let broker = broker_config(&config, tls.clone(), conduct.clone());
-        let (broker, mqtt) =
-            start_broker(&config, broker, &data, Arc::new(gatekeeper), Arc::new(uplink)).await?;
-
-        let has_provider = !config.oidc.issuer.is_empty();
-        let provider =
-            has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new);
+        let base = Base { clock, store, presence, changes, tls, http_connections };
+        let robots = start_robot_traffic(&config, &data, &base, planner).await?;
+        let RobotTraffic { writer, reports, requests, logs, vitals, robot_limiter, broker, mqtt } =
+            robots;
+        let Base { clock, store, presence, changes, tls, http_connections } = base;
+        let provider = provider(&config)?;
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
-        let (stop, tasks, http_traffic) =
-            (CancellationToken::new(), TaskTracker::new(), Arc::<HttpTotals>::default());
         let facts = Arc::new(ServerFacts::new(
             &config,
             &blobs,
             listeners(http_address, &broker, tls.is_some()),
+            public_key,
+            tls.as_ref().map(Tls::pin),
         ));
         let app = App::new(AppParts {
-            feed: Feed::new(clock.now_ms()),
             clock,
             store: store.clone(),
             actions,
+            desired_states,
             changes,
             reports: writer,
             presence,
@@ -205,20 +213,19 @@ impl Server {
             blobs,
             transfers,
             uploads: UploadSpace::new(data.fresh_directory("incoming")?, config.max_upload_bytes),
-            sessions: Arc::default(),
-            http_connections: http_connections.clone(),
-            conduct,
+            readers: ArchiveReaders::default(),
+            cookies: cookies(tls.as_ref(), provider.as_deref()),
+            http_connections,
+            robot_limiter,
             provider,
             attempts: Arc::default(),
             facts,
             slow_figures: Arc::default(),
             lists: Arc::default(),
             events: EventFeed::new(),
-            key: public_key,
-            ca_pin: tls.as_ref().map(Tls::pin),
             mqtt: Arc::new(mqtt),
             trusted_proxies: config.trusted_proxies.clone().into(),
-            http_traffic: http_traffic.clone(),
+            http_traffic: Arc::default(),
             people: Arc::new(PersonLimits::new(config.people)),
             data: data.path().to_owned(),
             readiness: Readiness::default(),
@@ -226,29 +233,12 @@ impl Server {
         });
         start_readiness(&tasks, &app).await;
         start_tasks(&tasks, &app, &config);
-        if let Some(tls) = tls.clone() {
-            tasks.spawn(tls.keep_current(stop.clone()));
-        }
-        tasks.spawn(watch_load(app.clone(), load));
-        tasks.spawn(database.attend(stop.clone()));
-        let (router, connections, traffic) =
-            (crate::http::router(app), http_connections, http_traffic);
-        let service = listener::Service { router, tls: tls.clone(), connections, traffic };
-        let http =
-            listener::serve(http, service, http_limits(&config), stop.clone(), REQUEST_PATIENCE);
-        let addresses = publish(&data, http_address, &broker, tls.as_ref().map(Tls::pin))?;
-        Ok(Self {
-            data,
-            addresses,
-            store,
-            unusable,
-            broker,
-            tls,
-            stop,
-            tasks,
-            http: tokio::spawn(http),
-            reports,
-        })
+        tasks.spawn(sample_load(app.clone(), load));
+        tasks.spawn(database.supervise(stop.clone()));
+        let http = serve_http(http, app, tls.clone(), &config);
+        let addresses = addresses(http_address, &broker, tls.as_ref().map(Tls::pin));
+        publish(&data, &addresses)?;
+        Ok(Self { data, addresses, store, unusable, broker, tls, stop, tasks, http, reports })
     }
 
     /// The addresses of the listeners.
@@ -265,13 +255,13 @@ impl Server {
         self.tls.as_ref().map_or(Ok(()), Tls::reload)
     }
 
-    /// Waits until the broker or the database has failed for good; returns the observation.
-    pub async fn broken(&self) -> String {
+    /// Waits until the broker or the database has failed for good, or another server has taken over.
+    pub async fn failure(&self) -> Failure {
         let (mut health, mut unusable) = (self.broker.health(), self.unusable.clone());
         let broker = async {
             match health.wait_for(|health| matches!(health, Health::Failed(_))).await.as_deref() {
-                Ok(Health::Failed(seen)) => format!("MQTT can't be served any more: {seen}"),
-                _ => "the broker's watchdog has ended".to_owned(),
+                Ok(Health::Failed(seen)) => format!("MQTT has failed: {seen}"),
+                _ => "the broker's watchdog has stopped".to_owned(),
             }
         };
         let database = async {
@@ -282,8 +272,9 @@ impl Server {
             }
         };
         tokio::select! {
-            seen = broker => seen,
-            why = database => why,
+            seen = broker => Failure::Broken(seen),
+            why = database => Failure::Broken(why),
+            successor = self.store.state().taken_over() => Failure::TakenOver { successor },
         }
     }
 
@@ -292,7 +283,7 @@ impl Server {
     pub async fn stop(self) {
         self.data.unpublish();
         self.stop.cancel();
-        let ((), http) = tokio::join!(self.broker.shutdown(SESSION_PATIENCE), self.http);
+        let ((), http) = tokio::join!(self.broker.shutdown(SESSION_TIMEOUT), self.http);
         if http.is_err() {
             tracing::error!("the HTTP listener had failed");
         }
@@ -304,37 +295,123 @@ impl Server {
             self.tasks.wait().await;
             self.reports.await
         };
-        if tokio::time::timeout(WRITER_PATIENCE, drained).await.is_err() {
-            tracing::warn!("not every report was stored in time; robots send them again");
+        if tokio::time::timeout(WRITER_TIMEOUT, drained).await.is_err() {
+            tracing::warn!("some reports were not stored in time; robots send them again");
         }
-        if tokio::time::timeout(DATABASE_PATIENCE, self.store.close()).await.is_err() {
+        if tokio::time::timeout(DATABASE_TIMEOUT, self.store.close()).await.is_err() {
             tracing::warn!("the database did not close in time");
         }
     }
 }
 
+/// The parts that the traffic with robots and the HTTP API share.
+struct Base {
+    clock: Clock,
+    store: Store,
+    presence: Arc<Presence>,
+    changes: Changes,
+    tls: Option<Tls>,
+    http_connections: Arc<HttpConnections>,
+}
+
+/// The MQTT broker and the parts that take messages from robots.
+struct RobotTraffic {
+    writer: ReportWriter,
+    /// Ends when all received reports are stored.
+    reports: JoinHandle<()>,
+    requests: Requests,
+    logs: RobotLogs,
+    vitals: RobotVitals,
+    robot_limiter: Arc<RobotLimiter>,
+    broker: Broker,
+    mqtt: MqttAccess,
+}
+
+/// Starts MQTT and the storing of reports.
+async fn start_robot_traffic(
+    config: &Config,
+    data: &DataDirectory,
+    base: &Base,
+    planner: DeliveryPlanner,
+) -> Result<RobotTraffic, ServeError> {
+    let Base { clock, store, presence, changes, tls, http_connections } = base;
+    let (writer, reports) =
+        ReportWriter::start(store.clone(), clock.clone(), changes.clone(), planner);
+    let (requests, logs, vitals) = (Requests::default(), RobotLogs::new(), RobotVitals::default());
+    let uplink = Uplink::new(
+        writer.clone(),
+        requests.clone(),
+        logs.clone(),
+        vitals.clone(),
+        presence.clone(),
+        changes.clone(),
+        clock.clone(),
+    );
+    let gatekeeper = StoreGatekeeper::new(
+        store.clone(),
+        clock.clone(),
+        presence.clone(),
+        http_connections.clone(),
+        changes.clone(),
+    );
+    let robot_limiter = RobotLimiter::new(config.robots);
+    let embedded = broker_config(config, tls.clone(), robot_limiter.clone());
+    let (broker, mqtt) =
+        start_broker(config, embedded, data, Arc::new(gatekeeper), Arc::new(uplink)).await?;
+    Ok(RobotTraffic { writer, reports, requests, logs, vitals, robot_limiter, broker, mqtt })
+}
+
+/// Opens the HTTP listener; returns its bound address.
+fn listen_for_http(address: SocketAddr) -> Result<(TcpListener, SocketAddr), ServeError> {
+    let failed = |source| ServeError::Listen { address, source };
+    let listener = listen(address).map_err(failed)?;
+    let bound = listener.local_addr().map_err(failed)?;
+    Ok((listener, bound))
+}
+
+/// The OpenID provider, if the configuration names one.
+fn provider(config: &Config) -> Result<Option<Arc<Provider>>, ServeError> {
+    let has_provider = !config.oidc.issuer.is_empty();
+    Ok(has_provider.then(|| Provider::new(config.oidc.clone())).transpose()?.map(Arc::new))
+}
+
+/// The form of the cookies of the page, which browsers reach over TLS if the server or the proxy at
+/// the provider's public address encrypts.
+fn cookies(tls: Option<&Tls>, provider: Option<&Provider>) -> PageCookies {
+    let is_behind_tls =
+        provider.is_some_and(|provider| provider.settings().public_url.starts_with("https:"));
+    PageCookies { is_secure: tls.is_some() || is_behind_tls }
+}
+
+/// Serves the HTTP API until the server stops.
+fn serve_http(
+    listener: TcpListener,
+    app: App,
+    tls: Option<Tls>,
+    config: &Config,
+) -> JoinHandle<()> {
+    let (connections, traffic) = (app.http_connections.clone(), app.http_traffic.clone());
+    let stop = app.stop.clone();
+    let service = listener::Service { router: crate::http::router(app), tls, connections, traffic };
+    let limits = http_limits(config);
+    tokio::spawn(listener::serve(listener, service, limits, stop, REQUEST_TIMEOUT))
+}
+
 /// Starts the tasks beside the listeners.
 fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     let downlink = Downlink {
-        actions: app.actions.clone(),
+        desired_states: app.desired_states.clone(),
         blobs: app.blobs.clone(),
         broker: app.broker.clone(),
         presence: app.presence.clone(),
         clock: app.clock.clone(),
     };
     tasks.spawn(downlink.run(app.changes.clone(), app.stop.clone()));
-    let source = EventSource {
-        store: app.store.clone(),
-        presence: app.presence.clone(),
-        conduct: app.conduct.clone(),
-        vitals: app.vitals.clone(),
-        feed: app.feed.clone(),
-        clock: app.clock.clone(),
-    };
-    tasks.spawn(app.events.clone().run(source, app.changes.clone(), app.stop.clone()));
+    let views = FromRef::from_ref(app);
+    tasks.spawn(app.events.clone().run(views, app.changes.clone(), app.stop.clone()));
     let (store, blobs, clock, stop) =
         (app.store.clone(), app.blobs.clone(), app.clock.clone(), app.stop.clone());
-    tasks.spawn(keep_checked(
+    tasks.spawn(check_periodically(
         store.clone(),
         clock.clone(),
         config.database_check_interval,
@@ -344,7 +421,7 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
     tasks.spawn(expire_assignments(app.clone()));
     let worker = FanOutWorker {
         store: app.store.clone(),
-        actions: app.actions.clone(),
+        deployments: app.actions.deployments.clone(),
         blobs: app.blobs.clone(),
         broker: app.broker.clone(),
         changes: app.changes.clone(),
@@ -357,10 +434,10 @@ fn start_tasks(tasks: &TaskTracker, app: &App, config: &Config) {
         clock: app.clock.clone(),
         data: app.data.clone(),
     };
-    tasks.spawn(app.feed.clone().run(source, app.changes.clone(), app.stop.clone()));
-    tasks.spawn(notice_silence(app.clone()));
+    tasks.spawn(feed::run(source, app.changes.clone(), app.stop.clone()));
+    tasks.spawn(announce_silent_robots(app.clone()));
     tasks.spawn(advance_rollouts(app.clone()));
-    tasks.spawn(show_conduct(app.clone()));
+    tasks.spawn(announce_violations(app.clone()));
 }
 
 /// Checks once, so that the first answer of `/readyz` is true, and continues in the background.
@@ -375,54 +452,64 @@ async fn start_readiness(tasks: &TaskTracker, app: &App) {
     tasks.spawn(check.run(app.stop.clone()));
 }
 
-async fn open_database(
+/// The database of the configuration. A Postgres is not opened yet, because another server may use
+/// it.
+async fn open_store(
     config: &Config,
+    data: &DataDirectory,
+    key: &PublicKey,
+) -> Result<Store, ServeError> {
+    let in_directory = || sqlite_url(&data.path().join("taskd.sqlite"));
+    let url = config.database.clone().unwrap_or_else(in_directory);
+    if config.postgres().is_none() {
+        return Ok(Store::open(&url).await?);
+    }
+    let host = host_name().unwrap_or_else(|| "taskd".to_owned());
+    let identity = ServerIdentity {
+        run: format!("{host}-{:016x}", rand::random::<u64>()),
+        key_id: key.id(),
+        topic_prefix: config.topic_prefix.as_str().to_owned(),
+    };
+    Ok(Store::guarded(&url, identity))
+}
+
+async fn open_database(
+    store: Store,
     data: &DataDirectory,
     presence: Arc<Presence>,
     clock: Clock,
 ) -> Result<Database, ServeError> {
-    let url =
-        config.database.clone().unwrap_or_else(|| sqlite_url(&data.path().join("taskd.sqlite")));
     let operator =
         FirstOperator { token: data.operator_token()?, path: data.operator_token_path() };
-    Ok(Database::open(&url, operator, presence, clock).await?)
+    Ok(Database::open(store, operator, presence, clock).await?)
 }
 
-/// Publishes the server's addresses for programs on this machine, if there is disk space.
-fn publish(
-    data: &DataDirectory,
-    http: SocketAddr,
-    broker: &Broker,
-    ca_pin: Option<CaPin>,
-) -> Result<Addresses, DataError> {
+/// The server's addresses for programs on this machine.
+fn addresses(http: SocketAddr, broker: &Broker, ca_pin: Option<CaPin>) -> Addresses {
     let mqtt = broker.local_addr().map(|bound| reachable(bound).to_string());
     let mqtt = mqtt.unwrap_or_else(|| broker.address());
-    let addresses = Addresses { http: reachable(http).to_string(), mqtt, ca_pin };
-    match data.publish(&addresses) {
-        Err(error @ DataError::Full { .. }) => {
-            let error = &error as &dyn std::error::Error;
-            tracing::warn!(
-                error,
-                "commands on this machine do not find the server; name it with --server"
-            );
-        }
-        published => published?,
-    }
-    Ok(addresses)
+    Addresses { http: reachable(http).to_string(), mqtt, ca_pin }
 }
 
-fn milliseconds(time: Duration) -> u64 {
-    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+/// Publishes the server's addresses, if there is disk space.
+fn publish(data: &DataDirectory, addresses: &Addresses) -> Result<(), DataError> {
+    match data.publish(addresses) {
+        Err(error @ DataError::Full { .. }) => {
+            let error = &error as &dyn std::error::Error;
+            tracing::warn!(error, "commands on this machine can't find the server; use --server");
+            Ok(())
+        }
+        published => published,
+    }
 }
 
 fn action_settings(config: &Config, tls: Option<&Tls>) -> ActionSettings {
     ActionSettings {
-        ca_pin: tls.and_then(Tls::told_pin),
-        assignment_lifetime_ms: milliseconds(config.assignment_expiry),
-        desired_lifetime_ms: milliseconds(config.desired_lifetime),
-        enrolment_approval: config.enrolment_approval,
-        enrolment_token_uses: config.enrolment_uses,
-        enrolments_per_minute: config.enrolment_per_minute,
+        ca_pin: tls.and_then(Tls::announced_pin),
+        assignment_lifetime_ms: millis(config.assignment_expiry),
+        enrollment_approval: config.enrollment_approval,
+        enrollment_token_uses: config.enrollment_uses,
+        enrollments_per_minute: config.enrollment_per_minute,
         ..ActionSettings::default()
     }
 }
@@ -436,7 +523,7 @@ fn tls_settings(config: &Config) -> TlsSettings {
 
 fn blob_settings(config: &Config) -> BlobSettings {
     let defaults = BlobSettings::default();
-    let disk_bytes = room(&config.data).map_or(u64::MAX, |(_, total)| total);
+    let disk_bytes = disk_space(&config.data).map_or(u64::MAX, |(_, total)| total);
     BlobSettings {
         reading: config.blob_read,
         max_blob_bytes: config.max_blob_bytes,
@@ -455,6 +542,7 @@ fn http_limits(config: &Config) -> listener::Limits {
         max_connections: config.max_http_connections,
         max_silent_per_address: config.max_silent_per_address,
         proxies: config.trusted_proxies.clone().into(),
+        proxy_protocol: ProxyProtocol::new(&config.proxies),
         handshake_timeout: HANDSHAKE_TIMEOUT,
     }
 }
@@ -504,13 +592,24 @@ fn listeners(http: SocketAddr, broker: &Broker, tls: bool) -> Vec<ListenerView> 
         .collect()
 }
 
-fn broker_config(config: &Config, tls: Option<Tls>, conduct: Arc<Conduct>) -> BrokerConfig {
+fn broker_config(
+    config: &Config,
+    tls: Option<Tls>,
+    robot_limiter: Arc<RobotLimiter>,
+) -> BrokerConfig {
     let limits = Limits {
         max_connections: config.max_mqtt_connections,
         max_silent_per_address: config.max_silent_per_address,
         ..Limits::default()
     };
-    BrokerConfig { listen: config.mqtt, tls, prefix: config.topic_prefix.clone(), limits, conduct }
+    BrokerConfig {
+        listen: config.mqtt,
+        tls,
+        proxy_protocol: ProxyProtocol::new(&config.proxies),
+        prefix: config.topic_prefix.clone(),
+        limits,
+        robot_limiter,
+    }
 }
 
 /// An address that works from this machine: clients can't connect to "all interfaces".

@@ -4,16 +4,17 @@
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::api::{DeliveryChoice, DeliveryDecision};
 use task_proto::desired::PackageRef;
-use task_proto::id::Labels;
-use task_proto::report::{LinkFacts, Report, TaskReport};
+use task_proto::ids::Labels;
+use task_proto::messages::report::{LinkFacts, Report, TaskReport};
 use task_proto::{DeploymentId, Digest, RobotId};
 
+use super::repositories::Deliveries;
 use super::rows::{from_json, from_optional_json, from_word, groups, id, number, values, word};
-use super::{StoreError, Write};
+use super::{StoreError, Transaction};
 
 /// The part of an order that concerns delivery.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DeliveryOrder {
+pub struct DeliveryRequest {
     /// The operator's choice of the mechanism.
     pub choice: DeliveryChoice,
     /// The package to deliver.
@@ -37,7 +38,7 @@ pub struct RobotFacts {
 
 /// The delivery decision for a robot.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Decided {
+pub struct RobotDecision {
     pub robot: RobotId,
     /// The mechanism, and the reason for it.
     pub decision: DeliveryDecision,
@@ -45,21 +46,21 @@ pub struct Decided {
     pub inputs: String,
 }
 
-impl Write {
+impl Deliveries<&mut Transaction> {
     /// The part of the order of `deployment` that concerns delivery.
-    pub async fn delivery_order(
+    pub async fn request(
         &mut self,
         deployment: &DeploymentId,
-    ) -> Result<DeliveryOrder, StoreError> {
+    ) -> Result<DeliveryRequest, StoreError> {
         let row = sqlx::query(
             "SELECT delivery, package,
                  (SELECT COUNT(*) FROM assignments WHERE deployment_id = deployments.id) AS robots
              FROM deployments WHERE id = $1",
         )
         .bind(deployment.as_str())
-        .fetch_one(self.connection())
+        .fetch_one(self.0.connection())
         .await?;
-        Ok(DeliveryOrder {
+        Ok(DeliveryRequest {
             choice: from_word("deployments.delivery", row.try_get("delivery")?)?,
             package: from_json("deployments.package", row.try_get("package")?)?,
             robots: number(row.try_get("robots")?),
@@ -85,7 +86,7 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            for row in query.fetch_all(self.connection()).await? {
+            for row in query.fetch_all(self.0.connection()).await? {
                 facts.push(robot_facts(&row, content)?);
             }
         }
@@ -93,7 +94,7 @@ impl Write {
     }
 
     /// The labels of all robots of `deployment`.
-    pub async fn labels_in(
+    pub async fn labels(
         &mut self,
         deployment: &DeploymentId,
     ) -> Result<Vec<(RobotId, Labels)>, StoreError> {
@@ -101,7 +102,7 @@ impl Write {
             "SELECT r.id, r.labels FROM assignments a JOIN robots r ON r.id = a.robot_id WHERE a.deployment_id = $1",
         )
         .bind(deployment.as_str())
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         rows.iter()
             .map(|(robot, labels)| {
@@ -114,7 +115,7 @@ impl Write {
     pub async fn store_decisions(
         &mut self,
         deployment: &DeploymentId,
-        decided: &[Decided],
+        decided: &[RobotDecision],
     ) -> Result<(), StoreError> {
         for group in groups(decided) {
             let sql = format!(
@@ -124,7 +125,7 @@ impl Write {
                 values(2, group.len(), &["TEXT"; 5])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql)).bind(deployment.as_str());
-            for Decided { robot, decision, inputs } in group {
+            for RobotDecision { robot, decision, inputs } in group {
                 query = query
                     .bind(robot.as_str())
                     .bind(word(&decision.mechanism))
@@ -132,7 +133,7 @@ impl Write {
                     .bind(decision.because.as_str())
                     .bind(inputs.as_str());
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }

@@ -2,82 +2,87 @@
 //! should happen and never reads the clock.
 //!
 //! Decisions are [`crate::domain::deployment`]'s and [`crate::domain::rollout`]'s. One SQL text
-//! serves SQLite and Postgres.
+//! serves SQLite and Postgres. Each noun has a repository (`repositories`), which the [`Store`]
+//! lends for reads and whole writes, and a [`Transaction`] for the statements of one write.
 
 #![expect(clippy::disallowed_methods, reason = "SQL is at home here")]
 
 mod database;
 mod deliveries;
+mod feed;
 mod fleet;
 mod orders;
 mod people;
 mod registry;
+mod repositories;
 mod rows;
 mod timelines;
 
+use std::collections::BTreeSet;
 use std::fmt;
-use std::fs::File;
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
-use std::str::FromStr as _;
 use std::sync::Arc;
-use std::time::Duration;
 
-use sqlx::migrate::MigrateError;
-use sqlx::sqlite::SqliteConnectOptions;
-use sqlx::{AnyConnection, Connection as _};
+use sqlx::Connection as _;
+use task_proto::RobotId;
 
 pub use database::connections::with_shared_reads;
-use database::connections::{Connections, Lent, Statement, Terms, bounded};
+use database::connections::{ConnectionPool, PooledConnection, Statement};
+pub use database::copy::{CopyError, copy_database};
 pub use database::fault::Fault;
+use database::guard::{Guard, LAST_TURN, NEXT_TURN, holder};
+pub use database::guard::{Holder, LockAttempt, ServerIdentity, lock_holder};
 pub use database::integrity::check_at_rest;
-use database::integrity::{Checked, check_quickly, postgres_guard};
+use database::integrity::{Checked, check_quickly, postgres_page_protection};
+use database::primary::NewConnection;
+pub use database::probe::check_postgres;
+use database::probe::probe;
+use database::sessions::{first_connection, make_file, pool_options};
 pub use database::state::DatabaseState;
-pub use deliveries::{Decided, DeliveryOrder, RobotFacts};
-pub use fleet::matching::Matching;
-pub use fleet::reports::{OpenAssignment, ReportedBy, ReportedRobot};
+use database::write_locks::{POSTGRES_LOCKS, SQLITE_LOCKS, WriteLocks};
+pub use deliveries::{DeliveryRequest, RobotDecision, RobotFacts};
+pub use feed::{FeedAudience, NewFeedEntry};
+pub use fleet::matching::MatchingRobots;
+pub use fleet::needed_packages::FetchGrant;
+pub use fleet::reports::{OpenAssignment, ReportTransaction, ReportedRobot, ReportingAgent};
 pub use fleet::robot_pages::RobotPage;
-pub use fleet::robots::{BrokerCredential, DesiredTasks, FetchedBy, KnownRobot};
-pub use orders::assignments::{Released, TaskOrder};
-pub use orders::deployments::{DeploymentPage, NewDeployment, OpenRobot, OpenRollout};
-pub use orders::earlier::{EarlierPackage, Unsuccessful};
-pub use orders::idempotency::PastOrder;
+pub use fleet::robots::{BrokerCredential, DesiredTasks, KnownRobot, RobotRow};
+pub use orders::assignments::{ReleasedBatch, TaskOrder};
+pub use orders::deployments::{
+    AssignmentRow, DeploymentPage, DeploymentRow, NewDeployment, OpenRobot, OpenRollout,
+};
+pub use orders::idempotency::IdempotencyRecord;
+pub use orders::past_assignments::{PreviousPackage, UnsuccessfulRobot};
+pub use orders::revert::Revocable;
 pub use orders::still_running::StillRunning;
-pub use orders::taking_back::Revocable;
-use people::access::{Access, Ending};
-use people::audit::everybodys_pace;
-pub use people::audit::{Act, Deed};
+use people::audit::new_self_service_limit;
+pub use people::audit::{AuditAction, AuditEvent};
+use people::auth_cache::{AuthCache, InvalidationGuard};
 use people::first_use::FirstUses;
-pub use people::tokens::{Admitted, EnrolmentTerms, TokenHolder};
+pub use people::page_sessions::{NewPageSession, PageSession};
+pub use people::tokens::{Admitted, EnrollmentTerms, TokenHolder};
 pub use people::users::{NewToken, User};
 pub use registry::outputs::NewOutput;
 pub use registry::package_use::{Deletion, PackageUsers};
 pub use registry::packages::{NewManifest, PutManifest, Reference, StoredManifest};
 pub use registry::publishers::SignedDocument;
 pub use registry::referrers::ReferrersPage;
-pub use registry::robot_blobs::bytes_taken;
+pub use registry::robot_blobs::disk_usage;
 pub use timelines::{HistoryPage, HistoryQuery};
 
+use crate::domain::database_url::{is_postgres, without_password};
+use crate::domain::limits::keyed_rate_limit::KeyedRateLimit;
 use crate::domain::person::Person;
-use crate::limits::pace::Pace;
 
 /// The page cache of the SQLite writer: 16 MiB.
 const WRITER_CACHE: &str = "PRAGMA cache_size = -16384";
-/// The page cache of each SQLite reader: 4 MiB. The system's page cache holds the rest.
-const READER_CACHE: &str = "PRAGMA cache_size = -4096";
+/// The page caches of all SQLite readers together: 16 MiB. The system's page cache holds the rest.
+const READER_CACHES_KIB: u32 = 16 * 1024;
 /// Number of connections for concurrent reads.
 const READERS: u32 = 6;
 /// Number of these connections that people's reads may use at once. The rest stay free for robots
 /// and orders.
 const SHARED_READERS: u32 = 4;
-/// Time limit of a statement's wait for a connection or for another process's write.
-const PATIENCE: Duration = Duration::from_secs(30);
-/// The same wait for a connection to Postgres. It is shorter than a request's time limit, so that
-/// the client is told why there is no answer.
-const POSTGRES_PATIENCE: Duration = Duration::from_secs(20);
-/// Time limit for connecting to a database server. It is short enough for the client to hear in
-/// time that there is no connection.
-const CONNECT: Duration = Duration::from_secs(5);
 /// Part of a SQLite URL: the file belongs to this process alone. The process then keeps in memory
 /// the index that it would otherwise share through a file.
 const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
@@ -85,14 +90,17 @@ const WITHOUT_SHARED_MEMORY: &str = "vfs=unix-excl";
 /// The database. Clones share its connections.
 #[derive(Clone)]
 pub struct Store {
-    reads: Connections,
-    writes: Connections,
-    access: Access,
+    reads: ConnectionPool,
+    writes: ConnectionPool,
+    auth_cache: AuthCache,
     first_uses: FirstUses,
-    everybodys: Arc<Pace>,
+    self_service_limit: Arc<KeyedRateLimit>,
     state: DatabaseState,
     url: Arc<str>,
     is_postgres: bool,
+    /// The lock that a server holds while it uses a Postgres.
+    guard: Option<Guard>,
+    locks: &'static WriteLocks,
 }
 
 impl fmt::Debug for Store {
@@ -129,7 +137,7 @@ pub enum StoreError {
     },
     /// A later version of this program has migrated the tables further.
     #[error(
-        "database {url} was last used by a newer taskd (its tables are at {version}): install that one again"
+        "database {url} was last used by a newer taskd (its tables are at {version}): install that version again"
     )]
     Newer {
         /// The database, without its password.
@@ -137,10 +145,21 @@ pub enum StoreError {
         /// The migration that this program does not have.
         version: i64,
     },
+    /// The sessions of the Postgres server lack a property that the store relies on.
+    #[error(
+        "database {url} can't be used: {reason}; the setting `database` has to name a Postgres server itself: a pooler in \
+         transaction mode (PgBouncer with pool_mode = transaction) or a look-alike of Postgres can't be used"
+    )]
+    Unsuitable {
+        /// The database, without its password.
+        url: String,
+        /// The missing property.
+        reason: String,
+    },
     /// The integrity check found damaged pages.
     #[error(
-        "database {url} is corrupt ({finding}): stop whatever uses it and put back a copy of the data directory, or save what \
-         can be read with sqlite3's .recover; docs/server.md says how"
+        "database {url} is corrupt ({finding}): stop every program that uses it and restore a copy of the data directory, \
+         or recover the readable part with sqlite3's .recover; see docs/server.md"
     )]
     Damaged {
         /// The database, without its password.
@@ -151,32 +170,61 @@ pub enum StoreError {
     #[error(
         "database {url} can't be opened on a full disk: make at least 16 MB free on its file system"
     )]
-    NoRoom {
+    DiskFull {
         /// The database, without its password.
         url: String,
     },
+    /// Another server holds the database's lock.
+    #[error(
+        "database {url} is in use by {holder}: stop that server, name another database in `database`, \
+         or set `standby = true`, so that this server waits and takes over"
+    )]
+    InUse {
+        /// The database, without its password.
+        url: String,
+        holder: Holder,
+    },
+    /// Another server has become the holder, so this one may not write any more.
+    #[error("{successor} has taken over the database; this server has stopped writing to it")]
+    TakenOver { successor: Holder },
+    /// Robots would refuse the orders of this server.
+    #[error(
+        "this server's signing key {own} is not the fleet's, {fleet}: copy signing.key from the data directory of \
+         the server that used this database before; see docs/cluster.md"
+    )]
+    ForeignKey {
+        /// The id of this server's key.
+        own: String,
+        /// The id of the key that robots know.
+        fleet: String,
+    },
+    /// Robots would miss the messages of this server.
+    #[error(
+        "topic_prefix is {own} here and {fleet} on the server that holds the database: a standby needs the same"
+    )]
+    ForeignPrefix { own: String, fleet: String },
     /// The database was found corrupt while it was in use.
-    #[error("the database is corrupt, so nothing is changed until it is mended")]
+    #[error("the database is corrupt; changes are refused until it is repaired")]
     Corrupt,
     #[error("the database refused a statement")]
     Statement(#[from] sqlx::Error),
     /// A write that serves several robots failed.
     #[error("a write for several robots failed")]
-    Together(#[source] Arc<StoreError>),
+    Batch(#[source] Arc<StoreError>),
     /// The caller's rights ended after the request began.
-    #[error("your rights have changed since this request began; sign in, or send it again")]
+    #[error("your permissions have changed since this request began; sign in again or retry")]
     RightsEnded,
     /// The person has reached the limit of audited acts on their own account.
     #[error(
-        "{who} has signed in, made tokens or set a password so often that the next time is in {seconds} s"
+        "{user} has signed in, created tokens or set a password too often; try again in {seconds} s"
     )]
     TooManyActs {
-        who: String,
+        user: String,
         /// Seconds until the next act is allowed.
         seconds: u64,
     },
     /// A row holds a value that this version can't read.
-    #[error("column {column} of the database holds what this version of taskd can't read")]
+    #[error("column {column} of the database holds a value that this version of taskd can't read")]
     Unreadable { column: &'static str },
 }
 
@@ -192,9 +240,11 @@ impl StoreError {
         match self {
             Self::Open { source, .. } | Self::Statement(source) => Fault::of(source),
             Self::Migrate { source, .. } => Fault::of_migration(source),
-            Self::Together(error) => error.fault(),
+            Self::Batch(error) => error.fault(),
             Self::Damaged { .. } | Self::Corrupt => Some(Fault::Corrupt),
-            Self::NoRoom { .. } => Some(Fault::Full),
+            Self::DiskFull { .. } => Some(Fault::Full),
+            // The database is another server's: it takes no statements of this one.
+            Self::TakenOver { .. } => Some(Fault::Unreachable),
             _ => None,
         }
     }
@@ -203,7 +253,7 @@ impl StoreError {
     /// was logged already.
     pub fn log(&self, what: &'static str) {
         match self.fault() {
-            Some(Fault::Away | Fault::Corrupt | Fault::Full) => {
+            Some(Fault::Unreachable | Fault::Corrupt | Fault::Full) => {
                 tracing::debug!(error = self as &dyn std::error::Error, "{what}")
             }
             _ => tracing::warn!(error = self as &dyn std::error::Error, "{what}"),
@@ -211,30 +261,32 @@ impl StoreError {
     }
 }
 
-/// A write transaction in progress. The write lock admits one at a time. Dropping the transaction
-/// without [`Write::commit`] rolls it back.
-pub struct Write {
-    lent: Lent,
-    turn: u64,
-    ending: Ending,
+/// A write transaction in progress, beside which nothing else is written. Dropping the transaction
+/// without [`Transaction::commit`] rolls it back.
+pub struct Transaction {
+    connection: PooledConnection,
+    /// The turn of this write among the exclusive ones; in a write of reports, the turn of the last
+    /// exclusive write.
+    sequence: u64,
+    invalidation: InvalidationGuard,
     /// The person whose rights this write has checked.
-    vouched_for: Option<Person>,
+    verified_person: Option<Person>,
     /// The rate limit for acts that every person may do.
-    everybodys: Arc<Pace>,
+    self_service_limit: Arc<KeyedRateLimit>,
 }
 
-impl Write {
+impl Transaction {
     /// The sequence number of this write; a later write has a higher one.
-    pub fn turn(&self) -> u64 {
-        self.turn
+    pub fn sequence(&self) -> u64 {
+        self.sequence
     }
 
     /// Commits the write. The commit runs to its end even if the caller does not wait for it.
     pub async fn commit(self) -> Result<(), StoreError> {
-        let Self { lent, ending, .. } = self;
+        let Self { connection, invalidation, .. } = self;
         let committing = tokio::spawn(async move {
-            let committed = lent.commit().await;
-            drop(ending);
+            let committed = connection.commit().await;
+            drop(invalidation);
             committed
         });
         match committing.await {
@@ -244,13 +296,13 @@ impl Write {
     }
 
     /// Marks this write as one that may change access rights.
-    fn changes_access(&mut self) {
-        self.ending.is_due = true;
+    fn mark_auth_change(&mut self) {
+        self.invalidation.invalidates = true;
     }
 
     /// The connection on which the store's own statements run.
     fn connection(&mut self) -> Statement<'_> {
-        self.lent.connection()
+        self.connection.connection()
     }
 }
 
@@ -277,13 +329,13 @@ impl Store {
                 let separator = if url.contains('?') { '&' } else { '?' };
                 let store =
                     Self::open_at(&format!("{url}{separator}{WITHOUT_SHARED_MEMORY}")).await;
-                let no_room = |error: StoreError| match error.fault() {
-                    Some(Fault::Full) => StoreError::NoRoom { url: without_password(url) },
+                let disk_full = |error: StoreError| match error.fault() {
+                    Some(Fault::Full) => StoreError::DiskFull { url: without_password(url) },
                     _ => error,
                 };
-                let store = store.map_err(no_room)?;
+                let store = store.map_err(disk_full)?;
                 tracing::warn!(
-                    "the disk is full: what is there can be read; until the next start no other program can open the database"
+                    "the disk is full: existing data can be read; until the next start no other program can open the database"
                 );
                 Ok(store)
             }
@@ -297,42 +349,88 @@ impl Store {
         Ok(store)
     }
 
+    /// The same as [`Self::unopened`] for a server that needs the database for itself: before
+    /// [`Self::prepare`] opens a Postgres, it takes the database's lock.
+    pub fn guarded(url: &str, identity: ServerIdentity) -> Self {
+        let mut store = Self::unopened(url);
+        if store.is_postgres {
+            store.guard = Some(Guard::new(url, identity, store.state.clone()));
+        }
+        store
+    }
+
     /// A database that refuses everything until [`Self::prepare`] has succeeded.
     pub fn unopened(url: &str) -> Self {
         sqlx::any::install_default_drivers();
         let state = DatabaseState::unknown();
+        let reader_cache = format!("PRAGMA cache_size = -{}", READER_CACHES_KIB / READERS);
         Self {
             // One writer: its transactions queue for this connection instead of failing each other.
-            writes: Connections::new(terms(url, 1, 1, WRITER_CACHE, &state)),
-            reads: Connections::new(terms(url, READERS, SHARED_READERS, READER_CACHE, &state)),
-            access: Access::default(),
+            writes: ConnectionPool::new(pool_options(url, 1, 1, WRITER_CACHE, &state)),
+            reads: ConnectionPool::new(pool_options(
+                url,
+                READERS,
+                SHARED_READERS,
+                &reader_cache,
+                &state,
+            )),
+            auth_cache: AuthCache::default(),
             first_uses: FirstUses::default(),
-            everybodys: Arc::new(everybodys_pace()),
+            self_service_limit: Arc::new(new_self_service_limit()),
             state,
             url: url.into(),
             is_postgres: is_postgres(url),
+            guard: None,
+            locks: if is_postgres(url) { &POSTGRES_LOCKS } else { &SQLITE_LOCKS },
         }
     }
 
-    /// Checks for damage and migrates the tables. After that the database can be used.
+    /// Opens the connection on which a standby waits for the database's lock.
+    pub async fn connect_to_lock(&self) -> Result<(), StoreError> {
+        match &self.guard {
+            Some(guard) => guard.connect().await,
+            None => Ok(()),
+        }
+    }
+
+    /// Takes the database's lock from a server that has ended. A standby calls this until the lock
+    /// is taken, before [`Self::prepare`].
+    pub async fn try_succeed(&self) -> Result<LockAttempt, StoreError> {
+        match &self.guard {
+            Some(guard) => guard.try_succeed().await,
+            None => Ok(LockAttempt::Taken),
+        }
+    }
+
+    /// Takes the database's lock, if it needs one, checks for damage and migrates the tables. After
+    /// that the database can be used.
     pub async fn prepare(&self) -> Result<(), StoreError> {
+        if let Some(guard) = &self.guard {
+            guard.take().await?;
+        }
         make_file(&self.url);
-        let first = first_connection(&self.url).await.inspect_err(|error| self.state.note(error));
+        let first =
+            first_connection(&self.url).await.inspect_err(|error| self.state.record_error(error));
         let mut first = first.map_err(|error| self.open_error(error))?;
         let prepared = self.prepare_by(&mut first).await;
-        let closed = first.close().await;
+        let closed = first.connection.close().await;
         prepared?;
-        self.state.opened();
+        if let Some(guard) = &self.guard {
+            guard.claim().await?;
+        }
+        self.state.mark_open();
         for connections in [&self.writes, &self.reads] {
-            connections.lend().await.map_err(|error| self.open_error(error))?;
+            connections.acquire().await.map_err(|error| self.open_error(error))?;
         }
         closed.map_err(|error| self.open_error(error))
     }
 
-    async fn prepare_by(&self, connection: &mut AnyConnection) -> Result<(), StoreError> {
+    async fn prepare_by(&self, first: &mut NewConnection) -> Result<(), StoreError> {
         let url = || without_password(&self.url);
+        let connection = &mut first.connection;
         if self.is_postgres {
-            self.state.guarded(postgres_guard(connection).await);
+            probe(&first.url, connection).await?;
+            self.state.set_page_protection(postgres_page_protection(connection).await);
         } else {
             match check_quickly(&self.url).await.map_err(|error| self.open_error(error))? {
                 Checked::Sound => {}
@@ -340,14 +438,11 @@ impl Store {
                     return Err(StoreError::Damaged { url: url(), finding });
                 }
                 Checked::Interrupted => {
-                    tracing::info!("the database is large: the check goes on while it is served")
+                    tracing::info!("the database is large: the check continues in the background")
                 }
             }
         }
-        database::migrate::run(connection).await.map_err(|source| match source {
-            MigrateError::VersionMissing(version) => StoreError::Newer { url: url(), version },
-            source => StoreError::Migrate { url: url(), source },
-        })
+        database::migrate::run(&self.url, connection).await
     }
 
     fn open_error(&self, source: sqlx::Error) -> StoreError {
@@ -363,15 +458,18 @@ impl Store {
         &self.state
     }
 
-    /// Closes all connections after the writes that are under way.
+    /// Closes all connections after the writes that are under way, and frees the database's lock.
     pub async fn close(&self) {
         self.writes.close().await;
         self.reads.close().await;
+        if let Some(guard) = &self.guard {
+            guard.release().await;
+        }
     }
 
     /// Whether the database answers.
     pub async fn ping(&self) -> Result<(), StoreError> {
-        Ok(self.reads.lend().await.map(drop)?)
+        Ok(self.reads.acquire().await.map(drop)?)
     }
 
     /// The kind of the database, and its size.
@@ -389,136 +487,72 @@ impl Store {
         Ok(DatabaseSize { kind, bytes: bytes.map(rows::number) })
     }
 
-    /// Begins a write. Its first statement updates one row that every write updates. On both
-    /// databases a second write therefore waits here, before it has read anything, until the first
-    /// has ended.
-    pub async fn begin(&self) -> Result<Write, StoreError> {
-        let mut write = self.begin_keeping_rights().await?;
-        write.changes_access();
+    /// Begins a write, alone: it waits here, before it has read anything, until all others have
+    /// ended, and others wait until this one has.
+    pub async fn begin(&self) -> Result<Transaction, StoreError> {
+        let mut write = self.begin_without_auth_invalidation().await?;
+        write.mark_auth_change();
         Ok(write)
     }
 
-    /// Begins a write that changes no access rights, such as a robot's report, or that is never
-    /// committed.
-    pub async fn begin_keeping_rights(&self) -> Result<Write, StoreError> {
+    /// Begins a write, alone, that changes no access rights or is never committed.
+    pub async fn begin_without_auth_invalidation(&self) -> Result<Transaction, StoreError> {
+        self.begin_locked(self.locks.exclusive, NEXT_TURN).await
+    }
+
+    /// Begins a write of reports of `robots`. On Postgres it runs beside others of its kind that
+    /// are about other robots.
+    pub async fn begin_report(
+        &self,
+        robots: &BTreeSet<&RobotId>,
+    ) -> Result<ReportTransaction, StoreError> {
+        let write = self.begin_locked(self.locks.shared, LAST_TURN).await?;
+        ReportTransaction::lock(write, robots, self.locks.robots).await
+    }
+
+    async fn begin_locked(
+        &self,
+        lock: &'static str,
+        turn: &'static str,
+    ) -> Result<Transaction, StoreError> {
         if self.state.corruption().is_some() {
             return Err(StoreError::Corrupt);
         }
-        let mut lent = self.writes.lend().await?;
-        lent.begin().await?;
-        let turn: i64 =
-            sqlx::query_scalar("UPDATE write_lock SET turn = turn + 1 WHERE id = 1 RETURNING turn")
-                .fetch_one(lent.connection())
-                .await?;
-        let ending = self.access.until_ended();
-        let everybodys = self.everybodys.clone();
-        Ok(Write { lent, turn: rows::number(turn), ending, vouched_for: None, everybodys })
+        let mut connection = self.writes.acquire().await?;
+        connection.begin(lock).await?;
+        let run = self.guard.as_ref().map_or("", Guard::run);
+        let turn = sqlx::query_scalar(turn).bind(run);
+        let Some(sequence) = turn.fetch_optional(connection.connection()).await? else {
+            let successor = holder(connection.connection()).await?;
+            self.state.record_takeover(&successor);
+            return Err(StoreError::TakenOver { successor });
+        };
+        let invalidation = self.auth_cache.invalidation_guard();
+        let self_service_limit = self.self_service_limit.clone();
+        Ok(Transaction {
+            connection,
+            sequence: rows::number(sequence),
+            invalidation,
+            verified_person: None,
+            self_service_limit,
+        })
     }
-}
-
-/// Creates the file of a new SQLite database so that only its owner can read it. SQLite gives the
-/// files beside it the same mode. A failure is reported later, by the code that opens the file.
-fn make_file(url: &str) {
-    if !url.contains("mode=rwc") {
-        return;
-    }
-    if let Ok(options) = SqliteConnectOptions::from_str(url) {
-        let _ =
-            File::options().write(true).create_new(true).mode(0o600).open(options.get_filename());
-    }
-}
-
-/// Opens a separate connection for work without a time limit. There is one attempt only, so that an
-/// error is reported at once.
-async fn first_connection(url: &str) -> Result<AnyConnection, sqlx::Error> {
-    let mut connection = match is_postgres(url) {
-        true => bounded(CONNECT, AnyConnection::connect(url)).await?,
-        false => AnyConnection::connect(url).await?,
-    };
-    // SQLite does not read its file before the first statement.
-    let first = if is_postgres(url) { POSTGRES_SESSION } else { SQLITE_SESSION };
-    if let Err(error) = sqlx::raw_sql(first).execute(&mut connection).await {
-        // The files are closed before they are opened again in another mode.
-        let _ = connection.close().await;
-        return Err(error);
-    }
-    Ok(connection)
-}
-
-fn is_postgres(url: &str) -> bool {
-    url.starts_with("postgres")
-}
-
-/// The pragmas of every SQLite session. FULL: a commit survives a power cut.
-const SQLITE_SESSION: &str =
-    "PRAGMA journal_mode = WAL; PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON;
-     PRAGMA busy_timeout = 30000;";
-/// Makes Postgres end a session whose server vanished without closing its connection. Such a
-/// session may hold the write lock, for which the next write waits. By default Postgres keeps it
-/// for hours.
-const POSTGRES_SESSION: &str =
-    "SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
-     SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;";
-/// Makes Postgres end a statement before the server gives up waiting for its answer.
-const POSTGRES_STATEMENT: &str = "SET statement_timeout = '50s';";
-
-/// The settings of a store's connections.
-fn terms(url: &str, count: u32, shared: u32, cache: &str, state: &DatabaseState) -> Terms {
-    let (url, state) = (url.to_owned(), state.clone());
-    if is_postgres(&url) {
-        let session = [POSTGRES_SESSION, POSTGRES_STATEMENT].concat();
-        let (answer, greeting) = (Duration::from_secs(60), Duration::from_secs(5));
-        let (connect, wait) = (CONNECT, POSTGRES_PATIENCE);
-        return Terms { url, session, count, shared, answer, greeting, connect, wait, state };
-    }
-    // A file does not stop answering: a slow answer is not a lost connection.
-    let session = [SQLITE_SESSION, cache].concat();
-    let forever = Duration::MAX;
-    Terms {
-        url,
-        session,
-        count,
-        shared,
-        answer: forever,
-        greeting: forever,
-        connect: PATIENCE,
-        wait: PATIENCE,
-        state,
-    }
-}
-
-/// A URL that is safe to show: without `user:password@`, and without the query, which may hold a
-/// password too.
-fn without_password(url: &str) -> String {
-    let shown = match (url.find("://"), url.rfind('@')) {
-        (Some(scheme), Some(at)) if scheme + 3 < at => {
-            format!("{}{}", &url[..scheme + 3], &url[at + 1..])
-        }
-        _ => url.to_owned(),
-    };
-    shown.split('?').next().unwrap_or_default().to_owned()
 }
 
 #[cfg(test)]
 mod tests {
+    use super::database::sessions::CONNECTION_WAIT;
     use super::*;
 
-    #[test]
-    fn a_shown_url_has_no_password() {
-        assert_eq!(without_password("postgres://u:p@ss@host/db"), "postgres://host/db");
-        assert_eq!(without_password("postgres://u:p?ss@host/db"), "postgres://host/db");
-        assert_eq!(without_password("postgres://host/db?password=secret"), "postgres://host/db");
-        assert_eq!(without_password("sqlite:///a.db"), "sqlite:///a.db");
-    }
-
     #[tokio::test]
-    async fn a_database_that_is_none_or_of_a_newer_program_is_called_so_at_once() {
+    async fn torn_missing_or_newer_database_is_refused_at_once() {
         let directory = tempfile::tempdir().expect("a directory");
         let refused = async |name: &str| {
             let url = sqlite_url(&directory.path().join(name));
             // Far below the time that a pool would wait.
-            let opened =
-                tokio::time::timeout(PATIENCE / 3, Store::open(&url)).await.expect("at once");
+            let opened = tokio::time::timeout(CONNECTION_WAIT / 3, Store::open(&url))
+                .await
+                .expect("at once");
             let error = opened.expect_err("refused");
             format!(
                 "{error}: {}",
@@ -542,7 +576,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_database_and_what_lies_beside_it_are_for_their_owner_alone() {
+    async fn database_files_are_readable_only_by_their_owner() {
         use std::os::unix::fs::PermissionsExt as _;
         let directory = tempfile::tempdir().expect("a directory");
         let store =
@@ -559,7 +593,7 @@ mod tests {
     }
 
     #[test]
-    fn a_path_may_hold_any_character() {
+    fn sqlite_url_escapes_any_character() {
         assert_eq!(sqlite_url(Path::new("/a b?/c%.db")), "sqlite:///a%20b%3F/c%25.db?mode=rwc");
     }
 }

@@ -80,7 +80,7 @@ pub(super) fn optional<T: FromStr>(
 }
 
 /// The deployment and the robot of each row.
-pub(super) fn parts_of(
+pub(super) fn deployment_robot_pairs(
     rows: Vec<(String, String)>,
 ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
     let read = |(deployment, robot): (String, String)| {
@@ -122,7 +122,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_number_beyond_the_columns_range_is_the_last_in_it() {
+    fn number_beyond_the_column_range_is_clamped() {
         for (given, kept) in [(0, 0), (1 << 53, 1 << 53), (1 << 63, i64::MAX), (u64::MAX, i64::MAX)]
         {
             assert_eq!(stored(given), kept, "{given}");
@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn values_count_on_from_the_first_parameter() {
+    fn values_are_numbered_from_the_first_parameter() {
         assert_eq!(
             values(3, 2, &["TEXT", "BIGINT"]),
             "VALUES (CAST($3 AS TEXT), CAST($4 AS BIGINT)), (CAST($5 AS TEXT), CAST($6 AS BIGINT))"

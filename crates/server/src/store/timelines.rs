@@ -8,8 +8,9 @@ use task_proto::DeploymentId;
 use task_proto::RobotId;
 use task_proto::TaskName;
 use task_proto::api::{MAX_TIMELINE, PastAssignment, TimelineEntry};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
+use super::repositories::Assignments;
 use super::rows::{from_json, from_optional_json, from_word, id, number};
 use super::{Store, StoreError, deliveries};
 
@@ -45,7 +46,7 @@ pub(super) fn step(phase: Phase, at_ms: u64, attempt: u32) -> String {
 }
 
 /// SQL for the column with a step appended; the step is SQL as well.
-pub(super) fn grown(step: &str) -> String {
+pub(super) fn appended_step(step: &str) -> String {
     let (most, first, after) = (MAX_TIMELINE * STEP, FIRST * STEP, (FIRST + 1) * STEP + 1);
     format!(
         "CASE WHEN length(assignments.timeline) < {most} THEN assignments.timeline || {step}
@@ -53,11 +54,12 @@ pub(super) fn grown(step: &str) -> String {
     )
 }
 
-/// [`grown`] by a phase that a person or the server has set, at the time in the parameter `now`.
-pub(super) fn grown_by(phase: Phase, now: &str) -> String {
+/// [`appended_step`] by a phase that a person or the server has set, at the time in the parameter
+/// `now`.
+pub(super) fn appended_phase(phase: Phase, now: &str) -> String {
     let digits = format!("CAST(CAST({now} AS BIGINT) AS TEXT)");
     let padded = format!("substr('0000000000000' || {digits}, length({digits}) + 1)");
-    grown(&format!("'{}' || {padded} || '000'", letter(phase)))
+    appended_step(&format!("'{}' || {padded} || '000'", letter(phase)))
 }
 
 /// Parses a stored timeline, the oldest step first. Unreadable steps are skipped.
@@ -97,11 +99,11 @@ fn letter(phase: Phase) -> char {
     }
 }
 
-impl Store {
+impl Assignments<&Store> {
     /// A page of a robot's past assignments; `None` if the deployment to begin before does not
     /// exist.
-    pub async fn task_history(
-        &self,
+    pub async fn history(
+        self,
         robot: &RobotId,
         query: HistoryQuery<'_>,
     ) -> Result<Option<HistoryPage>, StoreError> {
@@ -110,7 +112,7 @@ impl Store {
             Some(before) => {
                 let asked = sqlx::query_scalar("SELECT number FROM deployments WHERE id = $1")
                     .bind(before.as_str());
-                match asked.fetch_optional(&self.reads).await? {
+                match asked.fetch_optional(&self.0.reads).await? {
                     Some(number) => number,
                     None => return Ok(None),
                 }
@@ -128,7 +130,7 @@ impl Store {
         .bind(before)
         .bind(query.task.map_or("", TaskName::as_str).to_owned())
         .bind(i64::from(query.limit) + 1)
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let mut assignments = rows.iter().map(past_assignment).collect::<Result<Vec<_>, _>>()?;
         let has_more = assignments.len() > query.limit as usize;
@@ -167,7 +169,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_phase_is_read_back() {
+    fn timeline_of_every_phase_round_trips() {
         let entries: Vec<TimelineEntry> = (0..)
             .zip(Phase::ALL)
             .map(|(at, phase)| TimelineEntry { phase, at_ms: 1_800_000_000_000 + at, attempt: 7 })

@@ -6,6 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{SystemTime, UNIX_EPOCH};
 
+use task_proto::time::millis;
+
 /// A source of the time. Clones of a fixed clock move together.
 #[derive(Debug, Clone)]
 pub struct Clock(Source);
@@ -35,10 +37,7 @@ impl Clock {
     #[expect(clippy::disallowed_methods, reason = "this is the one module that reads the time")]
     pub fn now_ms(&self) -> u64 {
         match &self.0 {
-            Source::System => {
-                let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-                u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
-            }
+            Source::System => SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, millis),
             Source::Fixed(now_ms) => now_ms.load(Ordering::SeqCst),
         }
     }
@@ -64,7 +63,7 @@ mod tests {
     }
 
     #[test]
-    fn the_system_clock_is_past_2020() {
+    fn system_clock_is_past_2020() {
         assert!(Clock::system().now_ms() > 1_577_836_800_000);
     }
 }

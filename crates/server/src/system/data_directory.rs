@@ -10,23 +10,18 @@ use std::os::unix::fs::{
 };
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
-use task_proto::CaPin;
-use task_proto::digest::{hex, unhex};
-use task_proto::envelope::SigningKey;
-use task_proto::token::{Token, TokenKind};
+use task_proto::data_directory::{ADDRESSES, Addresses, LOCK, OPERATOR_TOKEN};
+use task_proto::ids::digest::{hex, unhex};
+use task_proto::trust::envelope::SigningKey;
+use task_proto::trust::token::{Token, TokenKind};
 
-const LOCK: &str = "taskd.lock";
 const SIGNING_KEY: &str = "signing.key";
 const BROKER_SECRET: &str = "broker.secret";
-/// The file with the first operator's token.
-pub(crate) const OPERATOR_TOKEN: &str = "operator.token";
 const AUTHORITY_KEY: &str = "ca.key";
 const AUTHORITY_CERTIFICATE: &str = "ca.pem";
-const ADDRESSES: &str = "addresses.json";
 
 /// Free space and size of the file system that holds `path`, in bytes.
-pub(crate) fn room(path: &Path) -> Option<(u64, u64)> {
+pub(crate) fn disk_space(path: &Path) -> Option<(u64, u64)> {
     let stat = nix::sys::statvfs::statvfs(path).ok()?;
     let block = stat.fragment_size();
     Some((stat.blocks_available().saturating_mul(block), stat.blocks().saturating_mul(block)))
@@ -37,46 +32,6 @@ pub(crate) fn room(path: &Path) -> Option<(u64, u64)> {
 pub struct DataDirectory {
     path: PathBuf,
     lock: File,
-}
-
-/// The bound addresses, for programs on the same machine: the content of `addresses.json`, which
-/// exists while a server runs.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Addresses {
-    /// The HTTP address, `host:port`.
-    pub http: String,
-    /// The MQTT address, `host:port`.
-    pub mqtt: String,
-    /// The pin of the authority behind the certificates of both listeners; present only if they
-    /// speak TLS.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub ca_pin: Option<CaPin>,
-}
-
-impl Addresses {
-    pub fn url(&self) -> String {
-        let scheme = if self.ca_pin.is_some() { "https" } else { "http" };
-        format!("{scheme}://{}", self.http)
-    }
-
-    /// The last addresses published in the directory at `path`, by a server that may have ended:
-    /// see [`is_locked`].
-    pub fn published(path: &Path) -> Option<Self> {
-        serde_json::from_slice(&std::fs::read(path.join(ADDRESSES)).ok()?).ok()
-    }
-}
-
-/// Whether a server runs from the directory at `path`, which need not exist.
-///
-/// # Errors
-///
-/// This account has no permission to read the directory.
-pub fn is_locked(path: &Path) -> io::Result<bool> {
-    match File::open(path.join(LOCK)) {
-        Ok(lock) => Ok(matches!(lock.try_lock_shared(), Err(TryLockError::WouldBlock))),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-        Err(error) => Err(error),
-    }
 }
 
 /// The reason why the directory can't be used.
@@ -94,15 +49,15 @@ pub enum DataError {
     },
     /// Every account of the machine may put files into the directory.
     #[error(
-        "{0} can be written by everybody on this machine, and belongs to somebody else: take that away (chmod o-w {0}), \
-         or name another directory", path.display()
+        "{0} is writable by every user of this machine and belongs to another user: run chmod o-w {0}, \
+         or use another directory", path.display()
     )]
-    OpenToAll { path: PathBuf },
+    WorldWritable { path: PathBuf },
     /// There is no disk space for a file.
-    #[error("{} can't be written on a full disk: make at least 16 MB free on its file system", path.display())]
+    #[error("{} can't be written, because the disk is full: free at least 16 MB on its file system", path.display())]
     Full { path: PathBuf },
     /// A file has unexpected content.
-    #[error("{} does not hold {expected}; put the right file back, or move it away to get a new one", path.display())]
+    #[error("{} does not contain {expected}; restore the file, or move it away to get a new one", path.display())]
     Content { path: PathBuf, expected: &'static str },
 }
 
@@ -141,7 +96,7 @@ impl DataDirectory {
             match lock.try_lock() {
                 Ok(()) => {
                     let data = Self { path: path.to_owned(), lock };
-                    data.close_to_others()?;
+                    data.restrict_permissions()?;
                     data.unpublish();
                     return Ok(data);
                 }
@@ -162,18 +117,18 @@ impl DataDirectory {
 
     /// Removes permissions that an earlier version, an umask or a copy has given to other accounts:
     /// no other account writes to the directory or reads its content.
-    fn close_to_others(&self) -> Result<(), DataError> {
+    fn restrict_permissions(&self) -> Result<(), DataError> {
         let io_error = |source| DataError::Io { path: self.path.clone(), source };
         let own = std::fs::metadata(&self.path).map_err(io_error)?;
         let (mode, shown) = (own.mode(), self.path.display());
         if mode & 0o022 != 0 {
             if std::fs::set_permissions(&self.path, Permissions::from_mode(mode & 0o7755)).is_ok() {
-                tracing::warn!("others could write to {shown}: they can no longer");
+                tracing::warn!("removed other users' write permission on {shown}");
             } else if mode & 0o002 != 0 {
-                return Err(DataError::OpenToAll { path: self.path.clone() });
+                return Err(DataError::WorldWritable { path: self.path.clone() });
             } else {
                 tracing::warn!(
-                    "the group of {shown} can write to it, and so replace the server's keys"
+                    "the group of {shown} can write to it and so replace the server's keys"
                 );
             }
         }
@@ -186,9 +141,9 @@ impl DataDirectory {
             }
             match std::fs::set_permissions(&path, Permissions::from_mode(found.mode() & 0o700)) {
                 Ok(()) => {
-                    tracing::info!("others could look into {}: they can no longer", path.display())
+                    tracing::info!("removed other users' permissions on {}", path.display())
                 }
-                Err(error) => tracing::warn!(%error, "others can look into {}", path.display()),
+                Err(error) => tracing::warn!(%error, "other users can read {}", path.display()),
             }
         }
         Ok(())
@@ -238,17 +193,17 @@ impl DataDirectory {
     /// The key of the private certificate authority, as PEM; `fresh` on the first start. Robots pin
     /// the authority.
     pub fn authority_key(&self, fresh: String) -> Result<String, DataError> {
-        self.read_or_make(&self.path.join(AUTHORITY_KEY), || fresh)
+        self.read_or_create(&self.path.join(AUTHORITY_KEY), || fresh)
     }
 
     /// The authority's own certificate, as PEM, for users who import it; `fresh` on the first
     /// start.
     pub fn authority_certificate(&self, fresh: String) -> Result<String, DataError> {
-        self.read_or_make(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
+        self.read_or_create(&self.path.join(AUTHORITY_CERTIFICATE), || fresh)
     }
 
     /// The error that one of these two files is unusable.
-    pub fn authority_is_wrong(&self, is_key: bool) -> DataError {
+    pub fn authority_error(&self, is_key: bool) -> DataError {
         let (name, expected) = match is_key {
             true => (AUTHORITY_KEY, "a certificate authority's key"),
             false => (AUTHORITY_CERTIFICATE, "the certificate of the key in ca.key"),
@@ -259,7 +214,7 @@ impl DataDirectory {
     /// The token of the first operator, created on the first start.
     pub fn operator_token(&self) -> Result<Token, DataError> {
         let path = self.operator_token_path();
-        let text = self.read_or_make(&path, || Token::random(TokenKind::Operator).reveal())?;
+        let text = self.read_or_create(&path, || Token::random(TokenKind::Operator).reveal())?;
         match text.trim().parse::<Token>() {
             Ok(token) if token.kind() == TokenKind::Operator => Ok(token),
             _ => Err(DataError::Content { path, expected: "an operator's token" }),
@@ -285,21 +240,21 @@ impl DataDirectory {
         &self,
         name: &str,
         expected: &'static str,
-        make: fn() -> [u8; 32],
+        create: fn() -> [u8; 32],
     ) -> Result<[u8; 32], DataError> {
         let path = self.path.join(name);
-        let text = self.read_or_make(&path, || hex(&make()))?;
+        let text = self.read_or_create(&path, || hex(&create()))?;
         unhex(text.trim()).ok_or(DataError::Content { path, expected })
     }
 
-    fn read_or_make(
+    fn read_or_create(
         &self,
         path: &Path,
-        make: impl FnOnce() -> String,
+        create: impl FnOnce() -> String,
     ) -> Result<String, DataError> {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
-                let text = make();
+                let text = create();
                 let text = text.trim_end().to_owned();
                 self.write_new(path, &format!("{text}\n")).map_err(DataError::io(path))?;
                 Ok(text)
@@ -331,6 +286,9 @@ mod tests {
     use std::sync::atomic::AtomicBool;
     use std::sync::atomic::Ordering::Relaxed;
 
+    use task_cli::local_server::{self, is_locked};
+    use task_proto::CaPin;
+
     use super::*;
 
     fn mode(path: &Path) -> u32 {
@@ -338,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn secrets_are_made_once_and_only_for_their_owner() {
+    fn secrets_are_created_once_with_private_modes() {
         let parent = tempfile::tempdir().expect("temp dir");
         let path = parent.path().join("deep/data");
         let data = DataDirectory::open(&path).expect("opens");
@@ -351,11 +309,11 @@ mod tests {
         assert_eq!(data.operator_token().expect("read"), token);
         std::fs::write(path.join(SIGNING_KEY), "nonsense").expect("written");
         let message = data.signing_key().err().expect("refused").to_string();
-        assert!(message.contains("signing.key does not hold a signing key"), "{message}");
+        assert!(message.contains("signing.key does not contain a signing key"), "{message}");
     }
 
     #[test]
-    fn what_others_could_read_or_write_is_closed_to_them() {
+    fn permissions_of_other_users_are_removed() {
         let directory = tempfile::tempdir().expect("temp dir");
         let (path, elsewhere) = (directory.path().join("data"), directory.path().join("elsewhere"));
         std::fs::create_dir(&path).expect("made");
@@ -382,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_second_server_is_refused_until_the_first_is_gone() {
+    fn second_server_is_refused_until_the_first_is_gone() {
         let directory = tempfile::tempdir().expect("temp dir");
         let first = DataDirectory::open(directory.path()).expect("opens");
         assert!(matches!(DataDirectory::open(directory.path()), Err(DataError::InUse { .. })));
@@ -396,7 +354,23 @@ mod tests {
     }
 
     #[test]
-    fn who_looks_whether_a_server_runs_keeps_none_from_starting() {
+    fn published_addresses_count_while_their_server_runs() {
+        let directory = tempfile::tempdir().expect("temp dir");
+        let found = || local_server::addresses(directory.path()).expect("told");
+        let server = DataDirectory::open(directory.path()).expect("opens");
+        assert_eq!(found(), None, "it does not listen yet");
+        let (http, mqtt) = ("127.0.0.1:8081".to_owned(), "127.0.0.1:1884".to_owned());
+        let addresses = Addresses { http, mqtt, ca_pin: Some(CaPin::of(b"an authority's key")) };
+        server.publish(&addresses).expect("written");
+        assert_eq!(found(), Some(addresses));
+        drop(server);
+        assert!(directory.path().join(ADDRESSES).exists() && found().is_none(), "it was killed");
+        let _next = DataDirectory::open(directory.path()).expect("opens");
+        assert_eq!(found(), None, "it does not listen yet");
+    }
+
+    #[test]
+    fn lock_check_does_not_block_a_start() {
         let directory = tempfile::tempdir().expect("temp dir");
         let is_over = AtomicBool::new(false);
         std::thread::scope(|scope| {

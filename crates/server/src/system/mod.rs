@@ -3,3 +3,4 @@
 
 pub mod clock;
 pub mod data_directory;
+pub mod host;

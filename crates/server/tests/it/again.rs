@@ -3,13 +3,13 @@
 
 use task_proto::api::{PackageView, RetryDeployment};
 use task_proto::desired::DesiredTask;
-use task_proto::manifest::TaskKind;
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::report::{ActiveVersion, Failure, FailureCode, Phase};
-use task_proto::selector::Selector;
-use task_proto::{DeploymentId, RepositoryName, TaskName};
+use task_proto::ids::selector::Selector;
+use task_proto::messages::report::{ActiveVersion, Failure, FailureCode, Phase};
+use task_proto::packages::manifest::TaskKind;
+use task_proto::packages::oci::MANIFEST_TYPE;
+use task_proto::{DeploymentId, Digest, RepositoryName, TaskName};
 use taskd::domain::person::Person;
-use taskd::orders::actions::{ActionError, Rollback, TaskOrder};
+use taskd::orders::actions::{DeploymentError, Rollback, SelectedRobot, TaskOrder};
 use taskd::store::{NewManifest, PutManifest, Reference, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -17,14 +17,15 @@ use crate::fleet::{Fleet, Robot, package, random_key};
 use crate::story::code;
 
 on_both_databases! {
-    a_package_that_runs_already_is_not_started_again,
-    package_that_came_back_after_a_failure_is_not_started_again,
-    a_restart_is_a_new_run_of_all_that_have_the_task,
-    a_retry_is_for_those_that_ended_badly_and_got_nothing_since,
-    a_retry_may_be_for_some_and_keeps_the_orders_ways,
-    a_rollback_brings_back_what_ran_before,
-    a_rollback_passes_over_what_never_ran_and_what_is_gone,
-    orders_that_follow_stay_in_ones_scope,
+    running_package_is_not_started_again,
+    package_restored_after_a_failure_is_not_started_again,
+    restart_begins_a_new_run_on_all_robots_with_the_task,
+    retry_orders_failed_robots_without_a_later_order,
+    retry_of_some_robots_keeps_the_options_of_the_order,
+    rollback_restores_the_previous_package,
+    rollback_skips_packages_that_never_ran_or_were_deleted,
+    retry_and_rollback_stay_in_the_scope,
+    robot_may_fetch_the_package_that_it_goes_back_to,
 }
 
 fn task() -> TaskName {
@@ -58,7 +59,7 @@ impl Fleet {
         };
         let repository = RepositoryName::of_package(&task());
         let put =
-            self.database.store.put_manifest(&repository, &new, None, self.clock.now_ms()).await;
+            self.database.store.manifests().put(&repository, &new, None, self.clock.now_ms()).await;
         assert_eq!(put.expect("writes"), PutManifest::Stored);
         view
     }
@@ -83,12 +84,12 @@ impl Fleet {
         by: &Person,
         id: &DeploymentId,
         retry: &RetryDeployment,
-    ) -> Result<DeploymentId, ActionError> {
-        self.actions.retry_deployment(by, &random_key(), id, retry).await
+    ) -> Result<DeploymentId, DeploymentError> {
+        self.deployments.retry(by, &random_key(), id, retry).await
     }
 
-    async fn roll_back(&self, robots: &str) -> Result<Rollback, ActionError> {
-        self.actions.roll_back(&self.operator, &random_key(), &task(), &selector(robots)).await
+    async fn rollback(&self, robots: &str) -> Result<Rollback, DeploymentError> {
+        self.deployments.rollback(&self.operator, &random_key(), &task(), &selector(robots)).await
     }
 
     pub async fn version(&self, robot: &Robot) -> String {
@@ -96,11 +97,11 @@ impl Fleet {
     }
 }
 
-fn names(robots: &[task_proto::api::MatchedRobot]) -> Vec<&str> {
+fn names(robots: &[SelectedRobot]) -> Vec<&str> {
     robots.iter().map(|robot| robot.name.as_str()).collect()
 }
 
-async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase) {
+async fn running_package_is_not_started_again(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(4).await;
     let first = fleet.deploy("1", |order| order.selector = selector("!r3")).await;
@@ -109,12 +110,12 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     fleet.follow(&mut robots[2], Phase::Running).await;
     let (key, third, task) = (random_key(), selector("r2"), task());
     fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &third)
         .await
         .expect("ordered");
     fleet.follow(&mut robots[2], Phase::Stopped).await;
-    fleet.changes.take_rings().await;
+    fleet.changes.take_robots_to_notify().await;
     let before = fleet.desired(&robots[0]).await.expect("state");
     // The task failed on one robot, was stopped on one, and never reached one: the retry begins
     // there.
@@ -129,7 +130,7 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
         "the robot hears of nothing"
     );
     assert_eq!(before.tasks[0].deployment, first);
-    assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots.len(), 3);
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
@@ -137,10 +138,7 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     // Where the task runs everywhere, all is settled at once, and nothing is left to cancel.
     let third = fleet.deploy("1", |_| ()).await;
     assert_eq!(fleet.deployment(&third).await.state, task_proto::api::DeploymentState::Settled);
-    assert_eq!(
-        code(fleet.actions.cancel_deployment(&fleet.operator, &third).await),
-        "nothing_to_cancel"
-    );
+    assert_eq!(code(fleet.deployments.cancel(&fleet.operator, &third).await), "nothing_to_cancel");
     // A restart can be forced, and another version is another matter.
     let forced = fleet.deploy("1", |order| order.restart = true).await;
     assert_eq!(fleet.phases(&forced).await, [Phase::Assigned; 4]);
@@ -155,8 +153,8 @@ async fn a_package_that_runs_already_is_not_started_again(database: TestDatabase
     let order = crate::fleet::order_of(&job);
     for _ in 0..2 {
         let id = fleet
-            .actions
-            .create_deployment(&fleet.operator, &random_key(), &order, &job)
+            .deployments
+            .create(&fleet.operator, &random_key(), &order, &job)
             .await
             .expect("ordered");
         assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, id);
@@ -175,7 +173,7 @@ fn active(deployment: &DeploymentId, version: &str) -> Option<ActiveVersion> {
     })
 }
 
-async fn package_that_came_back_after_a_failure_is_not_started_again(database: TestDatabase) {
+async fn package_restored_after_a_failure_is_not_started_again(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.publish("1").await;
     let mut robots = fleet.enroll(4).await;
@@ -194,9 +192,13 @@ async fn package_that_came_back_after_a_failure_is_not_started_again(database: T
         }
         fleet.report(robot).await;
     }
-    fleet.changes.take_rings().await;
-    let back = fleet.roll_back("*").await.expect("ordered").deployments.remove(0);
-    assert_eq!(fleet.changes.take_rings().await.robots.len(), 4, "the state of each is new");
+    fleet.changes.take_robots_to_notify().await;
+    let back = fleet.rollback("*").await.expect("ordered").deployments.remove(0);
+    assert_eq!(
+        fleet.changes.take_robots_to_notify().await.robots.len(),
+        4,
+        "the state of each is new"
+    );
     assert_eq!(
         fleet.phases(&back).await,
         [Phase::Running, Phase::Running, Phase::Assigned, Phase::Assigned]
@@ -234,19 +236,19 @@ async fn package_that_came_back_after_a_failure_is_not_started_again(database: T
     }
 }
 
-async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase) {
+async fn restart_begins_a_new_run_on_all_robots_with_the_task(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let id = fleet.deploy("1", |order| order.selector = selector("!r2")).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Failed).await;
-    fleet.changes.take_rings().await;
+    fleet.changes.take_robots_to_notify().await;
     let (key, all, task) = (random_key(), selector("*"), task());
     let restart =
-        || fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Restart, &task, &all);
+        || fleet.deployments.order_task(&fleet.operator, &key, TaskOrder::Restart, &task, &all);
     assert_eq!(names(&restart().await.expect("ordered")), ["r0", "r1"]);
     assert_eq!(names(&restart().await.expect("the same answer")), ["r0", "r1"]);
-    assert_eq!(fleet.changes.take_rings().await.robots.len(), 2);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots.len(), 2);
     assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Assigned]);
     for robot in &mut robots[..2] {
         assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].run, 2);
@@ -255,7 +257,7 @@ async fn a_restart_is_a_new_run_of_all_that_have_the_task(database: TestDatabase
     assert_eq!(fleet.phases(&id).await, [Phase::Running, Phase::Running]);
 }
 
-async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: TestDatabase) {
+async fn retry_orders_failed_robots_without_a_later_order(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.publish("1").await;
     let mut robots = fleet.enroll(7).await;
@@ -271,18 +273,21 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     fleet.deploy("2", |order| order.selector = selector("r4")).await;
     for (order, robot) in [(TaskOrder::Stop, "r5"), (TaskOrder::Remove, "r6")] {
         let ordered = fleet
-            .actions
+            .deployments
             .order_task(&fleet.operator, &random_key(), order, &task(), &selector(robot))
             .await;
         ordered.expect("ordered");
     }
     let retry = RetryDeployment::default();
-    let meant =
-        fleet.actions.robots_to_retry(&fleet.operator, &id, &retry).await.expect("there are some");
+    let meant = fleet
+        .deployments
+        .preview_retry(&fleet.operator, &id, &retry)
+        .await
+        .expect("there are some");
     assert_eq!(names(&meant), ["r1", "r2", "r3"]);
     assert_eq!(fleet.deployments().await.len(), 2, "a dry run orders nothing");
     let key = random_key();
-    let ordered = || fleet.actions.retry_deployment(&fleet.operator, &key, &id, &retry);
+    let ordered = || fleet.deployments.retry(&fleet.operator, &key, &id, &retry);
     let new = ordered().await.expect("ordered");
     assert_eq!(ordered().await.expect("the same"), new);
     assert_eq!(fleet.phases(&new).await, [Phase::Assigned; 3]);
@@ -290,10 +295,10 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     assert_eq!(code(fleet.retry(&fleet.operator, &id, &retry).await), "nothing_to_retry");
     let other =
         RetryDeployment { code: Some(FailureCode::DISK_FULL), ..RetryDeployment::default() };
-    let reused = fleet.actions.retry_deployment(&fleet.operator, &key, &id, &other).await;
+    let reused = fleet.deployments.retry(&fleet.operator, &key, &id, &other).await;
     assert_eq!(code(reused), "idempotency_key_reused");
     // An expired or cancelled deployment can be retried as well, but not once its package is gone.
-    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &new).await.expect("cancelled");
     fleet.unpublish("1").await;
     assert_eq!(code(fleet.retry(&fleet.operator, &new, &retry).await), "package_not_found");
     fleet.publish("1").await;
@@ -305,7 +310,7 @@ async fn a_retry_is_for_those_that_ended_badly_and_got_nothing_since(database: T
     );
 }
 
-async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabase) {
+async fn retry_of_some_robots_keeps_the_options_of_the_order(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.publish("1").await;
     let mut robots = fleet.enroll(4).await;
@@ -348,7 +353,7 @@ async fn a_retry_may_be_for_some_and_keeps_the_orders_ways(database: TestDatabas
     assert_eq!(view.expires_at_ms - view.created_at_ms, 600_000);
 }
 
-async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
+async fn rollback_restores_the_previous_package(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     for version in ["1", "2", "3"] {
         fleet.publish(version).await;
@@ -363,18 +368,21 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
-    let planned =
-        fleet.actions.rollback(&fleet.operator, &task(), &selector("*")).await.expect("reads");
+    let planned = fleet
+        .deployments
+        .preview_rollback(&fleet.operator, &task(), &selector("*"))
+        .await
+        .expect("reads");
     assert_eq!(
         (names(&planned.robots), names(&planned.without)),
         (vec!["r0", "r1", "r2"], vec!["r3"])
     );
     assert_eq!((planned.deployments.len(), fleet.deployments().await.len()), (0, 3));
-    fleet.changes.take_rings().await;
+    fleet.changes.take_robots_to_notify().await;
     let key = random_key();
     let order = || async {
         let all = selector("*");
-        fleet.actions.roll_back(&fleet.operator, &key, &task(), &all).await.expect("ordered")
+        fleet.deployments.rollback(&fleet.operator, &key, &task(), &all).await.expect("ordered")
     };
     let done = order().await;
     assert_eq!(order().await, done, "the same key orders once");
@@ -382,7 +390,7 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
         (&done.robots, &done.without, done.deployments.len()),
         (&planned.robots, &planned.without, 2)
     );
-    assert_eq!(fleet.changes.take_rings().await.robots.len(), 3);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots.len(), 3);
     for (robot, version) in robots.iter().zip(["1", "1", "2", "3"]) {
         assert_eq!(fleet.version(robot).await, version);
     }
@@ -393,7 +401,8 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
         let page = fleet
             .database
             .store
-            .deployments(None, before.as_ref(), 1)
+            .deployments()
+            .page(None, before.as_ref(), 1)
             .await
             .expect("reads")
             .expect("there");
@@ -409,18 +418,18 @@ async fn a_rollback_brings_back_what_ran_before(database: TestDatabase) {
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
-    fleet.roll_back("r0").await.expect("ordered");
+    fleet.rollback("r0").await.expect("ordered");
     assert_eq!(fleet.version(&robots[0]).await, "3");
-    let nobody = fleet.roll_back("r3").await;
+    let nobody = fleet.rollback("r3").await;
     assert_eq!(code(nobody), "nothing_to_roll_back");
     let unknown = fleet
-        .actions
-        .rollback(&fleet.operator, &"walker".parse().expect("a name"), &selector("*"))
+        .deployments
+        .preview_rollback(&fleet.operator, &"walker".parse().expect("a name"), &selector("*"))
         .await;
     assert_eq!(code(unknown), "no_robots_match");
 }
 
-async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDatabase) {
+async fn rollback_skips_packages_that_never_ran_or_were_deleted(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     for version in ["1", "2", "3", "4", "5"] {
         fleet.publish(version).await;
@@ -440,20 +449,21 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
     fleet.deploy("5", |_| ()).await;
     fleet.deploy("4", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Failed).await;
-    fleet.roll_back("*").await.expect("ordered");
+    fleet.rollback("*").await.expect("ordered");
     assert_eq!(fleet.version(&robots[0]).await, "2");
     fleet
-        .actions
-        .cancel_deployment(&fleet.operator, &fleet.deployments().await[0].id)
+        .deployments
+        .cancel(&fleet.operator, &fleet.deployments().await[0].id)
         .await
         .expect("cancelled");
     fleet.unpublish("2").await;
-    fleet.roll_back("*").await.expect("ordered");
+    fleet.rollback("*").await.expect("ordered");
     assert_eq!(fleet.version(&robots[0]).await, "1");
     let found = fleet
         .database
         .store
-        .find_package(&task(), &Reference::Tag("1".parse().expect("a tag")))
+        .packages()
+        .find(&task(), &Reference::Tag("1".parse().expect("a tag")))
         .await;
     assert_eq!(
         found.expect("reads").map(|view| view.package),
@@ -461,7 +471,7 @@ async fn a_rollback_passes_over_what_never_ran_and_what_is_gone(database: TestDa
     );
 }
 
-async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
+async fn retry_and_rollback_stay_in_the_scope(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     for version in ["1", "2"] {
         fleet.publish(version).await;
@@ -479,16 +489,48 @@ async fn orders_that_follow_stay_in_ones_scope(database: TestDatabase) {
     let all = RetryDeployment::default();
     assert_eq!(code(fleet.retry(&alice, &two, &all).await), "out_of_scope");
     assert_eq!(code(fleet.retry(&carol, &one, &all).await), "out_of_scope");
-    let back = fleet.actions.roll_back(&alice, &random_key(), &task(), &selector("*")).await;
+    let back = fleet.deployments.rollback(&alice, &random_key(), &task(), &selector("*")).await;
     assert_eq!(code(back), "out_of_scope");
     let own = RetryDeployment { selector: Some(selector("r0")), ..RetryDeployment::default() };
     let new = fleet.retry(&alice, &two, &own).await.expect("hers");
     assert_eq!(fleet.phases(&new).await.len(), 1);
     let back = fleet
-        .actions
-        .roll_back(&alice, &random_key(), &task(), &selector("r0"))
+        .deployments
+        .rollback(&alice, &random_key(), &task(), &selector("r0"))
         .await
         .expect("hers");
     assert_eq!(names(&back.robots), ["r0"]);
     assert_eq!(fleet.version(&robots[1]).await, "2");
+}
+
+/// A robot whose files were changed on its disk fetches them again, also those of an older package
+/// than ordered.
+async fn robot_may_fetch_the_package_that_it_goes_back_to(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let mut robots = fleet.enroll(2).await;
+    let ids = [0, 1].map(|robot: usize| robots[robot].id.clone());
+    let may = async |robot: usize, digest: Digest| {
+        let grant = fleet.database.store.robots().fetch_grant(&ids[robot], &digest).await;
+        grant.expect("reads").is_some()
+    };
+    let content = |version| package(version, TaskKind::Service).package.content.digest;
+    for (version, phase) in [
+        ("1", Phase::Running),
+        ("2", Phase::Running),
+        ("3", Phase::RolledBack),
+        ("4", Phase::Failed),
+    ] {
+        fleet.deploy(version, |order| order.selector = selector("r0")).await;
+        fleet.follow(&mut robots[0], phase).await;
+    }
+    fleet.deploy("4", |order| order.selector = selector("r1")).await;
+    assert!(may(0, content("4")).await && may(1, content("4")).await, "it is ordered");
+    assert!(may(0, content("2")).await, "it ran before the orders that failed");
+    assert!(!may(1, content("2")).await, "it never was on this robot");
+    assert!(!may(0, content("1")).await, "a later package ran since");
+    fleet.deploy("5", |order| order.selector = selector("r0")).await;
+    fleet.follow(&mut robots[0], Phase::Running).await;
+    // The answer about the content is cached for some seconds.
+    let config = package("2", TaskKind::Service).package.config.digest;
+    assert!(!may(0, config).await, "a later package ran since");
 }

@@ -4,12 +4,12 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use task_proto::digest::unhex;
-use task_proto::envelope::{PublicKey, SigningKey};
-use task_proto::id::InstanceId;
-use task_proto::log::LogLevel;
-use task_proto::request::{ACTION_TYPE, Action, Ask, Request};
-use task_proto::ros::Transition;
+use task_proto::ids::InstanceId;
+use task_proto::ids::digest::unhex;
+use task_proto::messages::request::{ACTION_TYPE, Action, Ask, Request};
+use task_proto::telemetry::log::LogLevel;
+use task_proto::telemetry::ros::Transition;
+use task_proto::trust::envelope::{PublicKey, SigningKey};
 use tokio::task::JoinHandle;
 
 use crate::cli::{Bench, Robot};
@@ -74,7 +74,8 @@ async fn session(bench: &Bench, robot: &Robot) -> Session {
 /// Robot `robot` publishes its log and goes, and the server knows that.
 pub async fn publish_log_and_go(bench: &Bench, robot: &Robot) {
     let mut session = session(bench, robot).await;
-    let batch = json!({ "robot_id": robot.identity.robot_id, "now_ms": NOW_MS, "lines": lines(), "suppressed": 7 });
+    let id = &robot.identity.robot_id;
+    let batch = json!({ "robot_id": id, "now_ms": NOW_MS, "lines": lines(), "suppressed": 7 });
     session.publish("log", batch.to_string().into_bytes()).await;
     session.leave().await;
     let id = robot.identity.robot_id.as_str();
@@ -85,12 +86,16 @@ pub async fn publish_log_and_go(bench: &Bench, robot: &Robot) {
 
 fn lines() -> Value {
     json!([
-        { "at_ms": NOW_MS - 50_000, "level": "debug", "source": "stdout", "task": "mapping", "text": "reading map.yaml" },
-        { "at_ms": NOW_MS - 40_000, "level": "info", "source": "rosout", "task": "mapping", "node": "/mapper",
-            "text": "1204 scans" },
-        { "at_ms": NOW_MS - 30_000, "level": "warn", "source": "diagnostics", "text": "battery: 11 %" },
-        { "at_ms": NOW_MS - 20_000, "level": "error", "source": "stderr", "task": "camera", "text": "no \u{1b}[31mframe" },
-        { "at_ms": NOW_MS - 10_000, "level": "fatal", "source": "agent", "task": "camera", "text": "gave up" },
+        { "at_ms": NOW_MS - 50_000, "level": "debug", "source": "stdout", "task": "mapping",
+            "text": "reading map.yaml" },
+        { "at_ms": NOW_MS - 40_000, "level": "info", "source": "rosout", "task": "mapping",
+            "node": "/mapper", "text": "1204 scans" },
+        { "at_ms": NOW_MS - 30_000, "level": "warn", "source": "diagnostics",
+            "text": "battery: 11 %" },
+        { "at_ms": NOW_MS - 20_000, "level": "error", "source": "stderr", "task": "camera",
+            "text": "no \u{1b}[31mframe" },
+        { "at_ms": NOW_MS - 10_000, "level": "fatal", "source": "agent", "task": "camera",
+            "text": "gave up" },
     ])
 }
 
@@ -105,9 +110,10 @@ fn answer(ask: &Ask) -> Result<Value, Refusal> {
         ] })),
         Ask::Node { name } => node(known(name.as_str())?),
         Ask::Topics => Ok(json!({ "type": "topics", "age_ms": 1250, "topics": [
-            { "name": "/map", "types": ["nav_msgs/msg/OccupancyGrid"], "publishers": ["/mapper"], "subscriptions": [] },
-            { "name": "/scan", "types": ["sensor_msgs/msg/LaserScan", "std_msgs/msg/String"], "publishers": ["/camera"],
-                "subscriptions": ["/mapper", "/rviz"] },
+            { "name": "/map", "types": ["nav_msgs/msg/OccupancyGrid"], "publishers": ["/mapper"],
+                "subscriptions": [] },
+            { "name": "/scan", "types": ["sensor_msgs/msg/LaserScan", "std_msgs/msg/String"],
+                "publishers": ["/camera"], "subscriptions": ["/mapper", "/rviz"] },
         ] })),
         Ask::Parameters { node } => known(node.as_str()).map(|_| {
             json!({ "type": "parameters", "parameters": [
@@ -165,11 +171,16 @@ fn known(name: &str) -> Result<&str, Refusal> {
 
 fn node(name: &str) -> Result<Value, Refusal> {
     let endpoint = |name: &str, kind: &str| json!({ "name": name, "type": kind });
-    let bare = json!({ "name": name, "publishers": [], "subscriptions": [], "services": [], "clients": [] });
+    let bare = json!({
+        "name": name, "publishers": [], "subscriptions": [], "services": [], "clients": [],
+    });
     let nodes = match name {
         "/mapper" => json!([{
             "name": name, "task": "mapping", "lifecycle": "active",
-            "publishers": [endpoint("/map", "nav_msgs/msg/OccupancyGrid"), endpoint("/rosout", "rcl_interfaces/msg/Log")],
+            "publishers": [
+                endpoint("/map", "nav_msgs/msg/OccupancyGrid"),
+                endpoint("/rosout", "rcl_interfaces/msg/Log"),
+            ],
             "subscriptions": [endpoint("/scan", "sensor_msgs/msg/LaserScan")],
             "services": [endpoint("/mapper/change_state", "lifecycle_msgs/srv/ChangeState")],
             "clients": [],
@@ -206,7 +217,8 @@ fn logs(
     let newest =
         &lines[lines.len().saturating_sub(usize::try_from(max_lines).expect("a small number"))..];
     let suppressed = if level == LogLevel::Debug { 2 } else { 0 };
-    Ok(
-        json!({ "type": "logs", "robot_id": "r0000000000000000", "now_ms": NOW_MS, "lines": newest, "suppressed": suppressed }),
-    )
+    Ok(json!({
+        "type": "logs", "robot_id": "r0000000000000000", "now_ms": NOW_MS, "lines": newest,
+        "suppressed": suppressed,
+    }))
 }

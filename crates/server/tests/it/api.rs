@@ -7,12 +7,12 @@ use serde_json::{Value, json};
 use task_proto::api::{
     DeploymentState, DeploymentView, MatchedRobots, PackageList, ReportReply, RobotList, ServerInfo,
 };
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{TestServer, answer, refusal};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_order_travels_to_the_robot_and_its_report_back() {
+async fn order_reaches_the_robot_and_its_report_returns() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -38,7 +38,7 @@ async fn an_order_travels_to_the_robot_and_its_report_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_goes_over_http_is_counted_at_the_sockets() {
+async fn http_traffic_is_counted_at_the_sockets() {
     let server = TestServer::start().await;
     let before: ServerInfo = server.get("/api/v1/server").await;
     let body: PackageList = server.get("/api/v1/packages").await;
@@ -51,7 +51,7 @@ async fn what_goes_over_http_is_counted_at_the_sockets() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_knows_its_state_gets_no_body() {
+async fn desired_state_with_a_matching_etag_has_no_body() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let tag = server.ask_desired(&robot).await.headers()["etag"].clone();
@@ -69,7 +69,7 @@ async fn a_robot_that_knows_its_state_gets_no_body() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_same_key_is_the_same_order() {
+async fn repeated_idempotency_key_returns_the_same_order() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -85,13 +85,14 @@ async fn the_same_key_is_the_same_order() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_dry_run_names_the_robots_and_orders_nothing() {
+async fn dry_run_names_the_robots_and_orders_nothing() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     server.enroll("boreas").await;
     let package = server.push("talker", "1.0.0").await;
     let body = json!({
-        "package": "talker", "manifest": package.manifest.digest, "selector": "atlas", "dry_run": true
+        "package": "talker", "manifest": package.manifest.digest, "selector": "atlas",
+        "dry_run": true,
     });
     let matched: MatchedRobots = server.post("/api/v1/deployments", &body).await;
     assert_eq!(
@@ -106,7 +107,7 @@ async fn a_dry_run_names_the_robots_and_orders_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cancelled_order_puts_the_old_version_back() {
+async fn cancelled_order_restores_the_old_version() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let (old, new) = (server.push("talker", "1.0.0").await, server.push("talker", "2.0.0").await);
@@ -171,7 +172,7 @@ async fn robots_are_found_edited_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn refusals_have_one_shape() {
+async fn errors_have_one_shape() {
     let server = TestServer::start().await;
     let get = |path: &str| server.request(Method::GET, path);
     let post = |body: String| {
@@ -225,7 +226,7 @@ async fn refusals_have_one_shape() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_known_mac_is_refused_without_a_token_for_that_robot() {
+async fn known_mac_needs_a_token_for_that_robot() {
     let server = TestServer::start().await;
     server.enroll("atlas").await;
     let mac = server.get::<RobotList>("/api/v1/robots").await.robots[0].mac.to_string();
@@ -242,7 +243,7 @@ async fn a_known_mac_is_refused_without_a_token_for_that_robot() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn events_tell_what_has_changed_and_end_with_the_server() {
+async fn event_stream_reports_changes_and_ends_with_the_server() {
     let server = TestServer::start().await;
     let response = server.request(Method::GET, "/api/v1/events").send().await.expect("an answer");
     assert_eq!(response.headers()["content-type"], "text/event-stream");

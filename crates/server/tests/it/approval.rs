@@ -7,33 +7,32 @@ use task_proto::RobotId;
 use task_proto::api::{
     AuditPage, CreateEnrollmentToken, EnrollResponse, EnrollmentToken, PendingRobotList, RobotView,
 };
-use task_proto::token::Token;
+use task_proto::trust::token::Token;
 use taskd::domain::person::Scope;
 use taskd::net::tls::ClientProof;
 use taskd::store::TokenHolder;
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases};
-use crate::enrolments::connack;
+use crate::enrollments::connack;
 use crate::fleet::{Fleet, mac};
 use crate::harness::{TestRobot, TestServer, answer, refusal};
 use crate::story::code;
 
 on_both_databases! {
-    a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed,
-    no_more_than_a_thousand_wait,
+    robot_waits_until_approval_rejection_or_a_week,
+    at_most_a_thousand_robots_wait_for_approval,
 }
 
 const DAY_MS: u64 = 24 * 60 * 60 * 1000;
 
-async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
-    database: TestDatabase,
-) {
+async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let holder = async |token: &Token| {
         store
-            .admit(token, &ClientProof::NotAsked, fleet.clock.now_ms())
+            .tokens()
+            .admit(token, &ClientProof::NotRequested, fleet.clock.now_ms())
             .await
             .expect("reads")
             .map(|admitted| admitted.holder)
@@ -41,7 +40,7 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     let order =
         CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
     let token = fleet.enrolment_token(order).await;
-    let one = fleet.try_enroll(&token, mac(1), Some("one")).await.expect("enrols");
+    let one = fleet.try_enroll(&token, mac(1), Some("one")).await.expect("enrolls");
     // An answer that was lost is mended as ever, and the robot goes on waiting.
     let one = fleet
         .try_enroll(&token, mac(1), Some("one"))
@@ -54,25 +53,30 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
         holder(&one.token).await,
         Some(TokenHolder::Pending { robot: one.robot_id.clone(), key: None })
     );
-    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
+    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrolls");
     assert_eq!(
         store
-            .matching_robots(&"*".parse().expect("valid"), &Scope::everything())
+            .robots()
+            .matching(&"*".parse().expect("valid"), &Scope::everything())
             .await
             .expect("reads")
             .robots,
         []
     );
-    assert_eq!(store.broker_credentials().await.expect("reads"), []);
-    assert_eq!(store.desired_tasks(std::slice::from_ref(&one.robot_id)).await.expect("reads"), []);
+    assert_eq!(store.robots().broker_credentials().await.expect("reads"), []);
+    assert_eq!(
+        store.robots().desired_tasks(std::slice::from_ref(&one.robot_id)).await.expect("reads"),
+        []
+    );
 
     for _ in 0..2 {
-        fleet.actions.approve_robot(&fleet.operator, &one.robot_id).await.expect("approved");
+        fleet.robots.approve(&fleet.operator, &one.robot_id).await.expect("approved");
     }
     assert!(matches!(holder(&one.token).await, Some(TokenHolder::Robot { .. })));
     assert_eq!(
         store
-            .matching_robots(&"*".parse().expect("valid"), &Scope::everything())
+            .robots()
+            .matching(&"*".parse().expect("valid"), &Scope::everything())
             .await
             .expect("reads")
             .robots
@@ -80,15 +84,12 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
         1
     );
     // Rejecting a robot that does not wait would be a removal.
-    assert_eq!(
-        code(fleet.actions.reject_robot(&fleet.operator, &one.robot_id).await),
-        "not_pending"
-    );
+    assert_eq!(code(fleet.robots.reject(&fleet.operator, &one.robot_id).await), "not_pending");
 
-    fleet.actions.reject_robot(&fleet.operator, &two.robot_id).await.expect("rejected");
+    fleet.robots.reject(&fleet.operator, &two.robot_id).await.expect("rejected");
     assert_eq!(holder(&two.token).await, None);
     // Name and MAC are free again.
-    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrols");
+    let two = fleet.try_enroll(&token, mac(2), Some("two")).await.expect("enrolls");
     fleet.clock.advance_ms(7 * DAY_MS);
     fleet.actions.expire().await.expect("looks");
     assert!(holder(&two.token).await.is_some(), "a week has not passed");
@@ -96,11 +97,11 @@ async fn a_robot_waits_until_it_is_approved_or_turned_away_or_a_week_has_passed(
     fleet.actions.expire().await.expect("looks");
     assert_eq!(holder(&two.token).await, None);
     let left: Vec<RobotId> =
-        store.robots().await.expect("reads").into_iter().map(|robot| robot.id).collect();
+        store.robots().list().await.expect("reads").into_iter().map(|row| row.robot.id).collect();
     assert_eq!(left, [one.robot_id]);
 }
 
-async fn no_more_than_a_thousand_wait(database: TestDatabase) {
+async fn at_most_a_thousand_robots_wait_for_approval(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let token = fleet
         .enrolment_token(CreateEnrollmentToken {
@@ -111,7 +112,7 @@ async fn no_more_than_a_thousand_wait(database: TestDatabase) {
         .await;
     let mut first = None;
     for number in 0..1_000 {
-        let came = fleet.try_enroll(&token, mac(number), None).await.expect("enrols");
+        let came = fleet.try_enroll(&token, mac(number), None).await.expect("enrolls");
         first.get_or_insert(came.robot_id);
     }
     let one_more = async || fleet.try_enroll(&token, mac(1_000), None).await;
@@ -120,8 +121,8 @@ async fn no_more_than_a_thousand_wait(database: TestDatabase) {
         fleet.try_enroll(&token, mac(0), None).await.is_ok(),
         "who waits already may ask again"
     );
-    fleet.actions.approve_robot(&fleet.operator, &first.expect("came")).await.expect("approved");
-    assert!(one_more().await.expect("enrols").awaits_approval);
+    fleet.robots.approve(&fleet.operator, &first.expect("came")).await.expect("approved");
+    assert!(one_more().await.expect("enrolls").awaits_approval);
 }
 
 async fn enrol(server: &TestServer, token: &str, number: u8) -> EnrollResponse {
@@ -136,9 +137,9 @@ async fn act(server: &TestServer, robot: &RobotId, verb: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
+async fn pending_robot_has_no_access_until_it_is_approved() {
     let directory = TempDir::new().expect("a directory");
-    let server = TestServer::start_in(directory, |config| config.enrolment_approval = true).await;
+    let server = TestServer::start_in(directory, |config| config.enrollment_approval = true).await;
     let package = server.push("talker", "1.0.0").await;
     let token: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
     let came = enrol(&server, &token.token, 1).await;
@@ -170,7 +171,8 @@ async fn a_robot_that_waits_has_nothing_until_it_is_approved() {
         ("robot-1", "unknown_robots"),
         (came.robot_id.as_str(), "unknown_robots"),
     ] {
-        let body = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": selector });
+        let digest = &package.manifest.digest;
+        let body = json!({ "package": "talker", "manifest": digest, "selector": selector });
         assert_eq!(refusal(server.order("/api/v1/deployments", selector, &body)).await.1, why);
     }
     let view: RobotView = server.get(&own).await;

@@ -5,9 +5,9 @@ use reqwest::StatusCode;
 use serde_json::{Value, json};
 use task_archive::{Limits, UnpackError, unpack};
 use task_proto::Digest;
-use task_proto::digest::Algorithm;
-use task_proto::manifest::ContentFacts;
-use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::manifest::ContentFacts;
+use task_proto::packages::oci::{ImageManifest, MANIFEST_TYPE};
 
 use crate::registry::TestRegistry;
 
@@ -125,7 +125,7 @@ fn manifests(tar: &[u8]) -> Vec<Case> {
         case(
             "a digest that nobody compares",
             ContentFacts { tar_digest: sha512, ..good },
-            "no SHA-256 digest",
+            "is not a SHA-256 digest",
         ),
         case(
             "more bytes",
@@ -168,7 +168,7 @@ fn names() -> Vec<Case> {
             Some("is a symbolic link"),
         ),
         of("a file below a file", &[file("b"), file("b/x")], Some("is a file")),
-        of("a name twice", &[file("b"), file("./b")], Some("there twice")),
+        of("a name twice", &[file("b"), file("./b")], Some("duplicate name")),
         of("a hard link to nothing", &[("b", Type::Link, "c", b"")], Some("an earlier file")),
         of("a second name", &[file("c"), ("b", Type::Link, "c", b"")], None),
         of("a way out", &[file("../b")], Some("'..'")),
@@ -195,7 +195,9 @@ fn unpacked(case: &Case) -> Result<(), String> {
 
 /// The reason for which the registry rejects the archive.
 async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
-    let task = json!({ "name": "talker", "version": "1.0.0", "run": { "exec": ["true"] }, "content": case.facts });
+    let task = json!({
+        "name": "talker", "version": "1.0.0", "run": { "exec": ["true"] }, "content": case.facts,
+    });
     let content = registry.push_blob("talker", &case.content).await;
     let config = registry.push_blob("talker", task.to_string().as_bytes()).await;
     let package = ImageManifest::package(config, content);
@@ -216,7 +218,7 @@ async fn pushed(registry: &TestRegistry, case: &Case) -> Result<(), String> {
 }
 
 #[tokio::test]
-async fn push_and_robot_come_to_the_same_verdict() {
+async fn push_and_robot_agree_on_every_archive() {
     use tar::EntryType as Type;
     let tar =
         tar_of(&[("main.sh", Type::Regular, "", &[b'x'; 900]), ("data", Type::Directory, "", b"")]);

@@ -5,8 +5,8 @@ use reqwest::{Method, RequestBuilder};
 use serde_json::{Value, json};
 use task_proto::api::{AccessToken, AuditPage, DeploymentView, EnrollmentToken};
 use task_proto::desired::PackageRef;
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
+use task_proto::packages::oci::MANIFEST_TYPE;
 use taskd::store::sqlite_url;
 
 use crate::database::{contents, rename};
@@ -23,7 +23,7 @@ struct Stage {
     deployment: String,
     paused: String,
     failed: String,
-    enrolment: String,
+    enrollment: String,
     signed_in: AccessToken,
     other_token: AccessToken,
 }
@@ -41,7 +41,8 @@ impl Stage {
         let failed = server.deploy(&runner, "*", "new-runner").await.id.to_string();
         let climber = server.push("climber", "1.0.0").await;
         let careful = json!({
-            "package": "climber", "manifest": climber.manifest.digest, "selector": "*", "batch": 1, "max_failures": 0,
+            "package": "climber", "manifest": climber.manifest.digest, "selector": "*", "batch": 1,
+            "max_failures": 0,
         });
         let paused: DeploymentView =
             answer(server.order("/api/v1/deployments", "careful", &careful)).await;
@@ -68,8 +69,9 @@ impl Stage {
                 .json(&json!({ "user": "alice", "password": PASSWORD }))
         };
         let (signed_in, other_token) = (answer(log_in()).await, answer(log_in()).await);
-        let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
-        let enrolment = enrolment.token;
+        let enrollment: EnrollmentToken =
+            server.post("/api/v1/enrollment-tokens", &json!({})).await;
+        let enrollment = enrollment.token;
         let paused = paused.id.to_string();
         Self {
             server,
@@ -80,7 +82,7 @@ impl Stage {
             deployment,
             paused,
             failed,
-            enrolment,
+            enrollment,
             signed_in,
             other_token,
         }
@@ -95,17 +97,19 @@ impl Stage {
         let request =
             |method, path: &str, body: Value| self.server.request(method, path).json(&body);
         let bare = |method, path: &str, body: Value| self.server.bare(method, path).json(&body);
+        let post = |path: &str, body| request(Method::POST, &format!("/api/v1/{path}"), body);
         let delete = |path: &str| self.server.request(Method::DELETE, path);
         let api = |path: &str| format!("/api/v1/{path}");
         let robot = |rest: &str| format!("/api/v1/robots/{}{rest}", self.robot.id);
         let all = json!({ "selector": "*" });
-        let deploy = json!({ "package": "walker", "manifest": self.walker.manifest.digest, "selector": "*" });
+        let walker = &self.walker.manifest.digest;
+        let deploy = json!({ "package": "walker", "manifest": walker, "selector": "*" });
         let manifest = self.server.request(Method::PUT, "/v2/talker/manifests/2.0.0");
         let manifest = manifest.header("content-type", MANIFEST_TYPE).body(self.manifest.clone());
         let unused = &self.unused;
         let ask = json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
         vec![
-            ("enrolment_token.create", request(Method::POST, &api("enrollment-tokens"), json!({}))),
+            ("enrolment_token.create", post("enrollment-tokens", json!({}))),
             (
                 "robot.enroll",
                 bare(
@@ -113,7 +117,7 @@ impl Stage {
                     &api("enroll"),
                     json!({ "mac": "02:00:00:00:00:07", "name": "ceto" }),
                 )
-                .bearer_auth(&self.enrolment),
+                .bearer_auth(&self.enrollment),
             ),
             ("robot.edit", request(Method::PATCH, &robot(""), json!({ "name": "argo" }))),
             ("robot.ask", request(Method::POST, &robot("/ask"), ask)),
@@ -126,32 +130,14 @@ impl Stage {
                 self.order(&api(&format!("deployments/{}/retry", self.failed)), &json!({})),
             ),
             ("task.rollback", self.order(&api("tasks/runner/rollback"), &all)),
-            (
-                "bulk.labels",
-                request(
-                    Method::POST,
-                    &api("bulk/labels"),
-                    json!({ "selector": "*", "set": { "a": "b" } }),
-                ),
-            ),
+            ("bulk.labels", post("bulk/labels", json!({ "selector": "*", "set": { "a": "b" } }))),
             ("manifest.delete", delete(&api("packages/spare/1.0.0"))),
             ("task.remove", self.order(&api("tasks/talker/remove"), &all)),
             (
                 "deployment.cancel",
-                request(
-                    Method::POST,
-                    &api(&format!("deployments/{}/cancel", self.deployment)),
-                    json!({}),
-                ),
+                post(&format!("deployments/{}/cancel", self.deployment), json!({})),
             ),
-            (
-                "deployment.resume",
-                request(
-                    Method::POST,
-                    &api(&format!("deployments/{}/resume", self.paused)),
-                    json!({}),
-                ),
-            ),
+            ("deployment.resume", post(&format!("deployments/{}/resume", self.paused), json!({}))),
             ("manifest.push", manifest),
             ("tag.delete", delete("/v2/talker/manifests/2.0.0")),
             (
@@ -159,10 +145,7 @@ impl Stage {
                 delete(&format!("/v2/unused/manifests/{}", unused.manifest.digest)),
             ),
             ("blob.delete", delete(&format!("/v2/unused/blobs/{}", unused.content.digest))),
-            (
-                "user.add",
-                request(Method::POST, &api("users"), json!({ "name": "bob", "roles": ["viewer"] })),
-            ),
+            ("user.add", post("users", json!({ "name": "bob", "roles": ["viewer"] }))),
             (
                 "user.edit",
                 request(Method::PATCH, &api("users/alice"), json!({ "roles": ["viewer"] })),
@@ -179,7 +162,7 @@ impl Stage {
                     json!({ "user": "alice", "password": PASSWORD }),
                 ),
             ),
-            ("token.create", request(Method::POST, &api("tokens"), json!({ "user": "alice" }))),
+            ("token.create", post("tokens", json!({ "user": "alice" }))),
             ("token.revoke", delete(&api(&format!("tokens/{}", self.other_token.id)))),
             (
                 "sign_out",
@@ -194,10 +177,7 @@ impl Stage {
                 ),
             ),
             ("user.remove", delete(&api("users/alice"))),
-            (
-                "bulk.remove",
-                request(Method::POST, &api("bulk/remove"), json!({ "selector": "boreas" })),
-            ),
+            ("bulk.remove", post("bulk/remove", json!({ "selector": "boreas" }))),
             ("robot.remove", delete(&robot(""))),
         ]
     }
@@ -213,7 +193,7 @@ impl Stage {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_can_not_be_written_down_is_not_done() {
+async fn act_without_an_audit_entry_is_not_done() {
     let stage = Stage::new().await;
     let before = stage.entries().await;
     rename(&stage.database(), "audit", "audit_elsewhere").await;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use task_proto::api::{EnrollmentToken, SessionView};
-use task_proto::token::{Token, TokenKind};
+use task_proto::trust::token::{Token, TokenKind};
 use taskd::http::auth::Access;
 use taskd::http::{Route, routes};
 
@@ -13,28 +13,28 @@ use crate::harness::{TestServer, refusal};
 
 /// All kinds of callers of a route.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Comer {
+enum TestCaller {
     Nobody,
     Nonsense,
     Stranger,
     Operator,
     OperatorByPassword,
-    Enrolment,
-    ExpiredEnrolment,
+    Enrollment,
+    ExpiredEnrollment,
     Robot,
     OtherRobot,
     RemovedRobot,
 }
 
-impl Comer {
+impl TestCaller {
     const ALL: [Self; 10] = [
         Self::Nobody,
         Self::Nonsense,
         Self::Stranger,
         Self::Operator,
         Self::OperatorByPassword,
-        Self::Enrolment,
-        Self::ExpiredEnrolment,
+        Self::Enrollment,
+        Self::ExpiredEnrollment,
         Self::Robot,
         Self::OtherRobot,
         Self::RemovedRobot,
@@ -42,23 +42,25 @@ impl Comer {
 
     /// The refusal to expect; `None` if the guard lets them in.
     fn refused(self, access: Access) -> Option<StatusCode> {
-        use Comer::{Enrolment, ExpiredEnrolment, Nobody, Nonsense, Operator, OperatorByPassword};
-        use Comer::{OtherRobot, RemovedRobot, Robot, Stranger};
+        use TestCaller::{
+            Enrollment, ExpiredEnrollment, Nobody, Nonsense, Operator, OperatorByPassword,
+        };
+        use TestCaller::{OtherRobot, RemovedRobot, Robot, Stranger};
         let is_let_in = match access {
             Access::Anyone => true,
             Access::Person(_) => matches!(self, Operator | OperatorByPassword),
             Access::OwnRobot => self == Robot,
-            Access::Enrolment => self == Enrolment,
+            Access::Enrollment => self == Enrollment,
             Access::PersonOrRobot => {
                 matches!(self, Operator | OperatorByPassword | Robot | OtherRobot)
             }
         };
         match self {
             _ if is_let_in => None,
-            Nobody | Nonsense | Stranger | ExpiredEnrolment | RemovedRobot => {
+            Nobody | Nonsense | Stranger | ExpiredEnrollment | RemovedRobot => {
                 Some(StatusCode::UNAUTHORIZED)
             }
-            Operator | OperatorByPassword | Enrolment | Robot | OtherRobot => {
+            Operator | OperatorByPassword | Enrollment | Robot | OtherRobot => {
                 Some(StatusCode::FORBIDDEN)
             }
         }
@@ -66,17 +68,17 @@ impl Comer {
 }
 
 /// A server with one of each.
-struct Gathering {
+struct Fixture {
     server: TestServer,
     robot_id: String,
     robot: String,
     other_robot: String,
     removed_robot: String,
-    enrolment: String,
-    expired_enrolment: String,
+    enrollment: String,
+    expired_enrollment: String,
 }
 
-impl Gathering {
+impl Fixture {
     async fn new() -> Self {
         let server = TestServer::start().await;
         let (robot, other, removed) = (
@@ -88,7 +90,8 @@ impl Gathering {
         server.request(Method::DELETE, &path).send().await.expect("an answer");
         let expired: EnrollmentToken =
             server.post("/api/v1/enrollment-tokens", &json!({ "ttl_s": 1 })).await;
-        let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
+        let enrollment: EnrollmentToken =
+            server.post("/api/v1/enrollment-tokens", &json!({})).await;
         server.clock.advance_ms(2_000);
         Self {
             server,
@@ -96,25 +99,27 @@ impl Gathering {
             robot: robot.token,
             other_robot: other.token,
             removed_robot: removed.token,
-            enrolment: enrolment.token,
-            expired_enrolment: expired.token,
+            enrollment: enrollment.token,
+            expired_enrollment: expired.token,
         }
     }
 
-    fn dress(&self, request: RequestBuilder, comer: Comer) -> RequestBuilder {
-        match comer {
-            Comer::Nobody => request,
-            Comer::Nonsense => request.header("authorization", "Bearer tsko_nonsense"),
-            Comer::Stranger => request.bearer_auth(Token::random(TokenKind::Operator).reveal()),
-            Comer::Operator => request.bearer_auth(self.server.operator.reveal()),
-            Comer::OperatorByPassword => {
+    fn authenticate(&self, request: RequestBuilder, caller: TestCaller) -> RequestBuilder {
+        match caller {
+            TestCaller::Nobody => request,
+            TestCaller::Nonsense => request.header("authorization", "Bearer tsko_nonsense"),
+            TestCaller::Stranger => {
+                request.bearer_auth(Token::random(TokenKind::Operator).reveal())
+            }
+            TestCaller::Operator => request.bearer_auth(self.server.operator.reveal()),
+            TestCaller::OperatorByPassword => {
                 request.basic_auth("anyone", Some(self.server.operator.reveal()))
             }
-            Comer::Enrolment => request.bearer_auth(&self.enrolment),
-            Comer::ExpiredEnrolment => request.bearer_auth(&self.expired_enrolment),
-            Comer::Robot => request.bearer_auth(&self.robot),
-            Comer::OtherRobot => request.bearer_auth(&self.other_robot),
-            Comer::RemovedRobot => request.bearer_auth(&self.removed_robot),
+            TestCaller::Enrollment => request.bearer_auth(&self.enrollment),
+            TestCaller::ExpiredEnrollment => request.bearer_auth(&self.expired_enrollment),
+            TestCaller::Robot => request.bearer_auth(&self.robot),
+            TestCaller::OtherRobot => request.bearer_auth(&self.other_robot),
+            TestCaller::RemovedRobot => request.bearer_auth(&self.removed_robot),
         }
     }
 
@@ -127,21 +132,24 @@ impl Gathering {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_route_lets_in_whom_it_names_and_nobody_else() {
-    let gathering = Gathering::new().await;
+async fn every_route_admits_only_its_callers() {
+    let fixture = Fixture::new().await;
     for route in routes() {
-        for comer in Comer::ALL {
+        for caller in TestCaller::ALL {
             // Revoking the robot would change the identity of the later callers.
             let puts_out = route.method == Some(Method::DELETE) && route.path.ends_with("{robot}");
             let is_last_word = puts_out || route.path.ends_with("/revoke");
-            if is_last_word && comer.refused(route.access).is_none() {
+            if is_last_word && caller.refused(route.access).is_none() {
                 continue;
             }
-            let response =
-                gathering.dress(gathering.request(&route), comer).send().await.expect("an answer");
+            let response = fixture
+                .authenticate(fixture.request(&route), caller)
+                .send()
+                .await
+                .expect("an answer");
             let (status, shown) =
-                (response.status(), format!("{:?} {} by {comer:?}", route.method, route.path));
-            match comer.refused(route.access) {
+                (response.status(), format!("{:?} {} by {caller:?}", route.method, route.path));
+            match caller.refused(route.access) {
                 Some(expected) => {
                     assert_eq!(status, expected, "{shown}");
                     let is_oci = route.path.starts_with("/v2");
@@ -160,8 +168,8 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
                     );
                 }
                 // Within the registry a robot sees blobs only.
-                None if route.path == "/v2/{*path}" && comer == Comer::Robot => {}
-                None if route.path == "/v2/{*path}" && comer == Comer::OtherRobot => {}
+                None if route.path == "/v2/{*path}" && caller == TestCaller::Robot => {}
+                None if route.path == "/v2/{*path}" && caller == TestCaller::OtherRobot => {}
                 None if route.path == "/api/v1/session" => {}
                 None => {
                     assert!(
@@ -175,7 +183,7 @@ async fn every_route_lets_in_whom_it_names_and_nobody_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn password_that_a_browser_adds_changes_nothing_for_a_foreign_page() {
+async fn basic_auth_from_a_foreign_page_changes_nothing() {
     let server = TestServer::start().await;
     let by_password = |method, path: &str| {
         server.bare(method, path).basic_auth("any", Some(server.operator.reveal()))
@@ -206,7 +214,7 @@ async fn password_that_a_browser_adds_changes_nothing_for_a_foreign_page() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_session_opens_what_its_token_opens_and_only_from_its_own_page() {
+async fn session_has_the_rights_of_its_token_on_its_own_page_only() {
     let server = TestServer::start().await;
     let origin = server.url("");
     let sign_in = |origin: &str, token: String| {
@@ -272,7 +280,7 @@ async fn sign_in_with(server: &TestServer, cookie: &str) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn signing_in_ends_the_session_that_the_browser_had() {
+async fn sign_in_ends_the_browsers_previous_session() {
     let server = TestServer::start().await;
     let robots = |cookie: &str| server.bare(Method::GET, "/api/v1/robots").header("cookie", cookie);
     let (first, other) =
@@ -285,15 +293,19 @@ async fn signing_in_ends_the_session_that_the_browser_had() {
         StatusCode::OK,
         "only if that succeeds"
     );
+    let events = server.bare(Method::GET, "/api/v1/events").header("cookie", &first).send();
+    let events = events.await.expect("an answer");
     let second = sign_in_with(&server, &first).await;
     assert_eq!(refusal(robots(&first)).await.0, 401);
+    let ended = tokio::time::timeout(Duration::from_secs(9), events.text()).await;
+    ended.expect("its stream ends").expect("a proper end");
     for lives in [&second, &other] {
         assert_eq!(robots(lives).send().await.expect("an answer").status(), StatusCode::OK);
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_browser_uses_nothing_that_it_kept_without_asking() {
+async fn answers_to_a_session_are_revalidated_before_use() {
     let server = TestServer::start().await;
     let package = server.push("talker", "1.0.0").await;
     let cookie = sign_in_with(&server, "theme=dark").await;
@@ -324,7 +336,7 @@ async fn a_browser_uses_nothing_that_it_kept_without_asking() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cookie_of_an_encrypted_server_takes_no_other_way() {
+async fn cookie_of_an_encrypted_server_is_secure() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.tls.private_ca = Some(true)).await;
     let sign_in = server

@@ -6,8 +6,8 @@ use std::collections::BTreeSet;
 use reqwest::Method;
 use serde_json::json;
 use task_proto::api::{AuditQuery, BulkLabels, DeploymentView, MatchedRobots, RobotList};
-use task_proto::id::Labels;
-use task_proto::report::Phase;
+use task_proto::ids::Labels;
+use task_proto::messages::report::Phase;
 use taskd::orders::changes::Change;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -17,7 +17,7 @@ use crate::story::code;
 
 on_both_databases! {
     labels_are_set_and_removed_at_once,
-    a_label_order_beyond_the_scope_changes_nothing,
+    label_change_beyond_the_scope_changes_nothing,
     robots_are_removed_at_once,
 }
 
@@ -42,7 +42,7 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     // More than one statement takes.
     let robots = fleet.enroll(75).await;
     let label =
-        async |order: &BulkLabels| fleet.actions.label_robots(&fleet.operator, None, order).await;
+        async |order: &BulkLabels| fleet.robots.label_selected(&fleet.operator, None, order).await;
     assert_eq!(
         label(&order("*", &[("site", "lab"), ("room", "7")], &[])).await.expect("done").len(),
         75
@@ -83,25 +83,25 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     label(&order("*", &many, &["site", "room"])).await.expect("just as many as there may be");
 }
 
-async fn a_label_order_beyond_the_scope_changes_nothing(database: TestDatabase) {
+async fn label_change_beyond_the_scope_changes_nothing(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(3).await;
     fleet
-        .actions
-        .label_robots(&fleet.operator, None, &order("!r2", &[("site", "lab")], &[]))
+        .robots
+        .label_selected(&fleet.operator, None, &order("!r2", &[("site", "lab")], &[]))
         .await
         .expect("done");
     let alice = fleet.limited("alice", "site=lab").await;
     for beyond in [order("*", &[("a", "b")], &[]), order("site=lab", &[("site", "field")], &[])] {
-        assert_eq!(code(fleet.actions.label_robots(&alice, None, &beyond).await), "out_of_scope");
+        assert_eq!(code(fleet.robots.label_selected(&alice, None, &beyond).await), "out_of_scope");
     }
     let everyone = "*".parse().expect("a selector");
-    assert_eq!(code(fleet.actions.remove_robots(&alice, None, &everyone).await), "out_of_scope");
+    assert_eq!(code(fleet.robots.remove_selected(&alice, None, &everyone).await), "out_of_scope");
     assert_eq!(fleet.view(&robots[0]).await.labels, labels(&[("site", "lab")]));
     assert!(fleet.view(&robots[2]).await.labels.is_empty());
     fleet
-        .actions
-        .label_robots(&alice, None, &order("site=lab", &[("a", "b")], &[]))
+        .robots
+        .label_selected(&alice, None, &order("site=lab", &[("a", "b")], &[]))
         .await
         .expect("hers");
     assert_eq!(fleet.view(&robots[1]).await.labels, labels(&[("a", "b"), ("site", "lab")]));
@@ -114,13 +114,13 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     fleet.follow(&mut robots[0], Phase::Running).await;
     let mut notices = fleet.changes.subscribe();
     let (key, others) = ("again".parse().expect("a key"), "!r0,!r1".parse().expect("a selector"));
-    let remove = async || fleet.actions.remove_robots(&fleet.operator, Some(&key), &others).await;
+    let remove = async || fleet.robots.remove_selected(&fleet.operator, Some(&key), &others).await;
     let gone = remove().await.expect("removed");
     assert_eq!(gone.len(), 73);
     assert_eq!(remove().await.expect("the same order"), gone);
     let other = "*".parse().expect("a selector");
     assert_eq!(
-        code(fleet.actions.remove_robots(&fleet.operator, Some(&key), &other).await),
+        code(fleet.robots.remove_selected(&fleet.operator, Some(&key), &other).await),
         "idempotency_key_reused"
     );
     let mut removed = 0;
@@ -129,18 +129,18 @@ async fn robots_are_removed_at_once(database: TestDatabase) {
     }
     assert_eq!(removed, 73);
     let one = AuditQuery { target: Some(robots[5].id.to_string()), ..AuditQuery::default() };
-    let written = fleet.database.store.audit(&one).await.expect("reads").records;
+    let written = fleet.database.store.audit().page(&one).await.expect("reads").records;
     assert!(written[0].entry.get().contains("robot.remove"), "{}", written[0].entry.get());
     assert_eq!(code(fleet.desired(&robots[5]).await), "not_found");
     // The remaining robot goes on, and assignments that waited for the others wait no longer.
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert_eq!(fleet.deployment(&id).await.state, task_proto::api::DeploymentState::Settled);
-    let again = fleet.actions.remove_robots(&fleet.operator, None, &others).await;
+    let again = fleet.robots.remove_selected(&fleet.operator, None, &others).await;
     assert_eq!(code(again), "no_robots_match");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn many_are_labelled_and_removed_over_http() {
+async fn bulk_labels_and_removal_work_over_http() {
     let server = TestServer::start().await;
     let mut robots = Vec::new();
     for name in ["atlas", "boreas", "ceto"] {

@@ -139,7 +139,8 @@ impl Bench {
             .as_str()
             .unwrap()
             .to_owned();
-        let body = json!({ "mac": format!("02:00:00:00:00:{number:02x}"), "name": format!("robot-{number}") });
+        let mac = format!("02:00:00:00:00:{number:02x}");
+        let body = json!({ "mac": mac, "name": format!("robot-{number}") });
         let answer = self
             .http
             .post(self.url("/enroll"))
@@ -169,8 +170,8 @@ impl Bench {
     /// in `phase`.
     pub async fn report(&self, robot: &Robot, deployment: &Value, phase: &str) {
         let mut task = json!({
-            "task": "hello", "deployment": deployment["id"], "package": deployment["package"], "wanted": "running",
-            "run": 1, "kind": "service", "phase": phase, "phase_ms": 1,
+            "task": "hello", "deployment": deployment["id"], "package": deployment["package"],
+            "wanted": "running", "run": 1, "kind": "service", "phase": phase, "phase_ms": 1,
         });
         if phase == "failed" {
             task["failure"] = json!({ "code": "process_exited", "text": "exit code 3" });
@@ -216,14 +217,14 @@ pub struct Robot {
 
 /// What could not take the place of another says so, and what goes on.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_run_that_is_unmet_says_what_runs_on() {
+async fn unmet_run_reports_the_version_that_still_runs() {
     let bench = Bench::start().await;
     let robot = bench.enroll(1).await;
     let order = ["push", &bench.package("1", ""), "--to", "*", "-o", "json"];
     let before = bench.taskd(&order).await.expect(0, "").json();
     bench.report(&robot, &before, "running").await;
     let again = bench.taskd(&["push", &bench.package("1", ""), "--to", "*"]).await;
-    again.expect(0, "already running on robot-1; --restart runs it anew there");
+    again.expect(0, "already running on robot-1; use --restart to restart it");
     let new = bench.package("2", "");
     let run = ["run", "robot-1", &new, "-o", "json", "--timeout", "60s"];
     let (ran, ()) = tokio::join!(bench.taskd(&run), async {
@@ -239,21 +240,23 @@ async fn a_run_that_is_unmet_says_what_runs_on() {
             }
         };
         let task = json!([{
-            "task": "hello", "deployment": newest["id"], "package": newest["package"], "wanted": "running", "run": 1,
-            "kind": "service", "phase": "unmet", "phase_ms": 1,
+            "task": "hello", "deployment": newest["id"], "package": newest["package"],
+            "wanted": "running", "run": 1, "kind": "service", "phase": "unmet", "phase_ms": 1,
             "failure": { "code": "requirements_unmet", "text": "no ros2launch" },
             "active": { "deployment": before["id"], "version": "1", "pid": 7 },
         }]);
         bench.report_tasks(&robot, task).await;
     });
-    ran.expect(1, "robot-1 still runs hello 1, which it had before; the new one does not run: requirements_unmet");
+    let said = "robot-1 still runs the previous version, hello 1; \
+                the new version does not run: requirements_unmet";
+    ran.expect(1, said);
     let list = bench.taskd(&["robot", "list"]).await.expect(0, "").stdout;
-    assert!(list.contains("hello:unmet/earlier-runs"), "{list}");
+    assert!(list.contains("hello:unmet/previous-runs"), "{list}");
 }
 
 /// Ctrl-C ends the wait and nothing else, and says how to go on.
 #[tokio::test(flavor = "multi_thread")]
-async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
+async fn interrupted_wait_prints_how_to_watch_and_cancel() {
     let bench = Bench::start().await;
     bench.enroll(1).await;
     let (data, package) = (bench.data().display().to_string(), bench.package("1", ""));
@@ -274,8 +277,8 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
     let (id, said, status) = interrupted.await.unwrap();
     assert_eq!(status.code(), Some(130), "{said:?}");
     let expected = [
-        "no longer waited for; the deployment goes on".to_owned(),
-        format!("follow it: taskd deploy watch {id}"),
+        "stopped waiting; the deployment continues".to_owned(),
+        format!("watch it: taskd deploy watch {id}"),
     ];
     assert_eq!(said[said.len() - 3..][..2], expected);
     assert_eq!(said.last(), Some(&format!("cancel it: taskd deploy cancel {id}")));
@@ -287,8 +290,7 @@ async fn an_interrupted_wait_says_how_to_follow_and_cancel() {
 async fn a_second_push_of_the_same_tree_transfers_no_blob() {
     let bench = Bench::start().await;
     let package = bench.package("1", "");
-    let first =
-        bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs transferred");
+    let first = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs uploaded");
     let second =
         bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "nothing to upload");
     assert_eq!(first.json(), second.json());
@@ -297,11 +299,13 @@ async fn a_second_push_of_the_same_tree_transfers_no_blob() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
+async fn exit_codes_tell_refusals_from_failures() {
     let bench = Bench::start().await;
     let list = ["robot", "list"];
     bench.taskd(&list).await.expect(0, "");
-    let other = task_proto::token::Token::random(task_proto::token::TokenKind::Operator).reveal();
+    let other =
+        task_proto::trust::token::Token::random(task_proto::trust::token::TokenKind::Operator)
+            .reveal();
     bench.taskd(&["robot", "list", "--token", &other]).await.expect(4, "");
     bench.taskd(&["robot", "list", "--token", "secret"]).await.expect(2, "not a token");
     bench.taskd(&["robot", "list", "--server", "nonsense"]).await.expect(2, "--server");
@@ -322,21 +326,23 @@ async fn who_may_not_ask_is_told_apart_from_what_does_not_work() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_wrong_is_said_before_anything_travels() {
+async fn mistakes_are_reported_before_any_upload() {
     let bench = Bench::start().await;
     let package = bench.package("1", "");
-    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "no robot matches");
+    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "no robots match *");
     let wrong = bench.package("2", "kindd = \"job\"\n[redy]\n");
     let ran = bench
         .taskd(&["push", &wrong])
         .await
-        .expect(2, "task.toml: run.kindd: there is no such key (did you mean run.kind?)");
+        .expect(2, "task.toml: run.kindd: unknown key (did you mean run.kind?)");
     assert!(
-        ran.stderr.contains("task.toml: redy: there is no such key (did you mean ready?)"),
+        ran.stderr.contains("task.toml: redy: unknown key (did you mean ready?)"),
         "{}",
         ran.stderr
     );
-    bench.taskd(&["push", "/nonexistent"]).await.expect(2, "there is no such directory");
+    bench.taskd(&["push", "/nonexistent"]).await.expect(2, "no such directory");
+    // The package is checked before the robots are selected.
+    bench.taskd(&["push", "/nonexistent", "--to", "*"]).await.expect(2, "no such directory");
     let packages = bench
         .http
         .get(bench.url("/packages"))
@@ -401,7 +407,7 @@ async fn waiting_survives_a_restart_of_the_server() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn many_robots_need_a_yes() {
+async fn orders_on_many_robots_need_confirmation() {
     let bench = Bench::start().await;
     for number in 1..=11 {
         bench.enroll(number).await;
@@ -412,9 +418,9 @@ async fn many_robots_need_a_yes() {
         .await
         .expect(0, "");
     assert_eq!(dry.json()["robots"].as_array().unwrap().len(), 11);
-    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "give --yes");
+    bench.taskd(&["push", &package, "--to", "*"]).await.expect(2, "confirm with --yes");
     bench.taskd(&["push", &package, "--to", "*", "--yes"]).await.expect(0, "to 11 robots");
-    bench.taskd(&["stop", "hello", "--on", "*"]).await.expect(2, "give --yes");
+    bench.taskd(&["stop", "hello", "--on", "*"]).await.expect(2, "confirm with --yes");
     bench.taskd(&["stop", "hello", "--on", "robot-3"]).await.expect(0, "stop hello on 1 robot");
     bench.taskd(&["stop", "other", "--on", "*"]).await.expect(2, "has the task other");
 }
@@ -454,7 +460,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
         shown.stdout
     );
     assert!(shown.stdout.contains("delivery    adaptive\n"), "{}", shown.stdout);
-    assert!(shown.stdout.contains("travels     inline: rule \"tiny\", size "), "{}", shown.stdout);
+    assert!(shown.stdout.contains("method      inline: rule \"tiny\", size "), "{}", shown.stdout);
     assert!(!shown.stdout.contains("DELIVERY"), "{}", shown.stdout);
     let shown = bench.taskd(&["deploy", "info", deployment, "--robots"]).await.expect(0, "");
     assert!(
@@ -471,7 +477,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
     for said in [
         "delivery    poll\n",
         "priority    -7\n",
-        "travels     poll: ordered, the order says poll\n",
+        "method      poll: ordered, the order says poll\n",
     ] {
         assert!(urgent.stdout.contains(said), "{}", urgent.stdout);
     }
@@ -483,7 +489,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
         bench.taskd(&["deploy", "cancel", deployment, "-o", "json"]).await.expect(0, "cancel");
     assert_eq!(cancelled.json()["state"], "cancelled");
     bench.taskd(&["deploy", "info", "d0000000000000000"]).await.expect(1, "not_found");
-    bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "give --yes");
+    bench.taskd(&["robot", "rm", "robot-7"]).await.expect(2, "confirm with --yes");
     bench.taskd(&["robot", "rm", "robot-7", "--yes"]).await.expect(0, id);
     bench
         .taskd(&["robot", "rm", "robot-7", "--yes"])
@@ -496,7 +502,7 @@ async fn robots_and_deployments_are_shown_and_removed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_version_means_what_was_pushed_under_it_by_force_last() {
+async fn version_names_the_package_that_was_force_pushed_last() {
     let bench = Bench::start().await;
     let robot = bench.enroll(1).await;
     let push = async |extra: &str| {
@@ -509,8 +515,11 @@ async fn a_version_means_what_was_pushed_under_it_by_force_last() {
     bench.report(&robot, &deployment, "running").await;
     let changed = bench.package("1", "[ready]\nhold_s = 9\n");
     let refused = bench.taskd(&["push", &changed, "--to", "*"]).await;
-    let said = format!("hello 1 is on the server with other content, {}", first.as_str().unwrap());
-    assert!(refused.expect(2, &said).stderr.contains("Raise the version"));
+    let said = format!(
+        "hello 1 already exists on the server with other content ({}",
+        first.as_str().unwrap()
+    );
+    assert!(refused.expect(2, &said).stderr.contains("raise the version"));
     let list = async || bench.taskd(&["robot", "list"]).await.expect(0, "").stdout;
     assert!(list().await.contains("hello:running") && !list().await.contains("outdated"));
     let second = push("[ready]\nhold_s = 9\n").await;
@@ -522,7 +531,7 @@ async fn a_version_means_what_was_pushed_under_it_by_force_last() {
         .await
         .expect(0, "")
         .stdout;
-    assert!(info.contains("a forced push gave this version to another package"), "{info}");
+    assert!(info.contains("a forced push replaced this version"), "{info}");
     let meant = async || {
         let info =
             bench.taskd(&["package", "info", "hello:1", "-o", "json"]).await.expect(0, "").json();
@@ -534,7 +543,7 @@ async fn a_version_means_what_was_pushed_under_it_by_force_last() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_list_that_is_cut_says_so() {
+async fn truncated_list_says_so() {
     let bench = Bench::start().await;
     bench.enroll(1).await;
     for version in ["1", "2", "3"] {
@@ -547,11 +556,11 @@ async fn a_list_that_is_cut_says_so() {
         list.iter().map(|one| one["package"]["version"].as_str().unwrap().to_owned()).collect()
     };
     assert_eq!(
-        versions(list("2").await.expect(0, "older ones are left out; -n shows more")),
+        versions(list("2").await.expect(0, "older deployments are not shown; use -n to show more")),
         ["3", "2"]
     );
     let whole = list("3").await;
-    assert!(!whole.stderr.contains("left out"), "{}", whole.stderr);
+    assert!(!whole.stderr.contains("not shown"), "{}", whole.stderr);
     assert_eq!(versions(whole), ["3", "2", "1"]);
 }
 
@@ -564,13 +573,13 @@ async fn removing_a_task_can_be_waited_for() {
     bench.report(&robot, &deployment, "running").await;
     let remove = ["remove", "hello", "--on", "*", "--idempotency-key", "k", "--wait"];
     let late = [&remove[..], &["--timeout", "5s"]].concat();
-    bench.taskd(&late).await.expect(5, "robot-1: not done in time");
+    bench.taskd(&late).await.expect(5, "robot-1: timed out");
     bench.report_absence(&robot).await;
-    bench.taskd(&remove).await.expect(0, "hello is gone from 1 robot");
+    bench.taskd(&remove).await.expect(0, "removed hello from 1 robot");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_server_says_what_went_over_it() {
+async fn server_info_shows_the_traffic() {
     let bench = Bench::start().await;
     let told = bench.taskd(&["server", "info"]).await.expect(0, "");
     assert!(told.stdout.contains("0 accepted, 0 refused"), "{}", told.stdout);
@@ -581,7 +590,7 @@ async fn the_server_says_what_went_over_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_closed_pipe_is_no_panic() {
+async fn closed_pipe_does_not_panic() {
     let bench = Bench::start().await;
     let mut list = command(&["robot", "list"]);
     list.env("TASKD_DATA", bench.data()).stdout(closed_pipe()).stderr(Stdio::piped());

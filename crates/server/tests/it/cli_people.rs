@@ -50,7 +50,7 @@ async fn add_user(bench: &Bench, name: &str, more: &[&str]) -> Ran {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_user_is_added_signs_in_and_out() {
+async fn user_is_added_signs_in_and_out() {
     let bench = Bench::start().await;
     let away = Away { bench: &bench };
     add_user(&bench, "alice", &["--role", "operator,publisher", "--robots", "site=lab"])
@@ -66,7 +66,7 @@ async fn a_user_is_added_signs_in_and_out() {
     bench
         .taskd(&["user", "add", "bob", "--role", "viewer"])
         .await
-        .expect(2, "give --password-stdin");
+        .expect(2, "use --password-stdin");
 
     away.taskd(&["whoami"]).await.expect(2, "sign in with taskd login");
     away.told(&["wrong"], &["login", "alice", "--password-stdin"])
@@ -104,7 +104,9 @@ async fn a_user_is_added_signs_in_and_out() {
     away.taskd(&["--token", &token, "whoami"]).await.expect(4, "expired or revoked");
 
     let passwd = ["user", "passwd", "--password-stdin"];
-    away.told(&["wrong", "another long one"], &passwd).await.expect(2, "old: it is wrong");
+    away.told(&["wrong", "another long one"], &passwd)
+        .await
+        .expect(2, "old: the old password is wrong");
     away.told(&[PASSWORD, "another long one"], &passwd)
         .await
         .expect(0, "signed out everywhere else");
@@ -117,7 +119,7 @@ async fn a_user_is_added_signs_in_and_out() {
     // The server that was signed in to last is meant where none is named.
     let mut anywhere = away.command(&["logout"]);
     anywhere.env_remove("TASKD_SERVER");
-    run(anywhere).await.expect(0, "signed out at http://");
+    run(anywhere).await.expect(0, "signed out of http://");
     away.taskd(&["--token", &token, "whoami"]).await.expect(4, "expired or revoked");
     away.taskd(&["whoami"]).await.expect(2, "no token");
     away.taskd(&["logout"]).await.expect(2, "you are not signed in");
@@ -126,8 +128,8 @@ async fn a_user_is_added_signs_in_and_out() {
         .taskd(&["user", "edit", "alice", "--role", "viewer", "--robots", "*"])
         .await
         .expect(0, "");
-    bench.taskd(&["user", "remove", "alice"]).await.expect(2, "give --yes");
-    bench.taskd(&["user", "remove", "alice", "--yes"]).await.expect(0, "removed alice");
+    bench.taskd(&["user", "remove", "alice"]).await.expect(2, "confirm with --yes");
+    bench.taskd(&["user", "remove", "alice", "--yes"]).await.expect(0, "removed user alice");
     away.told(&["another long one"], &["login", "alice", "--password-stdin"])
         .await
         .expect(4, "is wrong");
@@ -135,7 +137,7 @@ async fn a_user_is_added_signs_in_and_out() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_is_signed_out_where_the_server_was_not_told() {
+async fn failed_sign_out_keeps_the_local_token() {
     let mut bench = Bench::start().await;
     add_user(&bench, "alice", &["--role", "viewer"]).await.expect(0, "");
     let sign_in = ["login", "alice", "--password-stdin"];
@@ -144,12 +146,12 @@ async fn nobody_is_signed_out_where_the_server_was_not_told() {
     let stopped = bench.stop().await;
     run(log_out).await.expect(1, "can't reach the server");
     bench.go_on(stopped).await;
-    Away { bench: &bench }.taskd(&["logout"]).await.expect(0, "signed out at http://");
+    Away { bench: &bench }.taskd(&["logout"]).await.expect(0, "signed out of http://");
     bench.server.unwrap().stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_directory_that_is_typed_is_meant_whatever_is_in_the_environment() {
+async fn data_flag_wins_over_the_environment() {
     let (meant, other) = (Bench::start().await, Bench::start().await);
     let token = std::fs::read_to_string(other.data().join("operator.token")).unwrap();
     let data = meant.data();
@@ -168,7 +170,7 @@ async fn a_directory_that_is_typed_is_meant_whatever_is_in_the_environment() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_audit_is_shown_exported_and_verified() {
+async fn audit_is_shown_exported_and_verified() {
     let bench = Bench::start().await;
     add_user(&bench, "alice", &["--role", "viewer"]).await.expect(0, "");
     let package = bench.package("1", "");
@@ -189,7 +191,7 @@ async fn the_audit_is_shown_exported_and_verified() {
     assert_eq!(pushed["records"].as_array().unwrap().len(), 1);
     assert_eq!(pushed["records"][0]["entry"]["target"], "hello");
 
-    let seen = bench.taskd(&["audit", "--verify"]).await.expect(0, "all 3 entries hold").stdout;
+    let seen = bench.taskd(&["audit", "--verify"]).await.expect(0, "3 entries verified").stdout;
     assert!(seen.starts_with("3:sha256:"), "{seen}");
     let export = bench.taskd(&["audit", "--export"]).await.expect(0, "").stdout;
     assert_eq!(export.lines().count(), 3);
@@ -199,19 +201,22 @@ async fn the_audit_is_shown_exported_and_verified() {
         std::fs::write(&path, text).unwrap();
         bench.taskd(&["audit", "--verify", "--file", file, "--expect", seen.trim()]).await
     };
-    assert_eq!(verify(export.clone()).await.expect(0, "all 3 entries hold").stdout, seen);
+    assert_eq!(verify(export.clone()).await.expect(0, "3 entries verified").stdout, seen);
     verify(export.replace("\"hello\"", "\"other\""))
         .await
-        .expect(1, "the audit does not hold: entry 2");
+        .expect(1, "audit verification failed: entry 2");
     let shorter: String = export.lines().take(2).map(|line| format!("{line}\n")).collect();
-    verify(shorter).await.expect(1, "entry 3 was seen before, and now the last is 2");
-    verify("nonsense\n".to_owned()).await.expect(2, "line 1: it is no record");
+    verify(shorter).await.expect(1, "entry 3 is expected, but the log ends at entry 2");
+    verify("nonsense\n".to_owned()).await.expect(2, "line 1: not an audit record");
     let other = format!("2:{}", seen.trim().split_once(':').unwrap().1);
     bench
         .taskd(&["audit", "--verify", "--expect", &other])
         .await
-        .expect(1, "not the one that was seen before");
-    bench.taskd(&["audit", "--verify", "--expect", "x"]).await.expect(2, "what --verify prints");
+        .expect(1, "entry 2 differs from the expected link");
+    bench
+        .taskd(&["audit", "--verify", "--expect", "x"])
+        .await
+        .expect(2, "a link printed by --verify");
 
     // A robot is found by its name, under any name in the entries.
     bench.enroll(1).await;

@@ -8,8 +8,8 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use serde_json::Value;
-use task_proto::digest::hex;
-use task_proto::envelope::SigningKey;
+use task_proto::ids::digest::hex;
+use task_proto::trust::envelope::SigningKey;
 
 use crate::answering::{Answering, publish_log_and_go};
 use crate::cli::{Bench, Ran, closed_pipe, command, run};
@@ -116,7 +116,7 @@ impl Lab {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_commands_print_is_what_their_files_say() {
+async fn command_output_matches_its_files() {
     let lab = Lab::new().await;
     for file in [
         "robots.trycmd",
@@ -132,7 +132,7 @@ async fn what_commands_print_is_what_their_files_say() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_robot_answers_is_printed_as_the_files_say() {
+async fn robot_answers_match_their_files() {
     let (lab, _answering) = Lab::to_be_asked().await;
     for file in ["graph.trycmd", "logs.trycmd", "keys.trycmd"] {
         lab.holds(file).await;
@@ -141,7 +141,7 @@ async fn what_a_robot_answers_is_printed_as_the_files_say() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nobody_who_reads_is_no_failure() {
+async fn closed_pipe_is_not_a_failure() {
     let bench = Bench::start().await;
     for arguments in [
         &["robot", "list", "-o", "json"][..],
@@ -163,9 +163,9 @@ async fn nobody_who_reads_is_no_failure() {
 async fn every_command_has_a_man_page() {
     let dir = tempfile::tempdir().unwrap();
     let pages = dir.path().join("man1");
-    run(command(&["man", pages.to_str().unwrap()])).await.expect(0, "read them with: man ");
+    run(command(&["man", pages.to_str().unwrap()])).await.expect(0, "read the pages with: man ");
     let read = |page: &str| std::fs::read_to_string(pages.join(page)).unwrap();
-    assert!(read("taskd.1").contains("Exit codes: 0 done"), "{}", read("taskd.1"));
+    assert!(read("taskd.1").contains("Exit codes: 0 success"), "{}", read("taskd.1"));
     for page in [
         "taskd-push.1",
         "taskd-robot-label.1",
@@ -224,33 +224,33 @@ fn tree(dir: &Path) -> Vec<(String, Option<Vec<u8>>)> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_package_comes_out_of_the_store_as_it_went_in() {
+async fn exported_package_equals_the_pushed_one() {
     let bench = Bench::start().await;
     let plain = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plain");
     bench.taskd(&["push", plain.to_str().unwrap()]).await.expect(0, "");
     let list = bench.taskd(&["package", "list", "-o", "name"]).await.expect(0, "").stdout;
     let name = list.trim();
     let to = |file: &str| bench.dir.path().join(file).to_str().unwrap().to_owned();
-    bench.taskd(&["package", "export", name, &to("out")]).await.expect(0, "is in");
+    bench.taskd(&["package", "export", name, &to("out")]).await.expect(0, "exported ");
     assert_eq!(tree(Path::new(&to("out"))), tree(&plain));
     bench
         .taskd(&["package", "export", name, &to("out")])
         .await
-        .expect(2, "is there already and is not empty");
+        .expect(2, "already exists and is not empty");
     // The exported package can be pushed again, and is the same.
     bench.taskd(&["push", &to("out")]).await.expect(0, "nothing to upload");
-    bench.taskd(&["package", "export", name, &to("a.tar")]).await.expect(0, "is in");
-    bench.taskd(&["package", "export", name, &to("a.tar.zst")]).await.expect(0, "is in");
+    bench.taskd(&["package", "export", name, &to("a.tar")]).await.expect(0, "exported ");
+    bench.taskd(&["package", "export", name, &to("a.tar.zst")]).await.expect(0, "exported ");
     let plain = zstd::decode_all(std::fs::File::open(to("a.tar.zst")).unwrap()).unwrap();
     assert_eq!(std::fs::read(to("a.tar")).unwrap(), plain);
     bench
         .taskd(&["package", "export", "nothing", &to("b")])
         .await
-        .expect(2, "the server has no package nothing");
+        .expect(2, "package nothing not found");
     bench
         .taskd(&["package", "export", &format!("{name}:9.9.9"), &to("b")])
         .await
-        .expect(2, "has no package");
+        .expect(2, "not found on the server");
     bench.taskd(&["package", "export", "a/b", &to("b")]).await.expect(2, "a/b");
     bench.server.unwrap().stop().await;
 }
@@ -259,7 +259,8 @@ async fn a_package_comes_out_of_the_store_as_it_went_in() {
 fn ros_package(bench: &Bench) -> PathBuf {
     let dir = bench.dir.path().join("say");
     std::fs::create_dir_all(dir.join("launch")).unwrap();
-    let xml = "<package format=\"3\"><name>say</name><version>1.0.0</version><description>d</description>\
+    let xml = "<package format=\"3\"><name>say</name><version>1.0.0</version>\
+        <description>d</description>\
         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>\
         <export><build_type>ament_python</build_type></export></package>";
     for (file, text) in [
@@ -293,7 +294,7 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
     bench.enroll(1).await;
     let dir = ros_package(&bench);
     let dir = dir.to_str().unwrap();
-    bench.taskd(&["push", dir]).await.expect(2, "does not say how the package is run");
+    bench.taskd(&["push", dir]).await.expect(2, "does not specify how to run the package");
     let order = ["run", "robot-1", dir, "say.launch.py", "rate:=5", "--detach", "-o", "json"];
     let deployment = bench.taskd(&order).await.expect(0, "say 1.0.0 to robot-1").json();
     let pushed = runs(&bench).await;
@@ -320,7 +321,7 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
         (&["run", "robot-1", "say", "say.launch.py", "rate=5"], "expected ARG:=VALUE"),
         (&["run", "robot-1", "say", "say.launch.py", "rate:=", "--detach"], "run.args"),
         (&["run", "robot-9", "say", "say.launch.py"], "no robot has the name or id robot-9"),
-        (&["run", "robot-1", "shout", "say.launch.py"], "the server has no package shout"),
+        (&["run", "robot-1", "shout", "say.launch.py"], "package shout not found"),
     ] {
         bench.taskd(order).await.expect(2, said);
     }
@@ -365,7 +366,7 @@ async fn many_robots_are_labelled_and_removed_at_once() {
     for number in 11..=21 {
         bench.enroll(number).await;
     }
-    bench.taskd(&["robot", "label", "*", "site=lab"]).await.expect(2, "give --yes");
+    bench.taskd(&["robot", "label", "*", "site=lab"]).await.expect(2, "confirm with --yes");
     bench
         .taskd(&["robot", "label", "*", "site=lab", "--yes"])
         .await
@@ -374,7 +375,7 @@ async fn many_robots_are_labelled_and_removed_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_failed_is_tried_again_and_what_ran_before_comes_back() {
+async fn retry_and_rollback_select_the_right_robots() {
     let bench = Bench::start().await;
     let (one, two) = (bench.enroll(1).await, bench.enroll(2).await);
     let push = async |version: &str| {
@@ -391,7 +392,7 @@ async fn what_failed_is_tried_again_and_what_ran_before_comes_back() {
     bench
         .taskd(&["deploy", "retry", id, "--code", "build_failed"])
         .await
-        .expect(2, "failed on no robot that is meant");
+        .expect(2, "has no failed robots to retry");
     let again =
         bench.taskd(&["deploy", "retry", id, "--code", "process_exited", "-o", "json"]).await;
     let again = again.expect(0, "hello 1 to 1 robot").json();
@@ -400,23 +401,23 @@ async fn what_failed_is_tried_again_and_what_ran_before_comes_back() {
     bench
         .taskd(&["rollback", "hello", "--on", "*"])
         .await
-        .expect(2, "no robot that * selects has an earlier version");
+        .expect(2, "no robot that matches * has an earlier version");
     let second = push("2").await;
     bench.report(&one, &second, "running").await;
     let back = bench.taskd(&["rollback", "hello", "--on", "*", "-o", "json"]).await;
-    let back = back.expect(0, "no earlier version ran on robot-2").json();
+    let back = back.expect(0, "skipped, no earlier version: robot-2").json();
     assert_eq!(back["deployments"][0]["package"]["version"], "1");
     assert_eq!(back["robots"][0]["name"], "robot-1");
     let restarted = bench
         .taskd(&["restart", "hello", "--on", "robot-1", "-o", "name"])
         .await
-        .expect(0, "ordered: restart");
+        .expect(0, "requested: restart");
     assert_eq!(restarted.stdout, "robot-1\n");
     bench.server.unwrap().stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_package_is_looked_into_compared_and_deleted() {
+async fn package_is_listed_compared_and_deleted() {
     let bench = Bench::start().await;
     bench.enroll(1).await;
     let one = bench.package("1", "");
@@ -456,14 +457,11 @@ async fn a_package_is_looked_into_compared_and_deleted() {
     );
     let info = bench.taskd(&["package", "info", "hello:2"]).await.expect(0, "").stdout;
     assert!(
-        info.contains("ordered for 1 robot\n") && info.contains("run         true\n"),
+        info.contains("deployed to 1 robot\n") && info.contains("run         true\n"),
         "{info}"
     );
     bench.taskd(&["package", "rm", "hello:2", "--yes"]).await.expect(1, "robot-1");
     bench.taskd(&["package", "rm", "hello:1", "--yes"]).await.expect(0, "deleted hello:1");
-    bench
-        .taskd(&["package", "files", "hello:1"])
-        .await
-        .expect(2, "the server has no package hello:1");
+    bench.taskd(&["package", "files", "hello:1"]).await.expect(2, "package hello:1 not found");
     bench.server.unwrap().stop().await;
 }

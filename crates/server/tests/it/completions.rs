@@ -20,7 +20,8 @@ const FISH: &str = r#"taskd completions fish | source; or exit 9
 /// Completions of zsh for the typed line `$1`: a zsh in a terminal of its own writes the offered
 /// words into the file `$2`. A call of `compadd` with -O, -A or -D only tests which words fit.
 const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
-    zpty -w terminal "PROMPT= && autoload -U compinit && compinit -u -D && source <(taskd completions zsh)"
+    start='PROMPT= && autoload -U compinit && compinit -u -D'
+    zpty -w terminal "$start && source <(taskd completions zsh)"
     zpty -w terminal "compadd() {
         if (( ! \${@[(I)-[OAD]]} )); then
             local -a offered
@@ -29,9 +30,11 @@ const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
         fi
         builtin compadd \"\$@\"
     }"
-    # The words are put together only where they are printed: the terminal shows what is typed as well.
+    # The words are put together only where they are printed: the terminal shows what is typed as
+    # well.
     zpty -w terminal 'ended() { print -r "<""ended>" }; comppostfuncs=(ended); print -r "<""ready>"'
-    zpty -r terminal shown '*<ready>*' && zpty -w -n terminal "$1"$'\t' && zpty -r terminal shown '*<ended>*' || exit 9
+    zpty -r terminal shown '*<ready>*' && zpty -w -n terminal "$1"$'\t' &&
+        zpty -r terminal shown '*<ended>*' || exit 9
     zpty -d terminal"#;
 
 /// Runs a shell that finds the `taskd` that is tested.
@@ -103,7 +106,7 @@ async fn zsh_once(environment: &[(&str, String)], line: &str) -> Vec<String> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn bash_completes_what_the_server_knows_now() {
+async fn bash_completes_names_from_the_server() {
     let lab = Lab::new().await;
     let here = lab.here();
     assert_eq!(bash(&here, &["taskd", "robot", "info", "ro"]).await, ["robot-1", "robot-2"]);
@@ -135,7 +138,7 @@ async fn bash_completes_what_the_server_knows_now() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn fish_completes_what_the_server_knows_now() {
+async fn fish_completes_names_from_the_server() {
     let lab = Lab::new().await;
     let here = lab.here();
     assert_eq!(fish(&here, "taskd robot info ro").await, ["robot-1\tonline", "robot-2\tonline"]);
@@ -144,7 +147,7 @@ async fn fish_completes_what_the_server_knows_now() {
     let deployment = format!("{}\thello 2, settled", lab.deployment());
     assert_eq!(fish(&here, "taskd deploy watch d").await, [deployment]);
     let term = fish(&here, "taskd stop hello --on robot-2,!ro").await;
-    assert_eq!(term, ["robot-2,!robot-1\ta robot", "robot-2,!robot-2\ta robot"]);
+    assert_eq!(term, ["robot-2,!robot-1\trobot", "robot-2,!robot-2\trobot"]);
     assert_eq!(fish(&here, "taskd lifecycle robot-1 /n act").await, ["activate"]);
     lab.bench.enroll(3).await;
     assert_eq!(fish(&here, "taskd robot info robot-3").await, ["robot-3\toffline"]);
@@ -153,7 +156,7 @@ async fn fish_completes_what_the_server_knows_now() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn zsh_completes_what_the_server_knows_now() {
+async fn zsh_completes_names_from_the_server() {
     let lab = Lab::new().await;
     let here = lab.here();
     assert_eq!(zsh(&here, "taskd robot info ro").await, ["robot-1", "robot-2"]);

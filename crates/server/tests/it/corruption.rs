@@ -10,7 +10,7 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use sqlx::Connection as _;
 use task_proto::api::ServerStatus;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use taskd::config::Config;
 use taskd::serve::Server;
 use taskd::store::sqlite_url;
@@ -175,7 +175,7 @@ async fn damaged_index_at_rest_is_found_soon_after_start() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn damage_that_a_request_meets_ends_all_orders() {
+async fn damage_found_by_a_request_refuses_all_orders() {
     let (directory, mut robot) = stopped().await;
     let data = directory.path().join("data");
     let table = root_page(&data, "audit").await;

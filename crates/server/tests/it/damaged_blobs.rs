@@ -24,8 +24,7 @@ async fn push(server: &TestServer, digest: &Digest, bytes: Vec<u8>) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn blob_that_is_truncated_while_it_is_served_ends_that_answer_alone_and_can_be_pushed_again()
-{
+async fn truncated_blob_ends_one_answer_and_can_be_pushed_again() {
     for encrypts in [false, true] {
         let directory = TempDir::new().expect("a directory");
         let server =

@@ -5,25 +5,26 @@ use std::net::SocketAddr;
 
 use task_proto::api::{DeliveryChoice, DeliveryDecision, EditRobot};
 use task_proto::desired::{Delivery, DesiredTask};
-use task_proto::manifest::TaskKind;
-use task_proto::report::{LinkFacts, Phase};
+use task_proto::messages::report::{LinkFacts, Phase};
+use task_proto::packages::manifest::TaskKind;
 use taskd::config::DeliverySettings;
 use taskd::domain::delivery::{Condition, ConditionKey, Rule};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, order_of, package, random_key};
+use crate::story::refusal;
 
 on_both_databases! {
-    every_robot_gets_what_its_rule_says,
+    each_robot_gets_the_delivery_of_its_rule,
     robots_on_a_site_are_counted,
-    a_batch_is_decided_when_it_begins,
-    a_robot_that_has_the_bytes_lacks_nothing,
-    what_was_ordered_is_kept_and_orders_have_priorities,
-    more_than_an_announcement_carries_is_refused,
-    a_decision_of_an_older_version_is_the_orders,
-    blobs_ride_along_until_the_robot_has_them,
-    a_link_is_kept_until_another_is_measured,
-    who_waits_for_parts_is_known_until_it_has_them_or_pulls,
+    delivery_is_decided_when_the_batch_begins,
+    robot_with_the_content_lacks_no_bytes,
+    ordered_delivery_and_priority_are_kept,
+    inline_order_of_a_large_package_is_refused,
+    assignment_without_decision_uses_the_delivery_of_the_order,
+    inline_blobs_are_sent_until_the_robot_has_them,
+    link_facts_are_kept_until_the_next_measurement,
+    robot_awaits_parts_until_it_has_them_or_pulls,
 }
 
 /// A rule with one condition, named like it.
@@ -44,8 +45,8 @@ fn settings(own_rules: Vec<Rule>) -> DeliverySettings {
 async fn label(fleet: &Fleet, robot: &Robot, key: &str, value: &str) {
     let labels = [(key.parse().expect("a key"), value.parse().expect("a value"))].into();
     fleet
-        .actions
-        .edit_robot(
+        .robots
+        .edit(
             &fleet.operator,
             &robot.id,
             &EditRobot { labels: Some(labels), ..EditRobot::default() },
@@ -72,7 +73,7 @@ async fn only_task(fleet: &Fleet, robot: &Robot) -> DesiredTask {
     fleet.desired(robot).await.expect("a state").tasks.remove(0)
 }
 
-async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
+async fn each_robot_gets_the_delivery_of_its_rule(database: TestDatabase) {
     let rules = vec![
         rule("metered", 1, Delivery::PushPull),
         rule("battery_below", 20, Delivery::Poll),
@@ -110,10 +111,16 @@ async fn every_robot_gets_what_its_rule_says(database: TestDatabase) {
         assert_eq!(Some(only_task(&fleet, robot).await.delivery), mechanism);
     }
     let rung = [0, 2, 4, 5].map(|robot: usize| robots[robot].id.clone());
-    assert_eq!(fleet.changes.take_rings().await.robots, rung.into(), "who polls is not rung");
+    assert_eq!(
+        fleet.changes.take_robots_to_notify().await.robots,
+        rung.into(),
+        "who polls is not rung"
+    );
     let inputs = fleet.database.inputs(&id, &robots[3].id).await;
-    let expected = serde_json::json!({"size": 2, "lacking": 2, "robots": 6, "batch": 6, "connected": false,
-        "metered": false, "rtt_ms": 30, "losses": 0, "reconnects": 4, "transfers": 9, "backlog": 0});
+    let expected = serde_json::json!({
+        "size": 2, "lacking": 2, "robots": 6, "batch": 6, "connected": false, "metered": false,
+        "rtt_ms": 30, "losses": 0, "reconnects": 4, "transfers": 9, "backlog": 0,
+    });
     assert_eq!(serde_json::from_str::<serde_json::Value>(&inputs).expect("json"), expected);
 }
 
@@ -144,7 +151,7 @@ async fn robots_on_a_site_are_counted(database: TestDatabase) {
     assert_eq!(decided[4..], [alone.clone(), alone]);
 }
 
-async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
+async fn delivery_is_decided_when_the_batch_begins(database: TestDatabase) {
     let fleet =
         Fleet::with_delivery(database, &settings(vec![rule("losses_above", 2, Delivery::Poll)]))
             .await;
@@ -163,7 +170,7 @@ async fn a_batch_is_decided_when_it_begins(database: TestDatabase) {
     );
 }
 
-async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
+async fn robot_with_the_content_lacks_no_bytes(database: TestDatabase) {
     let fleet =
         Fleet::with_delivery(database, &settings(vec![rule("lacking_at_most", 0, Delivery::Poll)]))
             .await;
@@ -182,7 +189,7 @@ async fn a_robot_that_has_the_bytes_lacks_nothing(database: TestDatabase) {
     assert_eq!(decided[1..], [tiny.clone(), tiny], "one has begun only, one has nothing");
 }
 
-async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatabase) {
+async fn ordered_delivery_and_priority_are_kept(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     for (version, choice) in [
@@ -207,48 +214,41 @@ async fn what_was_ordered_is_kept_and_orders_have_priorities(database: TestDatab
         let mut order = order_of(&package("4", TaskKind::Service));
         order.priority = priority;
         let refused = fleet
-            .actions
-            .create_deployment(
-                &fleet.operator,
-                &random_key(),
-                &order,
-                &package("4", TaskKind::Service),
-            )
+            .deployments
+            .create(&fleet.operator, &random_key(), &order, &package("4", TaskKind::Service))
             .await;
         let error = refused.expect_err("refused");
         assert_eq!(error.to_string(), format!("priority: expected -100 to 100, not {priority}"));
     }
 }
 
-async fn more_than_an_announcement_carries_is_refused(database: TestDatabase) {
+async fn inline_order_of_a_large_package_is_refused(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     let mut large = package("1", TaskKind::Service);
     large.package.content.size = 10_171_187;
     let mut order = order_of(&large);
     order.delivery = DeliveryChoice::Inline;
-    let refused =
-        fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
-    let error = refused.expect_err("refused");
-    assert_eq!(error.to_string(), "delivery: talker 1 has 9.7 MB, inline carries at most 32 KB");
-    assert_eq!(error.code(), "package_too_large");
+    let refused = fleet.deployments.create(&fleet.operator, &random_key(), &order, &large).await;
+    let error = refusal(refused);
+    assert_eq!(error.message, "delivery: talker 1 has 9.7 MB, inline carries at most 32 KB");
+    assert_eq!(error.code, "package_too_large");
     // One byte too many, which the config brings.
     large.package.content.size = 32 << 10;
-    let refused =
-        fleet.actions.create_deployment(&fleet.operator, &random_key(), &order, &large).await;
+    let refused = fleet.deployments.create(&fleet.operator, &random_key(), &order, &large).await;
     let message = refused.expect_err("refused").to_string();
     assert_eq!(message, "delivery: talker 1 has 32769 B, inline carries at most 32768 B");
     order.delivery = DeliveryChoice::Adaptive;
     let id = fleet
-        .actions
-        .create_deployment(&fleet.operator, &random_key(), &order, &large)
+        .deployments
+        .create(&fleet.operator, &random_key(), &order, &large)
         .await
         .expect("ordered");
     let because = "size 32769 B > 32768 B";
     assert_eq!(decisions(&fleet, &id).await, [decision(Delivery::PushPull, "otherwise", because)]);
 }
 
-async fn a_decision_of_an_older_version_is_the_orders(database: TestDatabase) {
+async fn assignment_without_decision_uses_the_delivery_of_the_order(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |order| order.delivery = DeliveryChoice::Poll).await;
@@ -257,11 +257,12 @@ async fn a_decision_of_an_older_version_is_the_orders(database: TestDatabase) {
     assert_eq!(decisions(&fleet, &id).await, [None]);
 }
 
-async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
+async fn inline_blobs_are_sent_until_the_robot_has_them(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
-    let riding =
-        async |robot: &Robot| fleet.actions.desired(&robot.id).await.expect("a state").along;
+    let riding = async |robot: &Robot| {
+        fleet.desired_states.get(&robot.id).await.expect("a state").bundled_blobs
+    };
     let package = |version| package(version, TaskKind::Service).package;
     for (version, choice, expected) in [
         ("1", DeliveryChoice::Inline, vec![package("1").config, package("1").content]),
@@ -278,7 +279,7 @@ async fn blobs_ride_along_until_the_robot_has_them(database: TestDatabase) {
     }
 }
 
-async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
+async fn link_facts_are_kept_until_the_next_measurement(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let link =
@@ -301,13 +302,13 @@ async fn a_link_is_kept_until_another_is_measured(database: TestDatabase) {
     assert_eq!(fleet.view(&robots[0]).await.link, Some(newer));
 }
 
-async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestDatabase) {
+async fn robot_awaits_parts_until_it_has_them_or_pulls(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let content = package("1", TaskKind::Service).package.content.digest;
     let id = fleet.deploy("1", |order| order.delivery = DeliveryChoice::DirectPush).await;
     let store = fleet.database.store.clone();
-    let waiting = async || store.awaiting_parts(&content).await.expect("read");
+    let waiting = async || store.fan_outs().awaiting_parts(&content).await.expect("read");
     let part = |robot: &Robot| (id.clone(), robot.id.clone());
     assert_eq!(waiting().await, [part(&robots[0]), part(&robots[1])]);
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -316,14 +317,18 @@ async fn who_waits_for_parts_is_known_until_it_has_them_or_pulls(database: TestD
     // A robot that has all of the parts is left alone, for any request.
     let both = [part(&robots[0]), part(&robots[1])];
     for _ in 0..2 {
-        fleet.actions.pull_instead(&both, "it held up the others").await.expect("ordered");
+        fleet
+            .deployments
+            .switch_to_pull(&both, "the robot held up the others")
+            .await
+            .expect("ordered");
     }
     assert_eq!(fleet.desired(&robots[1]).await.expect("a state").generation.0, generation.0 + 1);
-    let told = decision(Delivery::PushPull, "fell behind", "it held up the others");
+    let told = decision(Delivery::PushPull, "fell behind", "the robot held up the others");
     let ordered = decision(Delivery::DirectPush, "ordered", "the order says direct-push");
     assert_eq!(decisions(&fleet, &id).await, [ordered, told]);
     assert_eq!(
-        (waiting().await, store.direct_pushes().await.expect("read").len()),
+        (waiting().await, store.fan_outs().list().await.expect("read").len()),
         (Vec::new(), 0)
     );
 }

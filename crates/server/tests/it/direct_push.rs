@@ -9,9 +9,9 @@ use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS, Subscribe
 use serde_json::json;
 use task_proto::api::DeploymentView;
 use task_proto::desired::{Delivery, DesiredState, PackageRef};
-use task_proto::part::{Part, PartRange};
-use task_proto::report::Phase;
-use task_proto::topic::{Topic, TopicPrefix};
+use task_proto::messages::part::{Part, PartRange};
+use task_proto::messages::report::Phase;
+use task_proto::messages::topic::{Topic, TopicPrefix};
 use taskd::config::Config;
 use tempfile::TempDir;
 use tokio::time::timeout;
@@ -36,7 +36,8 @@ async fn deploy(
     key: &str,
 ) -> DeploymentView {
     let body = json!({
-        "package": package.name, "manifest": package.manifest.digest, "selector": selector, "delivery": "direct-push"
+        "package": package.name, "manifest": package.manifest.digest, "selector": selector,
+        "delivery": "direct-push",
     });
     answer(server.order("/api/v1/deployments", key, &body)).await
 }
@@ -147,7 +148,7 @@ async fn server_with(configure: impl FnOnce(&mut Config)) -> (TestServer, Packag
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_stalled_are_told_to_pull_while_others_finish_also_who_misses_parts_or_comes_late() {
+async fn stalled_robots_are_told_to_pull_while_others_finish() {
     let (server, package) = server_with(|_| {}).await;
     let mut hearers = Vec::new();
     for name in ["quick", "lossy", "late", "stalled"] {
@@ -188,7 +189,7 @@ async fn the_stalled_are_told_to_pull_while_others_finish_also_who_misses_parts_
             if decision.mechanism == Delivery::PushPull {
                 assert_eq!(
                     (decision.rule.as_str(), decision.because.as_str()),
-                    ("fell behind", "it held up the others")
+                    ("fell behind", "the robot held up the others")
                 );
                 for name in ["quick", "lossy", "late"] {
                     let one = of(name);
@@ -207,7 +208,7 @@ async fn the_stalled_are_told_to_pull_while_others_finish_also_who_misses_parts_
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn only_those_it_is_meant_for_hear_it_and_only_as_long() {
+async fn only_robots_of_the_order_receive_parts_until_it_ends() {
     let (server, package) = server_with(|_| {}).await;
     let mut meant = Hearer::connect(&server, server.enroll("meant").await, &package);
     let mut other = Hearer::connect(&server, server.enroll("other").await, &package);
@@ -236,7 +237,7 @@ async fn only_those_it_is_meant_for_hear_it_and_only_as_long() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_fan_out_that_a_restart_interrupts_begins_again() {
+async fn interrupted_fan_out_begins_again_after_a_restart() {
     let (server, package) = server_with(|_| {}).await;
     let robot = server.enroll("patient").await;
     let again = TestRobot::new(robot.id.clone(), robot.token.clone());
@@ -260,10 +261,10 @@ async fn a_fan_out_that_a_restart_interrupts_begins_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_package_may_be_one_message_with_any_quality_of_service() {
+async fn package_in_one_message_works_with_any_qos() {
     for (ours, its) in [(0, QoS::AtMostOnce), (1, QoS::AtLeastOnce), (2, QoS::ExactlyOnce)] {
         let configure = |config: &mut Config| {
-            config.delivery.part_bytes = task_proto::part::MAX_PART_BYTES;
+            config.delivery.part_bytes = task_proto::messages::part::MAX_PART_BYTES;
             config.delivery.qos = ours;
         };
         let (server, package) = server_with(configure).await;
@@ -279,7 +280,7 @@ async fn a_package_may_be_one_message_with_any_quality_of_service() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_never_listens_is_told_to_pull() {
+async fn robot_that_never_subscribes_is_told_to_pull() {
     let (server, package) = server_with(|_| {}).await;
     let robot = server.enroll("atlas").await;
     let ordered = deploy(&server, &package, "*", "key-1").await;
@@ -295,7 +296,7 @@ async fn a_robot_that_never_listens_is_told_to_pull() {
     };
     assert_eq!(
         timeout(PATIENCE, told).await.expect("it should be told"),
-        "it did not listen for 10 s"
+        "the robot did not subscribe for 10 s"
     );
     let after = server.desired(&robot).await;
     assert!(after.generation > before.generation && after.tasks[0].delivery == Delivery::PushPull);

@@ -5,6 +5,7 @@ use serde_json::Value;
 use taskd::system::clock::Clock;
 
 use crate::cli::{Bench, Ran, command, run};
+use crate::postgres_cluster::{Postgres, free_port, url};
 
 /// The verdict on one check, and its findings.
 fn found(ran: &Ran, check: &str) -> Vec<(String, String)> {
@@ -41,14 +42,14 @@ async fn a_healthy_server_has_all_its_checks() {
     }
     assert!(!told.contains('✗') && !told.contains('\u{1b}'), "{told}");
     let ran = bench.taskd(&["doctor", "-o", "json"]).await.expect(0, "");
-    assert_found(&ran, "data", "good", "can be written");
-    assert_found(&ran, "tls", "good", "only this machine is in between");
+    assert_found(&ran, "data", "good", "is writable");
+    assert_found(&ran, "tls", "good", "the connection stays on this machine");
     assert_found(&ran, "robots", "good", "0 of 1 online");
     bench.server.unwrap().stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_stands_between_is_named() {
+async fn doctor_names_the_obstacle_to_the_server() {
     let bench = Bench::start().await;
     let at = async |server: &str| {
         bench.taskd(&["doctor", "-o", "json", "--server", server]).await.expect(1, "")
@@ -67,7 +68,9 @@ async fn what_stands_between_is_named() {
     );
     bench.taskd(&["doctor", "--server", "nonsense"]).await.expect(2, "--server");
 
-    let other = task_proto::token::Token::random(task_proto::token::TokenKind::Operator).reveal();
+    let other =
+        task_proto::trust::token::Token::random(task_proto::trust::token::TokenKind::Operator)
+            .reveal();
     let ran = bench.taskd(&["doctor", "-o", "json", "--token", &other]).await.expect(1, "");
     assert_found(&ran, "token", "bad", "");
     assert_found(&ran, "http", "good", "answers");
@@ -78,12 +81,12 @@ async fn what_stands_between_is_named() {
         .expect(0, "")
         .stdout;
     let ran = bench.taskd(&["doctor", "-o", "json", "--token", viewer.trim()]).await.expect(0, "");
-    assert_found(&ran, "token", "notice", "may read; it ends");
+    assert_found(&ran, "token", "notice", "has permission to read; the token expires");
     bench.server.unwrap().stop().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_clock_that_is_wrong_is_noticed() {
+async fn doctor_reports_clock_skew() {
     let ahead = Clock::fixed(Clock::system().now_ms() + 90_000);
     let bench = Bench::start_with(|_| {}, ahead).await;
     let ran = bench.taskd(&["doctor", "-o", "json"]).await.expect(0, "");
@@ -92,16 +95,11 @@ async fn a_clock_that_is_wrong_is_noticed() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_certificate_is_looked_at() {
+async fn doctor_reports_the_certificate_expiry() {
     let bench =
         Bench::start_with(|config| config.tls.private_ca = Some(true), Clock::system()).await;
     let ran = bench.taskd(&["doctor", "-o", "json"]).await.expect(0, "");
-    assert_found(
-        &ran,
-        "tls",
-        "good",
-        "vouched for by the pinned authority, the certificate ends 2",
-    );
+    assert_found(&ran, "tls", "good", "trusted by the pinned authority, the certificate expires 2");
     assert_found(&ran, "mqtt", "good", "answers");
     assert_found(&ran, "websocket", "good", "answers");
     let url = format!("https://{}", bench.server().addresses().http);
@@ -112,7 +110,7 @@ async fn a_certificate_is_looked_at() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_server_that_can_not_start_is_told_why() {
+async fn doctor_reports_why_a_server_can_not_start() {
     let mut bench = Bench::start().await;
     bench.server.take().unwrap().stop().await;
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -124,12 +122,32 @@ async fn a_server_that_can_not_start_is_told_why() {
     };
     let (http, mqtt) = (("TASKD_HTTP", "127.0.0.1:0"), ("TASKD_MQTT", "127.0.0.1:0"));
     let ran = with(&[http, mqtt]).await;
-    assert_found(&ran, "server", "bad", "none runs from this directory");
+    assert_found(&ran, "server", "bad", "no server is running on this directory");
     assert_found(&ran, "port", "good", "is free for --http");
     let ran = with(&[("TASKD_HTTP", &taken), mqtt]).await;
-    assert_found(&ran, "port", "bad", &format!("{taken} can't be had for --http"));
+    assert_found(&ran, "port", "bad", &format!("{taken} is not available for --http"));
     assert_found(&ran, "port", "good", "is free for --mqtt");
     let ran = with(&[("TASKD_HTTP", "nonsense")]).await;
     assert_found(&ran, "settings", "bad", "TASKD_HTTP");
     assert!(found(&ran, "space")[0].1.contains(" free"), "{}", ran.stdout);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn doctor_reports_the_postgres_servers_of_a_stopped_server() {
+    let postgres = Postgres::create();
+    postgres.start();
+    let directory = tempfile::tempdir().unwrap();
+    let with = async |database: &str| {
+        let mut command = command(&["doctor", "-o", "json", "--server", "http://127.0.0.1:1"]);
+        command.env("TASKD_DATA", directory.path()).env("TASKD_DATABASE", database);
+        let ran = run(command).await.expect(1, "");
+        assert!(!ran.stdout.contains("swordfish"), "{}", ran.stdout);
+        ran
+    };
+    let absent = free_port();
+    let ran = with(&[url(absent), postgres.url()].join(",")).await;
+    let found = format!("127.0.0.1:{}/postgres answers and takes writes", postgres.port);
+    assert_found(&ran, "database", "good", &found);
+    let ran = with(&url(absent)).await;
+    assert_found(&ran, "database", "bad", "Connection refused");
 }

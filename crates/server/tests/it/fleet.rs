@@ -1,25 +1,34 @@
 //! A fleet without a network: orders and reports go straight to the store, and robots are values.
 
 use std::collections::BTreeMap;
+use std::ops::Deref;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use task_proto::api::{
     AddUser, CreateDeployment, CreateEnrollmentToken, CreateToken, DeploymentView, EnrollRequest,
     PackageView, RobotView,
 };
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
-use task_proto::envelope::{DESIRED_STATE_TYPE, SigningKey};
-use task_proto::manifest::{TaskKind, TaskManifest};
-use task_proto::person::{Role, Roles};
-use task_proto::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
-use task_proto::token::{Token, TokenKind};
+use task_proto::messages::report::{HostFacts, LinkFacts, Phase, Report, TaskReport};
+use task_proto::packages::manifest::{TaskKind, TaskManifest};
+use task_proto::people::roles::{Role, Roles};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, SigningKey};
+use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, UserName};
 use taskd::config::DeliverySettings;
+use taskd::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
 use taskd::domain::person::Person;
 use taskd::fleet::presence::Presence;
-use taskd::orders::actions::{ActionError, ActionSettings, Actions, Enrolled, IdempotencyKey};
+use taskd::fleet::robot_vitals::RobotVitals;
+use taskd::http::views::Views;
+use taskd::orders::actions::{
+    ActionSettings, Actions, DeploymentActions, Enrolled, IdempotencyKey, PersonActions,
+    RobotActions, RobotError,
+};
 use taskd::orders::changes::Changes;
-use taskd::orders::chooser::{Chooser, ServerLoad};
+use taskd::orders::delivery_planner::{DeliveryPlanner, ServerLoad};
+use taskd::orders::desired_states::{DesiredStateError, DesiredStates};
 use taskd::orders::report_writer::ReportWriter;
 use taskd::store::TokenHolder;
 use taskd::system::clock::Clock;
@@ -27,20 +36,58 @@ use taskd::system::clock::Clock;
 use crate::database::TestDatabase;
 
 const SEED: [u8; 32] = [7; 32];
+/// The lifetime of signed desired states.
+pub const STATE_LIFETIME_MS: u64 = 30 * 24 * 60 * 60 * 1000;
 /// The number of every robot's MQTT session.
 const CONNECTION: u64 = 1;
 
-/// A server's inner half with a clock that stands still.
+/// The same part of each server. Every use is of the next server's.
+pub struct InTurns<T> {
+    parts: Vec<T>,
+    next: AtomicUsize,
+}
+
+impl<T> InTurns<T> {
+    /// A part of each of the servers' actions.
+    fn of_each(actions: &[Actions], part: impl Fn(&Actions) -> T) -> Self {
+        actions.iter().map(part).collect::<Vec<_>>().into()
+    }
+
+    /// The part of one of the servers, counted from 0.
+    pub fn of(&self, server: usize) -> &T {
+        &self.parts[server]
+    }
+}
+
+impl<T> From<Vec<T>> for InTurns<T> {
+    fn from(parts: Vec<T>) -> Self {
+        Self { parts, next: AtomicUsize::new(0) }
+    }
+}
+
+impl<T> Deref for InTurns<T> {
+    type Target = T;
+    fn deref(&self) -> &T {
+        &self.parts[self.next.fetch_add(1, Ordering::Relaxed) % self.parts.len()]
+    }
+}
+
+/// A server's inner half with a clock that stands still, or two with one database.
 pub struct Fleet {
     pub database: TestDatabase,
-    pub actions: Actions,
+    pub actions: InTurns<Actions>,
+    pub robots: InTurns<RobotActions>,
+    pub deployments: InTurns<DeploymentActions>,
+    pub people: InTurns<PersonActions>,
+    pub desired_states: DesiredStates,
     pub operator: Person,
-    pub writer: ReportWriter,
+    pub writer: InTurns<ReportWriter>,
     pub clock: Clock,
     pub changes: Changes,
     pub presence: Arc<Presence>,
+    pub views: Views,
     pub load: Arc<ServerLoad>,
-    pub chooser: Chooser,
+    pub planner: DeliveryPlanner,
 }
 
 /// A robot's own view: its accepted state and its reports.
@@ -63,26 +110,57 @@ impl Fleet {
         let load = Arc::new(ServerLoad::default());
         let (clock, changes) = (Clock::fixed(1_000_000), Changes::new());
         let presence = Arc::new(Presence::new(90_000, clock.now_ms()));
-        let chooser = Chooser::new(settings, presence.clone(), load.clone());
-        let (writer, _) = ReportWriter::start(
+        let planner = DeliveryPlanner::new(settings, presence.clone(), load.clone());
+        let stores: Vec<_> = [&database.store].into_iter().chain(&database.second).collect();
+        let writer = stores.iter().map(|&store| {
+            let (clock, changes) = (clock.clone(), changes.clone());
+            ReportWriter::start(store.clone(), clock, changes, planner.clone()).0
+        });
+        let key = Arc::new(SigningKey::from_bytes(SEED));
+        let desired_states = DesiredStates::new(
             database.store.clone(),
             clock.clone(),
-            changes.clone(),
-            chooser.clone(),
+            key.clone(),
+            STATE_LIFETIME_MS,
         );
-        let key = SigningKey::from_bytes(SEED);
-        let actions = Actions::new(
-            database.store.clone(),
-            clock.clone(),
-            changes.clone(),
-            key,
-            ActionSettings { enrolments_per_minute: 1_000_000, ..ActionSettings::default() },
-            chooser.clone(),
-        );
+        let actions = stores.iter().map(|&store| {
+            Actions::new(
+                store.clone(),
+                clock.clone(),
+                changes.clone(),
+                key.clone(),
+                ActionSettings { enrollments_per_minute: 1_000_000, ..ActionSettings::default() },
+                planner.clone(),
+            )
+        });
+        let writer = writer.collect::<Vec<_>>().into();
+        let actions: Vec<Actions> = actions.collect();
         let token = Token::random(TokenKind::Operator);
-        database.store.create_operator_token(&token, clock.now_ms()).await.expect("stored");
+        database.store.tokens().create_first(&token, clock.now_ms()).await.expect("stored");
         let operator = Person::first(token.id().parse().expect("an id"));
-        Self { database, actions, operator, writer, clock, changes, presence, load, chooser }
+        let views = Views {
+            store: database.store.clone(),
+            presence: presence.clone(),
+            robot_limiter: RobotLimiter::new(RobotLimits::default()),
+            vitals: RobotVitals::default(),
+            clock: clock.clone(),
+        };
+        Self {
+            database,
+            robots: InTurns::of_each(&actions, |actions| actions.robots.clone()),
+            deployments: InTurns::of_each(&actions, |actions| actions.deployments.clone()),
+            people: InTurns::of_each(&actions, |actions| actions.people.clone()),
+            actions: actions.into(),
+            desired_states,
+            operator,
+            writer,
+            clock,
+            changes,
+            presence,
+            views,
+            load,
+            planner,
+        }
     }
 
     /// An administrator of the robots that `scope` means.
@@ -91,30 +169,34 @@ impl Fleet {
         let scope = Some(scope.parse().expect("a selector"));
         let order =
             AddUser { name: user.clone(), roles: Roles::one(Role::Admin), scope, password: None };
-        self.actions.add_user(&self.operator, &order).await.expect("added");
+        self.people.add_user(&self.operator, &order).await.expect("added");
         let order = CreateToken { user: Some(user), ..CreateToken::default() };
-        let made = self.actions.create_token(&self.operator, &order).await.expect("made");
+        let made = self.people.create_token(&self.operator, &order).await.expect("made");
         let token = made.token.parse().expect("a token");
-        match self.database.store.token_holder(&token, self.clock.now_ms()).await.expect("reads") {
+        match self.database.store.tokens().holder(&token, self.clock.now_ms()).await.expect("reads")
+        {
             Some(TokenHolder::Person(person)) => person,
             other => panic!("{other:?}"),
         }
     }
 
-    pub async fn enrolment_token(&self, order: CreateEnrollmentToken) -> task_proto::token::Token {
+    pub async fn enrolment_token(
+        &self,
+        order: CreateEnrollmentToken,
+    ) -> task_proto::trust::token::Token {
         let made =
-            self.actions.create_enrollment_token(&self.operator, &order).await.expect("a token");
+            self.robots.create_enrollment_token(&self.operator, &order).await.expect("a token");
         made.token.parse().expect("a token")
     }
 
     pub async fn try_enroll(
         &self,
-        token: &task_proto::token::Token,
+        token: &task_proto::trust::token::Token,
         mac: MacAddress,
         name: Option<&str>,
-    ) -> Result<Enrolled, ActionError> {
+    ) -> Result<Enrolled, RobotError> {
         let name = name.map(|name| name.parse().expect("a name"));
-        self.actions
+        self.robots
             .enroll(
                 token,
                 &EnrollRequest { mac, name, labels: BTreeMap::new(), client_key: None },
@@ -143,7 +225,7 @@ impl Fleet {
             let enrolled = self
                 .try_enroll(&token, mac(number), Some(&format!("r{number}")))
                 .await
-                .expect("enrols");
+                .expect("enrolls");
             self.come_online(&enrolled.robot_id);
             robots.push(Robot::new(enrolled.robot_id));
         }
@@ -158,24 +240,25 @@ impl Fleet {
         let package = package(version, TaskKind::Service);
         let mut request = order_of(&package);
         order(&mut request);
-        self.actions
-            .create_deployment(&self.operator, &random_key(), &request, &package)
+        self.deployments
+            .create(&self.operator, &random_key(), &request, &package)
             .await
             .expect("ordered")
     }
 
     pub async fn deployment(&self, id: &DeploymentId) -> DeploymentView {
-        self.database.store.deployment(id, true).await.expect("reads").expect("there")
+        self.views.deployment(&self.operator, id, true).await.expect("there")
     }
 
     /// The newest ones.
     pub async fn deployments(&self) -> Vec<DeploymentView> {
-        let page = self.database.store.deployments(None, None, 1_000).await.expect("reads");
-        page.expect("no other was named").deployments
+        let page = self.database.store.deployments().page(None, None, 1_000).await.expect("reads");
+        let rows = page.expect("no other was named").deployments;
+        rows.into_iter().map(|row| row.into_view(None)).collect()
     }
 
     pub async fn view(&self, robot: &Robot) -> RobotView {
-        self.database.store.robot(&robot.id).await.expect("reads").expect("there")
+        self.views.robot(&robot.id, None).await.expect("there")
     }
 
     /// The phases of a deployment's assignments, by robot name.
@@ -188,8 +271,8 @@ impl Fleet {
             .collect()
     }
 
-    pub async fn desired(&self, robot: &Robot) -> Result<DesiredState, ActionError> {
-        let desired = self.actions.desired(&robot.id).await?;
+    pub async fn desired(&self, robot: &Robot) -> Result<DesiredState, DesiredStateError> {
+        let desired = self.desired_states.get(&robot.id).await?;
         let key = SigningKey::from_bytes(SEED).public_key();
         let payload =
             desired.envelope.open(DESIRED_STATE_TYPE, &key).expect("signed by the server");

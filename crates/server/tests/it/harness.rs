@@ -11,11 +11,11 @@ use task_proto::api::{
     DeploymentView, EnrollResponse, EnrollmentToken, IDEMPOTENCY_KEY, RobotView, ServerInfo,
 };
 use task_proto::desired::{BlobRef, DesiredState, DesiredTask, PackageRef};
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope};
-use task_proto::manifest::{ContentFacts, TaskKind};
-use task_proto::oci::{ImageManifest, MANIFEST_TYPE};
-use task_proto::report::{HostFacts, Phase, Report, TaskReport};
-use task_proto::token::Token;
+use task_proto::messages::report::{HostFacts, Phase, Report, TaskReport};
+use task_proto::packages::manifest::{ContentFacts, TaskKind};
+use task_proto::packages::oci::{ImageManifest, MANIFEST_TYPE};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope};
+use task_proto::trust::token::Token;
 use task_proto::{Digest, InstanceId, RobotId};
 use task_transport::Trust;
 use taskd::config::Config;
@@ -52,7 +52,7 @@ impl TestServer {
         let mut config = Config::with_data(directory.path().join("data"));
         config.http.set_port(0);
         config.mqtt.set_port(0);
-        config.enrolment_per_minute = 1_000_000;
+        config.enrollment_per_minute = 1_000_000;
         configure(&mut config);
         let clock = Clock::fixed(NOW_MS);
         let server = Server::start(config, clock.clone()).await.expect("the server starts");
@@ -179,7 +179,8 @@ impl TestServer {
     }
 
     pub async fn deploy(&self, package: &PackageRef, selector: &str, key: &str) -> DeploymentView {
-        let body = json!({ "package": package.name, "manifest": package.manifest.digest, "selector": selector });
+        let digest = &package.manifest.digest;
+        let body = json!({ "package": package.name, "manifest": digest, "selector": selector });
         answer(self.order("/api/v1/deployments", key, &body)).await
     }
 

@@ -16,9 +16,10 @@ const EVERYWHERE: [(&str, &str); 5] = [
 ];
 const ANSWER: &str =
     "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox";
-const PAGE: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; font-src 'self'; \
-                    connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; form-action 'none'; \
-                    frame-ancestors 'none'";
+const PAGE: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
+                    img-src 'self' data:; font-src 'self'; connect-src 'self'; \
+                    worker-src 'self'; manifest-src 'self'; base-uri 'none'; \
+                    form-action 'none'; frame-ancestors 'none'";
 
 fn check(response: &Response, policy: &str, what: &str) {
     let text = |name: &str| {
@@ -45,7 +46,7 @@ fn check(response: &Response, policy: &str, what: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_answer_says_that_it_is_not_a_page() {
+async fn every_api_answer_has_a_strict_content_policy() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -90,7 +91,7 @@ async fn every_answer_says_that_it_is_not_a_page() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_others_stored_is_never_a_page_and_neither_is_an_error() {
+async fn stored_content_and_errors_are_never_served_as_pages() {
     let server = TestServer::start().await;
     let html = "<script>fetch('/api/v1/users')</script>";
     let package = server.push_content("talker", "1.0.0", archive_with(html.as_bytes())).await;

@@ -3,8 +3,8 @@
 use serde_json::json;
 use task_proto::Generation;
 use task_proto::api::{EditRobot, MAX_TIMELINE, PastAssignment};
-use task_proto::report::Phase;
-use task_proto::settings::RobotSettings;
+use task_proto::desired::settings::RobotSettings;
+use task_proto::messages::report::Phase;
 use taskd::orders::actions::TaskOrder;
 use taskd::store::{HistoryPage, HistoryQuery};
 
@@ -12,15 +12,22 @@ use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot, random_key};
 
 on_both_databases! {
-    every_phase_says_when_it_began,
-    a_long_timeline_keeps_its_beginning_and_its_end,
-    what_a_robot_has_comes_back_into_its_timeline,
-    a_robots_history_is_read_in_pages,
+    every_phase_has_its_start_time,
+    long_timeline_keeps_its_beginning_and_end,
+    running_task_returns_to_its_timeline,
+    robot_history_is_read_in_pages,
     settings_are_part_of_the_desired_state,
 }
 
 async fn history(fleet: &Fleet, robot: &Robot, query: HistoryQuery<'_>) -> HistoryPage {
-    fleet.database.store.task_history(&robot.id, query).await.expect("read").expect("found")
+    fleet
+        .database
+        .store
+        .assignments()
+        .history(&robot.id, query)
+        .await
+        .expect("read")
+        .expect("found")
 }
 
 async fn newest(fleet: &Fleet, robot: &Robot) -> PastAssignment {
@@ -32,7 +39,7 @@ fn steps(past: &PastAssignment) -> Vec<(Phase, u64, u32)> {
     past.timeline.iter().map(|entry| (entry.phase, entry.at_ms, entry.attempt)).collect()
 }
 
-async fn every_phase_says_when_it_began(database: TestDatabase) {
+async fn every_phase_has_its_start_time(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     let began_ms = fleet.clock.now_ms();
@@ -45,10 +52,9 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
     fleet.report(&mut robot).await;
     fleet.clock.advance_ms(1000);
     // Progress alone is no step.
-    robot
-        .tasks
-        .values_mut()
-        .for_each(|task| task.progress = Some(task_proto::report::Progress { done: 1, total: 2 }));
+    robot.tasks.values_mut().for_each(|task| {
+        task.progress = Some(task_proto::messages::report::Progress { done: 1, total: 2 })
+    });
     fleet.report(&mut robot).await;
     fleet.follow(&mut robot, Phase::Running).await;
     let at = |seconds: u64| began_ms + seconds * 1000;
@@ -79,13 +85,13 @@ async fn every_phase_says_when_it_began(database: TestDatabase) {
     let replaced = past.remove(1);
     assert_eq!(steps(&replaced)[4..], [(Phase::Superseded, at(4), 0)]);
     assert_eq!((replaced.superseded_by, replaced.wanted), (Some(second.clone()), None));
-    fleet.actions.cancel_deployment(&fleet.operator, &second).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &second).await.expect("cancelled");
     let past = history(&fleet, &robot, all).await.assignments;
     assert_eq!(steps(&past[0])[1..], [(Phase::Cancelled, at(4), 0)]);
     assert_eq!(steps(&past[1])[5..], [(Phase::Assigned, at(4), 0)], "it is wanted again");
 }
 
-async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
+async fn running_task_returns_to_its_timeline(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
@@ -96,7 +102,7 @@ async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
     fleet.report(&mut robot).await;
     let (task, all) = ("talker".parse().expect("a name"), "*".parse().expect("a selector"));
     fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &all)
         .await
         .expect("ordered");
@@ -105,7 +111,7 @@ async fn what_a_robot_has_comes_back_into_its_timeline(database: TestDatabase) {
     assert_eq!(phases, [Phase::Assigned, Phase::Running, Phase::Stopped, Phase::Running]);
 }
 
-async fn a_long_timeline_keeps_its_beginning_and_its_end(database: TestDatabase) {
+async fn long_timeline_keeps_its_beginning_and_end(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robot = fleet.enroll(1).await.remove(0);
     fleet.deploy("1.0.0", |_| {}).await;
@@ -122,7 +128,7 @@ async fn a_long_timeline_keeps_its_beginning_and_its_end(database: TestDatabase)
     assert_eq!(at, (0..half).chain(101 - half..101).collect::<Vec<_>>());
 }
 
-async fn a_robots_history_is_read_in_pages(database: TestDatabase) {
+async fn robot_history_is_read_in_pages(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let mut ordered = Vec::new();
@@ -152,12 +158,19 @@ async fn a_robots_history_is_read_in_pages(database: TestDatabase) {
     let unknown = task_proto::DeploymentId::random();
     let before = HistoryQuery { task: None, before: Some(&unknown), limit: 9 };
     assert!(
-        fleet.database.store.task_history(&robots[0].id, before).await.expect("read").is_none()
+        fleet
+            .database
+            .store
+            .assignments()
+            .history(&robots[0].id, before)
+            .await
+            .expect("read")
+            .is_none()
     );
     let selector = robots[0].id.as_str().parse().expect("a selector");
     let key = random_key();
     let order =
-        fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Remove, &task, &selector);
+        fleet.deployments.order_task(&fleet.operator, &key, TaskOrder::Remove, &task, &selector);
     order.await.expect("removed");
     assert_eq!(newest(&fleet, &robots[0]).await.wanted, None);
 }
@@ -170,14 +183,16 @@ async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
     let set = async |settings: serde_json::Value| {
         let edit: EditRobot =
             serde_json::from_value(json!({ "settings": settings })).expect("parses");
-        fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &edit).await
+        fleet.robots.edit(&fleet.operator, &robots[0].id, &edit).await
     };
-    let wanted = json!({ "workspace": "/home/robot/it's ws", "ros_domain_id": 7, "limits": { "task_memory_mb": 512 } });
+    let wanted = json!({
+        "workspace": "/home/robot/it's ws", "ros_domain_id": 7, "limits": { "task_memory_mb": 512 },
+    });
     set(wanted.clone()).await.expect("set");
     let wanted: RobotSettings = serde_json::from_value(wanted).expect("parses");
     let state = fleet.desired(&robots[0]).await.expect("a state");
     assert_eq!((state.generation.0, &state.settings), (before.generation.0 + 1, &wanted));
-    assert_eq!(fleet.changes.take_rings().await.robots, [robots[0].id.clone()].into());
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, [robots[0].id.clone()].into());
     assert_eq!(fleet.view(&robots[0]).await.settings, Some(wanted.clone()));
     set(serde_json::to_value(&wanted).expect("json")).await.expect("the same");
     assert_eq!(
@@ -188,7 +203,7 @@ async fn settings_are_part_of_the_desired_state(database: TestDatabase) {
     assert!(set(json!({ "limits": { "parallel_tasks": 0 } })).await.is_err());
     let renamed =
         EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
-    fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &renamed).await.expect("renamed");
+    fleet.robots.edit(&fleet.operator, &robots[0].id, &renamed).await.expect("renamed");
     assert_eq!(fleet.desired(&robots[0]).await.expect("a state").settings, wanted, "absent stays");
     set(serde_json::Value::Null).await.expect("cleared");
     let cleared = fleet.desired(&robots[0]).await.expect("a state");

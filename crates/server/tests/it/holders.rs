@@ -132,7 +132,7 @@ async fn is_stopped_soon(server: &TestServer, robot: &TestRobot) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn viewer_that_takes_every_connection_does_not_keep_a_robot_from_being_stopped() {
+async fn viewer_with_every_connection_does_not_block_a_stop() {
     let (server, robot, blob) = crowded_server().await;
     let viewer = server.sign_in_as("mallory", "viewer").await;
     let request =
@@ -143,7 +143,7 @@ async fn viewer_that_takes_every_connection_does_not_keep_a_robot_from_being_sto
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn robot_that_takes_every_connection_does_not_keep_another_from_being_stopped() {
+async fn robot_with_every_connection_does_not_block_a_stop() {
     let (server, robot, _) = crowded_server().await;
     let rogue = server.enroll("rogue").await;
     // The answer that begins says that the body may come.
@@ -245,7 +245,7 @@ async fn eight_thousand_lists_of_one_viewer_do_not_delay_a_robot() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn person_over_the_rate_is_told_when_to_come_again_and_may_still_order() {
+async fn person_over_the_rate_gets_retry_after_and_may_still_order() {
     let directory = tempfile::tempdir().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.people.requests_per_s = 2).await;
     server.enroll("atlas").await;

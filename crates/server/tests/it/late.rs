@@ -4,8 +4,8 @@
 use task_proto::Generation;
 use task_proto::api::DeploymentState;
 use task_proto::desired::Wanted;
-use task_proto::manifest::TaskKind;
-use task_proto::report::{Condition, Phase, Report};
+use task_proto::messages::report::{Condition, Phase, Report};
+use task_proto::packages::manifest::TaskKind;
 use taskd::orders::actions::TaskOrder;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -13,27 +13,27 @@ use crate::fleet::{Fleet, Robot, package, random_key};
 use crate::story::code;
 
 on_both_databases! {
-    a_restart_that_comes_too_late_leaves_what_runs,
-    what_was_stopped_stays_so,
-    a_silent_robot_holds_up_its_batch_and_no_later_one,
-    no_batch_waits_for_who_has_run_it_or_was_put_out,
-    a_cancel_of_what_is_over_is_refused_and_changes_nothing,
-    nobody_takes_over_robots_that_are_not_theirs,
-    a_robots_word_opens_no_blob,
-    what_was_taken_over_can_be_rolled_back_to,
-    an_order_for_a_robot_that_diverged_since_expires,
-    a_robot_that_obeys_another_state_of_the_same_generation_has_diverged,
+    expired_restart_leaves_the_running_task,
+    stopped_task_stays_stopped_after_a_cancel,
+    silent_robot_delays_only_its_own_batch,
+    batch_waits_for_no_robot_that_ran_it_or_was_revoked,
+    cancel_of_a_settled_deployment_is_refused,
+    order_adopts_only_diverged_robots_in_the_scope,
+    adopted_task_gives_no_access_to_an_unstored_package,
+    rollback_to_an_adopted_task_works,
+    order_for_a_diverged_robot_expires,
+    other_state_of_the_same_generation_is_diverged,
 }
 
 /// An order for a task that has run, if it does not reach its robot in time, removes nothing from
 /// the robot.
-async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) {
+async fn expired_restart_leaves_the_running_task(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let order = async |order| {
         fleet
-            .actions
+            .deployments
             .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
             .await
             .expect("ordered");
@@ -69,7 +69,7 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
     }
     // Cancelling the order does not remove a task that was only told to restart either.
     order(TaskOrder::Restart).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &new).await.expect("cancelled");
     for robot in &robots {
         assert_eq!(fleet.desired(robot).await.expect("state").tasks[0].deployment, new);
     }
@@ -89,13 +89,13 @@ async fn a_restart_that_comes_too_late_leaves_what_runs(database: TestDatabase) 
     assert_eq!((desired.deployment, desired.wanted), (new, Wanted::Stopped));
 }
 
-async fn what_was_stopped_stays_so(database: TestDatabase) {
+async fn stopped_task_stays_stopped_after_a_cancel(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let order = async |order| {
         let (task, of) = ("talker".parse().expect("valid"), "r1".parse().expect("valid"));
         fleet
-            .actions
+            .deployments
             .order_task(&fleet.operator, &random_key(), order, &task, &of)
             .await
             .expect("ordered");
@@ -121,7 +121,7 @@ async fn what_was_stopped_stays_so(database: TestDatabase) {
     assert_eq!((desired.deployment, desired.wanted), (old, Wanted::Stopped));
 }
 
-async fn a_silent_robot_holds_up_its_batch_and_no_later_one(database: TestDatabase) {
+async fn silent_robot_delays_only_its_own_batch(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let id =
@@ -136,14 +136,14 @@ async fn a_silent_robot_holds_up_its_batch_and_no_later_one(database: TestDataba
     assert_eq!(fleet.desired(&robots[2]).await.expect("state").tasks[0].deployment, id);
 }
 
-async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase) {
+async fn batch_waits_for_no_robot_that_ran_it_or_was_revoked(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(5).await;
     let first = fleet.deploy("1", |order| order.batch = Some(1)).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     // The first robot's earlier version is desired again, and the robot never reports it.
     let other = fleet.deploy("2", |order| order.selector = "r0".parse().expect("valid")).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &other).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &other).await.expect("cancelled");
     assert_eq!(fleet.phases(&first).await[0], Phase::Assigned);
     let has_it =
         async |robot: &Robot| fleet.desired(robot).await.is_ok_and(|state| !state.tasks.is_empty());
@@ -151,13 +151,13 @@ async fn no_batch_waits_for_who_has_run_it_or_was_put_out(database: TestDatabase
     fleet.follow(&mut robots[1], Phase::Running).await;
     assert!(has_it(&robots[2]).await);
     // The next robot does not either, nor does it get anything if it is revoked before its turn.
-    fleet.actions.revoke_robot(&fleet.operator, &robots[3].id).await.expect("revoked");
+    fleet.robots.revoke(&fleet.operator, &robots[3].id).await.expect("revoked");
     assert!(!has_it(&robots[4]).await);
-    fleet.actions.revoke_robot(&fleet.operator, &robots[2].id).await.expect("revoked");
+    fleet.robots.revoke(&fleet.operator, &robots[2].id).await.expect("revoked");
     assert!(has_it(&robots[4]).await);
 }
 
-async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestDatabase) {
+async fn cancel_of_a_settled_deployment_is_refused(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let id = fleet.deploy("1", |_| ()).await;
@@ -165,7 +165,7 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
         fleet.follow(robot, Phase::Running).await;
     }
     let before = fleet.deployment(&id).await;
-    let refused = fleet.actions.cancel_deployment(&fleet.operator, &id).await;
+    let refused = fleet.deployments.cancel(&fleet.operator, &id).await;
     assert_eq!(code(refused), "nothing_to_cancel");
     assert_eq!(fleet.deployment(&id).await, before);
     assert_eq!(before.state, DeploymentState::Settled);
@@ -173,15 +173,12 @@ async fn a_cancel_of_what_is_over_is_refused_and_changes_nothing(database: TestD
     let newer = fleet.deploy("2", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Running).await;
-    assert_eq!(
-        code(fleet.actions.cancel_deployment(&fleet.operator, &id).await),
-        "nothing_to_cancel"
-    );
+    assert_eq!(code(fleet.deployments.cancel(&fleet.operator, &id).await), "nothing_to_cancel");
     // Where the deployment failed, the previous version comes back.
     let broken = fleet.deploy("3", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.follow(&mut robots[1], Phase::Failed).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &broken).await.expect("one has failed");
+    fleet.deployments.cancel(&fleet.operator, &broken).await.expect("one has failed");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, newer);
 }
 
@@ -200,23 +197,25 @@ async fn restored(database: TestDatabase, count: u32) -> (Fleet, Vec<Robot>) {
     (fleet, robots)
 }
 
-async fn nobody_takes_over_robots_that_are_not_theirs(database: TestDatabase) {
+async fn order_adopts_only_diverged_robots_in_the_scope(database: TestDatabase) {
     let (fleet, robots) = restored(database, 2).await;
     let alice = fleet.limited("alice", "r0").await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let meant =
-        fleet.actions.order_task(&alice, &random_key(), TaskOrder::Stop, &task, &everyone).await;
+    let meant = fleet
+        .deployments
+        .order_task(&alice, &random_key(), TaskOrder::Stop, &task, &everyone)
+        .await;
     assert_eq!(meant.expect("ordered").len(), 1);
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(2));
     assert_eq!(fleet.view(&robots[1]).await.generation, Generation(0));
     assert_eq!(code(fleet.desired(&robots[1]).await), "diverged");
 }
 
-async fn a_robots_word_opens_no_blob(database: TestDatabase) {
+async fn adopted_task_gives_no_access_to_an_unstored_package(database: TestDatabase) {
     let (fleet, robots) = restored(database, 1).await;
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
         .await
         .expect("ordered");
@@ -226,7 +225,8 @@ async fn a_robots_word_opens_no_blob(database: TestDatabase) {
         let order = fleet
             .database
             .store
-            .fetched_by(&robots[0].id, &named.content.digest)
+            .robots()
+            .fetch_grant(&robots[0].id, &named.content.digest)
             .await
             .expect("reads");
         order.is_some()
@@ -236,7 +236,7 @@ async fn a_robots_word_opens_no_blob(database: TestDatabase) {
     assert!(may().await);
 }
 
-async fn what_was_taken_over_can_be_rolled_back_to(database: TestDatabase) {
+async fn rollback_to_an_adopted_task_works(database: TestDatabase) {
     let (fleet, mut robots) = restored(database, 1).await;
     for version in ["1", "2"] {
         fleet.publish(version).await;
@@ -246,15 +246,15 @@ async fn what_was_taken_over_can_be_rolled_back_to(database: TestDatabase) {
     assert_eq!(fleet.phases(&two).await, [Phase::Failed]);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let back = fleet
-        .actions
-        .roll_back(&fleet.operator, &random_key(), &task, &everyone)
+        .deployments
+        .rollback(&fleet.operator, &random_key(), &task, &everyone)
         .await
         .expect("there is one");
     assert_eq!(back.robots.len(), 1);
     assert_eq!(fleet.version(&robots[0]).await, "1");
 }
 
-async fn an_order_for_a_robot_that_diverged_since_expires(database: TestDatabase) {
+async fn order_for_a_diverged_robot_expires(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |_| ()).await;
@@ -267,9 +267,7 @@ async fn an_order_for_a_robot_that_diverged_since_expires(database: TestDatabase
     assert_eq!((view.generation, view.conditions[0].code.as_str()), (Generation(1), "diverged"));
 }
 
-async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(
-    database: TestDatabase,
-) {
+async fn other_state_of_the_same_generation_is_diverged(database: TestDatabase) {
     let (fleet, mut robots) = restored(database, 1).await;
     // As if the robot had not reported yet. One order was lost, and one is made before the report.
     let robot = &mut robots[0];
@@ -292,7 +290,7 @@ async fn a_robot_that_obeys_another_state_of_the_same_generation_has_diverged(
     // The next order starts from the robot's current version.
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
         .await
         .expect("ordered");

@@ -12,11 +12,11 @@ use crate::fleet::{Fleet, Robot};
 use crate::harness::{TestServer, answer, refusal};
 
 on_both_databases! {
-    pages_of_robots_have_each_once,
-    pages_of_deployments_have_each_once,
+    pages_of_robots_list_each_robot_once,
+    pages_of_deployments_list_each_deployment_once,
 }
 
-async fn pages_of_robots_have_each_once(database: TestDatabase) {
+async fn pages_of_robots_list_each_robot_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(12).await;
     // The order is that of the bytes, on every database: capitals come first, r10 before r2.
@@ -27,7 +27,8 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
             fleet
                 .database
                 .store
-                .robots_page(scope, selector.as_ref(), after, limit)
+                .robots()
+                .page(scope, selector.as_ref(), after, limit)
                 .await
                 .expect("reads")
         };
@@ -35,7 +36,7 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
     loop {
         let page = page(&everything, None, after.as_ref(), 5).await;
         assert_eq!(page.total, 12);
-        names.extend(page.robots.into_iter().map(|robot| robot.name.to_string()));
+        names.extend(page.robots.into_iter().map(|row| row.robot.name.to_string()));
         after = page.next;
         match &after {
             Some(next) => assert_eq!(names.last().map(String::as_str), Some(next.as_str())),
@@ -45,7 +46,7 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
     assert_eq!(names, ["r0", "r1", "r10", "r11", "r2", "r3", "r4", "r5", "r6", "r7", "r8", "r9"]);
     let some = page(&everything, Some("!r10,!r4"), Some(&"r1".parse().expect("a name")), 3).await;
     assert_eq!(
-        some.robots.iter().map(|robot| robot.name.as_str()).collect::<Vec<_>>(),
+        some.robots.iter().map(|row| row.robot.name.as_str()).collect::<Vec<_>>(),
         ["r11", "r2", "r3"]
     );
     assert_eq!((some.total, some.next), (10, Some("r3".parse().expect("a name"))));
@@ -56,7 +57,7 @@ async fn pages_of_robots_have_each_once(database: TestDatabase) {
     assert_eq!((last.robots.len(), last.total, last.next), (2, 3, None));
 }
 
-async fn pages_of_deployments_have_each_once(database: TestDatabase) {
+async fn pages_of_deployments_list_each_deployment_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let mut ordered = Vec::new();
@@ -79,7 +80,8 @@ async fn pages_of_deployments_have_each_once(database: TestDatabase) {
             let page = fleet
                 .database
                 .store
-                .deployments(robots.as_deref(), before.as_ref(), 3)
+                .deployments()
+                .page(robots.as_deref(), before.as_ref(), 3)
                 .await
                 .expect("reads");
             let page = page.expect("it is there");
@@ -108,7 +110,8 @@ async fn pages_of_deployments_have_each_once(database: TestDatabase) {
     let unknown = fleet
         .database
         .store
-        .deployments(None, Some(&DeploymentId::random()), 3)
+        .deployments()
+        .page(None, Some(&DeploymentId::random()), 3)
         .await
         .expect("reads");
     assert!(unknown.is_none());
@@ -174,7 +177,7 @@ async fn lists_come_in_pages() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn thousands_of_robots_that_were_chosen_one_by_one_are_not_listed_each_time() {
+async fn long_selectors_are_omitted_from_lists() {
     let server = TestServer::start().await;
     server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;

@@ -14,14 +14,16 @@ use crate::uplink::Session;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 fn batch(robot: &TestRobot, level: &str, text: &str) -> Vec<u8> {
-    let line = json!({ "at_ms": 1_000, "level": level, "source": "stderr", "task": "talker", "text": text });
+    let line = json!({
+        "at_ms": 1_000, "level": level, "source": "stderr", "task": "talker", "text": text,
+    });
     json!({ "robot_id": robot.id, "now_ms": 2_000, "lines": [line], "suppressed": 3 })
         .to_string()
         .into_bytes()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_robot_published_is_shown_when_it_is_away() {
+async fn published_logs_are_shown_while_the_robot_is_offline() {
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("boreas").await);
     let mut session = Session::open(&server, &robot).await;
@@ -72,7 +74,7 @@ async fn next_event(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn followers_are_told_where_the_robot_is_and_what_it_says() {
+async fn log_followers_get_presence_and_lines() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let follow = server.request(Method::GET, "/api/v1/robots/atlas/logs?follow=true&level=error");

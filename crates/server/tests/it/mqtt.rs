@@ -8,7 +8,7 @@ use bytes::Bytes;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
 use task_proto::RobotId;
 use task_proto::api::Traffic;
-use task_proto::topic::RobotTopic;
+use task_proto::messages::topic::RobotTopic;
 use tokio::time::timeout;
 
 use crate::mqtt_harness::{
@@ -16,7 +16,7 @@ use crate::mqtt_harness::{
 };
 
 #[tokio::test(flavor = "multi_thread")]
-async fn logins_get_the_right_answer() {
+async fn logins_get_the_right_connack() {
     let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_secs(2)).await;
     let (robot, other) = (RobotId::random(), RobotId::random());
     let with = |change: fn(&mut Connect, &RobotId)| {
@@ -72,7 +72,7 @@ fn retained_will(robot: &RobotId, payload: &[u8]) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn message_to_be_retained_ends_the_session_unless_it_is_empty() {
+async fn retained_message_ends_the_session_unless_empty() {
     let broker = TestBroker::start().await;
     for qos in 0..=2 {
         let robot = RobotId::random();
@@ -112,7 +112,7 @@ async fn message_to_be_retained_ends_the_session_unless_it_is_empty() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_independent_client_listens_and_speaks() {
+async fn independent_client_subscribes_and_publishes() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let client = |id: &str, user: &str, password: &str| {
@@ -123,12 +123,12 @@ async fn an_independent_client_listens_and_speaks() {
     let (operator, mut from_operator) = client("somebody", "x", "operator");
     operator.subscribe("taskd/v1/r/+/report", QoS::ExactlyOnce).await.unwrap();
     operator.subscribe("#", QoS::AtLeastOnce).await.unwrap();
-    let (speaker, mut from_speaker) =
+    let (publisher, mut from_publisher) =
         client(robot.as_str(), robot.as_str(), &format!("pw-{robot}"));
-    speaker.subscribe(topic(&robot, RobotTopic::Desired), QoS::AtLeastOnce).await.unwrap();
+    publisher.subscribe(topic(&robot, RobotTopic::Desired), QoS::AtLeastOnce).await.unwrap();
 
     let mut codes = Vec::new();
-    let (mut rung, mut heard) = (None, Vec::new());
+    let (mut desired, mut received) = (None, Vec::new());
     timeout(PATIENCE, async {
         while codes.len() < 2 {
             if let Event::Incoming(Packet::SubAck(ack)) = from_operator.poll().await.unwrap() {
@@ -136,22 +136,25 @@ async fn an_independent_client_listens_and_speaks() {
             }
         }
         for qos in [QoS::AtMostOnce, QoS::AtLeastOnce, QoS::ExactlyOnce] {
-            speaker.publish(topic(&robot, RobotTopic::Report), qos, false, "report").await.unwrap();
+            publisher
+                .publish(topic(&robot, RobotTopic::Report), qos, false, "report")
+                .await
+                .unwrap();
         }
-        while rung.is_none() || heard.len() < 3 {
+        while desired.is_none() || received.len() < 3 {
             let incoming = tokio::select! {
-                event = from_speaker.poll() => event.unwrap(),
+                event = from_publisher.poll() => event.unwrap(),
                 event = from_operator.poll() => event.unwrap(),
             };
             match incoming {
                 Event::Incoming(Packet::SubAck(_)) => {
-                    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+                    broker.broker.send_desired(&robot, Bytes::from_static(b"ding")).unwrap();
                 }
                 Event::Incoming(Packet::Publish(message)) if message.topic.ends_with("desired") => {
-                    rung = Some(message)
+                    desired = Some(message)
                 }
                 Event::Incoming(Packet::Publish(message)) => {
-                    heard.push((message.qos, message.retain))
+                    received.push((message.qos, message.retain))
                 }
                 _ => {}
             }
@@ -163,15 +166,15 @@ async fn an_independent_client_listens_and_speaks() {
         codes,
         [SubscribeReasonCode::Success(QoS::ExactlyOnce), SubscribeReasonCode::Failure]
     );
-    assert_eq!(rung.unwrap().payload, "ding");
+    assert_eq!(desired.unwrap().payload, "ding");
     assert_eq!(
-        heard,
+        received,
         [(QoS::AtMostOnce, false), (QoS::AtLeastOnce, false), (QoS::ExactlyOnce, false)]
     );
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn denied_subscriptions_are_refused_one_by_one() {
+async fn denied_filters_are_refused_individually() {
     let broker = TestBroker::start().await;
     let (robot, other) = (RobotId::random(), RobotId::random());
     let (own, foreign) = (topic(&robot, RobotTopic::Desired), topic(&other, RobotTopic::Desired));
@@ -183,17 +186,17 @@ async fn denied_subscriptions_are_refused_one_by_one() {
     .await;
     raw.expect(&[0x90, 7, 0, 3, 0x80, 2, 0x80, 0x80, 0x80]).await;
     let _other = broker.robot(&other).await;
-    broker.broker.ring(&other, Bytes::from_static(b"secret")).unwrap();
-    broker.broker.ring(&robot, Bytes::from_static(b"mine")).unwrap();
+    broker.broker.send_desired(&other, Bytes::from_static(b"secret")).unwrap();
+    broker.broker.send_desired(&robot, Bytes::from_static(b"mine")).unwrap();
     raw.expect(&publish(&own, 1, 1, b"mine")).await;
     raw.send(&unsubscribe(4, &[&own, "never/subscribed"])).await;
     raw.expect(&[0xb0, 2, 0, 4]).await;
-    broker.broker.ring(&robot, Bytes::from_static(b"unheard")).unwrap();
+    broker.broker.send_desired(&robot, Bytes::from_static(b"unheard")).unwrap();
     raw.expect_nothing().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn publishing_elsewhere_ends_the_connection() {
+async fn publish_to_a_foreign_topic_ends_the_session() {
     let broker = TestBroker::start().await;
     let (robot, other) = (RobotId::random(), RobotId::random());
     for name in
@@ -210,17 +213,17 @@ async fn publishing_elsewhere_ends_the_connection() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nothing_is_acknowledged_before_it_is_stored() {
+async fn message_is_acknowledged_only_after_it_is_stored() {
     let broker = TestBroker::with(|limits| limits.inbox_timeout = Duration::from_millis(100)).await;
     let robot = RobotId::random();
     let report = topic(&robot, RobotTopic::Report);
-    broker.refuses.store(true, Ordering::SeqCst);
+    broker.refuse_messages.store(true, Ordering::SeqCst);
     for qos in 0..=2 {
         let mut raw = broker.robot(&robot).await;
         raw.send(&publish(&report, qos, 1, b"x")).await;
         raw.expect_close().await;
     }
-    broker.refuses.store(false, Ordering::SeqCst);
+    broker.refuse_messages.store(false, Ordering::SeqCst);
     let mut raw = broker.robot(&robot).await;
     raw.send(&publish(&report, 1, 1, b"stall")).await;
     raw.expect_close().await;
@@ -256,7 +259,7 @@ async fn qos_2_arrives_exactly_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_mqtt_permits_is_no_offence() {
+async fn permitted_mqtt_is_not_a_violation() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let (report, desired) = (topic(&robot, RobotTopic::Report), topic(&robot, RobotTopic::Desired));
@@ -275,19 +278,19 @@ async fn what_mqtt_permits_is_no_offence() {
     // And ask for more at once than it gets.
     raw.send(&subscribe(1, &[(desired.as_str(), 1); 100])).await;
     raw.expect(&[&[0x90_u8, 102, 0, 1][..], &[1; 64], &[0x80; 36]].concat()).await;
-    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+    broker.broker.send_desired(&robot, Bytes::from_static(b"ding")).unwrap();
     raw.expect(&publish(&desired, 1, 1, b"ding")).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_slow_robot_hears_the_newest_word_only() {
+async fn slow_robot_receives_only_the_newest_state() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let desired = topic(&robot, RobotTopic::Desired);
-    assert!(broker.broker.ring(&robot, Bytes::new()).is_err());
+    assert!(broker.broker.send_desired(&robot, Bytes::new()).is_err());
     let mut raw = broker.robot(&robot).await;
     for word in ["old", "older", "new"] {
-        broker.broker.ring(&robot, word.into()).unwrap();
+        broker.broker.send_desired(&robot, word.into()).unwrap();
     }
     raw.send(&subscribe(1, &[(&desired, 1)])).await;
     raw.expect(&[0x90, 3, 0, 1, 1]).await;
@@ -296,7 +299,7 @@ async fn a_slow_robot_hears_the_newest_word_only() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_old_session_has_ended_before_the_new_one_lives() {
+async fn takeover_waits_for_the_old_session_to_end() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let status = topic(&robot, RobotTopic::Status);
@@ -322,7 +325,7 @@ async fn the_old_session_has_ended_before_the_new_one_lives() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_will_is_said_unless_the_robot_says_goodbye() {
+async fn will_is_published_unless_the_client_disconnects() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let status = topic(&robot, RobotTopic::Status);
@@ -371,7 +374,7 @@ async fn silence_beyond_the_keepalive_ends_the_session() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
+async fn traffic_is_counted_for_the_connection_and_in_total() {
     let broker = TestBroker::start().await;
     let (robot, other) = (RobotId::random(), RobotId::random());
     let (report, desired) = (topic(&robot, RobotTopic::Report), topic(&robot, RobotTopic::Desired));
@@ -387,21 +390,21 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
     };
     assert_eq!(broker.broker.traffic_of(&robot), Some(expected));
 
-    let (listen, say, told) = (
+    let (subscribe_packet, publish_packet, desired_packet) = (
         subscribe(3, &[(&desired, 1)]),
         publish(&report, 1, 1, b"report"),
         publish(&desired, 1, 1, b"ding"),
     );
-    raw.send(&listen).await;
+    raw.send(&subscribe_packet).await;
     raw.expect(&[0x90, 3, 0, 3, 1]).await;
-    raw.send(&say).await;
+    raw.send(&publish_packet).await;
     raw.expect(&[0x40, 2, 0, 1]).await;
-    broker.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
-    raw.expect(&told).await;
+    broker.broker.send_desired(&robot, Bytes::from_static(b"ding")).unwrap();
+    raw.expect(&desired_packet).await;
     raw.send(&[0x40, 2, 0, 1]).await;
     raw.expect_nothing().await;
-    expected.bytes_in += (listen.len() + say.len() + 4 + 2) as u64;
-    expected.bytes_out += (5 + 4 + told.len() + 2) as u64;
+    expected.bytes_in += (subscribe_packet.len() + publish_packet.len() + 4 + 2) as u64;
+    expected.bytes_out += (5 + 4 + desired_packet.len() + 2) as u64;
     (expected.packets_in, expected.packets_out) = (5, 5);
     (expected.messages_in, expected.messages_out, expected.acks_in, expected.acks_out) =
         (1, 1, 1, 1);
@@ -432,7 +435,11 @@ async fn what_goes_over_a_connection_is_counted_for_it_and_for_all() {
         all.all.bytes_in,
         expected.bytes_in + (wrong.len() + connect as usize + forged.len()) as u64
     );
-    assert_eq!(broker.broker.traffic_of(&robot), Some(expected), "the others' are not this one's");
+    assert_eq!(
+        broker.broker.traffic_of(&robot),
+        Some(expected),
+        "other clients' traffic is not counted"
+    );
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -452,33 +459,33 @@ async fn revoked_and_stopped_sessions_end() {
 }
 
 #[tokio::test]
-async fn who_is_put_out_on_the_way_to_its_seat_gets_none() {
+async fn robot_evicted_during_admission_gets_no_session() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let connect = Connect { password: Some(format!("once-{robot}")), ..Connect::robot(&robot) };
     let mut raw = broker.raw_with(&connect.packet()).await;
-    timeout(PATIENCE, broker.door.asked.notified()).await.expect("the door is asked");
+    timeout(PATIENCE, broker.gatekeeper.asked.notified()).await.expect("the gatekeeper is asked");
     // There is no session yet that could be ended.
     broker.broker.disconnect(&robot);
-    broker.door.go_on.notify_one();
+    broker.gatekeeper.go_on.notify_one();
     raw.expect(&[0x20, 2, 0, 5]).await;
     raw.expect_close().await;
 }
 
 #[tokio::test]
-async fn a_new_token_ends_the_old_session_though_its_guest_is_given_up_on() {
+async fn new_token_ends_the_old_session_even_if_admission_times_out() {
     let broker = TestBroker::with(|limits| limits.admit_timeout = Duration::from_secs(2)).await;
     let robot = RobotId::random();
     let mut old = broker.robot(&robot).await;
     let connect = Connect { password: Some(format!("new-{robot}")), ..Connect::robot(&robot) };
     let mut new = broker.raw_with(&connect.packet()).await;
     new.expect(&[0x20, 2, 0, 3]).await;
-    broker.door.go_on.notify_one();
+    broker.gatekeeper.go_on.notify_one();
     old.expect_close().await;
 }
 
 #[tokio::test]
-async fn who_sends_a_large_packet_slowly_is_not_silent_unless_it_trickles() {
+async fn slow_large_packet_counts_as_activity_and_a_trickle_does_not() {
     let broker = TestBroker::with(|limits| limits.connect_timeout = Duration::from_secs(5)).await;
     let (slow, trickling) = (RobotId::random(), RobotId::random());
     // A client that says nothing is hung up on after five seconds; the others may be silent for

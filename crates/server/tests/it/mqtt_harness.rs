@@ -8,13 +8,14 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::future::BoxFuture;
 use task_proto::RobotId;
-use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_proto::messages::topic::{RobotTopic, Topic, TopicPrefix};
 use taskd::broker::{
     Broker, BrokerConfig, Gatekeeper, Inbox, Limits, Login, NotStored, Principal, Refusal,
     RobotMessage,
 };
 use taskd::config::TlsSettings;
-use taskd::limits::conduct::{Conduct, ConductLimits};
+use taskd::domain::limits::robot_limiter::{RobotLimiter, RobotLimits};
+use taskd::net::proxy_protocol::ProxyProtocol;
 use taskd::net::tls::Tls;
 use taskd::system::clock::Clock;
 use taskd::system::data_directory::DataDirectory;
@@ -26,19 +27,19 @@ use tokio::time::timeout;
 /// Time limit that only a hanging test exceeds.
 pub const PATIENCE: Duration = Duration::from_secs(10);
 
-/// Lets robots in with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some
-/// passwords meet other ends.
+/// Admits robots with `pw-<robot id>`, and operators with `operator` or `operator-<name>`; some
+/// passwords have other effects.
 #[derive(Default)]
-pub struct Door {
+pub struct TestGatekeeper {
     /// Announces that a client with `once-<robot id>` is being admitted for the first time;
-    /// [`Door::go_on`] completes the admission. The second time the client is refused. A client
-    /// with `new-<robot id>` waits for `go_on` as well, and is a new token's first use.
+    /// [`TestGatekeeper::go_on`] completes the admission. The second time the client is refused. A
+    /// client with `new-<robot id>` waits for `go_on` as well, and is a new token's first use.
     pub asked: Notify,
     pub go_on: Notify,
     was_asked: AtomicBool,
 }
 
-impl Gatekeeper for Door {
+impl Gatekeeper for TestGatekeeper {
     fn admit(&self, login: Login) -> BoxFuture<'_, Result<Principal, Refusal>> {
         Box::pin(async move {
             let user = login.user_name.unwrap_or_default();
@@ -83,15 +84,15 @@ pub enum Seen {
     Received(RobotId, RobotTopic, Bytes),
 }
 
-struct Letterbox {
+struct TestInbox {
     seen: mpsc::UnboundedSender<Seen>,
-    refuses: Arc<AtomicBool>,
+    refuse_messages: Arc<AtomicBool>,
 }
 
-impl Inbox for Letterbox {
+impl Inbox for TestInbox {
     fn receive(&self, message: RobotMessage) -> BoxFuture<'_, Result<(), NotStored>> {
         Box::pin(async move {
-            if self.refuses.load(Ordering::SeqCst) {
+            if self.refuse_messages.load(Ordering::SeqCst) {
                 return Err(NotStored);
             }
             if &message.payload[..] == b"stall" {
@@ -107,25 +108,25 @@ impl Inbox for Letterbox {
     fn disconnected(&self, robot: &RobotId, connection: u64) {
         let _ = self.seen.send(Seen::Disconnected(robot.clone(), connection));
     }
-    fn everyone_may_be_there(&self) {}
+    fn external_broker_connected(&self) {}
 }
 
 /// Limits under which no client is slowed or banned.
-fn lenient() -> ConductLimits {
-    ConductLimits {
+fn lenient() -> RobotLimits {
+    RobotLimits {
         messages_per_s: 1 << 40,
         bytes_per_s: 1 << 40,
         backoff: Duration::ZERO,
-        ..ConductLimits::default()
+        ..RobotLimits::default()
     }
 }
 
 /// A running broker.
 pub struct TestBroker {
     pub broker: Broker,
-    pub refuses: Arc<AtomicBool>,
-    pub door: Arc<Door>,
-    pub conduct: Arc<Conduct>,
+    pub refuse_messages: Arc<AtomicBool>,
+    pub gatekeeper: Arc<TestGatekeeper>,
+    pub robot_limiter: Arc<RobotLimiter>,
     seen: Mutex<mpsc::UnboundedReceiver<Seen>>,
 }
 
@@ -139,8 +140,11 @@ impl TestBroker {
         Self::start_with(None, change, lenient()).await
     }
 
-    pub async fn with_conduct(change: impl FnOnce(&mut Limits), conduct: ConductLimits) -> Self {
-        Self::start_with(None, change, conduct).await
+    pub async fn with_robot_limits(
+        change: impl FnOnce(&mut Limits),
+        robot_limits: RobotLimits,
+    ) -> Self {
+        Self::start_with(None, change, robot_limits).await
     }
 
     /// One that speaks TLS, by an authority of its own.
@@ -154,24 +158,25 @@ impl TestBroker {
     async fn start_with(
         tls: Option<Tls>,
         change: impl FnOnce(&mut Limits),
-        conduct: ConductLimits,
+        robot_limits: RobotLimits,
     ) -> Self {
-        let conduct = Conduct::new(conduct);
+        let robot_limiter = RobotLimiter::new(robot_limits);
         let mut limits = Limits { canary_interval: Duration::from_secs(3600), ..Limits::default() };
         change(&mut limits);
         let config = BrokerConfig {
             listen: "127.0.0.1:0".parse().unwrap(),
             tls,
+            proxy_protocol: ProxyProtocol::new(&[]),
             prefix: TopicPrefix::default(),
             limits,
-            conduct: conduct.clone(),
+            robot_limiter: robot_limiter.clone(),
         };
         let (sender, receiver) = mpsc::unbounded_channel();
-        let refuses = Arc::new(AtomicBool::new(false));
-        let inbox = Letterbox { seen: sender, refuses: refuses.clone() };
-        let door = Arc::new(Door::default());
-        let broker = Broker::start(config, door.clone(), Arc::new(inbox)).await.unwrap();
-        Self { broker, refuses, door, conduct, seen: Mutex::new(receiver) }
+        let refuse_messages = Arc::new(AtomicBool::new(false));
+        let inbox = TestInbox { seen: sender, refuse_messages: refuse_messages.clone() };
+        let gatekeeper = Arc::new(TestGatekeeper::default());
+        let broker = Broker::start(config, gatekeeper.clone(), Arc::new(inbox)).await.unwrap();
+        Self { broker, refuse_messages, gatekeeper, robot_limiter, seen: Mutex::new(receiver) }
     }
 
     pub fn address(&self) -> SocketAddr {
@@ -184,10 +189,10 @@ impl TestBroker {
         timeout(PATIENCE, async {
             loop {
                 let next = seen.recv().await.unwrap();
-                let (Seen::Connected(who, _)
-                | Seen::Disconnected(who, _)
-                | Seen::Received(who, ..)) = &next;
-                if who == robot {
+                let (Seen::Connected(seen_robot, _)
+                | Seen::Disconnected(seen_robot, _)
+                | Seen::Received(seen_robot, ..)) = &next;
+                if seen_robot == robot {
                     return next;
                 }
             }
@@ -209,7 +214,7 @@ impl TestBroker {
         raw
     }
 
-    /// A robot that is in.
+    /// A connected robot.
     pub async fn robot(&self, robot: &RobotId) -> Raw {
         let mut raw = self.raw_with(&Connect::robot(robot).packet()).await;
         raw.expect(&[0x20, 2, 0, 0]).await;
@@ -233,7 +238,7 @@ impl TestBroker {
         let mut client = self.robot(&robot).await;
         client.send(&subscribe(7, &[(&topic(&robot, RobotTopic::Desired), 1)])).await;
         client.expect(&[0x90, 3, 0, 7, 1]).await;
-        self.broker.ring(&robot, Bytes::from_static(b"ding")).unwrap();
+        self.broker.send_desired(&robot, Bytes::from_static(b"ding")).unwrap();
         client.expect(&publish(&topic(&robot, RobotTopic::Desired), 1, 1, b"ding")).await;
         client.send(&[0x40, 2, 0, 1]).await;
         client.send(&publish(&report, 1, 9, b"fine")).await;
@@ -242,7 +247,7 @@ impl TestBroker {
     }
 }
 
-/// A CONNECT to be.
+/// The fields of a CONNECT.
 pub struct Connect {
     pub client_id: String,
     pub user_name: Option<String>,

@@ -6,7 +6,7 @@ use std::time::Duration;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 use task_proto::RobotId;
-use task_proto::topic::RobotTopic;
+use task_proto::messages::topic::RobotTopic;
 use taskd::broker::Limits;
 use tokio::io::AsyncReadExt;
 use tokio::time::timeout;
@@ -30,7 +30,7 @@ fn reset(raw: Raw) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_connect_is_not_answered() {
+async fn invalid_connect_is_not_answered() {
     let broker = TestBroker::start().await;
     let id = text("somebody");
     let credentials = [text("somebody"), text("user"), text("operator")].concat();
@@ -135,7 +135,7 @@ fn violations(robot: &RobotId) -> Vec<Vec<u8>> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn violations_end_the_session_and_nothing_else() {
+async fn violations_end_only_their_own_session() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     for packet in violations(&robot) {
@@ -152,7 +152,7 @@ async fn violations_end_the_session_and_nothing_else() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn silent_and_slow_clients_hold_up_nobody() {
+async fn silent_and_slow_clients_delay_no_other_client() {
     let broker =
         TestBroker::with(|limits| limits.connect_timeout = Duration::from_millis(300)).await;
     let mut silent = Vec::new();
@@ -174,12 +174,12 @@ async fn silent_and_slow_clients_hold_up_nobody() {
             }
         }
     };
-    timeout(PATIENCE, dribble).await.expect("the slow client should be shown out");
+    timeout(PATIENCE, dribble).await.expect("the slow client should be disconnected");
     broker.assert_serves().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_client_that_comes_byte_by_byte_but_in_time_is_served() {
+async fn client_that_sends_byte_by_byte_in_time_is_served() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let bytes = [
@@ -197,7 +197,7 @@ async fn a_client_that_comes_byte_by_byte_but_in_time_is_served() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn resets_and_storms_on_one_client_id_do_no_harm() {
+async fn resets_and_takeover_storms_are_survived() {
     let broker = TestBroker::with(|limits| limits.max_sessions_per_person = 256).await;
     let robot = RobotId::random();
     let packet = Connect::robot(&robot).packet();
@@ -224,7 +224,7 @@ async fn resets_and_storms_on_one_client_id_do_no_harm() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_burst_and_a_goodbye_do_no_harm() {
+async fn burst_before_disconnect_is_survived() {
     let broker = TestBroker::start().await;
     let mut operators = Vec::new();
     for _ in 0..5 {
@@ -269,19 +269,19 @@ async fn floods_are_capped() {
 
     // Endless pings by a client that reads no answer: disconnected by the write timeout, or cut off
     // while sending.
-    let mut deaf = broker.robot(&robot).await;
+    let mut stalled = broker.robot(&robot).await;
     let pings = vec![[0xc0, 0]; 32 * 1024].concat();
     let flood = async {
         use tokio::io::AsyncWriteExt;
-        while deaf.stream.write_all(&pings).await.is_ok() {}
+        while stalled.stream.write_all(&pings).await.is_ok() {}
     };
     // All that lies between the two has to fill up first, two bytes at a time.
-    timeout(6 * PATIENCE, flood).await.expect("the deaf client should be shown out");
+    timeout(6 * PATIENCE, flood).await.expect("the client should be disconnected");
     broker.assert_serves().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_operator_who_does_not_acknowledge_is_shown_out() {
+async fn operator_that_does_not_acknowledge_is_disconnected() {
     let broker = TestBroker::with(|limits| limits.write_timeout = Duration::from_millis(300)).await;
     let robot = RobotId::random();
     let report = topic(&robot, RobotTopic::Report);
@@ -290,16 +290,16 @@ async fn an_operator_who_does_not_acknowledge_is_shown_out() {
     for id in 1..=300 {
         raw.send(&publish(&report, 1, id, b"x")).await;
     }
-    let mut heard = Vec::new();
-    let _ = timeout(PATIENCE, operator.stream.read_to_end(&mut heard))
+    let mut received = Vec::new();
+    let _ = timeout(PATIENCE, operator.stream.read_to_end(&mut received))
         .await
         .expect("the broker should close");
-    assert_eq!(heard.len(), 32 * publish(&report, 1, 1, b"x").len(), "no more than the window");
+    assert_eq!(received.len(), 32 * publish(&report, 1, 1, b"x").len(), "no more than the window");
     broker.assert_serves().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_idle_client_is_not_taken_for_deaf_when_it_speaks_again() {
+async fn idle_client_does_not_hit_the_write_timeout() {
     let write_timeout = Duration::from_millis(50);
     let broker = TestBroker::with(|limits| limits.write_timeout = write_timeout).await;
     let mut raw = broker.robot(&RobotId::random()).await;
@@ -311,7 +311,7 @@ async fn an_idle_client_is_not_taken_for_deaf_when_it_speaks_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn there_are_as_many_places_as_configured() {
+async fn connection_and_operator_limits_hold() {
     let broker =
         TestBroker::with(|limits| (limits.max_connections, limits.max_operators) = (6, 2)).await;
     let (first, second) =
@@ -320,7 +320,7 @@ async fn there_are_as_many_places_as_configured() {
     third.expect(&[0x20, 2, 0, 3]).await;
     third.expect_close().await;
     drop((first, second, third));
-    // The places are free once the broker has noticed; until then a newcomer is turned away.
+    // The places are free once the broker has noticed; until then a new client is rejected.
     let mut crowd = Vec::new();
     timeout(PATIENCE, async {
         while crowd.len() < 6 {
@@ -338,7 +338,7 @@ async fn there_are_as_many_places_as_configured() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_person_does_not_take_all_places_of_people() {
+async fn session_limit_of_one_person_leaves_room_for_others() {
     let broker = TestBroker::start().await;
     let mut sessions = Vec::new();
     for _ in 0..16 {
@@ -364,13 +364,13 @@ async fn one_person_does_not_take_all_places_of_people() {
 const HOUR: Duration = Duration::from_secs(3600);
 
 #[tokio::test(flavor = "multi_thread")]
-async fn silent_connections_give_way_when_all_places_are_taken() {
+async fn silent_connections_are_evicted_at_the_connection_limit() {
     let broker =
         TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (2, HOUR))
             .await;
-    let mut spoken = broker.robot(&RobotId::random()).await;
+    let mut connected = broker.robot(&RobotId::random()).await;
     let mut silent = broker.raw().await;
-    // No client is evicted in its first seconds: until then newcomers are turned away.
+    // No client is evicted in its first seconds: until then new clients are rejected.
     let mut ticks = tokio::time::interval(Duration::from_millis(100));
     let mut newcomer = timeout(PATIENCE, async {
         loop {
@@ -385,11 +385,11 @@ async fn silent_connections_give_way_when_all_places_are_taken() {
     .expect("a place should be free");
     silent.expect_close().await;
     newcomer.expect_nothing().await;
-    spoken.expect_nothing().await;
+    connected.expect_nothing().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_silence_of_one_address_fills_a_quarter_of_the_places() {
+async fn one_address_gets_a_quarter_of_the_connections_before_connect() {
     let broker =
         TestBroker::with(|limits| (limits.max_connections, limits.connect_timeout) = (400, HOUR))
             .await;
@@ -412,7 +412,7 @@ async fn the_silence_of_one_address_fills_a_quarter_of_the_places() {
 }
 
 #[test]
-fn random_bytes_and_mutated_packets_break_nothing() {
+fn random_bytes_and_mutated_packets_are_survived() {
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let broker = runtime.block_on(TestBroker::start());
     let robot = RobotId::random();

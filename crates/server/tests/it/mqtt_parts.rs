@@ -3,7 +3,7 @@
 
 use bytes::Bytes;
 use rumqttc::{AsyncClient, Event, MqttOptions, Packet, QoS, SubscribeReasonCode};
-use task_proto::topic::{Topic, TopicPrefix};
+use task_proto::messages::topic::{Topic, TopicPrefix};
 use task_proto::{Digest, RobotId};
 use taskd::broker::{FanOut, FanOutError, FanOutSettings, MAX_PART_BYTES, Part, PartQos};
 use tokio::io::AsyncReadExt;
@@ -17,13 +17,13 @@ fn name_of(digest: Digest) -> String {
 }
 
 /// A subscription to a package, and its expected answer.
-async fn listen(raw: &mut Raw, digest: Digest, code: u8) {
+async fn subscribe_to(raw: &mut Raw, digest: Digest, code: u8) {
     raw.send(&subscribe(9, &[(&name_of(digest), 1)])).await;
     raw.expect(&[0x90, 3, 0, 9, code]).await;
 }
 
 /// The part comes as the session's message with this packet id.
-async fn hear(raw: &mut Raw, digest: Digest, id: u8, part: &str) {
+async fn expect_part(raw: &mut Raw, digest: Digest, id: u8, part: &str) {
     raw.expect(&publish(&name_of(digest), 1, id.into(), part.as_bytes())).await;
 }
 
@@ -52,7 +52,7 @@ async fn send(fan_out: &mut FanOut, part: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
+async fn parts_reach_only_robots_with_a_grant() {
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
     let (digest, other) = (Digest::of(b"package"), Digest::of(b"other"));
@@ -62,49 +62,49 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
         broker.robot(&robots[1]).await,
         broker.robot(&robots[2]).await,
     );
-    listen(&mut one, digest, 0x80).await;
+    subscribe_to(&mut one, digest, 0x80).await;
 
     let mut fan_out = begin(&broker, digest, &robots[..2]).expect("room");
     let again = begin(&broker, digest, &[]).err();
-    assert_eq!(again, Some(FanOutError::UnderWay(digest)));
+    assert_eq!(again, Some(FanOutError::AlreadyRunning(digest)));
     let too_large =
         Part { header: Bytes::from_static(b"h"), bytes: vec![0; MAX_PART_BYTES].into() };
     assert_eq!(fan_out.publish(too_large).await, Err(FanOutError::TooLarge(MAX_PART_BYTES + 1)));
     send(&mut fan_out, "unheard").await;
-    listen(&mut one, digest, 1).await;
-    listen(&mut two, digest, 1).await;
-    listen(&mut three, digest, 0x80).await;
-    listen(&mut one, other, 0x80).await;
-    assert_eq!(fan_out.listeners(), 2);
+    subscribe_to(&mut one, digest, 1).await;
+    subscribe_to(&mut two, digest, 1).await;
+    subscribe_to(&mut three, digest, 0x80).await;
+    subscribe_to(&mut one, other, 0x80).await;
+    assert_eq!(fan_out.subscribers(), 2);
     for number in 1..=40 {
         send(&mut fan_out, &format!("part {number}")).await;
         for raw in [&mut one, &mut two] {
-            hear(raw, digest, number, &format!("part {number}")).await;
+            expect_part(raw, digest, number, &format!("part {number}")).await;
             acknowledge(raw, number).await;
         }
     }
 
     fan_out.withdraw(&robots[1]);
     send(&mut fan_out, "late").await;
-    hear(&mut one, digest, 41, "late").await;
+    expect_part(&mut one, digest, 41, "late").await;
     acknowledge(&mut one, 41).await;
     two.expect_nothing().await;
-    listen(&mut two, digest, 0x80).await;
-    assert_eq!(fan_out.listeners(), 1);
+    subscribe_to(&mut two, digest, 0x80).await;
+    assert_eq!(fan_out.subscribers(), 1);
 
     // A client that leaves, or whose grant ends with the fan-out, receives the next one only by
     // subscribing again.
     one.send(&unsubscribe(7, &[&name_of(digest)])).await;
     one.expect(&[0xb0, 2, 0, 7]).await;
-    assert_eq!(fan_out.listeners(), 0);
-    listen(&mut one, digest, 1).await;
+    assert_eq!(fan_out.subscribers(), 0);
+    subscribe_to(&mut one, digest, 1).await;
     drop(fan_out);
-    listen(&mut one, digest, 0x80).await;
+    subscribe_to(&mut one, digest, 0x80).await;
     let mut fan_out = begin(&broker, digest, &robots).expect("room");
     send(&mut fan_out, "again").await;
-    listen(&mut three, digest, 1).await;
+    subscribe_to(&mut three, digest, 1).await;
     send(&mut fan_out, "and on").await;
-    hear(&mut three, digest, 1, "and on").await;
+    expect_part(&mut three, digest, 1, "and on").await;
     for raw in [&mut one, &mut two, &mut operator] {
         raw.expect_nothing().await;
     }
@@ -116,7 +116,7 @@ async fn parts_are_heard_by_whom_they_are_granted_to_and_only_as_long() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
+async fn withdrawn_subscription_is_no_longer_listed() {
     let broker = TestBroker::start().await;
     let (robot, digest) = (RobotId::random(), Digest::of(b"package"));
     let mut raw = broker.robot(&robot).await;
@@ -127,12 +127,12 @@ async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
     };
     for round in 0..50 {
         let fan_out = begin(&broker, digest, std::slice::from_ref(&robot)).expect("room");
-        listen(&mut raw, digest, 1).await;
+        subscribe_to(&mut raw, digest, 1).await;
         assert_eq!(broker.broker.subscriptions_of(&robot).len(), 1);
         if round % 2 == 0 {
             fan_out.withdraw(&robot);
         } else {
-            // The client subscribes again while its right ends: either may come first.
+            // The client subscribes again while its permission ends: either may come first.
             raw.send(&subscribe(9, &[(&name_of(digest), 1)])).await;
             fan_out.withdraw(&robot);
             let mut answer = [0; 5];
@@ -145,19 +145,19 @@ async fn what_a_robot_may_no_longer_hear_is_not_listed_however_it_ends() {
 
 /// Receives part `number`, which is the session's message of that packet id, and acknowledges it.
 async fn take(raw: &mut Raw, digest: Digest, number: u8) {
-    hear(raw, digest, number, &format!("part {number}")).await;
+    expect_part(raw, digest, number, &format!("part {number}")).await;
     acknowledge(raw, number).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_is_slow_holds_the_parts_back_and_one_that_goes_lets_them_go() {
+async fn slow_subscriber_delays_parts_until_it_leaves() {
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..2).map(|_| RobotId::random()).collect();
     let digest = Digest::of(b"package");
     let mut fan_out = begin(&broker, digest, &robots).expect("room");
     let (mut quick, mut slow) = (broker.robot(&robots[0]).await, broker.robot(&robots[1]).await);
-    listen(&mut quick, digest, 1).await;
-    listen(&mut slow, digest, 1).await;
+    subscribe_to(&mut quick, digest, 1).await;
+    subscribe_to(&mut slow, digest, 1).await;
     let publishing = tokio::spawn(async move {
         for number in 1..=100 {
             send(&mut fan_out, &format!("part {number}")).await;
@@ -182,11 +182,11 @@ async fn a_robot_that_is_slow_holds_the_parts_back_and_one_that_goes_lets_them_g
         take(&mut quick, digest, number).await;
     }
     let fan_out = publishing.await.expect("no panic");
-    assert_eq!((fan_out.listeners(), fan_out.take_put_out()), (1, Vec::new()));
+    assert_eq!((fan_out.subscribers(), fan_out.take_evicted()), (1, Vec::new()));
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded() {
+async fn stalled_subscriber_is_evicted_and_the_queue_stays_bounded() {
     const PART_BYTES: usize = 128 * 1024;
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..3).map(|_| RobotId::random()).collect();
@@ -200,10 +200,10 @@ async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded(
         raws.push(broker.robot(robot).await);
     }
     for raw in &mut raws {
-        listen(raw, digest, 1).await;
+        subscribe_to(raw, digest, 1).await;
     }
     let stalled = raws.pop();
-    let hearing: Vec<_> = raws
+    let receiving: Vec<_> = raws
         .into_iter()
         .map(|mut raw| {
             tokio::spawn(async move {
@@ -224,14 +224,14 @@ async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded(
     for number in 1..=200 {
         let bytes = vec![number; PART_BYTES].into();
         fan_out.publish(Part { header: Bytes::new(), bytes }).await.expect("sent");
-        // The window, however many listen and however slow they are.
+        // The window, however many subscribe and however slow they are.
         assert!(broker.broker.queued_part_bytes() <= 24 * PART_BYTES);
     }
     let mut raws = Vec::new();
-    for hearing in hearing {
-        raws.push(hearing.await.expect("heard all"));
+    for receiving in receiving {
+        raws.push(receiving.await.expect("received all"));
     }
-    assert_eq!((fan_out.take_put_out(), fan_out.listeners()), (vec![robots[2].clone()], 2));
+    assert_eq!((fan_out.take_evicted(), fan_out.subscribers()), (vec![robots[2].clone()], 2));
     drop(fan_out);
     assert_eq!(broker.broker.queued_part_bytes(), 0);
     drop(stalled);
@@ -239,7 +239,7 @@ async fn a_robot_that_reads_nothing_is_put_out_and_what_is_queued_stays_bounded(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn parts_come_with_the_lower_of_both_qualities_of_service() {
+async fn parts_use_the_lower_qos_of_both_sides() {
     let broker = TestBroker::start().await;
     let robot = RobotId::random();
     let digest = Digest::of(b"package");
@@ -252,7 +252,7 @@ async fn parts_come_with_the_lower_of_both_qualities_of_service() {
         let mut raw = broker.robot(&robot).await;
         raw.send(&subscribe(9, &[(&name_of(digest), its)])).await;
         raw.expect(&[0x90, 3, 0, 9, its]).await;
-        let hearing = tokio::spawn(async move {
+        let receiving = tokio::spawn(async move {
             for number in 1..=100 {
                 raw.expect(&publish(&name_of(digest), expected, number, b"sixteen bytes ok")).await;
                 let id = number as u8;
@@ -272,12 +272,12 @@ async fn parts_come_with_the_lower_of_both_qualities_of_service() {
             send(&mut fan_out, "sixteen bytes ok").await;
             fan_out.settle(PATIENCE).await;
         }
-        hearing.await.expect("heard all");
+        receiving.await.expect("received all");
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_whole_package_is_one_message_that_nobody_copies() {
+async fn whole_package_is_one_shared_message() {
     let broker = TestBroker::start().await;
     let robots: Vec<RobotId> = (0..4).map(|_| RobotId::random()).collect();
     let digest = Digest::of(b"package");
@@ -285,12 +285,12 @@ async fn a_whole_package_is_one_message_that_nobody_copies() {
         (0..48 * 1024 * 1024_u32).map(|at| (at % 251) as u8).collect::<Vec<u8>>().into();
     let settings = settings(bytes.len() + 1, PartQos::AtLeastOnce);
     let mut fan_out = broker.broker.fan_out(digest, settings, robots.clone()).expect("room");
-    let mut hearing = Vec::new();
+    let mut receiving = Vec::new();
     for robot in &robots {
         let mut raw = broker.robot(robot).await;
-        listen(&mut raw, digest, 1).await;
+        subscribe_to(&mut raw, digest, 1).await;
         let expected = publish(&name_of(digest), 1, 1, &[b"h", &bytes[..]].concat());
-        hearing.push(tokio::spawn(async move {
+        receiving.push(tokio::spawn(async move {
             raw.expect_large(&expected).await;
             acknowledge(&mut raw, 1).await;
             raw
@@ -302,13 +302,13 @@ async fn a_whole_package_is_one_message_that_nobody_copies() {
         .expect("sent");
     assert_eq!(broker.broker.queued_part_bytes(), bytes.len() + 1, "once, for all");
     fan_out.settle(PATIENCE).await;
-    for hearing in hearing {
-        hearing.await.expect("heard all").expect_nothing().await;
+    for receiving in receiving {
+        receiving.await.expect("received all").expect_nothing().await;
     }
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of_service() {
+async fn independent_client_receives_all_parts_in_order_at_each_qos() {
     const PARTS: u32 = 300;
     let (broker, subscribed) = (TestBroker::start().await, Notify::new());
     for (ours, its) in [
@@ -323,13 +323,16 @@ async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of
         options.set_credentials(robot.as_str(), format!("pw-{robot}"));
         let (client, mut events) = AsyncClient::new(options, 10);
         client.subscribe(name_of(digest), its).await.expect("queued");
-        let hearing = async {
-            let mut heard = 0;
-            while heard < PARTS {
+        let receiving = async {
+            let mut received = 0;
+            while received < PARTS {
                 match events.poll().await.expect("connected") {
                     Event::Incoming(Packet::Publish(part)) => {
-                        assert_eq!((part.qos, &part.payload[..4]), (its, &heard.to_be_bytes()[..]));
-                        heard += 1;
+                        assert_eq!(
+                            (part.qos, &part.payload[..4]),
+                            (its, &received.to_be_bytes()[..])
+                        );
+                        received += 1;
                     }
                     Event::Incoming(Packet::SubAck(ack)) => {
                         assert_eq!(ack.return_codes, [SubscribeReasonCode::Success(its)]);
@@ -346,7 +349,7 @@ async fn an_independent_client_hears_every_part_in_order_whatever_the_quality_of
                 fan_out.publish(Part { header, bytes: vec![0; 8000].into() }).await.expect("sent");
             }
         };
-        timeout(PATIENCE, async { tokio::join!(hearing, publishing) })
+        timeout(PATIENCE, async { tokio::join!(receiving, publishing) })
             .await
             .expect("all should arrive");
     }

@@ -3,13 +3,13 @@
 use reqwest::{Method, Response, StatusCode};
 use serde_json::{Value, json};
 use task_proto::desired::BlobRef;
-use task_proto::digest::Algorithm;
-use task_proto::oci::{INDEX_TYPE, MANIFEST_TYPE};
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::oci::{INDEX_TYPE, MANIFEST_TYPE};
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::config::BlobRead;
 use taskd::http::auth::Caller;
-use taskd::http::registry::oci::Registry;
+use taskd::http::registry::Registry;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -18,7 +18,7 @@ use crate::registry::{GRACE, NOW_MS, TestRegistry, header, image, operator, refu
 on_both_databases!(referrers_come_in_pages);
 
 #[tokio::test]
-async fn nobody_is_let_in_without_a_token() {
+async fn registry_refuses_requests_without_a_token() {
     let registry = TestRegistry::start_with(BlobSettings::default(), None).await;
     for path in ["/v2/", "/v2/a/tags/list", "/v2/a/manifests/x", "/v2/nonsense"] {
         let answer = registry.get(path).await;
@@ -32,7 +32,7 @@ async fn nobody_is_let_in_without_a_token() {
 }
 
 #[tokio::test]
-async fn a_robot_reads_no_blob_that_is_not_assigned_to_it() {
+async fn robot_reads_only_blobs_of_its_packages() {
     let robot =
         TestRegistry::start_with(BlobSettings::default(), Some(Caller::Robot(RobotId::random())))
             .await;
@@ -56,7 +56,7 @@ async fn a_robot_reads_no_blob_that_is_not_assigned_to_it() {
 }
 
 #[tokio::test]
-async fn a_blob_is_read_whole_and_in_parts_from_either_kind_of_store() {
+async fn blob_reads_and_ranges_agree_for_mmap_and_pread() {
     let bytes: Vec<u8> = (0..1_000_000_u32).flat_map(u32::to_le_bytes).collect();
     for reading in [BlobRead::Mmap, BlobRead::Pread] {
         let settings = BlobSettings { reading, ..BlobSettings::default() };
@@ -114,7 +114,7 @@ async fn a_blob_is_read_whole_and_in_parts_from_either_kind_of_store() {
 }
 
 #[tokio::test]
-async fn nothing_here_has_a_digest_of_another_algorithm() {
+async fn unsupported_digest_algorithms_are_not_found() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
     let digest = format!("sha384:{}", "0".repeat(96));
@@ -142,7 +142,7 @@ async fn nothing_here_has_a_digest_of_another_algorithm() {
 }
 
 #[tokio::test]
-async fn what_is_pushed_by_sha512_has_that_name() {
+async fn sha512_push_is_stored_under_its_digest() {
     let registry = TestRegistry::start().await;
     let [config, layer] = [&b"{}"[..], &vec![7; 3_000_000]].map(|bytes| {
         (
@@ -199,7 +199,7 @@ async fn what_is_pushed_by_sha512_has_that_name() {
 }
 
 #[tokio::test]
-async fn a_path_that_is_no_text_is_refused_as_a_name() {
+async fn path_that_is_not_utf8_is_an_invalid_name() {
     let registry = TestRegistry::start().await;
     for path in ["/v2/x/manifests/%FF", "/v2/%FF/tags/list"] {
         assert_eq!(refusal(registry.get(path).await).await, refused(400, "NAME_INVALID"), "{path}");
@@ -207,7 +207,7 @@ async fn a_path_that_is_no_text_is_refused_as_a_name() {
 }
 
 #[tokio::test]
-async fn chunks_come_in_order_or_not_at_all() {
+async fn chunks_out_of_order_are_refused() {
     let registry = TestRegistry::start().await;
     let upload = registry.begin("a").await;
     let patch = async |range: &str, body: &'static str| {
@@ -276,7 +276,7 @@ async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
 }
 
 #[tokio::test]
-async fn limits_are_told_and_held() {
+async fn upload_limits_are_enforced() {
     let settings = BlobSettings { max_blob_bytes: 1000, max_uploads: 1, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
     let left = registry.begin("a").await;
@@ -325,7 +325,7 @@ async fn limits_are_told_and_held() {
 }
 
 #[tokio::test]
-async fn one_blob_pushed_by_many_at_once_is_one_blob() {
+async fn concurrent_pushes_of_one_blob_store_it_once() {
     let registry = TestRegistry::start().await;
     let bytes = vec![7; 300_000];
     let pushes = (0..8).map(|_| registry.push_blob("a", &bytes));
@@ -335,7 +335,7 @@ async fn one_blob_pushed_by_many_at_once_is_one_blob() {
 }
 
 #[tokio::test]
-async fn a_blob_is_mounted_or_asked_for() {
+async fn blob_mount_succeeds_or_starts_an_upload() {
     let registry = TestRegistry::start().await;
     let digest = registry.push_blob("from", b"x").await.digest;
     let mount = async |query: &str| {
@@ -366,7 +366,7 @@ async fn a_blob_is_mounted_or_asked_for() {
 }
 
 #[tokio::test]
-async fn a_manifest_is_kept_byte_for_byte_under_digest_and_tag() {
+async fn manifest_is_stored_byte_for_byte_under_digest_and_tag() {
     let registry = TestRegistry::start().await;
     let digest = registry.push_image("a/b", "v1").await;
     for reference in ["v1".to_owned(), digest.to_string()] {
@@ -391,7 +391,7 @@ async fn a_manifest_is_kept_byte_for_byte_under_digest_and_tag() {
 }
 
 #[tokio::test]
-async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
+async fn invalid_manifest_is_refused_with_a_reason() {
     let registry = TestRegistry::start().await;
     let config = registry.push_blob("a", b"{}").await;
     let missing = BlobRef { digest: Digest::of(b"missing"), size: 7 };
@@ -426,7 +426,8 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
         assert_eq!(put("v1", MANIFEST_TYPE, &manifest).await, invalid, "{key}");
     }
     assert_eq!(put("v1", "", &json!({ "mediaType": "application/x-\n" })).await, invalid);
-    let index = json!({ "schemaVersion": 2, "manifests": [{ "mediaType": MANIFEST_TYPE, "digest": missing.digest }] });
+    let entry = json!({ "mediaType": MANIFEST_TYPE, "digest": missing.digest });
+    let index = json!({ "schemaVersion": 2, "manifests": [entry] });
     assert_eq!(put("v1", INDEX_TYPE, &index).await, refused(400, "MANIFEST_BLOB_UNKNOWN"));
     let name = registry.put_manifest("/v2/A/manifests/v1", MANIFEST_TYPE, &good).await;
     assert_eq!(refusal(name).await, refused(400, "NAME_INVALID"));
@@ -438,7 +439,7 @@ async fn a_manifest_that_can_not_be_is_refused_with_the_reason() {
 }
 
 #[tokio::test]
-async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
+async fn manifest_with_a_page_type_is_served_as_bytes() {
     let registry = TestRegistry::start().await;
     let Registry { store, blobs, .. } = &registry.registry;
     let page = "<script>fetch('/api/v1/users')</script>";
@@ -459,7 +460,7 @@ async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
         output: None,
         document: None,
     };
-    let put = store.put_manifest(&"a".parse().expect("a name"), &new, None, NOW_MS).await;
+    let put = store.manifests().put(&"a".parse().expect("a name"), &new, None, NOW_MS).await;
     assert_eq!(put.expect("writes"), PutManifest::Stored);
     let answer = registry.get("/v2/a/manifests/old").await;
     assert_eq!(header(&answer, "content-type"), "application/octet-stream");
@@ -467,7 +468,7 @@ async fn a_manifest_that_was_taken_as_a_page_is_served_as_bytes() {
 }
 
 #[tokio::test]
-async fn of_two_manifests_for_one_tag_one_wins() {
+async fn concurrent_pushes_to_one_tag_leave_one_manifest() {
     let registry = TestRegistry::start().await;
     let images = [registry.push_image("a", "one").await, registry.push_image("a", "two").await];
     let bodies =
@@ -527,7 +528,7 @@ async fn tags_are_listed_in_pages() {
 }
 
 #[tokio::test]
-async fn referrers_are_found_by_subject_and_filtered_by_type() {
+async fn referrers_are_listed_by_subject_and_type() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
     let subject =
@@ -582,7 +583,7 @@ async fn put_referrer(
         document: None,
     };
     let repository: RepositoryName = "a".parse().expect("a name");
-    let put = registry.registry.store.put_manifest(&repository, &new, None, NOW_MS).await;
+    let put = registry.registry.store.manifests().put(&repository, &new, None, NOW_MS).await;
     assert_eq!(put.expect("writes"), PutManifest::Stored);
 }
 
@@ -621,27 +622,21 @@ async fn referrers_come_in_pages(database: TestDatabase) {
             let index: Value = serde_json::from_str(&body).expect("JSON");
             let manifests = index["manifests"].as_array().expect("a list");
             counts.push(manifests.len());
-            seen.extend(
-                manifests
-                    .iter()
-                    .map(|manifest| manifest["digest"].as_str().expect("text").to_owned()),
-            );
+            let digest = |manifest: &Value| manifest["digest"].as_str().expect("text").to_owned();
+            seen.extend(manifests.iter().map(digest));
         }
         assert_eq!(counts, pages, "{filter}");
         assert!(seen.is_sorted_by(|one, next| one < next), "each once");
     }
     for nonsense in ["last=x", "artifactType=%00"] {
         let path = format!("/v2/a/referrers/{many}?{nonsense}");
-        assert_eq!(
-            registry.status(Method::GET, &path).await,
-            StatusCode::BAD_REQUEST,
-            "{nonsense}"
-        );
+        let status = registry.status(Method::GET, &path).await;
+        assert_eq!(status, StatusCode::BAD_REQUEST, "{nonsense}");
     }
 }
 
 #[tokio::test]
-async fn what_lists_of_referrers_repeat_is_bounded() {
+async fn annotations_of_referrers_are_bounded() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
     let mut manifest = image(blob, blob);
@@ -655,7 +650,7 @@ async fn what_lists_of_referrers_repeat_is_bounded() {
     let body: Value = answer.json().await.expect("an error body");
     assert_eq!(body["errors"][0]["code"], "MANIFEST_INVALID");
     let message = body["errors"][0]["message"].as_str().expect("text");
-    assert!(message.starts_with("annotations: they have 65537 bytes"), "{message}");
+    assert!(message.starts_with("annotations: 65537 bytes"), "{message}");
     manifest["annotations"] = json!({ "note": "x".repeat(64 * 1024 - 4) });
     let fits = registry.put_manifest("/v2/a/manifests/long", MANIFEST_TYPE, &manifest).await;
     assert_eq!(fits.status(), StatusCode::CREATED);

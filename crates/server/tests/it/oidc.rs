@@ -47,7 +47,7 @@ fn free_port() -> u16 {
         .port()
 }
 
-async fn town() -> (TestServer, Provider) {
+async fn server_with_provider() -> (TestServer, Provider) {
     let (provider, directory, port) =
         (Provider::start().await, TempDir::new().expect("a directory"), free_port());
     let oidc = settings(&provider.issuer, &directory, port);
@@ -144,8 +144,8 @@ fn act(who: &str, act: &str) -> (String, String, String) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn somebody_comes_in_and_may_what_the_rules_say() {
-    let (server, provider) = town().await;
+async fn provider_sign_in_grants_the_rights_of_the_matching_rule() {
+    let (server, provider) = server_with_provider().await;
     let view: SessionView = answer(server.bare(Method::GET, "/api/v1/session")).await;
     let way_in = view.provider.expect("there is one");
     assert_eq!(
@@ -198,8 +198,8 @@ async fn somebody_comes_in_and_may_what_the_rules_say() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn coming_in_again_ends_the_session_that_the_browser_had() {
-    let (server, _provider) = town().await;
+async fn provider_sign_in_ends_the_browsers_previous_session() {
+    let (server, _provider) = server_with_provider().await;
     let mut visitor = Visitor::new(&server);
     assert_eq!(visitor.sign_in().await, "/");
     let former = visitor.cookie();
@@ -212,7 +212,7 @@ async fn coming_in_again_ends_the_session_that_the_browser_had() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_provider_there_is_no_such_way_in() {
+async fn provider_sign_in_without_a_provider_is_not_found() {
     let server = TestServer::start().await;
     let view: SessionView = answer(server.bare(Method::GET, "/api/v1/session")).await;
     assert_eq!(view.provider, None);
@@ -222,8 +222,8 @@ async fn without_a_provider_there_is_no_such_way_in() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_answer_is_good_once_and_in_one_browser() {
-    let (server, provider) = town().await;
+async fn authorization_response_is_valid_once_and_in_one_browser() {
+    let (server, provider) = server_with_provider().await;
     let (mut mine, mut theirs, mut nobody) =
         (Visitor::new(&server), Visitor::new(&server), Visitor::new(&server));
     let back = mine.go_to_provider().await;
@@ -262,8 +262,8 @@ async fn an_answer_is_good_once_and_in_one_browser() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_that_says_the_wrong_thing_lets_nobody_in() {
-    let (server, provider) = town().await;
+async fn invalid_id_token_is_refused() {
+    let (server, provider) = server_with_provider().await;
     let s = crate::harness::NOW_MS / 1000;
     for (header, claims) in [
         (json!({ "alg": "none" }), json!({})),
@@ -288,8 +288,8 @@ async fn a_token_that_says_the_wrong_thing_lets_nobody_in() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_rule_nobody_comes_in_and_who_was_in_is_out() {
-    let (server, provider) = town().await;
+async fn user_without_a_matching_rule_is_refused_and_signed_out() {
+    let (server, provider) = server_with_provider().await;
     provider.says(json!({ "groups": ["staff"] }));
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=no_role");
     provider.says(json!({ "groups": null }));
@@ -321,8 +321,8 @@ async fn without_a_rule_nobody_comes_in_and_who_was_in_is_out() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_name_is_no_proof_of_who_somebody_is() {
-    let (server, provider) = town().await;
+async fn provider_user_is_known_by_subject_and_not_by_name() {
+    let (server, provider) = server_with_provider().await;
     let user = json!({ "name": "alice", "roles": ["admin"], "password": PASSWORD });
     let _: Value = server.post("/api/v1/users", &user).await;
     assert_eq!(Visitor::new(&server).sign_in().await, "/#problem=name_taken");
@@ -347,8 +347,8 @@ async fn a_name_is_no_proof_of_who_somebody_is() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_the_provider_decides_is_not_changed_by_hand() {
-    let (server, _provider) = town().await;
+async fn provider_users_rights_and_password_are_not_editable() {
+    let (server, _provider) = server_with_provider().await;
     let mut alice = Visitor::new(&server);
     assert_eq!(alice.sign_in().await, "/");
     let of_provider = (409, "of_provider".to_owned());
@@ -375,8 +375,8 @@ async fn what_the_provider_decides_is_not_changed_by_hand() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_new_key_is_found_and_a_provider_in_trouble_is_left_in_peace() {
-    let (server, provider) = town().await;
+async fn new_provider_key_is_fetched_and_failures_are_backed_off() {
+    let (server, provider) = server_with_provider().await;
     let sign_in = || async { Visitor::new(&server).sign_in().await };
     assert_eq!(sign_in().await, "/");
     provider.changes_key("second");
@@ -415,8 +415,8 @@ async fn a_new_key_is_found_and_a_provider_in_trouble_is_left_in_peace() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn failed_sign_ins_by_the_provider_are_counted_by_address() {
-    let (server, provider) = town().await;
+async fn failed_provider_sign_ins_are_limited_by_address() {
+    let (server, provider) = server_with_provider().await;
     // Requests that a foreign page could trigger in its visitors' browsers do not count.
     let foreign = server.url("/api/v1/oidc/callback?code=guess&state=guess");
     for _ in 0..60 {
@@ -452,7 +452,8 @@ impl Foreign {
     fn start() -> Self {
         let Ok(environment) = std::env::var("TASKD_TEST_OIDC") else {
             panic!(
-                "TASKD_TEST_OIDC is not set: run ./scripts/test, or set it to the directory that scripts/need oidc prints"
+                "TASKD_TEST_OIDC is not set: run ./scripts/test, \
+                 or set it to the directory that scripts/need oidc prints"
             );
         };
         let alice = json!({ "sub": "1", "preferred_username": "alice", "groups": ["robotics"] })
@@ -488,7 +489,7 @@ impl Drop for Foreign {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_provider_that_others_made_lets_people_in() {
+async fn sign_in_works_with_a_third_party_provider() {
     let (directory, port) = (TempDir::new().expect("a directory"), free_port());
     let provider = tokio::task::spawn_blocking(Foreign::start).await.expect("started");
     let mut config = Config::with_data(directory.path().join("data"));

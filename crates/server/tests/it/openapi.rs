@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use reqwest::Method;
 use serde_json::json;
-use task_proto::person::Role;
+use task_proto::people::roles::Role;
 use tokio::process::Command;
 
 use crate::harness::TestServer;
@@ -18,8 +18,8 @@ const PATIENCE: Duration = Duration::from_secs(240);
 fn tool(name: &str) -> Command {
     let Ok(environment) = std::env::var("TASKD_TEST_SCHEMATHESIS") else {
         panic!(
-            "TASKD_TEST_SCHEMATHESIS is not set: run ./scripts/test, or set it to the directory that scripts/need \
-             schemathesis prints"
+            "TASKD_TEST_SCHEMATHESIS is not set: run ./scripts/test, \
+             or set it to the directory that scripts/need schemathesis prints"
         );
     };
     let mut command = Command::new(format!("{environment}/bin/{name}"));
@@ -39,7 +39,7 @@ async fn run(mut command: Command) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_description_is_openapi() {
+async fn openapi_document_is_valid() {
     let server = TestServer::start().await;
     let answer = server.bare(Method::GET, "/api/openapi.json").send().await.expect("an answer");
     let tag = answer.headers()["etag"].clone();
@@ -54,7 +54,7 @@ async fn the_description_is_openapi() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whatever_is_asked_is_answered_as_described() {
+async fn answers_match_the_openapi_document() {
     let server = TestServer::start().await;
     // The names are the description's examples, which are asked for most.
     server.enroll("atlas-1").await;
@@ -78,7 +78,8 @@ async fn whatever_is_asked_is_answered_as_described() {
         "--phases",
         "examples,coverage,fuzzing",
         "--checks",
-        "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance",
+        "not_a_server_error,status_code_conformance,content_type_conformance,\
+         response_schema_conformance",
         "--request-timeout",
         "30",
         "--continue-on-failure",

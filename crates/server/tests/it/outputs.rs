@@ -7,12 +7,12 @@ use reqwest::{Body, Method, StatusCode};
 use serde_json::{Value, json};
 use task_proto::api::OutputList;
 use task_proto::desired::BlobRef;
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::output::{OUTPUT_TYPE, OutputFile, OutputSet};
+use task_proto::packages::oci::MANIFEST_TYPE;
+use task_proto::packages::output::{OUTPUT_TYPE, OutputFile, OutputSet};
 use task_proto::{Digest, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::blobs::collector;
-use taskd::http::registry::oci::Registry;
+use taskd::http::registry::Registry;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::harness::{TestRobot, TestServer, refusal};
@@ -71,7 +71,7 @@ pub fn file(path: &str, blob: BlobRef) -> OutputFile {
 }
 
 #[tokio::test]
-async fn a_robot_brings_files_back_and_operators_read_them() {
+async fn outputs_of_a_robot_are_readable_by_operators() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let push = Push::new(&server, &robot, format!("outputs/{}/mapping", robot.id));
@@ -109,7 +109,7 @@ async fn a_robot_brings_files_back_and_operators_read_them() {
 }
 
 #[tokio::test]
-async fn what_is_kept_of_a_robot_is_bounded_whatever_its_tasks_are_called() {
+async fn outputs_are_bounded_across_all_tasks_of_a_robot() {
     const TASKS: u64 = 21;
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
@@ -140,7 +140,7 @@ async fn what_is_kept_of_a_robot_is_bounded_whatever_its_tasks_are_called() {
 }
 
 #[tokio::test]
-async fn a_robot_pushes_nothing_else_and_nowhere_else() {
+async fn robot_pushes_only_its_own_outputs() {
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("husky").await);
     let secret = server.push("secret", "1.0.0").await;
@@ -170,7 +170,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     assert_eq!(head.send().await.expect("an answer").status(), StatusCode::NOT_FOUND);
 
     let map = own.blob(b"x").await;
-    let package = task_proto::oci::ImageManifest::package(map, map);
+    let package = task_proto::packages::oci::ImageManifest::package(map, map);
     let put = own
         .ask(Method::PUT, "manifests/latest")
         .header("content-type", MANIFEST_TYPE)
@@ -224,7 +224,7 @@ async fn a_robot_pushes_nothing_else_and_nowhere_else() {
     assert_eq!(unknown, (404, "not_found".to_owned()));
 }
 
-async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
+async fn outputs_of_one_robot_are_bounded_in_bytes(database: TestDatabase) {
     const KB: u64 = 1024;
     let data = tempfile::tempdir().expect("a directory");
     let settings = BlobSettings { max_robot_bytes: 512 * KB, ..BlobSettings::default() };
@@ -296,16 +296,14 @@ async fn what_one_robot_brings_is_bounded_in_bytes(database: TestDatabase) {
 
     // Only deletion from the disk makes room.
     let robot = "r00000000000000a1".parse().expect("valid");
-    let kept = registry.registry.store.bytes_of_robot(&robot).await.expect("a sum");
+    let kept = registry.registry.store.robot_blobs().disk_usage(&robot).await.expect("a sum");
     assert_eq!(kept, (500 + 400 + 2 * 64) * KB);
     let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
     registry.collect(NOW_MS + 2 * grace_ms).await;
     assert_eq!(push(&first, 3, 125 * KB).await, StatusCode::CREATED);
 }
 
-async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(
-    database: TestDatabase,
-) {
+async fn oldest_output_is_deleted_beyond_the_quota(database: TestDatabase) {
     const HOUR_MS: u64 = 3_600_000;
     let data = tempfile::tempdir().expect("a directory");
     // A run takes twice 400 KB and twice 64 KB.
@@ -378,17 +376,19 @@ async fn beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk(
 }
 
 on_both_databases!(
-    what_one_robot_brings_is_bounded_in_bytes,
-    beyond_so_many_bytes_the_oldest_output_goes_and_soon_is_off_the_disk,
+    outputs_of_one_robot_are_bounded_in_bytes,
+    oldest_output_is_deleted_beyond_the_quota,
 );
 
 /// They are on the disk as well.
 #[tokio::test]
-async fn a_robots_manifests_and_links_count() {
+async fn manifests_and_links_count_as_disk_usage() {
     let settings = BlobSettings { max_robot_bytes: 320 * 1024, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
     let robot: RobotId = "r00000000000000a1".parse().expect("valid");
-    let kept = async || registry.registry.store.bytes_of_robot(&robot).await.expect("a sum") / 1024;
+    let kept = async || {
+        registry.registry.store.robot_blobs().disk_usage(&robot).await.expect("a sum") / 1024
+    };
     let repository = format!("outputs/{robot}/mapping");
     let blob = registry.push_blob(&repository, b"{}").await;
     assert_eq!(kept().await, 64);
@@ -414,7 +414,7 @@ async fn a_robots_manifests_and_links_count() {
 
 /// Many requests of a robot count no more than one request with the same bytes.
 #[tokio::test]
-async fn a_file_that_was_let_in_before_another_came_is_counted_with_it() {
+async fn concurrent_output_uploads_count_together() {
     const MB: usize = 1024 * 1024;
     let settings = BlobSettings { max_robot_bytes: 6 * MB as u64, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;

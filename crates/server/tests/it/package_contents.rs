@@ -5,13 +5,13 @@ use std::path::Path;
 
 use reqwest::{Method, StatusCode};
 use serde_json::json;
+use task_package::{Packed, pack};
 use task_proto::api::{
     AccessToken, PackageDiff, PackageFile, PackageFileKind, PackageFiles, PackageList,
     PackageVersions,
 };
 use task_proto::desired::PackageRef;
-use task_proto::oci::MANIFEST_TYPE;
-use taskd::package::{Packed, pack};
+use task_proto::packages::oci::MANIFEST_TYPE;
 
 use crate::harness::{TestServer, answer, refusal};
 use crate::people::PASSWORD;
@@ -72,7 +72,7 @@ fn paths(files: &[PackageFile]) -> Vec<&str> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_package_shows_its_versions_files_and_differences() {
+async fn package_shows_its_versions_files_and_differences() {
     let server = TestServer::start().await;
     let [old, new] = server.two_versions().await;
     server.enroll("atlas").await;
@@ -128,7 +128,7 @@ async fn a_package_shows_its_versions_files_and_differences() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_package_in_use_is_not_deleted() {
+async fn package_in_use_is_not_deleted() {
     let server = TestServer::start().await;
     let [old, new] = server.two_versions().await;
     for name in ["atlas", "boreas"] {
@@ -145,7 +145,7 @@ async fn a_package_in_use_is_not_deleted() {
     let said = body["error"]["message"].as_str().expect("text");
     assert!(
         said.starts_with(
-            "mapper 1.0.0 is what 2 robots should have: atlas, boreas, by 1 deployments: d"
+            "mapper 1.0.0 is in use by 2 robots: atlas, boreas, through 1 deployments: d"
         ),
         "{said}"
     );
@@ -161,9 +161,9 @@ async fn a_package_in_use_is_not_deleted() {
     let pia: AccessToken = answer(login).await;
     let hers = server.bare(Method::DELETE, "/api/v1/packages/mapper/1.0.0").bearer_auth(&pia.token);
     let said = hers.send().await.expect("an answer").text().await.expect("text");
-    assert!(said.contains("2 robots should have: boreas, …,") && !said.contains("atlas"), "{said}");
+    assert!(said.contains("2 robots: boreas, …,") && !said.contains("atlas"), "{said}");
     assert!(
-        said.contains(&format!("by 2 deployments: {}, …;", one.id))
+        said.contains(&format!("through 2 deployments: {}, …;", one.id))
             && !said.contains(other.id.as_str()),
         "{said}"
     );

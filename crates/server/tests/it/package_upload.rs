@@ -6,8 +6,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use reqwest::{Method, StatusCode};
+use task_package::pack;
 use task_proto::api::{AuditPage, PackageFiles, PackageList, PackageView};
-use taskd::package::pack;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -54,7 +54,7 @@ impl TestServer {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_people_bring_leaves_the_reserve_of_the_disk() {
+async fn package_uploads_leave_the_disk_reserve_free() {
     let directory_of_server = tempfile::TempDir::new().expect("a directory");
     let server =
         TestServer::start_in(directory_of_server, |config| config.disk_reserve = Some(1 << 50))
@@ -70,11 +70,11 @@ async fn what_people_bring_leaves_the_reserve_of_the_disk() {
     let refused = push.send().await.expect("an answer");
     assert_eq!(refused.status(), StatusCode::INSUFFICIENT_STORAGE);
     let said = refused.text().await.expect("text");
-    assert!(said.contains("kept for its database") && said.contains("disk_reserve"), "{said}");
+    assert!(said.contains("reserved for the database") && said.contains("disk_reserve"), "{said}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_uploaded_directory_is_the_package_that_the_command_makes() {
+async fn uploaded_directory_equals_the_pushed_package() {
     let server = TestServer::start().await;
     let dir = directory(
         "1.0.0",
@@ -115,7 +115,7 @@ async fn an_uploaded_directory_is_the_package_that_the_command_makes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_no_package_is_refused_and_leaves_nothing() {
+async fn invalid_package_is_refused_and_leaves_nothing() {
     let server = TestServer::start_in(tempfile::TempDir::new().expect("a directory"), |config| {
         config.max_upload_bytes = 1 << 20;
     })
@@ -162,7 +162,10 @@ async fn what_is_no_package_is_refused_and_leaves_nothing() {
         .await
         .expect("json");
     let said = said["error"]["message"].as_str().expect("text");
-    assert!(said.contains("task.toml: version: is absent") && !said.contains("incoming"), "{said}");
+    assert!(
+        said.contains("task.toml: version: is missing") && !said.contains("incoming"),
+        "{said}"
+    );
     let list: PackageList = server.get("/api/v1/packages").await;
     assert!(list.packages.is_empty());
     assert!(!server.data().join("outside").exists() && !Path::new("/outside").exists());
@@ -185,7 +188,7 @@ async fn refused_bytes(server: &TestServer, header: &str, rest: &[u8]) -> String
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
+async fn uploads_are_limited_and_disconnect_frees_the_slot() {
     let server = TestServer::start().await;
     let publishers = [
         server.sign_in_as("alice", "publisher").await,
@@ -204,15 +207,16 @@ async fn two_upload_at_a_time_and_who_goes_away_leaves_a_place() {
     // A caller that finds the place taken by the request below asks again.
     let endless = async |token: &str| while refusal(upload_by(token, body())).await.0 == 429 {};
     let until = async |status: u16| while refusal(upload("hello".into())).await.0 != status {};
+    let both = async { tokio::join!(endless(&publishers[0]), endless(&publishers[1])) };
     tokio::select! {
-        _ = async { tokio::join!(endless(&publishers[0]), endless(&publishers[1])) } => panic!("an upload without an end had one"),
+        _ = both => panic!("an upload without an end had one"),
         refused = timeout(PATIENCE, until(429)) => refused.expect("no third place"),
     }
     timeout(PATIENCE, until(422)).await.expect("places again");
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_bomb_is_refused_before_it_is_unpacked_whole() {
+async fn archive_bomb_is_refused_before_it_is_unpacked() {
     let server = TestServer::start().await;
     let bomb =
         zstd::encode_all(&lone("zeros", 0o644, &vec![0; 65 << 20])[..], 3).expect("compressed");
@@ -224,7 +228,7 @@ async fn a_bomb_is_refused_before_it_is_unpacked_whole() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_refusal_reaches_who_sends_everything_before_reading() {
+async fn refusal_reaches_a_client_that_sends_before_reading() {
     let server = TestServer::start().await;
     let answer = refused_bytes(&server, "", &vec![0; REFUSED_BYTES]).await;
     assert!(answer.starts_with("HTTP/1.1 401 "), "{answer}");
@@ -234,7 +238,7 @@ async fn a_refusal_reaches_who_sends_everything_before_reading() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_an_upload_left_is_gone_after_a_restart() {
+async fn upload_leftovers_are_removed_at_restart() {
     let server = TestServer::start().await;
     let left = server.data().join("incoming/left/package");
     std::fs::create_dir_all(&left).expect("made");

@@ -5,12 +5,12 @@ use std::time::Duration;
 use futures_util::FutureExt as _;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
-use task_proto::digest::Algorithm;
-use task_proto::envelope::SigningKey;
-use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
-use task_proto::person::{Role, Roles};
-use task_proto::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
-use task_proto::report::Phase;
+use task_proto::ids::digest::Algorithm;
+use task_proto::messages::report::Phase;
+use task_proto::packages::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
+use task_proto::packages::publisher::{PackageStatement, SIGNATURE_ARTIFACT};
+use task_proto::people::roles::{Role, Roles};
+use task_proto::trust::envelope::SigningKey;
 use task_proto::{Digest, RepositoryName, RobotId};
 use taskd::blobs::BlobSettings;
 use taskd::blobs::collector::{self, Collected};
@@ -33,7 +33,7 @@ fn task(name: &str) -> Value {
 }
 
 #[tokio::test]
-async fn a_task_package_is_checked_and_listed() {
+async fn task_package_is_checked_and_listed() {
     let registry = TestRegistry::start().await;
     let content = registry.push_blob("talker", &archive_with(b"content")).await;
     let mut no_command = task("talker");
@@ -63,24 +63,28 @@ async fn a_task_package_is_checked_and_listed() {
         refused(400, "MANIFEST_INVALID"),
         "no robot knows it by that name"
     );
-    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+    assert_eq!(registry.registry.store.packages().list().await.expect("packages"), []);
 
     for _ in 0..2 {
         let answer =
             registry.put_manifest("/v2/talker/manifests/1.0.0", MANIFEST_TYPE, &package).await;
         assert_eq!(answer.status(), StatusCode::CREATED);
     }
-    let packages = registry.registry.store.packages().await.expect("packages");
+    let packages = registry.registry.store.packages().list().await.expect("packages");
     let [view] = &packages[..] else { panic!("{packages:?}") };
     assert_eq!((view.package.config, view.package.content), (config, content));
     assert_eq!((view.pushed_at_ms, view.package.version.as_str()), (NOW_MS, "1.0.0"));
-    let found =
-        registry.registry.store.package(&view.package.name, &view.package.manifest.digest).await;
+    let found = registry
+        .registry
+        .store
+        .packages()
+        .get(&view.package.name, &view.package.manifest.digest)
+        .await;
     assert_eq!(found.expect("a package").as_ref(), Some(view));
 
     let manifest = format!("/v2/talker/manifests/{}", view.package.manifest.digest);
     assert_eq!(registry.status(Method::DELETE, &manifest).await, StatusCode::ACCEPTED);
-    assert_eq!(registry.registry.store.packages().await.expect("packages"), []);
+    assert_eq!(registry.registry.store.packages().list().await.expect("packages"), []);
 }
 
 #[tokio::test]
@@ -88,7 +92,7 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
     let registry = TestRegistry::start().await;
     let store = &registry.registry.store;
     let first = registry.push_package("early/talker", "talker").await;
-    assert_eq!(store.packages().await.expect("packages"), [], "a copy alone is no package");
+    assert_eq!(store.packages().list().await.expect("packages"), [], "a copy alone is no package");
     let own = registry.push_package("talker", "talker").await;
     assert_eq!(own, first);
     for mirror in ["mirror/team/talker", "walker"] {
@@ -109,7 +113,7 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
         assert_eq!(referrers["manifests"][0]["digest"], signature.to_string(), "{referrers}");
     }
     // The package is ordered by its own name and listed once.
-    let packages = store.packages().await.expect("packages");
+    let packages = store.packages().list().await.expect("packages");
     assert_eq!(
         packages.iter().map(|view| view.package.name.as_str()).collect::<Vec<_>>(),
         ["talker"]
@@ -132,12 +136,12 @@ async fn package_in_another_repository_is_a_copy_with_its_referrers() {
     // Deleting a copy deletes nothing else, and a remaining copy is no package.
     let status = registry.status(Method::DELETE, &format!("/v2/walker/manifests/{own}")).await;
     assert_eq!(
-        (status, store.packages().await.expect("packages").len()),
+        (status, store.packages().list().await.expect("packages").len()),
         (StatusCode::ACCEPTED, 1)
     );
     let status = registry.status(Method::DELETE, &format!("/v2/talker/manifests/{own}")).await;
     assert_eq!(
-        (status, store.packages().await.expect("packages").len()),
+        (status, store.packages().list().await.expect("packages").len()),
         (StatusCode::ACCEPTED, 0)
     );
     let copy =
@@ -164,7 +168,7 @@ impl TestRegistry {
     /// Pushes a signature of the package with this manifest beside its copy.
     async fn push_signature(&self, repository: &str, manifest: Digest) -> Digest {
         let package =
-            self.registry.store.package(&"talker".parse().expect("a name"), &manifest).await;
+            self.registry.store.packages().get(&"talker".parse().expect("a name"), &manifest).await;
         let package = package.expect("read").expect("there").package;
         let envelope =
             PackageStatement { package: package.clone() }.seal(&SigningKey::from_bytes([7; 32]));
@@ -186,7 +190,7 @@ impl TestRegistry {
     }
 }
 
-async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) {
+async fn version_moves_to_other_content_only_by_force(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
     let registry =
@@ -210,11 +214,11 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
     }
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
-    let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
+    let ordered = registry.registry.store.packages().list().await.expect("packages").remove(0);
     let order = order_of(&ordered);
     let id = fleet
-        .actions
-        .create_deployment(&fleet.operator, &random_key(), &order, &ordered)
+        .deployments
+        .create(&fleet.operator, &random_key(), &order, &ordered)
         .await
         .expect("ordered");
     fleet.follow(&mut robots[0], Phase::Running).await;
@@ -254,7 +258,7 @@ async fn a_version_moves_to_other_content_only_by_force(database: TestDatabase) 
     }
 }
 
-async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
+async fn package_in_use_outlives_its_manifest(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
     let registry =
@@ -269,10 +273,10 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
 
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
-    let ordered = registry.registry.store.packages().await.expect("packages").remove(0);
+    let ordered = registry.registry.store.packages().list().await.expect("packages").remove(0);
     fleet
-        .actions
-        .create_deployment(&fleet.operator, &random_key(), &order_of(&ordered), &ordered)
+        .deployments
+        .create(&fleet.operator, &random_key(), &order_of(&ordered), &ordered)
         .await
         .expect("ordered");
     let robot = serve(registry.registry.clone(), Some(Caller::Robot(robots[0].id.clone()))).await;
@@ -305,23 +309,24 @@ async fn a_package_in_use_outlives_its_manifest(database: TestDatabase) {
     }
 }
 
-async fn what_is_needed_holds_no_push_back_and_is_no_write(database: TestDatabase) {
+async fn collecting_needed_blobs_neither_blocks_pushes_nor_writes(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
     let registry =
         TestRegistry::start_on(store, data, BlobSettings::default(), Some(operator())).await;
     registry.push_image("a", "v1").await;
     // A write that is not committed leaves the number as it was.
-    let turn = async || database.store.begin_keeping_rights().await.expect("begins").turn();
-    let before = turn().await;
+    let sequence =
+        async || database.store.begin_without_auth_invalidation().await.expect("begins").sequence();
+    let before = sequence().await;
     let _push = registry.registry.blobs.hold_collection().await;
     let collected =
         tokio::time::timeout(Duration::from_secs(30), registry.collect(NOW_MS + YEAR_MS)).await;
     assert_eq!(collected.expect("it waits for no push"), Collected::default());
-    assert_eq!(turn().await, before);
+    assert_eq!(sequence().await, before);
 }
 
-async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) {
+async fn blob_needed_since_the_lookup_is_kept(database: TestDatabase) {
     let data = tempfile::tempdir().expect("a directory");
     let store = database.store.clone();
     let registry =
@@ -357,7 +362,7 @@ async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) 
         document: None,
     };
     let repository: RepositoryName = "a".parse().expect("a name");
-    let put = store.put_manifest(&repository, &new, None, NOW_MS).await;
+    let put = store.manifests().put(&repository, &new, None, NOW_MS).await;
     assert_eq!(put.expect("writes"), PutManifest::Stored);
     drop(push);
     assert_eq!(collecting.await.expect("it ends").blobs, 1);
@@ -368,14 +373,14 @@ async fn what_is_needed_since_it_was_looked_for_is_kept(database: TestDatabase) 
 }
 
 on_both_databases! {
-    a_version_moves_to_other_content_only_by_force,
-    a_package_in_use_outlives_its_manifest,
-    what_is_needed_holds_no_push_back_and_is_no_write,
-    what_is_needed_since_it_was_looked_for_is_kept,
+    version_moves_to_other_content_only_by_force,
+    package_in_use_outlives_its_manifest,
+    collecting_needed_blobs_neither_blocks_pushes_nor_writes,
+    blob_needed_since_the_lookup_is_kept,
 }
 
 #[tokio::test]
-async fn what_nothing_refers_to_is_collected_after_its_grace() {
+async fn unreferenced_blob_is_collected_after_its_grace() {
     let registry = TestRegistry::start().await;
     let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
     let manifest = registry.push_image("a", "kept").await;
@@ -399,7 +404,7 @@ async fn what_nothing_refers_to_is_collected_after_its_grace() {
 }
 
 #[tokio::test]
-async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
+async fn head_request_keeps_a_blob_only_with_push_permission() {
     let registry = TestRegistry::start().await;
     let grace_ms = u64::try_from(GRACE.as_millis()).expect("small");
     let robot = RobotId::random();
@@ -445,7 +450,7 @@ async fn only_who_may_push_there_spares_a_blob_by_asking_for_it() {
 }
 
 #[tokio::test]
-async fn uploads_that_were_given_up_are_collected() {
+async fn abandoned_uploads_are_collected() {
     let registry = TestRegistry::start().await;
     let upload = registry.begin("a").await;
     // The file's time is the machine's, which is before the test's.

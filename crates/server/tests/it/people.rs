@@ -7,36 +7,36 @@ use task_proto::api::{
     AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditRobot, EditUser, LogIn,
     TokenOrigin,
 };
-use task_proto::audit::{AuditEntry, Link};
-use task_proto::manifest::TaskKind;
-use task_proto::person::{Permission, Roles};
-use task_proto::report::Phase;
-use task_proto::selector::Selector;
-use task_proto::token::{Token, TokenKind};
+use task_proto::ids::selector::Selector;
+use task_proto::messages::report::Phase;
+use task_proto::packages::manifest::TaskKind;
+use task_proto::people::audit::{AuditEntry, ChainLink};
+use task_proto::people::roles::{Permission, Roles};
+use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{Digest, RobotId, TokenId, UserName};
 use taskd::domain::person::Person;
 use taskd::http::error::ApiError;
 use taskd::net::tls::ClientProof;
-use taskd::orders::actions::{ActionError, TaskOrder};
+use taskd::orders::actions::{PersonError, TaskOrder};
 use taskd::store::{Deletion, Store, StoreError, TokenHolder};
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, order_of, package, random_key};
-use crate::story::code;
+use crate::story::{code, refusal};
 
 on_both_databases! {
-    a_person_may_what_roles_and_token_both_allow,
-    an_order_beyond_the_scope_is_refused_as_a_whole,
-    a_robot_stays_in_its_editors_scope,
-    a_password_opens_and_a_changed_one_closes,
-    wrong_passwords_are_counted_by_account_and_by_address,
-    the_last_way_in_stays_open,
-    tokens_end_with_what_they_came_from,
-    what_is_done_is_written_down_and_nothing_else_is,
-    an_act_that_fails_leaves_no_entry,
-    everybodys_own_acts_are_bounded_and_orders_are_not,
-    a_changed_audit_is_found_out,
-    another_persons_key_is_another_key,
+    rights_are_those_allowed_by_role_and_token,
+    order_beyond_the_scope_is_refused_as_a_whole,
+    edited_robot_stays_in_the_editors_scope,
+    password_change_ends_the_old_password_and_its_sign_ins,
+    wrong_passwords_are_limited_by_account_and_address,
+    last_administrator_is_not_removed,
+    token_ends_with_its_parent,
+    audit_has_every_change_and_no_read,
+    failed_act_leaves_no_audit_entry,
+    self_service_acts_are_rate_limited_and_orders_are_not,
+    changed_audit_entry_breaks_the_chain,
+    idempotency_key_of_another_person_is_refused,
 }
 
 pub const PASSWORD: &str = "correct horse battery";
@@ -55,15 +55,20 @@ pub fn selector(text: &str) -> Selector {
 }
 
 impl Fleet {
-    async fn add(&self, who: &str, may: &str, scope: Option<&str>) {
+    pub async fn add(&self, who: &str, may: &str, scope: Option<&str>) {
         let (password, scope) = (Some(PASSWORD.to_owned()), scope.map(selector));
         let order = AddUser { name: name(who), roles: roles(may), scope, password };
-        self.actions.add_user(&self.operator, &order).await.expect("added");
+        self.people.add_user(&self.operator, &order).await.expect("added");
     }
 
-    async fn sign_in(&self, who: &str, password: &str, from: IpAddr) -> Result<Token, ActionError> {
+    pub async fn sign_in(
+        &self,
+        who: &str,
+        password: &str,
+        from: IpAddr,
+    ) -> Result<Token, PersonError> {
         let order = LogIn { user: name(who), password: password.to_owned(), ttl_s: None };
-        Ok(self.actions.sign_in(&order, TokenOrigin::Login, from).await?.token)
+        Ok(self.people.sign_in(&order, TokenOrigin::Login, from).await?.token)
     }
 
     /// The person that the token stands for now.
@@ -71,7 +76,8 @@ impl Fleet {
         match self
             .database
             .store
-            .admit(token, &ClientProof::NotAsked, self.clock.now_ms())
+            .tokens()
+            .admit(token, &ClientProof::NotRequested, self.clock.now_ms())
             .await
             .expect("reads")?
             .holder
@@ -91,12 +97,12 @@ impl Fleet {
         let labels =
             [(labels.0.parse().expect("a key"), labels.1.parse().expect("a value"))].into();
         let edit = EditRobot { labels: Some(labels), ..EditRobot::default() };
-        self.actions.edit_robot(&self.operator, &robot.id, &edit).await.expect("edited");
+        self.robots.edit(&self.operator, &robot.id, &edit).await.expect("edited");
     }
 
     async fn audit(&self) -> Vec<AuditEntry> {
         let query = AuditQuery { after: Some(0), ..AuditQuery::default() };
-        let page = self.database.store.audit(&query).await.expect("reads");
+        let page = self.database.store.audit().page(&query).await.expect("reads");
         verified(&page).expect("holds");
         page.records.iter().map(|record| record.read().expect("an entry")).collect()
     }
@@ -108,15 +114,15 @@ impl Fleet {
     }
 }
 
-fn verified(page: &AuditPage) -> Result<Link, task_proto::audit::BrokenChain> {
-    page.records.iter().try_fold(Link::START, Link::follow)
+fn verified(page: &AuditPage) -> Result<ChainLink, task_proto::people::audit::BrokenChain> {
+    page.records.iter().try_fold(ChainLink::START, ChainLink::append)
 }
 
 fn act(who: &str, act: &str, target: impl ToString) -> (String, String, String) {
     (who.to_owned(), act.to_owned(), target.to_string())
 }
 
-async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
+async fn rights_are_those_allowed_by_role_and_token(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator,publisher", Some("site=lab")).await;
     let alice = fleet.signed_in("alice").await;
@@ -133,7 +139,7 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
         ttl_s: Some(3600),
         ..CreateToken::default()
     };
-    let made = fleet.actions.create_token(&alice, &narrow).await.expect("made");
+    let made = fleet.people.create_token(&alice, &narrow).await.expect("made");
     let token: Token = made.token.parse().expect("a token");
     let dashboard = fleet.person(&token).await.expect("good");
     assert_eq!(allowed(&dashboard), [Permission::Read, Permission::Publish]);
@@ -142,16 +148,16 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     // A token creates no other tokens, because the chain would never end; and no user creates a
     // token with more permissions than their own.
     assert_eq!(
-        code(fleet.actions.create_token(&dashboard, &CreateToken::default()).await),
+        code(fleet.people.create_token(&dashboard, &CreateToken::default()).await),
         "forbidden"
     );
     let wide = CreateToken { roles: Some(roles("admin")), ..CreateToken::default() };
-    assert_eq!(code(fleet.actions.create_token(&alice, &wide).await), "invalid_request");
+    assert_eq!(code(fleet.people.create_token(&alice, &wide).await), "invalid_request");
     let for_bob = CreateToken { user: Some(name("bob")), ..CreateToken::default() };
-    assert_eq!(code(fleet.actions.create_token(&alice, &for_bob).await), "forbidden");
-    assert_eq!(code(fleet.actions.create_token(&fleet.operator, &for_bob).await), "not_found");
+    assert_eq!(code(fleet.people.create_token(&alice, &for_bob).await), "forbidden");
+    assert_eq!(code(fleet.people.create_token(&fleet.operator, &for_bob).await), "not_found");
     assert_eq!(
-        code(fleet.actions.create_token(&fleet.operator, &CreateToken::default()).await),
+        code(fleet.people.create_token(&fleet.operator, &CreateToken::default()).await),
         "invalid_request"
     );
 
@@ -159,16 +165,12 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     // is gone.
     let edit = |may: &str| EditUser { roles: Some(roles(may)), scope: Some(selector("*")) };
     fleet
-        .actions
+        .people
         .edit_user(&fleet.operator, &name("alice"), &edit("publisher"))
         .await
         .expect("edited");
     assert_eq!(fleet.person(&token).await.expect("good").scope.to_string(), "r1,r2");
-    fleet
-        .actions
-        .edit_user(&fleet.operator, &name("alice"), &edit("viewer"))
-        .await
-        .expect("edited");
+    fleet.people.edit_user(&fleet.operator, &name("alice"), &edit("viewer")).await.expect("edited");
     assert_eq!(fleet.person(&token).await, None);
     // An administrator with a scope does not administer settings that concern all users.
     fleet.add("boss", "admin", Some("site=lab")).await;
@@ -176,7 +178,7 @@ async fn a_person_may_what_roles_and_token_both_allow(database: TestDatabase) {
     assert!(boss.may(Permission::Maintain) && !boss.may(Permission::Administer));
 }
 
-async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase) {
+async fn order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     fleet.label(&robots[0], "site=lab").await;
@@ -190,15 +192,15 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     };
     let ordered = |to: &'static str| {
         let (fleet, alice, order, bundle) = (&fleet, &alice, order(to), &bundle);
-        async move { fleet.actions.create_deployment(alice, &random_key(), &order, bundle).await }
+        async move { fleet.deployments.create(alice, &random_key(), &order, bundle).await }
     };
-    let refused = ordered("*").await.expect_err("refused");
+    let refused = refusal(ordered("*").await);
     let expected =
         "1 of the 3 robots of \"*\" are outside of alice's scope \"site=lab\"; nothing was done";
-    assert_eq!((refused.code(), refused.to_string().as_str()), ("out_of_scope", expected));
+    assert_eq!((refused.code, refused.message.as_str()), ("out_of_scope", expected));
     assert_eq!(code(ordered("r2").await), "unknown_robots");
     assert_eq!(code(ordered("r0,r2").await), "unknown_robots");
-    assert_eq!(code(fleet.actions.matching_robots(&alice, &selector("*")).await), "out_of_scope");
+    assert_eq!(code(fleet.deployments.preview(&alice, &selector("*")).await), "out_of_scope");
     assert_eq!(code(ordered("site=mars").await), "no_robots_match");
     assert_eq!(fleet.acts_since(before).await, []);
     assert!(
@@ -213,19 +215,20 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
         fleet.follow(robot, Phase::Running).await;
     }
     let (task, key) = ("talker".parse().expect("a name"), random_key());
-    let stop = fleet.actions.order_task(&alice, &key, TaskOrder::Stop, &task, &selector("*")).await;
+    let stop =
+        fleet.deployments.order_task(&alice, &key, TaskOrder::Stop, &task, &selector("*")).await;
     assert_eq!(code(stop), "out_of_scope");
     assert_eq!(
-        code(fleet.actions.robots_with_task(&alice, &task, &selector("*")).await),
+        code(fleet.deployments.preview_task_order(&alice, &task, &selector("*")).await),
         "out_of_scope"
     );
-    assert_eq!(code(fleet.actions.cancel_deployment(&alice, &everywhere).await), "out_of_scope");
-    assert_eq!(code(fleet.actions.resume_deployment(&alice, &everywhere).await), "out_of_scope");
-    let over = fleet.actions.cancel_deployment(&alice, &own).await;
+    assert_eq!(code(fleet.deployments.cancel(&alice, &everywhere).await), "out_of_scope");
+    assert_eq!(code(fleet.deployments.resume(&alice, &everywhere).await), "out_of_scope");
+    let over = fleet.deployments.cancel(&alice, &own).await;
     assert_eq!(code(over), "nothing_to_cancel", "all of it is hers, and over");
     let lab = selector("site=lab");
     let stopped = fleet
-        .actions
+        .deployments
         .order_task(&alice, &key, TaskOrder::Stop, &task, &lab)
         .await
         .expect("ordered");
@@ -233,10 +236,11 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     assert_eq!(fleet.phases(&everywhere).await[2], Phase::Running);
 
     // And of lists she sees her part.
-    let mine = fleet.database.store.robots_in(&alice.scope).await.expect("reads");
+    let mine = fleet.database.store.robots().ids_in(&alice.scope).await.expect("reads");
     assert_eq!(mine.len(), 2);
     let parts = async |robots: &[RobotId]| {
-        let page = fleet.database.store.deployments(Some(robots), None, 10).await.expect("reads");
+        let page =
+            fleet.database.store.deployments().page(Some(robots), None, 10).await.expect("reads");
         page.expect("no other was named").deployments
     };
     let (none, parts) = (parts(&[]).await, parts(&mine).await);
@@ -247,7 +251,7 @@ async fn an_order_beyond_the_scope_is_refused_as_a_whole(database: TestDatabase)
     assert_eq!(none, []);
 }
 
-async fn a_robot_stays_in_its_editors_scope(database: TestDatabase) {
+async fn edited_robot_stays_in_the_editors_scope(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     fleet.label(&robots[0], "site=lab").await;
@@ -255,21 +259,18 @@ async fn a_robot_stays_in_its_editors_scope(database: TestDatabase) {
     let boss = fleet.signed_in("boss").await;
     let field = [("site".parse().expect("a key"), "field".parse().expect("a value"))].into();
     let out = EditRobot { labels: Some(field), ..EditRobot::default() };
-    assert_eq!(code(fleet.actions.edit_robot(&boss, &robots[0].id, &out).await), "out_of_scope");
+    assert_eq!(code(fleet.robots.edit(&boss, &robots[0].id, &out).await), "out_of_scope");
     let lab = [("site".parse().expect("a key"), "lab".parse().expect("a value"))].into();
     let pulled_in = EditRobot { labels: Some(lab), ..EditRobot::default() };
-    assert_eq!(
-        code(fleet.actions.edit_robot(&boss, &robots[1].id, &pulled_in).await),
-        "out_of_scope"
-    );
-    assert_eq!(code(fleet.actions.remove_robot(&boss, &robots[1].id).await), "out_of_scope");
+    assert_eq!(code(fleet.robots.edit(&boss, &robots[1].id, &pulled_in).await), "out_of_scope");
+    assert_eq!(code(fleet.robots.remove(&boss, &robots[1].id).await), "out_of_scope");
     let renamed =
         EditRobot { name: Some("atlas".parse().expect("a name")), ..EditRobot::default() };
-    fleet.actions.edit_robot(&boss, &robots[0].id, &renamed).await.expect("it is his");
-    fleet.actions.remove_robot(&boss, &robots[0].id).await.expect("it is his");
+    fleet.robots.edit(&boss, &robots[0].id, &renamed).await.expect("it is his");
+    fleet.robots.remove(&boss, &robots[0].id).await.expect("it is his");
 }
 
-async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
+async fn password_change_ends_the_old_password_and_its_sign_ins(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator", None).await;
     for (who, password) in [("alice", "wrong"), ("bob", PASSWORD), ("operator.token", PASSWORD)] {
@@ -281,16 +282,16 @@ async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
     );
     let (token, other) = (token.expect("signed in"), other.expect("signed in"));
     let alice = fleet.person(&token).await.expect("good");
-    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
+    let made = fleet.people.create_token(&alice, &CreateToken::default()).await.expect("made");
     let change = |old: &str, new: &str| ChangePassword { old: old.to_owned(), new: new.to_owned() };
-    let changed = fleet.actions.change_password(&alice, &change("wrong", "another long one")).await;
-    assert_eq!(changed.expect_err("refused").to_string(), "old: it is wrong");
+    let changed = fleet.people.change_password(&alice, &change("wrong", "another long one")).await;
+    assert_eq!(changed.expect_err("refused").to_string(), "old: the old password is wrong");
     assert_eq!(
-        code(fleet.actions.change_password(&alice, &change(PASSWORD, "short")).await),
+        code(fleet.people.change_password(&alice, &change(PASSWORD, "short")).await),
         "invalid_request"
     );
     fleet
-        .actions
+        .people
         .change_password(&alice, &change(PASSWORD, "another long one"))
         .await
         .expect("changed");
@@ -303,25 +304,25 @@ async fn a_password_opens_and_a_changed_one_closes(database: TestDatabase) {
         "what was made on purpose"
     );
     // An administrator who sets the password signs out all of the user's sessions.
-    fleet.actions.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
+    fleet.people.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
     assert_eq!(fleet.person(&token).await, None);
     assert_eq!(
-        code(fleet.actions.set_password(&fleet.operator, &name("bob"), PASSWORD).await),
+        code(fleet.people.set_password(&fleet.operator, &name("bob"), PASSWORD).await),
         "not_found"
     );
-    let first = fleet.actions.change_password(&fleet.operator, &change(PASSWORD, PASSWORD)).await;
+    let first = fleet.people.change_password(&fleet.operator, &change(PASSWORD, PASSWORD)).await;
     assert_eq!(code(first), "forbidden");
     // Without a password, no sign-in by password succeeds.
     let order =
         AddUser { name: name("ci"), roles: roles("publisher"), scope: None, password: None };
-    assert!(!fleet.actions.add_user(&fleet.operator, &order).await.expect("added").has_password);
+    assert!(!fleet.people.add_user(&fleet.operator, &order).await.expect("added").has_password);
     assert_eq!(code(fleet.sign_in("ci", "", HERE).await), "unauthorized");
-    assert_eq!(code(fleet.actions.add_user(&fleet.operator, &order).await), "user_exists");
+    assert_eq!(code(fleet.people.add_user(&fleet.operator, &order).await), "user_exists");
     let reserved = AddUser { name: name("operator.token"), ..order };
-    assert_eq!(code(fleet.actions.add_user(&fleet.operator, &reserved).await), "user_exists");
+    assert_eq!(code(fleet.people.add_user(&fleet.operator, &reserved).await), "user_exists");
 }
 
-async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDatabase) {
+async fn wrong_passwords_are_limited_by_account_and_address(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator", None).await;
     fleet.sign_in("alice", PASSWORD, HERE).await.expect("signed in");
@@ -331,12 +332,10 @@ async fn wrong_passwords_are_counted_by_account_and_by_address(database: TestDat
     }
     let before = fleet.audit().await.len();
     for n in 10..13 {
-        let refused = fleet
-            .sign_in("alice", PASSWORD, stranger(n))
-            .await
-            .expect_err("not even the right one");
-        assert_eq!(refused.code(), "too_many_requests");
-        assert_eq!(refused.to_string(), "too many wrong passwords; try again in 900 s");
+        // Not even the right one is accepted.
+        let refused = refusal(fleet.sign_in("alice", PASSWORD, stranger(n)).await);
+        assert_eq!(refused.code, "too_many_requests");
+        assert_eq!(refused.message, "too many wrong passwords; try again in 900 s");
     }
     assert_eq!(fleet.acts_since(before).await, [act("server", "sign_in.blocked", "alice")], "once");
     fleet.sign_in("alice", PASSWORD, HERE).await.expect("from where she came before she still can");
@@ -368,16 +367,16 @@ async fn neighbours_of_a_failing_address(fleet: &Fleet) {
     fleet.sign_in("alice", PASSWORD, HERE).await.expect("she is known here");
 }
 
-async fn the_last_way_in_stays_open(database: TestDatabase) {
+async fn last_administrator_is_not_removed(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let first = Token::random(TokenKind::Operator);
-    fleet.database.store.create_operator_token(&first, fleet.clock.now_ms()).await.expect("stored");
+    fleet.database.store.tokens().create_first(&first, fleet.clock.now_ms()).await.expect("stored");
     let first_id: TokenId = first.id().parse().expect("an id");
     let by = fleet.person(&first).await.expect("good");
     assert!(by.is_first());
-    let revoked = fleet.actions.revoke_token(&by, &first_id).await;
-    let said =
-        "operator.token is the last administrator with a way in; give another one a password first";
+    let revoked = fleet.people.revoke_token(&by, &first_id).await;
+    let said = "operator.token is the last administrator who can sign in; \
+                give another administrator a password first";
     assert_eq!(revoked.expect_err("refused").to_string(), said);
     for (who, may, scope) in
         [("boss", "admin", None), ("other", "admin", Some("site=lab")), ("op", "operator", None)]
@@ -385,53 +384,53 @@ async fn the_last_way_in_stays_open(database: TestDatabase) {
         fleet.add(who, may, scope).await;
     }
     let boss = fleet.signed_in("boss").await;
-    fleet.actions.revoke_token(&boss, &fleet.operator.token).await.expect("there is another");
-    fleet.actions.revoke_token(&boss, &first_id).await.expect("there is another");
-    fleet.actions.revoke_token(&boss, &first_id).await.expect("twice is harmless");
+    fleet.people.revoke_token(&boss, &fleet.operator.token).await.expect("there is another");
+    fleet.people.revoke_token(&boss, &first_id).await.expect("there is another");
+    fleet.people.revoke_token(&boss, &first_id).await.expect("twice is harmless");
     assert_eq!(fleet.person(&first).await, None);
     let demoted = EditUser { roles: Some(roles("viewer")), scope: None };
     let limited = EditUser { roles: None, scope: Some(selector("site=lab")) };
     assert_eq!(
-        code(fleet.actions.edit_user(&boss, &name("boss"), &demoted).await),
+        code(fleet.people.edit_user(&boss, &name("boss"), &demoted).await),
         "last_administrator"
     );
     assert_eq!(
-        code(fleet.actions.edit_user(&boss, &name("boss"), &limited).await),
+        code(fleet.people.edit_user(&boss, &name("boss"), &limited).await),
         "last_administrator"
     );
-    assert_eq!(code(fleet.actions.remove_user(&boss, &name("boss")).await), "last_administrator");
+    assert_eq!(code(fleet.people.remove_user(&boss, &name("boss")).await), "last_administrator");
     // The token in the data directory does not come back to life.
     fleet.actions.expire().await.expect("done");
-    let stored = fleet.database.store.create_operator_token(&first, fleet.clock.now_ms()).await;
+    let stored = fleet.database.store.tokens().create_first(&first, fleet.clock.now_ms()).await;
     assert!(stored.is_err_and(|error| error.is_unique_violation()));
-    fleet.actions.remove_user(&boss, &name("other")).await.expect("she was none");
+    fleet.people.remove_user(&boss, &name("other")).await.expect("she was none");
 }
 
-async fn tokens_end_with_what_they_came_from(database: TestDatabase) {
+async fn token_ends_with_its_parent(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator", None).await;
     fleet.add("bob", "viewer", None).await;
     let token = fleet.sign_in("alice", PASSWORD, HERE).await.expect("signed in");
     let (alice, bob) = (fleet.person(&token).await.expect("good"), fleet.signed_in("bob").await);
-    let listed = fleet.actions.tokens(&alice, false).await.expect("reads").tokens;
+    let listed = fleet.people.tokens(&alice, false).await.expect("reads").tokens;
     assert_eq!(listed.len(), 1);
     assert_eq!((&listed[0].id, listed[0].origin), (&alice.token, TokenOrigin::Login));
-    assert_eq!(code(fleet.actions.revoke_token(&bob, &alice.token).await), "not_found");
-    fleet.actions.sign_out(&alice).await.expect("out");
+    assert_eq!(code(fleet.people.revoke_token(&bob, &alice.token).await), "not_found");
+    fleet.people.sign_out(&alice, None).await.expect("out");
     assert_eq!(fleet.person(&token).await, None);
 
     let ttl = CreateToken { ttl_s: Some(60), ..CreateToken::default() };
     let alice = fleet.signed_in("alice").await;
-    let made = fleet.actions.create_token(&alice, &ttl).await.expect("made");
+    let made = fleet.people.create_token(&alice, &ttl).await.expect("made");
     let short: Token = made.token.parse().expect("a token");
     assert!(fleet.person(&short).await.is_some());
     fleet.clock.advance_ms(60_000);
     assert_eq!(fleet.person(&short).await, None);
     let ended = fleet.actions.expire().await.expect("done");
     assert!(ended.contains(&name("alice")) && !ended.contains(&name("bob")), "{ended:?}");
-    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
+    let made = fleet.people.create_token(&alice, &CreateToken::default()).await.expect("made");
     let lasting: Token = made.token.parse().expect("a token");
-    fleet.actions.remove_user(&fleet.operator, &name("alice")).await.expect("removed");
+    fleet.people.remove_user(&fleet.operator, &name("alice")).await.expect("removed");
     assert_eq!(fleet.person(&lasting).await, None);
     // The next user with this name inherits nothing.
     fleet.add("alice", "admin", None).await;
@@ -441,10 +440,10 @@ async fn tokens_end_with_what_they_came_from(database: TestDatabase) {
     for _ in 0..3 {
         fleet.signed_in("alice").await;
     }
-    assert!(fleet.actions.tokens(&newest, false).await.expect("reads").tokens.len() <= 50);
+    assert!(fleet.people.tokens(&newest, false).await.expect("reads").tokens.len() <= 50);
 }
 
-async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase) {
+async fn audit_has_every_change_and_no_read(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     fleet.add("alice", "admin", None).await;
@@ -467,27 +466,28 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     let (task, all) = ("talker".parse().expect("a name"), selector("*"));
     let bundle = package("1", TaskKind::Service);
     let key = random_key();
-    let id = fleet
-        .actions
-        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
-        .await
-        .expect("ordered");
+    let id =
+        fleet.deployments.create(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
     fleet
-        .actions
-        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .deployments
+        .create(&alice, &key, &order_of(&bundle), &bundle)
         .await
         .expect("the same again");
     // Robots' reports are not people's acts.
     fleet.follow(&mut robots[0], Phase::Running).await;
     fleet.actions.expire().await.expect("nobody's business");
     for order in [TaskOrder::Stop, TaskOrder::Start, TaskOrder::Remove] {
-        fleet.actions.order_task(&alice, &random_key(), order, &task, &all).await.expect("ordered");
+        fleet
+            .deployments
+            .order_task(&alice, &random_key(), order, &task, &all)
+            .await
+            .expect("ordered");
     }
-    fleet.actions.cancel_deployment(&alice, &id).await.expect("cancelled");
-    fleet.actions.cancel_deployment(&alice, &id).await.expect("again is nothing");
-    let made = fleet.actions.create_token(&alice, &CreateToken::default()).await.expect("made");
-    fleet.actions.revoke_token(&alice, &made.id).await.expect("revoked");
-    fleet.actions.remove_robot(&alice, &robots[0].id).await.expect("removed");
+    fleet.deployments.cancel(&alice, &id).await.expect("cancelled");
+    fleet.deployments.cancel(&alice, &id).await.expect("again is nothing");
+    let made = fleet.people.create_token(&alice, &CreateToken::default()).await.expect("made");
+    fleet.people.revoke_token(&alice, &made.id).await.expect("revoked");
+    fleet.robots.remove(&alice, &robots[0].id).await.expect("removed");
     let expected = [
         act("alice", "deployment.create", &id),
         act("alice", "task.stop", "talker"),
@@ -505,7 +505,7 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     assert_eq!((created.detail["robots"].as_str(), created.detail["count"].as_str()), ("*", "1"));
 
     let found = async |query: AuditQuery| -> Vec<u64> {
-        let page = fleet.database.store.audit(&query).await.expect("reads");
+        let page = fleet.database.store.audit().page(&query).await.expect("reads");
         page.records.iter().map(|record| record.read().expect("an entry").number).collect()
     };
     let by = |who: &str| AuditQuery { who: Some(who.to_owned()), ..AuditQuery::default() };
@@ -522,34 +522,35 @@ async fn what_is_done_is_written_down_and_nothing_else_is(database: TestDatabase
     assert_eq!(found(AuditQuery { after: Some(10), ..AuditQuery::default() }).await, [11, 12]);
 }
 
-async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
+async fn failed_act_leaves_no_audit_entry(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let before = fleet.audit().await.len();
     let taken = EditRobot { name: Some("r1".parse().expect("a name")), ..EditRobot::default() };
-    assert_eq!(
-        code(fleet.actions.edit_robot(&fleet.operator, &robots[0].id, &taken).await),
-        "name_taken"
-    );
+    assert_eq!(code(fleet.robots.edit(&fleet.operator, &robots[0].id, &taken).await), "name_taken");
     let repository = "talker".parse().expect("a name");
-    let deed =
-        taskd::store::Deed::by(&fleet.operator, taskd::store::Act::ManifestDelete, &repository);
+    let event = taskd::store::AuditEvent::by(
+        &fleet.operator,
+        taskd::store::AuditAction::ManifestDelete,
+        &repository,
+    );
     let store = &fleet.database.store;
     let missing =
-        store.delete_manifest(&repository, &Digest::of(b"x"), &deed, 1).await.expect("reads");
+        store.manifests().delete(&repository, &Digest::of(b"x"), &event, 1).await.expect("reads");
     assert_eq!(missing, Deletion::Unknown);
     let missing = store
-        .delete_tag(&repository, &"latest".parse().expect("a tag"), &deed, 1)
+        .tags()
+        .delete(&repository, &"latest".parse().expect("a tag"), &event, 1)
         .await
         .expect("reads");
     assert_eq!(missing, Deletion::Unknown);
     // A write that is dropped after its entry was written takes the entry with it.
     let mut write = store.begin().await.expect("begins");
-    write.audit(&deed, 1).await.expect("written");
+    write.audit().record(&event, 1).await.expect("written");
     drop(write);
     assert_eq!(fleet.acts_since(before).await, []);
     let mut write = store.begin().await.expect("begins");
-    write.audit(&deed, 1).await.expect("written");
+    write.audit().record(&event, 1).await.expect("written");
     write.commit().await.expect("stored");
     assert_eq!(
         fleet.acts_since(before).await,
@@ -557,7 +558,7 @@ async fn an_act_that_fails_leaves_no_entry(database: TestDatabase) {
     );
 }
 
-async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDatabase) {
+async fn self_service_acts_are_rate_limited_and_orders_are_not(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     fleet.deploy("1", |_| {}).await;
@@ -567,12 +568,12 @@ async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDataba
     let before = fleet.audit().await.len();
     let mut made = 0;
     let refused = loop {
-        let token = match fleet.actions.create_token(&vera, &order).await {
+        let token = match fleet.people.create_token(&vera, &order).await {
             Ok(token) => token,
             Err(refused) => break refused,
         };
         made += 1;
-        fleet.actions.revoke_token(&vera, &token.id).await.expect("one may always end one's own");
+        fleet.people.revoke_token(&vera, &token.id).await.expect("one may always end one's own");
         assert!(made < 1_000, "it goes on without end");
     };
     let ApiError { status, code, message, retry_after_s } = refused.into();
@@ -587,48 +588,46 @@ async fn everybodys_own_acts_are_bounded_and_orders_are_not(database: TestDataba
         let task = "talker".parse().expect("a name");
         let all = "*".parse().expect("a selector");
         fleet
-            .actions
+            .deployments
             .order_task(&ada, &random_key(), TaskOrder::Stop, &task, &all)
             .await
             .expect("ordered");
     }
 }
 
-async fn a_changed_audit_is_found_out(database: TestDatabase) {
+async fn changed_audit_entry_breaks_the_chain(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(3).await;
     let url = fleet.database.url.clone();
     let whole = AuditQuery { after: Some(0), ..AuditQuery::default() };
-    let page = fleet.database.store.audit(&whole).await.expect("reads");
+    let page = fleet.database.store.audit().page(&whole).await.expect("reads");
     assert_eq!(verified(&page).expect("holds").number, page.last);
     fleet.database.forge_audit(2, "r0", "r9").await;
     let store = Store::open(&url).await.expect("opens");
-    let page: Result<AuditPage, StoreError> = store.audit(&whole).await;
+    let page: Result<AuditPage, StoreError> = store.audit().page(&whole).await;
     let broken = verified(&page.expect("reads")).expect_err("found out");
-    assert_eq!(broken, task_proto::audit::BrokenChain::Changed { number: 2 });
+    assert_eq!(broken, task_proto::people::audit::BrokenChain::Changed { number: 2 });
     fleet.database.drop_audit(2).await;
-    let broken = verified(&store.audit(&whole).await.expect("reads")).expect_err("found out");
-    assert_eq!(broken, task_proto::audit::BrokenChain::Missing { expected: 2, found: 3 });
+    let broken =
+        verified(&store.audit().page(&whole).await.expect("reads")).expect_err("found out");
+    assert_eq!(broken, task_proto::people::audit::BrokenChain::Missing { expected: 2, found: 3 });
 }
 
-async fn another_persons_key_is_another_key(database: TestDatabase) {
+async fn idempotency_key_of_another_person_is_refused(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     fleet.add("alice", "operator", None).await;
     fleet.add("bob", "operator", None).await;
     let (alice, bob) = (fleet.signed_in("alice").await, fleet.signed_in("bob").await);
     let (key, bundle) = (random_key(), package("1", TaskKind::Service));
-    let id = fleet
-        .actions
-        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
-        .await
-        .expect("ordered");
+    let id =
+        fleet.deployments.create(&alice, &key, &order_of(&bundle), &bundle).await.expect("ordered");
     let again = fleet
-        .actions
-        .create_deployment(&alice, &key, &order_of(&bundle), &bundle)
+        .deployments
+        .create(&alice, &key, &order_of(&bundle), &bundle)
         .await
         .expect("the same");
     assert_eq!(again, id);
-    let other = fleet.actions.create_deployment(&bob, &key, &order_of(&bundle), &bundle).await;
+    let other = fleet.deployments.create(&bob, &key, &order_of(&bundle), &bundle).await;
     assert_eq!(code(other), "idempotency_key_reused");
 }

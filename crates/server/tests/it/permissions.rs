@@ -2,7 +2,7 @@
 //! subscribes on every MQTT topic of a robot. The results are docs/permissions.md. After an
 //! intended change: `UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions`. A new route of the
 //! table is tried without further work; give it a body in `body` and values for its parameters in
-//! `Town::path`, if needed.
+//! `Fixture::path`, if needed.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -12,9 +12,9 @@ use reqwest::Method;
 use serde_json::{Value, json};
 use task_proto::api::{DeploymentView, EnrollmentToken, ServerInfo, TokenOrigin};
 use task_proto::desired::PackageRef;
-use task_proto::person::{Permission, Role, Roles};
-use task_proto::token::{Token, TokenKind};
-use task_proto::topic::RobotTopic;
+use task_proto::messages::topic::RobotTopic;
+use task_proto::people::roles::{Permission, Role, Roles};
+use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{Digest, UserName};
 use taskd::config::{Config, OidcSettings};
 use taskd::http::{Route, routes};
@@ -27,9 +27,9 @@ const DOCUMENT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/permissi
 
 /// All kinds of clients.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Comer {
+enum TestCaller {
     Nobody,
-    Enrolment,
+    Enrollment,
     Itself,
     OtherRobot,
     Person(Role),
@@ -37,10 +37,10 @@ enum Comer {
     Elsewhere(Role),
 }
 
-impl Comer {
+impl TestCaller {
     const ALL: [Self; 10] = [
         Self::Nobody,
-        Self::Enrolment,
+        Self::Enrollment,
         Self::Itself,
         Self::OtherRobot,
         Self::Person(Role::Viewer),
@@ -54,11 +54,11 @@ impl Comer {
     fn title(self) -> String {
         match self {
             Self::Nobody => "nobody".to_owned(),
-            Self::Enrolment => "enrolment token".to_owned(),
+            Self::Enrollment => "enrollment token".to_owned(),
             Self::Itself => "the robot".to_owned(),
             Self::OtherRobot => "another robot".to_owned(),
             Self::Person(role) => role.to_string(),
-            Self::Elsewhere(role) => format!("{role} of other robots"),
+            Self::Elsewhere(role) => format!("{role} elsewhere"),
         }
     }
 }
@@ -72,18 +72,18 @@ struct Probe {
 }
 
 /// A server with one client of each kind.
-struct Town {
+struct Fixture {
     server: TestServer,
     /// The server's database, where users and tokens are created without hashing and signing in.
     store: Store,
     robot: TestRobot,
     other_robot: TestRobot,
-    enrolment: String,
+    enrollment: String,
     package: PackageRef,
     deployment: DeploymentView,
 }
 
-impl Town {
+impl Fixture {
     async fn new() -> Self {
         // The provider does not answer: only permission to go there counts.
         let issuer = "http://127.0.0.1:9".to_owned();
@@ -106,8 +106,17 @@ impl Town {
             (server.push("talker", "1.0.0").await, server.push("walker", "1.0.0").await);
         let deployment = server.deploy(&talker, "atlas", "talker").await;
         server.deploy(&package, "atlas", "walker").await;
-        let enrolment: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
-        Self { server, store, robot, other_robot, enrolment: enrolment.token, package, deployment }
+        let enrollment: EnrollmentToken =
+            server.post("/api/v1/enrollment-tokens", &json!({})).await;
+        Self {
+            server,
+            store,
+            robot,
+            other_robot,
+            enrollment: enrollment.token,
+            package,
+            deployment,
+        }
     }
 
     /// A fresh token of a user with the original role and scope.
@@ -124,7 +133,7 @@ impl Town {
         };
         let token = Token::random(TokenKind::Operator);
         let mut write = self.store.begin().await.expect("begins");
-        write.put_user(&user).await.expect("stored");
+        write.users().put(&user).await.expect("stored");
         let new = NewToken {
             token: &token,
             user: &name,
@@ -134,19 +143,19 @@ impl Town {
             scope: None,
             expires_at_ms: NOW_MS + 3_600_000,
         };
-        write.create_token(&new, NOW_MS).await.expect("stored");
+        write.tokens().create(&new, NOW_MS).await.expect("stored");
         write.commit().await.expect("stored");
         token
     }
 
-    async fn token(&self, comer: Comer) -> Option<String> {
-        Some(match comer {
-            Comer::Nobody => return None,
-            Comer::Enrolment => self.enrolment.clone(),
-            Comer::Itself => self.robot.token.clone(),
-            Comer::OtherRobot => self.other_robot.token.clone(),
-            Comer::Person(role) => self.sign_in(role.as_str(), role, None).await.reveal(),
-            Comer::Elsewhere(role) => {
+    async fn token(&self, caller: TestCaller) -> Option<String> {
+        Some(match caller {
+            TestCaller::Nobody => return None,
+            TestCaller::Enrollment => self.enrollment.clone(),
+            TestCaller::Itself => self.robot.token.clone(),
+            TestCaller::OtherRobot => self.other_robot.token.clone(),
+            TestCaller::Person(role) => self.sign_in(role.as_str(), role, None).await.reveal(),
+            TestCaller::Elsewhere(role) => {
                 self.sign_in(&format!("{role}2"), role, Some("boreas")).await.reveal()
             }
         })
@@ -185,9 +194,9 @@ impl Town {
     }
 
     /// The result of the call: `✓`, or the status of the refusal.
-    async fn try_out(&self, probe: &Probe, comer: Comer) -> String {
+    async fn outcome(&self, probe: &Probe, caller: TestCaller) -> String {
         let mut request = self.server.bare(probe.method.clone(), &self.path(probe).await);
-        if let Some(token) = self.token(comer).await {
+        if let Some(token) = self.token(caller).await {
             request = request.bearer_auth(token);
         }
         if let Some(body) = &probe.body {
@@ -199,7 +208,7 @@ impl Town {
         let status = response.status();
         assert!(
             !status.is_server_error() || status.as_u16() == 504,
-            "{} by {comer:?}: {status}",
+            "{} by {caller:?}: {status}",
             probe.title
         );
         let is_registry = probe.path.starts_with("/v2");
@@ -212,13 +221,15 @@ impl Town {
     }
 
     /// A session with the comer's credentials; `None` if the session is refused.
-    async fn connect(&self, comer: Comer) -> Option<Raw> {
-        let (client_id, user_name) = match comer {
-            Comer::Itself => (self.robot.id.to_string(), self.robot.id.to_string()),
-            Comer::OtherRobot => (self.other_robot.id.to_string(), self.other_robot.id.to_string()),
+    async fn connect(&self, caller: TestCaller) -> Option<Raw> {
+        let (client_id, user_name) = match caller {
+            TestCaller::Itself => (self.robot.id.to_string(), self.robot.id.to_string()),
+            TestCaller::OtherRobot => {
+                (self.other_robot.id.to_string(), self.other_robot.id.to_string())
+            }
             _ => (String::new(), "anyone".to_owned()),
         };
-        let password = self.token(comer).await;
+        let password = self.token(caller).await;
         let connect = Connect {
             client_id,
             user_name: password.is_some().then_some(user_name),
@@ -239,21 +250,21 @@ impl Town {
         self.server.get::<ServerInfo>("/api/v1/server").await.traffic.messages_refused
     }
 
-    async fn publishes(&self, comer: Comer, topic: &str, payload: &[u8]) -> String {
-        let Some(mut raw) = self.connect(comer).await else { return "–".to_owned() };
+    async fn publishes(&self, caller: TestCaller, topic: &str, payload: &[u8]) -> String {
+        let Some(mut raw) = self.connect(caller).await else { return "–".to_owned() };
         let before = self.messages_refused().await;
         raw.send(&publish(topic, 1, 7, payload)).await;
         let is_acknowledged = raw.read(4).await.is_some_and(|answer| answer == [0x40, 2, 0, 7]);
         let is_refused = self.messages_refused().await > before;
-        assert_ne!(is_acknowledged, is_refused, "{topic} by {comer:?}");
+        assert_ne!(is_acknowledged, is_refused, "{topic} by {caller:?}");
         if is_acknowledged { "✓" } else { "no" }.to_owned()
     }
 
-    async fn subscribes(&self, comer: Comer, filter: &str) -> String {
-        let Some(mut raw) = self.connect(comer).await else { return "–".to_owned() };
+    async fn subscribes(&self, caller: TestCaller, filter: &str) -> String {
+        let Some(mut raw) = self.connect(caller).await else { return "–".to_owned() };
         raw.send(&subscribe(7, &[(filter, 1)])).await;
         let answer = raw.read(5).await.expect("a SUBACK");
-        assert_eq!(answer[..4], [0x90, 3, 0, 7], "{filter} by {comer:?}");
+        assert_eq!(answer[..4], [0x90, 3, 0, 7], "{filter} by {caller:?}");
         if answer[4] == 0x80 { "no" } else { "✓" }.to_owned()
     }
 }
@@ -310,7 +321,7 @@ fn probes(route: &Route) -> Vec<Probe> {
             let change =
                 json!({ "type": "lifecycle", "node": "/talker", "transition": "activate" });
             let mut changing = probe(route.path, method, route.path, Some(change));
-            changing.title += " what changes something";
+            changing.title += " that changes something";
             probes.push(changing);
         }
         ("GET", "/api/v1/tokens") => {
@@ -378,36 +389,55 @@ fn table(header: &[String], rows: &[Vec<String>]) -> String {
     text
 }
 
-async fn http_table(town: &Town) -> String {
-    let mut header = vec!["route".to_owned()];
-    header.extend(Comer::ALL.map(Comer::title));
-    let mut rows = Vec::new();
+/// The first callers of `TestCaller::ALL`: those without a user.
+const MACHINES: usize = 4;
+/// The answers of most routes to them.
+const CLOSED: [&str; MACHINES] = ["401", "403", "403", "403"];
+
+/// Two tables, because one with all callers would be wider than the page.
+async fn http_tables(fixture: &Fixture) -> String {
+    let (machines, users) = TestCaller::ALL.split_at(MACHINES);
+    let header = |callers: &[TestCaller]| {
+        let mut header = vec!["route".to_owned()];
+        header.extend(callers.iter().copied().map(TestCaller::title));
+        header
+    };
+    let (mut machine_rows, mut user_rows) = (Vec::new(), Vec::new());
     for route in routes() {
         for probe in probes(&route) {
             let mut row = vec![probe.title.clone()];
-            for comer in Comer::ALL {
-                row.push(town.try_out(&probe, comer).await);
+            for caller in machines {
+                row.push(fixture.outcome(&probe, *caller).await);
             }
-            rows.push(row);
+            if row[1..] != CLOSED {
+                machine_rows.push(row);
+            }
+            let mut row = vec![probe.title.clone()];
+            for caller in users {
+                row.push(fixture.outcome(&probe, *caller).await);
+            }
+            user_rows.push(row);
         }
     }
-    table(&header, &rows)
+    let machines = table(&header(machines), &machine_rows);
+    let users = table(&header(users), &user_rows);
+    format!("{HTTP_MACHINES}{machines}{HTTP_USERS}{users}")
 }
 
-async fn mqtt_table(town: &mut Town) -> String {
-    let comers = [
-        Comer::Nobody,
-        Comer::Enrolment,
-        Comer::Itself,
-        Comer::OtherRobot,
-        Comer::Person(Role::Viewer),
-        Comer::Person(Role::Admin),
-        Comer::Elsewhere(Role::Admin),
+async fn mqtt_table(fixture: &mut Fixture) -> String {
+    let callers = [
+        TestCaller::Nobody,
+        TestCaller::Enrollment,
+        TestCaller::Itself,
+        TestCaller::OtherRobot,
+        TestCaller::Person(Role::Viewer),
+        TestCaller::Person(Role::Admin),
+        TestCaller::Elsewhere(Role::Admin),
     ];
     let mut header = vec!["topic".to_owned()];
-    header.extend(comers.map(Comer::title));
-    let state = town.server.desired(&town.robot).await;
-    let report = town.robot.next_report(&state, task_proto::report::Phase::Fetching);
+    header.extend(callers.map(TestCaller::title));
+    let state = fixture.server.desired(&fixture.robot).await;
+    let report = fixture.robot.next_report(&state, task_proto::messages::report::Phase::Fetching);
     let report = serde_json::to_vec(&report).expect("json");
     let topics = [
         RobotTopic::Desired,
@@ -418,24 +448,24 @@ async fn mqtt_table(town: &mut Town) -> String {
         RobotTopic::Request,
         RobotTopic::Reply,
     ];
-    let parts = format!("taskd/v1/p/{}", town.package.content.digest);
+    let parts = format!("taskd/v1/p/{}", fixture.package.content.digest);
     let mut rows = Vec::new();
     for last in topics {
-        let topic = topic(&town.robot.id, last);
-        let shown = topic.replace(town.robot.id.as_str(), "ROBOT");
+        let topic = topic(&fixture.robot.id, last);
+        let shown = topic.replace(fixture.robot.id.as_str(), "ROBOT");
         let payload: &[u8] = if last == RobotTopic::Report { &report } else { b"{}" };
         let mut row = vec![format!("publish `{shown}`")];
-        for comer in comers {
-            row.push(town.publishes(comer, &topic, payload).await);
+        for caller in callers {
+            row.push(fixture.publishes(caller, &topic, payload).await);
         }
         rows.push(row);
         let mut row = vec![format!("subscribe `{shown}`")];
-        for comer in comers {
-            row.push(town.subscribes(comer, &topic).await);
+        for caller in callers {
+            row.push(fixture.subscribes(caller, &topic).await);
         }
         rows.push(row);
     }
-    let wide = format!("taskd/v1/r/{}/+", town.robot.id);
+    let wide = format!("taskd/v1/r/{}/+", fixture.robot.id);
     let filters = [
         ("taskd/v1/p/DIGEST", parts.as_str()),
         ("taskd/v1/r/ROBOT/+", wide.as_str()),
@@ -446,14 +476,14 @@ async fn mqtt_table(town: &mut Town) -> String {
     ];
     for (shown, filter) in filters {
         let mut row = vec![format!("subscribe `{shown}`")];
-        for comer in comers {
-            row.push(town.subscribes(comer, filter).await);
+        for caller in callers {
+            row.push(fixture.subscribes(caller, filter).await);
         }
         rows.push(row);
     }
     let mut row = vec!["publish `taskd/v1/p/DIGEST`".to_owned()];
-    for comer in comers {
-        row.push(town.publishes(comer, &parts, b"x").await);
+    for caller in callers {
+        row.push(fixture.publishes(caller, &parts, b"x").await);
     }
     rows.push(row);
     table(&header, &rows)
@@ -473,41 +503,52 @@ fn roles_table() -> String {
 }
 
 const HEAD: &str = "\
-# Who may what
+# Permissions
 
 The test `permissions` makes this page. It calls every route and uses every topic with every kind of
 account, and fails when the page differs from the result.
-`UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions` writes it anew.
+`UPDATE_GOLDEN=1 cargo test -p taskd --test it permissions` writes the page again.
 
 A user has one role or several and may do what any of them allows. An account whose scope is limited
 to some robots has `administer` for nothing that concerns all of them; see [people.md](people.md).
 
 ";
 
-const HTTP: &str = "
+const HTTP_MACHINES: &str = "
 ## HTTP
 
-`✓`: admitted, whatever the answer is. A number: refused with that status. \"Of other robots\": limited
-to robots that do not include the one in question; their lists leave it out.
+`✓`: admitted, whatever the answer is. A number: refused with that status.
+
+### Without a user
+
+A route that is absent from this table answers 401 without a token, and 403 to an enrollment token
+and to robots.
+
+";
+
+const HTTP_USERS: &str = "
+### Users
+
+Elsewhere: the scope has other robots, not the one in question. Lists leave that robot out.
 
 ";
 
 const MQTT: &str = "
 ## MQTT
 
-`ROBOT` is the robot's id. `–`: does not come in at all.
+`ROBOT` is the robot's id. `–`: can't connect.
 
 ";
 
 #[tokio::test(flavor = "multi_thread")]
-async fn permissions_are_as_the_page_has_them() {
-    let mut town = Town::new().await;
-    let mut found = format!("{HEAD}{}{HTTP}", roles_table());
-    found += &http_table(&town).await;
+async fn permissions_match_the_documented_tables() {
+    let mut fixture = Fixture::new().await;
+    let mut found = format!("{HEAD}{}", roles_table());
+    found += &http_tables(&fixture).await;
     found += MQTT;
-    found += &mqtt_table(&mut town).await;
+    found += &mqtt_table(&mut fixture).await;
     // None of these calls opened a way for a client that was refused.
-    let me: Value = answer(town.server.request(Method::GET, "/api/v1/me")).await;
+    let me: Value = answer(fixture.server.request(Method::GET, "/api/v1/me")).await;
     assert_eq!(me["name"], "operator.token");
     if std::env::var_os("UPDATE_GOLDEN").is_some() {
         std::fs::write(DOCUMENT, &found).expect("written");

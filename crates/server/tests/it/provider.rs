@@ -69,7 +69,10 @@ impl Provider {
             issuer: issuer.clone(),
             key: new_key(),
             key_id: "first".to_owned(),
-            claims: json!({ "sub": "248289761001", "preferred_username": "Alice", "groups": ["robotics", "staff"] }),
+            claims: json!({
+                "sub": "248289761001", "preferred_username": "Alice",
+                "groups": ["robotics", "staff"],
+            }),
             header_lie: json!({}),
             claims_lie: json!({}),
             is_open: true,

@@ -11,8 +11,8 @@ use reqwest::{Client, Method, RequestBuilder, Response, StatusCode};
 use serde_json::{Value, json};
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::token::{Token, TokenKind};
+use task_proto::packages::oci::MANIFEST_TYPE;
+use task_proto::trust::token::{Token, TokenKind};
 
 use taskd::blobs::collector::{self, Collected};
 use taskd::blobs::{BlobSettings, Blobs};
@@ -21,7 +21,7 @@ use taskd::domain::person::Person;
 use taskd::http::auth::Caller;
 use taskd::http::connection::drain::drain_unread;
 use taskd::http::registry::archives::ArchiveReaders;
-use taskd::http::registry::oci::{self, Registry};
+use taskd::http::registry::{Registry, oci};
 use taskd::link::transfers::Transfers;
 use taskd::orders::changes::Changes;
 use taskd::store::{Store, sqlite_url};
@@ -61,7 +61,7 @@ impl TestRegistry {
         caller: Option<Caller>,
     ) -> Self {
         let blobs = Blobs::open(data.path(), settings).expect("a blob store");
-        store.create_operator_token(&OPERATOR, NOW_MS).await.expect("stored");
+        store.tokens().create_first(&OPERATOR, NOW_MS).await.expect("stored");
         let site_label = "site".parse().expect("a label's key");
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
         let (clock, changes) = (Clock::fixed(NOW_MS), Changes::new());
@@ -168,12 +168,16 @@ pub fn operator() -> Caller {
     Caller::Person(Person::first(OPERATOR.id().parse().expect("an id")))
 }
 
+fn described(kind: &str, blob: BlobRef) -> Value {
+    json!({ "mediaType": kind, "digest": blob.digest, "size": blob.size })
+}
+
 pub fn image(config: BlobRef, layer: BlobRef) -> Value {
     json!({
         "schemaVersion": 2,
         "mediaType": MANIFEST_TYPE,
-        "config": { "mediaType": "application/vnd.example.config", "digest": config.digest, "size": config.size },
-        "layers": [{ "mediaType": "application/vnd.example.layer", "digest": layer.digest, "size": layer.size }],
+        "config": described("application/vnd.example.config", config),
+        "layers": [described("application/vnd.example.layer", layer)],
     })
 }
 

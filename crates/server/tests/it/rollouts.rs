@@ -4,23 +4,22 @@ use std::time::Duration;
 
 use serde_json::json;
 use task_proto::api::{DeploymentState, DeploymentView};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use taskd::domain::rollout::{LOST_AFTER_MS, OFFLINE_GRACE_MS};
-use taskd::orders::actions::ActionError;
+use taskd::http::error::ApiError;
 use tokio::time::timeout;
 
 use crate::database::{TestDatabase, on_both_databases};
 use crate::fleet::{Fleet, Robot};
 use crate::harness::{TestServer, answer};
-use crate::story::code;
 
 on_both_databases! {
-    an_offline_robot_is_passed_over_and_begins_when_it_is_back,
-    offline_robots_that_are_left_expire,
-    a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute,
-    a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back,
+    offline_robot_is_skipped_and_begins_when_it_is_back,
+    remaining_offline_robots_expire,
+    robot_offline_before_it_begins_holds_its_batch_for_a_minute,
+    robot_lost_in_its_batch_counts_as_a_failure_until_it_is_back,
     robots_that_come_back_together_begin_in_batches,
-    a_resume_of_what_is_not_paused_says_what_it_waits_for,
+    resume_of_an_unpaused_rollout_names_its_obstacle,
 }
 
 impl Fleet {
@@ -29,11 +28,11 @@ impl Fleet {
     }
 
     async fn advance(&self) {
-        self.actions.advance_rollouts().await.expect("moved on");
+        self.deployments.advance_rollouts().await.expect("moved on");
     }
 }
 
-async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: TestDatabase) {
+async fn offline_robot_is_skipped_and_begins_when_it_is_back(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(4).await;
     fleet.go_offline(&robots[0].id);
@@ -55,7 +54,7 @@ async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: Te
     fleet.advance().await;
     assert!(!fleet.has_begun(&robots[2]).await);
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
-    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
+    fleet.deployments.resume(&fleet.operator, &id).await.expect("resumed");
     fleet.follow(&mut robots[2], Phase::Running).await;
     assert_eq!(
         fleet.phases(&id).await,
@@ -63,7 +62,7 @@ async fn an_offline_robot_is_passed_over_and_begins_when_it_is_back(database: Te
     );
 }
 
-async fn offline_robots_that_are_left_expire(database: TestDatabase) {
+async fn remaining_offline_robots_expire(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     fleet.go_offline(&robots[0].id);
@@ -83,9 +82,7 @@ async fn offline_robots_that_are_left_expire(database: TestDatabase) {
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 }
 
-async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute(
-    database: TestDatabase,
-) {
+async fn robot_offline_before_it_begins_holds_its_batch_for_a_minute(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let id =
@@ -105,9 +102,7 @@ async fn a_robot_that_goes_offline_before_it_begins_holds_its_batch_for_a_minute
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 }
 
-async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(
-    database: TestDatabase,
-) {
+async fn robot_lost_in_its_batch_counts_as_a_failure_until_it_is_back(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let id =
@@ -121,7 +116,7 @@ async fn a_robot_that_is_lost_in_its_batch_counts_as_a_failure_until_it_is_back(
     fleet.clock.advance_ms(1);
     fleet.advance().await;
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
-    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
+    fleet.deployments.resume(&fleet.operator, &id).await.expect("resumed");
     assert!(fleet.has_begun(&robots[1]).await);
     fleet.follow(&mut robots[1], Phase::Running).await;
     // The robot is back and goes on: the others wait for it again.
@@ -155,37 +150,34 @@ async fn robots_that_come_back_together_begin_in_batches(database: TestDatabase)
     );
 }
 
-async fn a_resume_of_what_is_not_paused_says_what_it_waits_for(database: TestDatabase) {
+async fn resume_of_an_unpaused_rollout_names_its_obstacle(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(4).await;
     fleet.go_offline(&robots[3].id);
     let id = fleet.deploy("1", |order| order.batch = Some(1)).await;
-    let refused = async || {
-        fleet.actions.resume_deployment(&fleet.operator, &id).await.expect_err("not paused")
-    };
+    let refused =
+        async || fleet.deployments.resume(&fleet.operator, &id).await.expect_err("not paused");
     let (error, expected) = (
         refused().await.to_string(),
-        format!(
-            "deployment {id} is not paused: it waits for r0; next: r1, r2; offline, going on when they are back: r3"
-        ),
+        format!("deployment {id} is not paused: waiting for r0; next: r1, r2; offline: r3"),
     );
     assert_eq!(error, expected);
     fleet.come_online(&robots[3].id);
     for robot in &mut robots {
         fleet.follow(robot, Phase::Running).await;
     }
-    assert!(matches!(refused().await, ActionError::NotPaused { .. }));
-    assert_eq!(code::<()>(Err(refused().await)), "not_paused");
-    assert!(refused().await.to_string().ends_with("it has settled on every robot"));
+    assert_eq!(ApiError::from(refused().await).code, "not_paused");
+    assert!(refused().await.to_string().ends_with("settled on all robots"));
 }
 
 /// The running server looks at rollouts by itself where a robot comes online.
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_comes_online_begins_at_once() {
+async fn waiting_robot_begins_when_it_comes_online() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
-    let order = json!({ "package": "talker", "manifest": package.manifest.digest, "selector": "*", "batch": 1 });
+    let digest = &package.manifest.digest;
+    let order = json!({ "package": "talker", "manifest": digest, "selector": "*", "batch": 1 });
     let ordered: DeploymentView =
         answer(server.order("/api/v1/deployments", "key-1", &order)).await;
     let has_begun =

@@ -7,9 +7,9 @@ use futures_util::StreamExt as _;
 use reqwest::{Method, RequestBuilder, StatusCode};
 use serde_json::{Value, json};
 use task_proto::api::{AccessToken, DeploymentList, DeploymentView, OutputList, RobotList};
-use task_proto::oci::MANIFEST_TYPE;
-use task_proto::publisher::PackageStatement;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
+use task_proto::packages::oci::MANIFEST_TYPE;
+use task_proto::packages::publisher::PackageStatement;
 use task_proto::{Digest, TokenId};
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
@@ -73,7 +73,7 @@ fn out_of_scope() -> (u16, String) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn lists_and_views_have_only_ones_own_robots() {
+async fn lists_and_views_are_limited_to_the_scope() {
     let mut sites = Sites::new().await;
     sites.add("alice", &["operator"], Some("site=lab")).await;
     let package = sites.server.push("talker", "1.0.0").await;
@@ -164,13 +164,14 @@ async fn lists_and_views_have_only_ones_own_robots() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_order_says_how_many_robots_are_not_ones_own() {
+async fn order_counts_robots_outside_the_scope() {
     let sites = Sites::new().await;
     sites.add("alice", &["operator"], Some("site=lab")).await;
     let package = sites.server.push("talker", "1.0.0").await;
     let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
     let order = |selector: &str, key: &str| {
-        let body = json!({ "package": package.name, "manifest": package.manifest.digest, "selector": selector });
+        let digest = &package.manifest.digest;
+        let body = json!({ "package": package.name, "manifest": digest, "selector": selector });
         alice.ask(Method::POST, "/api/v1/deployments").header("idempotency-key", key).json(&body)
     };
     let refused = order("*", "one").send().await.expect("an answer");
@@ -185,7 +186,7 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
     // Whether a robot of that name is another's is not hers to know.
     for selector in ["boreas", "site=lab,boreas", "site=lab,!boreas", "nobody"] {
         let said = format!(
-            "selector: no robot that takes orders has the name or id {}; nothing was done",
+            "selector: no registered robot has the name or id {}; nothing was done",
             if selector == "nobody" { "nobody" } else { "boreas" }
         );
         let refused = order(selector, "two").send().await.expect("an answer");
@@ -205,7 +206,7 @@ async fn an_order_says_how_many_robots_are_not_ones_own() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use() {
+async fn package_in_use_outside_the_scope_is_not_deleted_or_retagged() {
     let sites = Sites::new().await;
     let package = sites.server.push("talker", "1.0.0").await;
     let later = sites.server.push("talker", "2.0.0").await;
@@ -241,10 +242,7 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
         .await
         .expect("an answer");
     let said = refused.text().await.expect("text");
-    assert!(
-        said.contains("is what 2 robots should have: atlas, …") && !said.contains("boreas"),
-        "{said}"
-    );
+    assert!(said.contains("is in use by 2 robots: atlas, …") && !said.contains("boreas"), "{said}");
     // The tag stays unchanged as well; setting it again to its current target is permitted.
     let bytes = |digest| pia.ask(Method::GET, &format!("/v2/talker/manifests/{digest}")).send();
     let moved = async |by: &Asker<'_>, digest: Digest| {
@@ -276,7 +274,7 @@ async fn the_registry_deletes_and_renames_nothing_of_a_package_that_others_use()
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_answer_that_is_given_again_names_only_robots_that_are_ones_own_now() {
+async fn repeated_answer_is_limited_to_the_current_scope() {
     let sites = Sites::new().await;
     sites.add("alice", &["operator"], Some("site=lab")).await;
     sites.add("mia", &["admin"], Some("site=lab")).await;
@@ -357,7 +355,7 @@ impl Events {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn events_are_of_ones_own_robots_and_end_with_ones_rights() {
+async fn event_stream_is_limited_to_the_scope_and_ends_with_the_rights() {
     let sites = Sites::new().await;
     sites.add("alice", &["viewer"], Some("site=lab")).await;
     let alice = Asker { server: &sites.server, token: sites.log_in("alice").await.token };
@@ -417,7 +415,7 @@ async fn mqtt(sites: &Sites, token: &str) -> (Raw, [u8; 4]) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_revoked_token_ends_its_mqtt_session_at_once() {
+async fn revoked_token_ends_its_mqtt_session_at_once() {
     let sites = Sites::new().await;
     sites.add("alice", &["viewer"], None).await;
     sites.add("bob", &["viewer"], Some("site=lab")).await;
@@ -435,7 +433,7 @@ async fn a_revoked_token_ends_its_mqtt_session_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_made_for_less_ends_no_other() {
+async fn token_with_fewer_rights_revokes_no_other_token() {
     let sites = Sites::new().await;
     sites.add("alice", &["viewer"], None).await;
     let alice = sites.log_in("alice").await;
@@ -464,7 +462,7 @@ async fn a_token_made_for_less_ends_no_other() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_trusted_proxy_says_who_asks_and_nobody_else_does() {
+async fn forwarded_address_counts_only_from_a_trusted_proxy() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| {
         config.trusted_proxies = vec![[127, 0, 0, 1].into()]
@@ -491,7 +489,7 @@ async fn a_trusted_proxy_says_who_asks_and_nobody_else_does() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_sign_in_flood_does_not_keep_robots_waiting() {
+async fn sign_in_flood_does_not_delay_robots() {
     let sites = Sites::new().await;
     let mut flood = tokio::task::JoinSet::new();
     for n in 0..200 {
@@ -515,13 +513,14 @@ async fn a_sign_in_flood_does_not_keep_robots_waiting() {
 /// The head of a request by `token` with a body of `length` bytes.
 fn head(request: &str, token: &str, length: usize) -> String {
     format!(
-        "{request} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {token}\r\nconnection: close\r\n\
-         content-type: application/json\r\ncontent-length: {length}\r\nexpect: 100-continue\r\n\r\n"
+        "{request} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {token}\r\n\
+         connection: close\r\ncontent-type: application/json\r\ncontent-length: {length}\r\n\
+         expect: 100-continue\r\n\r\n"
     )
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_was_removed_while_their_request_came_does_nothing_by_it() {
+async fn request_in_flight_of_a_removed_person_changes_nothing() {
     let sites = Sites::new().await;
     for name in ["mallory", "alice"] {
         sites.add(name, &["admin"], None).await;
@@ -567,7 +566,7 @@ async fn who_was_removed_while_their_request_came_does_nothing_by_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_removed_persons_session_ends_also_if_nobody_waits_for_the_answer() {
+async fn removed_persons_session_ends_even_if_the_client_disconnects() {
     let sites = Sites::new().await;
     let is_there = async |name: &str| {
         let users: Value = sites.server.get("/api/v1/users").await;

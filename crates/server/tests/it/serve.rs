@@ -9,8 +9,8 @@ use std::time::Duration;
 use nix::sys::signal::Signal;
 use reqwest::{Method, StatusCode};
 use serde_json::{Value, json};
-use task_proto::report::Phase;
-use task_proto::topic::RobotTopic;
+use task_proto::messages::report::Phase;
+use task_proto::messages::topic::RobotTopic;
 use taskd::config::Config;
 use taskd::serve::{ServeError, Server};
 use taskd::system::clock::Clock;
@@ -21,14 +21,14 @@ use crate::harness::{TestServer, answer};
 use crate::mqtt_harness::{Connect, Raw, publish, topic};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_first_start_makes_what_is_needed_and_nobody_else_reads_it() {
+async fn first_start_creates_private_files() {
     let server = TestServer::start().await;
     let mode =
         |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
     assert_eq!(mode(""), 0o700);
     assert_eq!((mode("operator.token"), mode("signing.key")), (0o600, 0o600));
     let addresses = std::fs::read(server.data().join("addresses.json")).expect("published");
-    let addresses: taskd::system::data_directory::Addresses =
+    let addresses: task_proto::data_directory::Addresses =
         serde_json::from_slice(&addresses).expect("json");
     assert_eq!(addresses, *server.server.addresses());
     for path in ["/healthz", "/readyz"] {
@@ -58,7 +58,7 @@ async fn readyz_asked_often_writes_seldom() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_server_on_the_same_directory_is_refused() {
+async fn second_server_on_the_same_directory_is_refused() {
     let server = TestServer::start().await;
     let mut config = Config::with_data(server.data().to_owned());
     config.http.set_port(0);
@@ -71,7 +71,7 @@ async fn a_second_server_on_the_same_directory_is_refused() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn when_all_places_are_taken_those_without_a_request_end() {
+async fn idle_connections_are_closed_at_the_connection_limit() {
     let directory = tempfile::tempdir().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.max_http_connections = 2).await;
     let (mut streams, request) = (Vec::new(), b"GET /healthz HTTP/1.1\r\nhost: x\r\n\r\n");
@@ -112,7 +112,7 @@ async fn a_restart_keeps_everything() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_stop_under_load_loses_no_report_that_was_answered() {
+async fn stop_under_load_loses_no_answered_report() {
     let server = TestServer::start().await;
     let package = server.push("talker", "1.0.0").await;
     let mut robots = Vec::new();
@@ -143,14 +143,14 @@ async fn a_stop_under_load_loses_no_report_that_was_answered() {
 /// A socket that begins to send a login and never completes the login.
 async fn trickling_login(address: &str) -> TcpStream {
     let mut stream = TcpStream::connect(address).await.expect("connects");
-    let head =
-        b"POST /api/v1/login HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: 99\r\n\r\n{";
+    let head = b"POST /api/v1/login HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\n\
+                 content-length: 99\r\n\r\n{";
     stream.write_all(head).await.expect("written");
     stream
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn strangers_that_trickle_do_not_keep_out_who_has_a_token() {
+async fn trickling_clients_do_not_block_authenticated_ones() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.max_http_connections = 8).await;
     let address = server.server.addresses().http.clone();
@@ -173,7 +173,7 @@ async fn strangers_that_trickle_do_not_keep_out_who_has_a_token() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_has_shown_no_token_counts_against_its_address_whatever_it_sends() {
+async fn unauthenticated_connections_are_limited_by_address() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.max_silent_per_address = 1).await;
     let address = server.server.addresses().http.clone();
@@ -209,7 +209,7 @@ async fn who_has_shown_no_token_counts_against_its_address_whatever_it_sends() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn idle_and_dawdling_clients_do_not_hold_up_a_stop() {
+async fn idle_and_slow_clients_do_not_delay_a_stop() {
     let server = TestServer::start().await;
     let address = server.server.addresses().http.clone();
     let mut idle = TcpStream::connect(&address).await.expect("connects");
@@ -229,7 +229,7 @@ async fn idle_and_dawdling_clients_do_not_hold_up_a_stop() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_database_that_was_put_back_leaves_robots_alone_until_their_next_order() {
+async fn restored_database_changes_no_robot_until_the_next_order() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let (first, later) =
@@ -295,7 +295,7 @@ impl Program {
         BufReader::new(stdout).read_line(&mut said).expect("it says where it is");
         assert!(said.starts_with("taskd serves HTTP on http://127.0.0.1:"), "{said}");
         let addresses = std::fs::read(data.join("addresses.json")).expect("published");
-        let addresses: taskd::system::data_directory::Addresses =
+        let addresses: task_proto::data_directory::Addresses =
             serde_json::from_slice(&addresses).expect("json");
         let token = std::fs::read_to_string(data.join("operator.token"))
             .expect("a token")
@@ -313,8 +313,9 @@ impl Program {
         let mut upload = TcpStream::connect(&self.http).await.expect("connects");
         let digest = task_proto::Digest::of(b"0123456789");
         let head = format!(
-            "POST /v2/talker/blobs/uploads/?digest={digest} HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {}\r\n\
-             content-type: application/octet-stream\r\nexpect: 100-continue\r\ncontent-length: 10\r\n\r\n",
+            "POST /v2/talker/blobs/uploads/?digest={digest} HTTP/1.1\r\nhost: x\r\n\
+             authorization: Bearer {}\r\ncontent-type: application/octet-stream\r\n\
+             expect: 100-continue\r\ncontent-length: 10\r\n\r\n",
             self.token
         );
         upload.write_all(head.as_bytes()).await.expect("written");
@@ -348,7 +349,7 @@ impl Program {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_signal_lets_requests_under_way_end() {
+async fn signal_lets_running_requests_end() {
     let program = Program::start();
     let mut upload = program.half_an_upload().await;
     program.signal(Signal::SIGTERM);
@@ -361,7 +362,7 @@ async fn a_signal_lets_requests_under_way_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_signal_ends_it_at_once() {
+async fn second_signal_ends_the_server_at_once() {
     let program = Program::start();
     let _upload = program.half_an_upload().await;
     program.signal(Signal::SIGINT);
@@ -377,7 +378,7 @@ async fn a_second_signal_ends_it_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whatever_a_robot_says_is_one_line_of_the_log() {
+async fn robot_text_is_one_line_of_the_log() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let path = directory.path().join("log");
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
@@ -390,10 +391,10 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
                 .json(body),
         )
     };
-    let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
-    let enrolment = enrolment["token"].as_str().expect("a token");
+    let enrollment = post("enrollment-tokens", &program.token, &json!({})).await;
+    let enrollment = enrollment["token"].as_str().expect("a token");
     let robot =
-        post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+        post("enroll", enrollment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
     let id: task_proto::RobotId =
         robot["robot_id"].as_str().expect("an id").parse().expect("an id");
     let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
@@ -415,7 +416,7 @@ async fn whatever_a_robot_says_is_one_line_of_the_log() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_servers_alone() {
+async fn repeated_robot_errors_do_not_fill_the_log_and_data_is_private() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let path = directory.path().join("log");
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
@@ -428,10 +429,10 @@ async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_ser
                 .json(body),
         )
     };
-    let enrolment = post("enrollment-tokens", &program.token, &json!({})).await;
-    let enrolment = enrolment["token"].as_str().expect("a token");
+    let enrollment = post("enrollment-tokens", &program.token, &json!({})).await;
+    let enrollment = enrollment["token"].as_str().expect("a token");
     let robot =
-        post("enroll", enrolment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
+        post("enroll", enrollment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
     let id: task_proto::RobotId =
         robot["robot_id"].as_str().expect("an id").parse().expect("an id");
     let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
@@ -470,7 +471,7 @@ async fn what_a_robot_sends_again_and_again_fills_no_log_and_the_data_is_the_ser
 
 #[test]
 #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
-fn a_wrong_setting_is_wrong_usage_wherever_it_stands() {
+fn invalid_setting_is_a_usage_error_from_every_source() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let file = directory.path().join("taskd.toml");
     std::fs::write(&file, "htpt = \"127.0.0.1:0\"").expect("written");

@@ -3,7 +3,7 @@
 use reqwest::{Method, StatusCode};
 use serde_json::json;
 use task_proto::api::{DeploymentView, RobotView, TaskHistory};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{TestServer, answer, refusal};
 
@@ -13,7 +13,10 @@ async fn settings_are_checked_kept_and_cleared() {
     let robot = server.enroll("atlas").await;
     let edit =
         |body: serde_json::Value| server.request(Method::PATCH, "/api/v1/robots/atlas").json(&body);
-    let settings = json!({ "underlays": ["/opt/ros/jazzy/setup.bash"], "forward_level": "error", "limits": { "task_pids": 64 } });
+    let settings = json!({
+        "underlays": ["/opt/ros/jazzy/setup.bash"], "forward_level": "error",
+        "limits": { "task_pids": 64 },
+    });
     let view: RobotView = answer(edit(json!({ "settings": settings }))).await;
     assert_eq!(serde_json::to_value(&view.settings).expect("json"), settings);
     assert_eq!(
@@ -39,7 +42,7 @@ async fn settings_are_checked_kept_and_cleared() {
 }
 
 #[tokio::test]
-async fn a_robots_history_and_timelines_are_shown_to_who_asks() {
+async fn robot_history_and_timelines_are_shown_on_request() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;

@@ -4,12 +4,13 @@
 use reqwest::{Method, Response, StatusCode};
 use task_proto::api::DeploymentView;
 use task_proto::desired::{BlobRef, PackageRef, SignatureRef};
-use task_proto::envelope::{Envelope, SigningKey};
-use task_proto::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
-use task_proto::publisher::{
+use task_proto::messages::report::Phase;
+use task_proto::packages::oci::{EMPTY, ImageManifest, MANIFEST_TYPE};
+use task_proto::packages::publisher::{
     LIST_ARTIFACT, LIST_REPOSITORY, LIST_TYPE, MAX_SIGNATURES, PackageStatement, PublisherList,
     Role, SIGNATURE_ARTIFACT,
 };
+use task_proto::trust::envelope::{Envelope, SigningKey};
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases};
@@ -37,7 +38,7 @@ fn list(version: u64, keeper: u8) -> PublisherList {
 
 fn sealed(list: &PublisherList, seeds: &[u8]) -> Envelope {
     let mut envelope = list.seal(&key(seeds[0]));
-    seeds.iter().for_each(|seed| envelope.sign_also(LIST_TYPE, &key(*seed)).expect("signed"));
+    seeds.iter().for_each(|seed| envelope.add_signature(LIST_TYPE, &key(*seed)).expect("signed"));
     envelope
 }
 
@@ -104,7 +105,7 @@ async fn may_read(server: &TestServer, robot: &TestRobot, blob: BlobRef) -> bool
     request.send().await.expect("an answer").status() == StatusCode::OK
 }
 
-async fn a_signature_goes_to_the_robots_that_should_have_its_package(database: TestDatabase) {
+async fn signature_is_sent_to_the_robots_of_its_package(database: TestDatabase) {
     let server = server(&database).await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("bolt").await);
     let package = server.push("talker", "1.0.0").await;
@@ -140,9 +141,7 @@ async fn a_signature_goes_to_the_robots_that_should_have_its_package(database: T
     );
 }
 
-async fn a_signature_that_says_something_else_than_its_manifest_is_turned_away(
-    database: TestDatabase,
-) {
+async fn signature_that_contradicts_its_manifest_is_refused(database: TestDatabase) {
     let server = server(&database).await;
     let (talker, other) =
         (server.push("talker", "1.0.0").await, server.push("other", "1.0.0").await);
@@ -166,7 +165,7 @@ async fn a_signature_that_says_something_else_than_its_manifest_is_turned_away(
         .await;
     assert_refused(
         push(&server, "talker", about, &[b' '; 20_000], None).await,
-        "16384 are possible",
+        "at most 16384 are allowed",
     )
     .await;
     assert_refused(
@@ -176,7 +175,7 @@ async fn a_signature_that_says_something_else_than_its_manifest_is_turned_away(
     .await;
 }
 
-async fn more_signatures_than_anyone_looks_at_do_not_push_out_the_first(database: TestDatabase) {
+async fn surplus_signatures_do_not_displace_the_first(database: TestDatabase) {
     let server = server(&database).await;
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -192,9 +191,7 @@ async fn more_signatures_than_anyone_looks_at_do_not_push_out_the_first(database
     assert_eq!((named.len(), named[0].envelope), (MAX_SIGNATURES, blob(&first)));
 }
 
-async fn lists_follow_one_another_and_robots_are_told_what_they_need_to_follow(
-    database: TestDatabase,
-) {
+async fn robots_get_the_chain_of_publisher_lists(database: TestDatabase) {
     let server = server(&database).await;
     let robot = server.enroll("atlas").await;
     let first = sealed(&list(1, 2), &[2]);
@@ -218,22 +215,34 @@ async fn lists_follow_one_another_and_robots_are_told_what_they_need_to_follow(
     assert_stored(&push_list(&server, &lists[0], "2").await);
 
     for (envelope, tag, reason) in [
-        (sealed(&list(7, 9), &[9]), "7", "signed by 0 of the 1 keepers that it takes"),
-        (sealed(&list(7, 2), &[2]), "7", "signed by 0 of the 1 keepers that it takes"),
-        (sealed(&list(7, 9), &[3]), "7", "signed by 0 of the 1 keepers that it names itself"),
-        (sealed(&list(6, 3), &[3, 2]), "6", "its version 6 is not newer than 6"),
-        (sealed(&list(3, 3), &[3]), "3", "its version 3 is not newer than 6"),
-        (sealed(&list(7, 3), &[3]), "8", "the tag of a list of publishers is its version"),
+        (
+            sealed(&list(7, 9), &[9]),
+            "7",
+            "signed by 0 of the 1 required keepers (of the previous list",
+        ),
+        (
+            sealed(&list(7, 2), &[2]),
+            "7",
+            "signed by 0 of the 1 required keepers (of the previous list",
+        ),
+        (
+            sealed(&list(7, 9), &[3]),
+            "7",
+            "signed by 0 of the 1 required keepers that it names itself",
+        ),
+        (sealed(&list(6, 3), &[3, 2]), "6", "its version 6 is not newer than the known version 6"),
+        (sealed(&list(3, 3), &[3]), "3", "its version 3 is not newer than the known version 6"),
+        (sealed(&list(7, 3), &[3]), "8", "the tag of a list of publishers must be its version"),
     ] {
         assert_refused(push_list(&server, &envelope, tag).await, reason).await;
     }
     let elsewhere = serde_json::to_vec(&lists[4]).expect("json");
     let answer = push(&server, "talker", (LIST_ARTIFACT, None), &elsewhere, Some("6")).await;
-    assert_refused(answer, "belongs into the repository taskd/publishers").await;
+    assert_refused(answer, "belongs in the repository taskd/publishers").await;
     assert_eq!(server.desired(&robot).await.evidence.lists.len(), 3);
 }
 
-async fn what_is_deleted_is_not_told_any_more(database: TestDatabase) {
+async fn deleted_signature_is_not_sent_to_robots(database: TestDatabase) {
     let server = server(&database).await;
     let robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -259,10 +268,35 @@ async fn what_is_deleted_is_not_told_any_more(database: TestDatabase) {
     assert!(!may_read(&server, &robot, blob(&signature)).await);
 }
 
+async fn robot_gets_the_signatures_of_the_package_that_it_goes_back_to(database: TestDatabase) {
+    let server = server(&database).await;
+    let mut robot = server.enroll("atlas").await;
+    let order = async |robot: &mut TestRobot, version: &str, phase| {
+        let package = server.push("talker", version).await;
+        server.deploy(&package, "atlas", version).await;
+        let state = server.desired(robot).await;
+        assert_eq!(server.report(robot, &state, phase).await.status(), StatusCode::OK);
+        package
+    };
+    let old = order(&mut robot, "1.0.0", Phase::Running).await;
+    let signature = PackageStatement { package: old.clone() }.seal(&key(1));
+    assert_stored(&push_signature(&server, &old, &signature).await);
+    let new = order(&mut robot, "2.0.0", Phase::RolledBack).await;
+    let state = server.desired(&robot).await;
+    assert_eq!(state.tasks[0].package, new);
+    let named = SignatureRef { manifest: old.manifest.digest, envelope: blob(&signature) };
+    assert_eq!(state.evidence.signatures, [named]);
+    assert!(may_read(&server, &robot, blob(&signature)).await);
+    order(&mut robot, "3.0.0", Phase::Running).await;
+    assert!(server.desired(&robot).await.evidence.is_empty());
+    assert!(!may_read(&server, &robot, blob(&signature)).await);
+}
+
 on_both_databases!(
-    a_signature_goes_to_the_robots_that_should_have_its_package,
-    a_signature_that_says_something_else_than_its_manifest_is_turned_away,
-    more_signatures_than_anyone_looks_at_do_not_push_out_the_first,
-    lists_follow_one_another_and_robots_are_told_what_they_need_to_follow,
-    what_is_deleted_is_not_told_any_more,
+    robot_gets_the_signatures_of_the_package_that_it_goes_back_to,
+    signature_is_sent_to_the_robots_of_its_package,
+    signature_that_contradicts_its_manifest_is_refused,
+    surplus_signatures_do_not_displace_the_first,
+    robots_get_the_chain_of_publisher_lists,
+    deleted_signature_is_not_sent_to_robots,
 );

@@ -3,13 +3,13 @@
 use reqwest::Method;
 use serde_json::json;
 use task_proto::api::{ServerRules, ServerStatus, SessionList};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{TestServer, answer, refusal};
 use crate::uplink::Session;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_servers_status_has_what_it_does() {
+async fn server_status_has_traffic_transfers_and_sites() {
     let server = TestServer::start().await;
     let mut atlas = server.enroll("atlas").await;
     server.enroll("boreas").await;
@@ -57,7 +57,7 @@ async fn the_servers_status_has_what_it_does() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn sessions_are_listed_with_what_they_listen_to() {
+async fn sessions_are_listed_with_their_subscriptions() {
     let server = TestServer::start().await;
     let (atlas, boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
     server.enroll("away").await;
@@ -89,11 +89,13 @@ async fn sessions_are_listed_with_what_they_listen_to() {
         400
     );
 
-    let order = json!({ "name": "carol", "roles": ["viewer"], "scope": "boreas", "password": "correct horse battery" });
+    let password = "correct horse battery";
+    let order =
+        json!({ "name": "carol", "roles": ["viewer"], "scope": "boreas", "password": password });
     let added =
         server.request(Method::POST, "/api/v1/users").json(&order).send().await.expect("an answer");
     assert!(added.status().is_success(), "{}", added.text().await.unwrap_or_default());
-    let login = json!({ "user": "carol", "password": "correct horse battery" });
+    let login = json!({ "user": "carol", "password": password });
     let token: serde_json::Value =
         answer(server.bare(Method::POST, "/api/v1/login").json(&login)).await;
     let token = token["token"].as_str().expect("a token").to_owned();

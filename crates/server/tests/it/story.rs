@@ -1,58 +1,71 @@
-//! One story of robots, orders and reports, told on every database.
+//! One story of robots, orders and reports, told on every database, and by two servers in turns.
 
 use std::collections::BTreeSet;
+use std::slice;
+use std::sync::Arc;
 
 use task_proto::Generation;
 use task_proto::api::{CreateEnrollmentToken, DeploymentState, EditRobot};
 use task_proto::desired::Wanted;
-use task_proto::manifest::TaskKind;
-use task_proto::report::Phase;
-use taskd::orders::actions::{ActionError, Actions, TaskOrder};
+use task_proto::messages::report::Phase;
+use task_proto::packages::manifest::TaskKind;
+use taskd::http::error::ApiError;
+use taskd::orders::actions::{Actions, TaskOrder};
 use taskd::orders::report_writer::ReportError;
 use taskd::store::Store;
 
-use crate::database::{TestDatabase, on_both_databases};
-use crate::fleet::{Fleet, Robot, mac, order_of, package, random_key};
+use crate::database::{TestDatabase, on_all_databases, on_both_databases};
+use crate::fleet::{Fleet, Robot, STATE_LIFETIME_MS, mac, order_of, package, random_key};
 
-on_both_databases! {
-    a_removed_robot_leaves_its_mac_and_name,
-    an_order_reaches_all_that_match_and_settles,
-    a_name_that_no_robot_has_is_refused_by_every_order,
-    an_idempotency_key_orders_once,
+on_all_databases! {
+    removed_robot_frees_its_mac_and_name,
+    state_is_signed_again_after_half_its_lifetime,
+    order_reaches_all_matching_robots_and_settles,
+    order_with_an_unknown_robot_name_is_refused,
+    idempotency_key_orders_once,
     racing_operators_leave_one_winner,
-    a_newer_deployment_supersedes_and_a_cancel_puts_back,
-    a_cancel_skips_what_was_cancelled_before,
-    a_cancel_passes_over_what_was_deleted,
-    robots_that_are_to_poll_are_not_rung,
+    newer_deployment_supersedes_and_its_cancel_restores,
+    cancel_restores_no_cancelled_deployment,
+    cancel_restores_no_deleted_package,
+    polling_robots_get_no_notice,
     batches_follow_each_other_and_failures_pause,
-    what_is_not_done_in_time_expires,
+    unfinished_assignment_expires,
     tasks_are_stopped_started_and_removed,
     late_reports_change_nothing,
     reports_at_once_are_all_acknowledged,
-    a_report_that_can_not_be_stored_is_answered_so,
-    a_restored_database_leaves_robots_alone_until_the_next_order,
+    unstored_report_gets_an_error,
+    robots_ahead_of_a_restored_database_are_left_alone,
     numbers_at_the_end_of_their_range_stop_no_order,
-    a_reopened_database_knows_everything,
+    reopened_database_keeps_all_state,
 }
 
-pub fn code<T>(result: Result<T, ActionError>) -> &'static str {
-    result.err().expect("refused").code()
+/// The code by which the API refuses the order.
+pub fn code<T, E: Into<ApiError>>(result: Result<T, E>) -> &'static str {
+    refusal(result).code
 }
 
-async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
+/// The API's answer to a refused order.
+pub fn refusal<T, E: Into<ApiError>>(result: Result<T, E>) -> ApiError {
+    result.err().expect("refused").into()
+}
+
+async fn removed_robot_frees_its_mac_and_name(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
-    let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrols");
+    let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     let mut robot = Robot::new(old.robot_id.clone());
     let deployment = fleet.deploy("1", |_| ()).await;
-    fleet.actions.remove_robot(&fleet.operator, &old.robot_id).await.expect("removed");
+    fleet.robots.remove(&fleet.operator, &old.robot_id).await.expect("removed");
     assert_eq!(fleet.phases(&deployment).await, [Phase::Cancelled]);
-    assert_eq!(code(fleet.actions.remove_robot(&fleet.operator, &old.robot_id).await), "not_found");
-    assert_eq!(code(fleet.actions.desired(&old.robot_id).await), "not_found");
+    assert_eq!(code(fleet.robots.remove(&fleet.operator, &old.robot_id).await), "not_found");
+    assert_eq!(code(fleet.desired_states.get(&old.robot_id).await), "not_found");
     let report = fleet.writer.submit(robot.next_report(), 0).await;
     assert!(matches!(report, Err(ReportError::RobotNotFound(_))));
     let now_ms = fleet.clock.now_ms();
-    assert_eq!(fleet.database.store.token_holder(&old.token, now_ms).await.expect("reads"), None);
+    assert_eq!(
+        fleet.database.store.tokens().holder(&old.token, now_ms).await.expect("reads"),
+        None
+    );
     let new = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("both are free");
     assert_ne!(new.robot_id, old.robot_id);
     // A name that a selector could take for another robot's id is refused.
@@ -61,12 +74,32 @@ async fn a_removed_robot_leaves_its_mac_and_name(database: TestDatabase) {
         ..EditRobot::default()
     };
     assert_eq!(
-        code(fleet.actions.edit_robot(&fleet.operator, &new.robot_id, &edit).await),
+        code(fleet.robots.edit(&fleet.operator, &new.robot_id, &edit).await),
         "invalid_request"
     );
 }
 
-async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
+async fn state_is_signed_again_after_half_its_lifetime(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    let robot = fleet.enroll(1).await.remove(0);
+    let signed = async || {
+        let states = fleet.desired_states.get_many(slice::from_ref(&robot.id)).await;
+        let (_, many) = states.expect("reads").remove(0);
+        let one = fleet.desired_states.get(&robot.id).await.expect("signed");
+        assert_eq!(one, many, "the cache serves both");
+        one.envelope
+    };
+    let first = signed().await;
+    fleet.clock.advance_ms(STATE_LIFETIME_MS / 2);
+    assert_eq!(signed().await, first);
+    fleet.clock.advance_ms(1);
+    let second = signed().await;
+    assert_ne!(second, first, "half of the lifetime is over");
+    fleet.deploy("1", |_| ()).await;
+    assert_ne!(signed().await, second, "the state has changed");
+}
+
+async fn order_reaches_all_matching_robots_and_settles(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(3).await;
     let nobody = order_of(&package("1", TaskKind::Service));
@@ -75,26 +108,21 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
         ..nobody
     };
     let refused = fleet
-        .actions
-        .create_deployment(
-            &fleet.operator,
-            &random_key(),
-            &nobody,
-            &package("1", TaskKind::Service),
-        )
+        .deployments
+        .create(&fleet.operator, &random_key(), &nobody, &package("1", TaskKind::Service))
         .await;
     assert_eq!(code(refused), "no_robots_match");
     let id = fleet.deploy("1", |order| order.selector = "r0,r2".parse().expect("valid")).await;
     let rung: BTreeSet<_> = [robots[0].id.clone(), robots[2].id.clone()].into();
-    assert_eq!(fleet.changes.take_rings().await.robots, rung);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, rung);
     assert_eq!(fleet.phases(&id).await, [Phase::Assigned, Phase::Assigned]);
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Active);
     assert!(fleet.desired(&robots[1]).await.expect("state").tasks.is_empty());
     let content = package("1", TaskKind::Service).package.content.digest;
     let store = fleet.database.store.clone();
 
-    assert!(store.fetched_by(&robots[0].id, &content).await.expect("reads").is_some());
-    assert_eq!(store.fetched_by(&robots[1].id, &content).await.expect("reads"), None);
+    assert!(store.robots().fetch_grant(&robots[0].id, &content).await.expect("reads").is_some());
+    assert_eq!(store.robots().fetch_grant(&robots[1].id, &content).await.expect("reads"), None);
     for robot in [0, 2] {
         fleet.follow(&mut robots[robot], Phase::Running).await;
     }
@@ -104,25 +132,26 @@ async fn an_order_reaches_all_that_match_and_settles(database: TestDatabase) {
     let robot = fleet.view(&robots[0]).await;
     assert_eq!((robot.generation, robot.observed_generation), (Generation(1), Generation(1)));
     assert_eq!((robot.tasks[0].phase, robot.tasks[0].run), (Phase::Running, 1));
-    assert_eq!(store.packages_in_use().await.expect("reads").len(), 1);
+    assert_eq!(store.deployments().packages_in_use().await.expect("reads").len(), 1);
     assert_eq!(fleet.deployments().await.len(), 1);
 }
 
-async fn a_name_that_no_robot_has_is_refused_by_every_order(database: TestDatabase) {
+async fn order_with_an_unknown_robot_name_is_refused(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
-    let (by, actions, task) = (&fleet.operator, &fleet.actions, "talker".parse().expect("a name"));
+    let (by, task) = (&fleet.operator, "talker".parse().expect("a name"));
+    let (deployments, robot_actions) = (&fleet.deployments, &fleet.robots);
     let view = package("1", TaskKind::Service);
     let (key, named) = (random_key(), "r0,r1".parse().expect("valid"));
     let order = task_proto::api::CreateDeployment { selector: named, ..order_of(&view) };
-    let id = actions.create_deployment(by, &key, &order, &view).await.expect("ordered");
-    actions.remove_robot(by, &robots[1].id).await.expect("removed");
-    let again = actions.create_deployment(by, &key, &order, &view).await;
+    let id = deployments.create(by, &key, &order, &view).await.expect("ordered");
+    robot_actions.remove(by, &robots[1].id).await.expect("removed");
+    let again = deployments.create(by, &key, &order, &view).await;
     assert_eq!(again.expect("the same order as before"), id);
     for (text, unknown) in
         [("r0,r1,r7", "r1, r7"), ("!r7", "r7"), ("*&r7,r0", "r7"), (robots[1].id.as_str(), "")]
     {
-        let selector: task_proto::selector::Selector = text.parse().expect("valid");
+        let selector: task_proto::ids::selector::Selector = text.parse().expect("valid");
         let order =
             task_proto::api::CreateDeployment { selector: selector.clone(), ..order_of(&view) };
         let retry = task_proto::api::RetryDeployment {
@@ -135,61 +164,59 @@ async fn a_name_that_no_robot_has_is_refused_by_every_order(database: TestDataba
             remove: Vec::new(),
             dry_run: false,
         };
+        let (key, stop) = (random_key(), TaskOrder::Stop);
         let refusals = [
-            actions.create_deployment(by, &random_key(), &order, &view).await.err(),
-            actions.matching_robots(by, &selector).await.err(),
-            actions.order_task(by, &random_key(), TaskOrder::Stop, &task, &selector).await.err(),
-            actions.robots_with_task(by, &task, &selector).await.err(),
-            actions.roll_back(by, &random_key(), &task, &selector).await.err(),
-            actions.rollback(by, &task, &selector).await.err(),
-            actions.robots_to_retry(by, &id, &retry).await.err(),
-            actions.label_robots(by, None, &labels).await.err(),
-            actions.remove_robots(by, None, &selector).await.err(),
+            refusal(deployments.create(by, &key, &order, &view).await),
+            refusal(deployments.preview(by, &selector).await),
+            refusal(deployments.order_task(by, &key, stop, &task, &selector).await),
+            refusal(deployments.preview_task_order(by, &task, &selector).await),
+            refusal(deployments.rollback(by, &key, &task, &selector).await),
+            refusal(deployments.preview_rollback(by, &task, &selector).await),
+            refusal(deployments.preview_retry(by, &id, &retry).await),
+            refusal(robot_actions.label_selected(by, None, &labels).await),
+            refusal(robot_actions.remove_selected(by, None, &selector).await),
+            refusal(robot_actions.preview_removal(by, &selector).await),
         ];
         for refusal in refusals {
-            let refusal = refusal.expect("refused");
-            assert_eq!(refusal.code(), "unknown_robots", "{text}");
-            assert!(refusal.to_string().contains(&format!("name or id {unknown}")), "{refusal}");
+            assert_eq!(refusal.code, "unknown_robots", "{text}");
+            let message = refusal.message;
+            assert!(message.contains(&format!("name or id {unknown}")), "{message}");
         }
     }
     // Where the name is known, and nothing else is wrong, nothing has changed.
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(1));
 }
 
-async fn an_idempotency_key_orders_once(database: TestDatabase) {
+async fn idempotency_key_orders_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.enroll(1).await;
     let (key, package) = (random_key(), package("1", TaskKind::Service));
     let order = order_of(&package);
-    let first = fleet
-        .actions
-        .create_deployment(&fleet.operator, &key, &order, &package)
-        .await
-        .expect("ordered");
-    let again = fleet
-        .actions
-        .create_deployment(&fleet.operator, &key, &order, &package)
-        .await
-        .expect("the same");
+    let first =
+        fleet.deployments.create(&fleet.operator, &key, &order, &package).await.expect("ordered");
+    let again =
+        fleet.deployments.create(&fleet.operator, &key, &order, &package).await.expect("the same");
     assert_eq!(first, again);
     let other = task_proto::api::CreateDeployment { batch: Some(1), ..order };
-    let refused = fleet.actions.create_deployment(&fleet.operator, &key, &other, &package).await;
+    let refused = fleet.deployments.create(&fleet.operator, &key, &other, &package).await;
     assert_eq!(code(refused), "idempotency_key_reused");
     let before = fleet
-        .actions
-        .deployment_ordered_before(&fleet.operator, &key, &order_of(&package))
+        .deployments
+        .repeated(&fleet.operator, &key, &order_of(&package))
         .await
         .expect("reads");
     assert_eq!(before, Some(first));
     let never = fleet
-        .actions
-        .deployment_ordered_before(&fleet.operator, &random_key(), &order_of(&package))
+        .deployments
+        .repeated(&fleet.operator, &random_key(), &order_of(&package))
         .await
         .expect("reads");
     assert_eq!(never, None);
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
-    let refused =
-        fleet.actions.order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone).await;
+    let refused = fleet
+        .deployments
+        .order_task(&fleet.operator, &key, TaskOrder::Stop, &task, &everyone)
+        .await;
     assert_eq!(code(refused), "idempotency_key_reused");
     assert_eq!(fleet.deployments().await.len(), 1);
 }
@@ -199,14 +226,14 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
     let robots = fleet.enroll(5).await;
     // A second server process on the same database would be as good a rival as a second operator.
     let rival = Store::open(&fleet.database.url).await.expect("opens");
-    let key = task_proto::envelope::SigningKey::random();
+    let key = Arc::new(task_proto::trust::envelope::SigningKey::random());
     let rival = Actions::new(
         rival,
         fleet.clock.clone(),
         fleet.changes.clone(),
         key,
         Default::default(),
-        fleet.chooser.clone(),
+        fleet.planner.clone(),
     );
     let mut orders = tokio::task::JoinSet::new();
     for round in 0..50u32 {
@@ -219,7 +246,8 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
                 let operator = fleet.operator.clone();
                 orders.spawn(async move {
                     let id = actions
-                        .create_deployment(&operator, &key, &order_of(&package), &package)
+                        .deployments
+                        .create(&operator, &key, &order_of(&package), &package)
                         .await
                         .expect("ordered");
                     (key.to_string(), id)
@@ -242,7 +270,7 @@ async fn racing_operators_leave_one_winner(database: TestDatabase) {
     assert_eq!(newest.supersedes.len(), 1);
 }
 
-async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestDatabase) {
+async fn newer_deployment_supersedes_and_its_cancel_restores(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let old = fleet.deploy("1", |_| ()).await;
@@ -256,10 +284,10 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
         fleet.deployment(&old).await.assignments.expect("there").remove(0).superseded_by;
     assert_eq!(superseded_by, Some(new.clone()));
     fleet.follow(&mut robots[0], Phase::Fetching).await;
-    fleet.changes.take_rings().await;
-    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("cancelled");
-    fleet.actions.cancel_deployment(&fleet.operator, &new).await.expect("again is harmless");
-    assert_eq!(fleet.changes.take_rings().await.robots, [robots[0].id.clone()].into());
+    fleet.changes.take_robots_to_notify().await;
+    fleet.deployments.cancel(&fleet.operator, &new).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &new).await.expect("again is harmless");
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, [robots[0].id.clone()].into());
     assert_eq!(fleet.deployment(&new).await.state, DeploymentState::Cancelled);
     assert_eq!(fleet.phases(&new).await, [Phase::Cancelled]);
     let desired = fleet.desired(&robots[0]).await.expect("state");
@@ -271,40 +299,37 @@ async fn a_newer_deployment_supersedes_and_a_cancel_puts_back(database: TestData
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert!(fleet.deployment(&new).await.supersedes.is_empty());
     // A service that runs has settled: there is nothing to interrupt.
-    assert_eq!(
-        code(fleet.actions.cancel_deployment(&fleet.operator, &old).await),
-        "nothing_to_cancel"
-    );
+    assert_eq!(code(fleet.deployments.cancel(&fleet.operator, &old).await), "nothing_to_cancel");
     assert_eq!(fleet.phases(&old).await, [Phase::Running, Phase::Running]);
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let third = fleet.deploy("3", |_| ()).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &third).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &third).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment, old);
     let unknown = task_proto::DeploymentId::random();
-    assert_eq!(code(fleet.actions.cancel_deployment(&fleet.operator, &unknown).await), "not_found");
+    assert_eq!(code(fleet.deployments.cancel(&fleet.operator, &unknown).await), "not_found");
     assert_eq!(
-        code(fleet.actions.resume_deployment(&fleet.operator, &third).await),
+        code(fleet.deployments.resume(&fleet.operator, &third).await),
         "deployment_cancelled"
     );
 }
 
-async fn a_cancel_skips_what_was_cancelled_before(database: TestDatabase) {
+async fn cancel_restores_no_cancelled_deployment(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(1).await;
     fleet.publish("1").await;
     let one = fleet.deploy("1", |_| ()).await;
     let two = fleet.deploy("2", |_| ()).await;
     let three = fleet.deploy("3", |_| ()).await;
-    fleet.actions.cancel_deployment(&fleet.operator, &two).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &two).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, three);
-    fleet.actions.cancel_deployment(&fleet.operator, &three).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &three).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, one);
     // Without anything to put back, the task goes.
-    fleet.actions.cancel_deployment(&fleet.operator, &one).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &one).await.expect("cancelled");
     assert!(fleet.desired(&robots[0]).await.expect("state").tasks.is_empty());
 }
 
-async fn a_cancel_passes_over_what_was_deleted(database: TestDatabase) {
+async fn cancel_restores_no_deleted_package(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let mut orders = [Vec::new(), Vec::new()];
@@ -322,21 +347,21 @@ async fn a_cancel_passes_over_what_was_deleted(database: TestDatabase) {
     // Their bytes may be gone: no robot should have them, and none would get them by one cancel.
     for (robot, [first, second]) in [(0, [4, 3]), (1, [3, 4])] {
         let orders = &orders[robot];
-        fleet.actions.cancel_deployment(&fleet.operator, &orders[first]).await.expect("cancelled");
+        fleet.deployments.cancel(&fleet.operator, &orders[first]).await.expect("cancelled");
         let left = fleet.desired(&robots[robot]).await.expect("state").tasks;
         assert_eq!(left[0].deployment, orders[second]);
-        fleet.actions.cancel_deployment(&fleet.operator, &orders[second]).await.expect("cancelled");
+        fleet.deployments.cancel(&fleet.operator, &orders[second]).await.expect("cancelled");
         let left = fleet.desired(&robots[robot]).await.expect("state").tasks;
         assert_eq!(left[0].deployment, orders[0]);
     }
     // A replaced version is kept for a later revert, even if the version is deleted.
     let next = fleet.deploy("4", |_| ()).await;
     fleet.unpublish("1").await;
-    fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &next).await.expect("cancelled");
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, orders[0][0]);
 }
 
-async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
+async fn polling_robots_get_no_notice(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let robots = fleet.enroll(2).await;
     let poll = fleet.deploy("1", |order| {
@@ -345,7 +370,7 @@ async fn robots_that_are_to_poll_are_not_rung(database: TestDatabase) {
     });
     let poll = poll.await;
     fleet.deploy("2", |order| order.selector = "r1".parse().expect("valid")).await;
-    assert_eq!(fleet.changes.take_rings().await.robots, [robots[1].id.clone()].into());
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots, [robots[1].id.clone()].into());
     assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].deployment, poll);
 }
 
@@ -362,25 +387,25 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
         let assignments = fleet.deployment(&id).await.assignments.expect("there");
         assignments.iter().filter(|assignment| assignment.released).count()
     };
-    assert_eq!(fleet.changes.take_rings().await.robots.len(), 2);
+    assert_eq!(fleet.changes.take_robots_to_notify().await.robots.len(), 2);
     assert_eq!(released().await, 2);
     fleet.follow(&mut robots[0], Phase::Running).await;
     assert_eq!(released().await, 2);
     fleet.follow(&mut robots[1], Phase::Failed).await;
     assert_eq!(released().await, 4);
     assert_eq!(
-        fleet.changes.take_rings().await.robots,
+        fleet.changes.take_robots_to_notify().await.robots,
         [robots[2].id.clone(), robots[3].id.clone()].into()
     );
     fleet.follow(&mut robots[2], Phase::Failed).await;
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Paused);
     fleet.follow(&mut robots[3], Phase::Running).await;
     assert_eq!(released().await, 4);
-    fleet.actions.resume_deployment(&fleet.operator, &id).await.expect("resumed");
+    fleet.deployments.resume(&fleet.operator, &id).await.expect("resumed");
     assert_eq!(released().await, 6);
     fleet.follow(&mut robots[4], Phase::Running).await;
     // A removed robot is not waited for.
-    fleet.actions.remove_robot(&fleet.operator, &robots[5].id).await.expect("removed");
+    fleet.robots.remove(&fleet.operator, &robots[5].id).await.expect("removed");
     assert_eq!(fleet.deployment(&id).await.state, DeploymentState::Settled);
 
     // A newer order also replaces assignments that still wait for their batch.
@@ -391,7 +416,7 @@ async fn batches_follow_each_other_and_failures_pause(database: TestDatabase) {
     assert_eq!(desired.tasks[0].deployment, fast);
 }
 
-async fn what_is_not_done_in_time_expires(database: TestDatabase) {
+async fn unfinished_assignment_expires(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     let old = fleet.deploy("1", |_| ()).await;
@@ -421,7 +446,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     let order = async |order| {
         fleet
-            .actions
+            .deployments
             .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
             .await
             .expect("ordered")
@@ -458,7 +483,7 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
     assert!(fleet.view(&robots[0]).await.tasks.is_empty());
     let refused = fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &everyone)
         .await;
     assert_eq!(code(refused), "no_robots_match");
@@ -500,7 +525,7 @@ async fn reports_at_once_are_all_acknowledged(database: TestDatabase) {
     assert!(fleet.phases(&id).await.iter().all(|phase| *phase == Phase::Running));
 }
 
-async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) {
+async fn unstored_report_gets_an_error(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     fleet.database.store.close().await;
@@ -508,7 +533,7 @@ async fn a_report_that_can_not_be_stored_is_answered_so(database: TestDatabase) 
     assert!(matches!(refused, Err(ReportError::NotStored(_))));
 }
 
-async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: TestDatabase) {
+async fn robots_ahead_of_a_restored_database_are_left_alone(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(2).await;
     // The robots know three orders that this database has never seen.
@@ -532,7 +557,7 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
 
     let (task, first) = ("talker".parse().expect("valid"), "r0".parse().expect("valid"));
     fleet
-        .actions
+        .deployments
         .order_task(&fleet.operator, &random_key(), TaskOrder::Stop, &task, &first)
         .await
         .expect("ordered");
@@ -546,7 +571,7 @@ async fn a_restored_database_leaves_robots_alone_until_the_next_order(database: 
     let desired = fleet.desired(&robots[1]).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks.len()), (Generation(4), 1));
     assert_eq!(desired.tasks[0].deployment, next);
-    fleet.actions.cancel_deployment(&fleet.operator, &next).await.expect("cancelled");
+    fleet.deployments.cancel(&fleet.operator, &next).await.expect("cancelled");
     assert_eq!(
         fleet.desired(&robots[1]).await.expect("state").tasks[0].deployment,
         lost.tasks[0].deployment
@@ -574,7 +599,7 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
     let (task, everyone) = ("talker".parse().expect("valid"), "*".parse().expect("valid"));
     for order in [TaskOrder::Stop, TaskOrder::Start] {
         fleet
-            .actions
+            .deployments
             .order_task(&fleet.operator, &random_key(), order, &task, &everyone)
             .await
             .expect("ordered");
@@ -586,16 +611,16 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
     }
 }
 
-async fn a_reopened_database_knows_everything(database: TestDatabase) {
+async fn reopened_database_keeps_all_state(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let mut robots = fleet.enroll(1).await;
     let id = fleet.deploy("1", |_| ()).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
-    let before = fleet.view(&robots[0]).await;
+    let before = fleet.database.store.robots().get(&robots[0].id).await.expect("reads");
+    assert!(before.is_some());
     fleet.database.store.close().await;
     let store = Store::open(&fleet.database.url).await.expect("opens again");
-    assert_eq!(store.robot(&robots[0].id).await.expect("reads"), Some(before));
-    let deployment = store.deployment_summary(&id).await.expect("reads").expect("there");
-    assert_eq!(deployment.state, DeploymentState::Settled);
-    assert_eq!(deployment.assignments, None);
+    assert_eq!(store.robots().get(&robots[0].id).await.expect("reads"), before);
+    let deployment = store.deployments().summary(&id).await.expect("reads").expect("there");
+    assert_eq!(deployment.state(), DeploymentState::Settled);
 }

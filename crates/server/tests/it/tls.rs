@@ -17,10 +17,11 @@ use rustls::{ClientConfig, RootCertStore};
 use serde_json::json;
 use task_proto::CaPin;
 use task_proto::api::{EnrollResponse, EnrollmentToken, RobotToken};
-use task_proto::token::Token;
+use task_proto::trust::token::Token;
 use task_transport::{ClientKey, Duplex, Route, Trust, dial};
 use taskd::config::Config;
 use taskd::http::connection::listener::{Limits, Service, serve};
+use taskd::net::proxy_protocol::ProxyProtocol;
 use taskd::system::clock::Clock;
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -133,7 +134,7 @@ async fn asked_anew(address: SocketAddr, tls: &Arc<ClientConfig>) -> std::io::Re
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_token_is_enough_to_know_the_server() {
+async fn enrollment_token_is_enough_to_trust_the_server() {
     let server = encrypted().await;
     let token: EnrollmentToken = server.post("/api/v1/enrollment-tokens", &json!({})).await;
     let token: Token = token.token.parse().expect("a token");
@@ -169,7 +170,7 @@ async fn one_token_is_enough_to_know_the_server() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_websocket_has_the_doors_of_mqtts_own_port() {
+async fn websocket_has_the_same_checks_as_the_mqtt_port() {
     let server = encrypted().await;
     let robot = server.enroll("atlas").await;
     let tls = Some(pinned(pin_of(&server)));
@@ -193,7 +194,7 @@ async fn the_websocket_has_the_doors_of_mqtts_own_port() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_pinned_robot_refuses_another_servers_certificate() {
+async fn pinned_robot_refuses_another_servers_certificate() {
     let (own, other) = (encrypted().await, encrypted().await);
     let requests = own.server.addresses().clone();
     assert_ne!(pin_of(&own), pin_of(&other));
@@ -218,7 +219,7 @@ async fn a_pinned_robot_refuses_another_servers_certificate() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_authority_is_made_once_and_can_be_imported() {
+async fn authority_is_created_once_and_can_be_imported() {
     let server = encrypted().await;
     let mode =
         |name: &str| server.data().join(name).metadata().expect(name).permissions().mode() & 0o777;
@@ -239,7 +240,7 @@ async fn the_authority_is_made_once_and_can_be_imported() {
     let refused =
         taskd::serve::Server::start(config, Clock::system()).await.err().expect("refused");
     assert!(
-        refused.to_string().contains("ca.pem does not hold the certificate of the key"),
+        refused.to_string().contains("ca.pem does not contain the certificate of the key"),
         "{refused}"
     );
 }
@@ -249,7 +250,7 @@ async fn with_own_files(directory: TempDir) -> TestServer {
     let (certificate, key) = own_files(directory.path());
     TestServer::start_in(directory, |config| {
         (config.tls.certificate, config.tls.key) = (Some(certificate), Some(key));
-        config.tls.look_interval = Duration::from_millis(2);
+        config.tls.check_interval = Duration::from_millis(2);
     })
     .await
 }
@@ -265,7 +266,7 @@ fn put_in_place(directory: &Path, (certificate, key): &(String, String)) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_own_certificate_is_for_everybody_but_those_who_pinned() {
+async fn own_certificate_is_served_except_to_pinned_clients() {
     let (authority, directory) = (Authority::new(), TempDir::new().expect("a directory"));
     let own = authority.issue();
     put_in_place(directory.path(), &own);
@@ -294,7 +295,7 @@ async fn until_shown(server: &TestServer, authority: &Authority, certificate: &s
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_certificate_that_changes_under_load_drops_nobody() {
+async fn certificate_change_under_load_drops_no_connection() {
     let (authority, directory) = (Authority::new(), TempDir::new().expect("a directory"));
     put_in_place(directory.path(), &authority.issue());
     let path = directory.path().to_owned();
@@ -346,7 +347,7 @@ async fn a_certificate_that_changes_under_load_drops_nobody() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_certificate_without_its_key_is_not_shown() {
+async fn certificate_without_its_key_is_not_served() {
     let (authority, directory) = (Authority::new(), TempDir::new().expect("a directory"));
     let (first, second) = (authority.issue(), authority.issue());
     put_in_place(directory.path(), &first);
@@ -414,7 +415,7 @@ async fn answers_to(server: &TestServer, robot: &TestRobot, key: Option<&ClientK
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_opens_nothing_without_the_key_that_its_robot_registered() {
+async fn token_is_refused_without_the_robots_client_certificate() {
     let configure = |config: &mut Config| {
         private(config);
         config.tls.client_certificates = true;
@@ -462,7 +463,7 @@ pub fn allow_open_files() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_thousand_half_open_connections_keep_nobody_out() {
+async fn half_open_connections_do_not_block_new_clients() {
     allow_open_files();
     let server = encrypted().await;
     let robot = server.enroll("atlas").await;
@@ -522,12 +523,13 @@ async fn listener(limits: Limits) -> (SocketAddr, tokio_util::sync::DropGuard, T
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
+async fn oldest_silent_connection_is_evicted_during_its_handshake() {
     const HOUR: Duration = Duration::from_secs(3600);
     let limits = Limits {
         max_connections: 1000,
         max_silent_per_address: 1,
         proxies: [].into(),
+        proxy_protocol: ProxyProtocol::new(&[]),
         handshake_timeout: HOUR,
     };
     let (http, _stop, _directory) = listener(limits).await;
@@ -559,12 +561,13 @@ async fn the_oldest_silent_connection_gives_way_during_its_handshake() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_silent_socket_and_a_slow_handshake_end_by_themselves() {
+async fn silent_socket_and_slow_handshake_time_out() {
     let hasty = Duration::from_millis(200);
     let (http, _stop, _directory) = listener(Limits {
         max_connections: 1,
         max_silent_per_address: 10,
         proxies: [].into(),
+        proxy_protocol: ProxyProtocol::new(&[]),
         handshake_timeout: hasty,
     })
     .await;

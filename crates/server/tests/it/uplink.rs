@@ -7,8 +7,8 @@ use reqwest::Method;
 use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::{Value, json};
 use task_proto::api::{RobotToken, ServerInfo};
-use task_proto::desired::{DesiredState, Doorbell};
-use task_proto::report::{Condition, MAX_REPORT_BYTES, Phase};
+use task_proto::desired::{DesiredNotice, DesiredState};
+use task_proto::messages::report::{Condition, MAX_REPORT_BYTES, Phase};
 use taskd::store::{Store, sqlite_url};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -142,7 +142,8 @@ impl Session {
                 continue;
             };
             assert_eq!(publish.topic, format!("{}/desired", self.topics));
-            let Ok(Doorbell::State { envelope, .. }) = serde_json::from_slice(&publish.payload)
+            let Ok(DesiredNotice::State { envelope, .. }) =
+                serde_json::from_slice(&publish.payload)
             else {
                 panic!("the whole state fits into a message");
             };
@@ -155,7 +156,7 @@ impl Session {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_connected_robot_is_told_and_its_report_is_stored_before_the_acknowledgement() {
+async fn connected_robot_gets_its_state_and_its_report_is_stored_before_the_puback() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -181,7 +182,7 @@ async fn a_connected_robot_is_told_and_its_report_is_stored_before_the_acknowled
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_reports_an_old_generation_is_told_again() {
+async fn report_of_an_old_generation_gets_the_state_again() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;
@@ -199,7 +200,7 @@ async fn a_robot_that_reports_an_old_generation_is_told_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_largest_report_is_stored_and_acknowledged() {
+async fn largest_report_is_stored_and_acknowledged() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let mut session = Session::open(&server, &robot).await;
@@ -212,7 +213,7 @@ async fn the_largest_report_is_stored_and_acknowledged() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn of_what_a_report_says_so_much_is_kept() {
+async fn report_fields_are_trimmed_to_their_limits() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let state = server.desired(&robot).await;
@@ -231,7 +232,7 @@ async fn of_what_a_report_says_so_much_is_kept() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nonsense_is_acknowledged_and_dropped() {
+async fn invalid_messages_are_acknowledged_and_dropped() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let other = server.enroll("boreas").await;
@@ -248,7 +249,7 @@ async fn nonsense_is_acknowledged_and_dropped() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_removed_robot_is_hung_up_on_and_not_let_in_again() {
+async fn removed_robot_is_disconnected_and_not_admitted_again() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let mut session = Session::open(&server, &robot).await;
@@ -260,7 +261,7 @@ async fn a_removed_robot_is_hung_up_on_and_not_let_in_again() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
+async fn new_token_ends_the_old_session_at_its_first_use() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let mut session = Session::open(&server, &robot).await;
@@ -301,7 +302,7 @@ async fn a_new_token_leaves_the_old_session_alone_until_it_is_used() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_new_token_ends_the_old_session_though_the_request_that_shows_it_first_is_broken_off() {
+async fn new_token_ends_the_old_session_even_if_its_first_request_is_aborted() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let mut session = Session::open(&server, &robot).await;
@@ -344,7 +345,7 @@ async fn two_of_one(server: &TestServer) -> (TestRobot, TestRobot) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_instances_that_displace_each_other_get_no_more_work() {
+async fn instances_that_displace_each_other_get_no_more_work() {
     let server = TestServer::start().await;
     let (robot, _clone) = two_of_one(&server).await;
     let refused = server.ask_desired(&robot).await;
@@ -357,7 +358,7 @@ async fn two_instances_that_displace_each_other_get_no_more_work() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
+async fn first_use_of_a_token_over_mqtt_ends_sessions_of_the_old_one() {
     let server = TestServer::start().await;
     let (mut robot, clone) = two_of_one(&server).await;
     let path = format!("/api/v1/robots/{}", robot.id);
@@ -395,7 +396,7 @@ async fn a_token_that_is_first_used_over_mqtt_ends_what_came_by_the_old_one() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_enrolment_token_or_another_robots_name_opens_nothing() {
+async fn enrollment_token_or_foreign_robot_name_is_refused() {
     let server = TestServer::start().await;
     let (robot, other) = (server.enroll("atlas").await, server.enroll("boreas").await);
     let token: task_proto::api::EnrollmentToken =

@@ -4,7 +4,7 @@
 use reqwest::Method;
 use serde_json::json;
 use task_proto::api::{RobotView, VitalsView};
-use task_proto::request::{Answer, Ask};
+use task_proto::messages::request::{Answer, Ask};
 
 use crate::harness::{NOW_MS, TestRobot, TestServer, answer, refusal};
 use crate::uplink::Session;
@@ -20,7 +20,7 @@ async fn samples(server: &TestServer, robot: &str) -> Vec<(u64, Option<f32>)> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_a_robot_says_of_its_machine_is_shown_for_an_hour() {
+async fn vitals_are_shown_for_an_hour() {
     let server = TestServer::start().await;
     let (atlas, boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
     assert_eq!(
@@ -51,7 +51,7 @@ async fn what_a_robot_says_of_its_machine_is_shown_for_an_hour() {
 }
 
 #[tokio::test]
-async fn a_robot_that_polls_says_it_over_http() {
+async fn polling_robot_reports_vitals_over_http() {
     let server = TestServer::start().await;
     let (atlas, boreas) = (server.enroll("atlas").await, server.enroll("boreas").await);
     let say = |robot: &TestRobot, body: serde_json::Value| {
@@ -77,7 +77,7 @@ async fn a_robot_that_polls_says_it_over_http() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_is_asked_how_it_does_now() {
+async fn vitals_are_requested_from_the_robot() {
     let server = TestServer::start().await;
     let robot = server.enroll("atlas").await;
     let mut session = Session::open(&server, &robot).await;

@@ -15,7 +15,7 @@ import {
 /** A place beside the dialog. */
 const BESIDE = [5, 450];
 
-test('text that is selected to beyond the edge of a question is kept', async (t) => {
+test('a text selection that ends outside the dialog keeps it open', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
@@ -36,15 +36,15 @@ test('text that is selected to beyond the edge of a question is kept', async (t)
   assertQuiet(page);
 });
 
-test('what is shown but once stays until somebody says that they have it', async (t) => {
+test('a secret stays open until it is confirmed', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server, { hash: '#/settings' });
   const dialog = page.getByRole('dialog');
   await page
-    .locator('section', { hasText: 'Enrolment tokens' })
+    .locator('section', { hasText: 'Enrollment tokens' })
     .getByRole('button', { name: 'New token…' })
     .click();
-  await dialog.getByRole('button', { name: 'Make it' }).click();
+  await dialog.getByRole('button', { name: 'Create token' }).click();
   const secret = dialog.locator('code', { hasText: '--token' });
   await secret.waitFor();
   // Twice by keys: at the second request, a browser closes a dialog by itself.
@@ -54,12 +54,12 @@ test('what is shown but once stays until somebody says that they have it', async
   await settled(page);
   assert.ok(await secret.isVisible());
   await assertAccessible(page, 'the secret');
-  await dialog.getByRole('button', { name: 'I have it' }).click();
+  await dialog.getByRole('button', { name: 'Done' }).click();
   await dialog.waitFor({ state: 'hidden' });
   assertQuiet(page);
 });
 
-test('an order that waits for the packages takes the place of no other question', async (t) => {
+test('a push dialog that is still loading does not replace another dialog', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0');
@@ -69,7 +69,7 @@ test('an order that waits for the packages takes the place of no other question'
     const asked = new Promise((resume) => page.route(/\/packages$/, resume, { times: 1 }));
     await page.getByRole('button', { name: 'Push…' }).click();
     await dialog.getByRole('heading', { name: 'Push to atlas' }).waitFor();
-    await dialog.getByText('Fetching…').waitFor();
+    await dialog.getByText('Loading…').waitFor();
     return asked;
   };
   const answer = async (route) => {
@@ -90,7 +90,7 @@ test('an order that waits for the packages takes the place of no other question'
   assert.equal(
     await page.evaluate(() => document.activeElement.id),
     'order-name',
-    'what is to be filled in has the focus',
+    'the first field has the focus',
   );
   assertQuiet(page);
 });

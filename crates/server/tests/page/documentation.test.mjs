@@ -3,7 +3,7 @@
 import { test } from 'node:test';
 import { assertQuiet, open, Server } from './harness.mjs';
 
-test('the description calls as whoever is signed in, and breaks no policy', async (t) => {
+test('the API documentation calls as the signed-in user and violates no policy', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   await page.goto(`${server.url}/api/docs`);

@@ -18,12 +18,12 @@ import {
 const row = (page, name) => page.locator('.row[data-robot]', { hasText: name });
 const phase = (page, name, text) => row(page, name).locator('.phase', { hasText: text });
 
-test('a robot that enrols by the shown command appears by itself', async (t) => {
+test('a robot enrolled with the shown command appears without a reload', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   await page.getByText('Waiting for the first robot…').waitFor();
   await page.evaluate(() => (window.isSameDocument = true));
-  await page.getByRole('button', { name: 'Show the command' }).click();
+  await page.getByRole('button', { name: 'Show command' }).click();
   const line = await page.locator('.command code', { hasText: '--token' }).innerText();
   const [, url, token] = line.match(/^task-agent enroll --server (\S+) --token (\S+)$/);
   assert.equal(url, server.url);
@@ -31,15 +31,11 @@ test('a robot that enrols by the shown command appears by itself', async (t) => 
   await row(page, 'first').locator('.state', { hasText: 'Offline' }).waitFor();
   await agent(t, server, 'atlas');
   await row(page, 'atlas').locator('.state', { hasText: 'Online' }).waitFor();
-  assert.equal(
-    await page.evaluate(() => window.isSameDocument),
-    true,
-    'the page was never loaded again',
-  );
+  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was not reloaded');
   assertQuiet(page);
 });
 
-test('two robots are chosen, get a package while it is seen to come, and run it', async (t) => {
+test('a push to two selected robots shows its progress until they run the package', async (t) => {
   // Slow enough to observe the progress.
   const server = await Server.start(t, { environment: { TASKD_TRANSFERS_BYTES_PER_S: '250 KB' } });
   for (const name of ['atlas', 'borea', 'corvus']) await agent(t, server, name);
@@ -79,12 +75,12 @@ test('two robots are chosen, get a package while it is seen to come, and run it'
   assert.equal(
     await row(page, 'corvus').locator('[data-task]').count(),
     0,
-    'who was not chosen gets nothing',
+    'the robot that is not selected gets nothing',
   );
   assertQuiet(page);
 });
 
-test('who fails is found by the counter, and says why', async (t) => {
+test('the counter of failures filters the robots; a failed robot shows its reason', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await agent(t, server, name);
   server.push('sensor', '0.1.0', {
@@ -103,7 +99,7 @@ test('who fails is found by the counter, and says why', async (t) => {
   assertQuiet(page);
 });
 
-test('a deployment is cancelled, and the version before goes on', async (t) => {
+test('a cancelled deployment leaves the previous version running', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
   server.push('talker', '1.0.0', { to: 'atlas' });
@@ -116,19 +112,16 @@ test('a deployment is cancelled, and the version before goes on', async (t) => {
   });
   await page.goto(`${server.url}/#/deployments/${newest.id}`);
   await page.getByRole('button', { name: 'Cancel…' }).click();
-  await page
-    .getByRole('dialog')
-    .getByRole('button', { name: /^Cancel the/ })
-    .click();
-  await page.locator('.standing', { hasText: 'Cancelled' }).waitFor();
+  await page.getByRole('dialog').getByRole('button', { name: 'Cancel deployment' }).click();
+  await page.locator('.deployment-state', { hasText: 'Cancelled' }).waitFor();
   await eventually(
-    'the version before to be what is wanted',
+    'the previous version to be desired',
     async () => (await server.ask('GET', '/robots/atlas')).tasks[0]?.version === '1.0.0',
   );
   assertQuiet(page);
 });
 
-test('the log is followed, paused and filtered', async (t) => {
+test('a log can be followed, paused and filtered', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
   server.push('talker', '1.0.0', {
@@ -143,10 +136,10 @@ test('the log is followed, paused and filtered', async (t) => {
   await page.getByRole('button', { name: 'Pause' }).click();
   const before = await lines();
   // The button shows the number of waiting lines.
-  const goOn = page.getByRole('button', { name: /Go on \([2-9]\d* wait\)/ });
-  await goOn.waitFor();
+  const resume = page.getByRole('button', { name: /Resume \([2-9]\d* new\)/ });
+  await resume.waitFor();
   assert.equal(await lines(), before, 'nothing moves while it is paused');
-  await goOn.click();
+  await resume.click();
   await eventually('lines to go on', async () => (await lines()) !== before);
   await page.getByLabel('Level').selectOption('error');
   await eventually('only errors to be left', async () => !/line \d/.test(await lines()));
@@ -154,7 +147,41 @@ test('the log is followed, paused and filtered', async (t) => {
   assertQuiet(page);
 });
 
-test('the page of another robot shows nothing of the one before', async (t) => {
+test('a live line that was fetched before appears once', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const page = await open(t, server);
+  const [fetched, later] = ['fetched', 'later'].map((text, at_ms) => ({
+    at_ms,
+    level: 'info',
+    source: 'task',
+    task: 'talker',
+    text,
+  }));
+  const line = (text) => page.getByRole('log').getByText(text, { exact: true });
+  let streams = 0;
+  await page.route('**/robots/*/logs?**', async (route) => {
+    if (!route.request().url().includes('follow')) {
+      await route.fulfill({ json: { from: 'robot', age_ms: 0, lines: [fetched] } });
+      return;
+    }
+    streams += 1;
+    // The next connection stays open and silent.
+    if (streams > 1) return;
+    await line('fetched').waitFor();
+    const event = { type: 'lines', lines: [fetched, later], suppressed: 0 };
+    await route.fulfill({
+      contentType: 'text/event-stream',
+      body: `data: ${JSON.stringify(event)}\n\n`,
+    });
+  });
+  await page.goto(`${server.url}/#/robots/atlas/logs`);
+  await line('later').waitFor();
+  assert.equal(await line('fetched').count(), 1);
+  assertQuiet(page);
+});
+
+test('the log of another robot shows no lines of the previous robot', async (t) => {
   const server = await Server.start(t);
   for (const [robot, task] of [
     ['atlas', 'talker'],
@@ -168,19 +195,19 @@ test('the page of another robot shows nothing of the one before', async (t) => {
   }
   const page = await open(t, server, { hash: '#/robots/atlas/logs' });
   const said = async (text) => (await page.getByRole('log').innerText()).includes(text);
-  await eventually('what the first says', () => said('talker of atlas'));
+  await eventually('lines of the first robot', () => said('talker of atlas'));
   await page.goto(`${server.url}/#/robots/borea/logs`);
-  await eventually('what the second says', () => said('singer of borea'));
+  await eventually('lines of the second robot', () => said('singer of borea'));
   assert.equal(await said('atlas'), false);
   // The same robot by its id has a page of its own as well.
   const { id } = await server.ask('GET', '/robots/borea');
   await page.goto(`${server.url}/#/robots/${id}/logs`);
   await until(page, () => document.querySelector('.log-line'));
-  assert.equal(await page.locator('.log-place > *').count(), 1);
+  assert.equal(await page.locator('.log-view > *').count(), 1);
   assertQuiet(page);
 });
 
-test('labels are edited one by one and in bulk', async (t) => {
+test('labels can be edited for one robot and in bulk', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
   const page = await open(t, server);
@@ -191,7 +218,7 @@ test('labels are edited one by one and in bulk', async (t) => {
     'the labels',
     async () => (await server.ask('GET', '/robots/atlas')).labels.floor === '2',
   );
-  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('checkbox', { name: 'Select all shown robots' }).click();
   await page.getByRole('button', { name: 'Label…' }).click();
   await page.getByLabel('Labels to set').fill('site=yard');
   await page.getByRole('dialog').getByRole('checkbox', { name: 'floor' }).check();
@@ -207,24 +234,24 @@ test('labels are edited one by one and in bulk', async (t) => {
   await row(page, 'atlas').getByRole('button', { name: 'Edit atlas' }).click();
   await page.getByRole('textbox', { name: 'Labels' }).fill('site');
   await page.getByRole('button', { name: 'Save' }).click();
-  await page.getByRole('dialog').getByText('site: a label is written as name=value').waitFor();
+  await page.getByRole('dialog').getByText('site: labels have the form name=value').waitFor();
   assert.equal(await page.getByRole('textbox', { name: 'Labels' }).inputValue(), 'site');
   assertQuiet(page);
 });
 
-test('an order is for whoever was chosen, while the rest of the list is on its way', async (t) => {
+test('bulk actions apply only to the robots loaded when they were selected', async (t) => {
   const server = await Server.start(t);
   // One more than the first page of the list holds.
   for (let arm = 1; arm <= 101; arm += 1) await Puppet.enroll(server, `arm${arm}`);
   const page = await open(t, server);
   await page.route(/\/robots\?.*after=/, () => {});
   await page.reload();
-  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('checkbox', { name: 'Select all shown robots' }).click();
   await page.getByText('100 selected').waitFor();
   await page.getByRole('button', { name: 'Label…' }).click();
   await page.getByLabel('Labels to set').fill('floor=2');
   await page.getByRole('dialog').getByRole('button', { name: 'Label' }).click();
-  await page.getByText('100 robots labelled.').waitFor();
+  await page.getByText('Labels of 100 robots updated.').waitFor();
   await page.getByRole('button', { name: 'Delete…' }).click();
   await page.getByRole('dialog').getByRole('button', { name: 'Delete' }).click();
   await page.getByText('100 robots deleted.').waitFor();
@@ -232,12 +259,12 @@ test('an order is for whoever was chosen, while the rest of the list is on its w
   assert.deepEqual(
     robots.map(({ labels }) => labels),
     [{}],
-    'whom the page did not know is left, and as it was',
+    'the robot that was not loaded is unchanged',
   );
   assertQuiet(page);
 });
 
-test('who is limited to some robots gives orders to all that they see', async (t) => {
+test('an operator with a scope can deploy to all robots in it', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name, { site: 'lab' });
   await Puppet.enroll(server, 'corvus', { site: 'yard' });
@@ -245,7 +272,7 @@ test('who is limited to some robots gives orders to all that they see', async (t
   await server.ask('POST', '/users', { name: 'alice', roles: ['operator'], scope: 'site=lab' });
   const { token } = await server.ask('POST', '/tokens', { user: 'alice', title: 'the page' });
   const page = await open(t, server, { token });
-  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('checkbox', { name: 'Select all shown robots' }).click();
   await page.getByRole('button', { name: 'Push…' }).click();
   await page.getByRole('dialog').getByLabel('Package').selectOption('talker');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();

@@ -30,7 +30,8 @@ const TASK_USER = '65534';
 const packages = process.env.TASKD_TEST_PAGE;
 assert.ok(
   packages,
-  'TASKD_TEST_PAGE is not set: run ./scripts/test, or set it to the directory that scripts/need page prints',
+  'TASKD_TEST_PAGE is not set: run ./scripts/test, ' +
+    'or set it to the directory that scripts/need page prints',
 );
 const require = createRequire(join(packages, 'node_modules/'));
 const { chromium } = require('playwright-core');
@@ -39,7 +40,7 @@ const AXE = readFileSync(require.resolve('axe-core/axe.min.js'), 'utf8');
 export const root = join(dirname(fileURLToPath(import.meta.url)), '../../../..');
 
 /** The path of one of the workspace's programs. */
-function program(name) {
+export function program(name) {
   const path = join(process.env.CARGO_TARGET_DIR ?? join(root, 'target'), 'debug', name);
   assert.ok(existsSync(path), `${path} is missing: run cargo build --bins, or ./scripts/test`);
   return path;
@@ -106,7 +107,8 @@ function start(t, log, path, args, environment = {}) {
 export async function smallDisk(t, bytes) {
   const path = directory(t);
   const isRoot = process.getuid() === 0;
-  const order = `mount -t tmpfs -o size=${bytes} none "$0" && mkdir "$0/there" && exec sleep 1000000`;
+  const mount = `mount -t tmpfs -o size=${bytes} none "$0"`;
+  const order = `${mount} && mkdir "$0/there" && exec sleep 1000000`;
   const { child } = start(t, join(directory(t), 'disk.log'), 'unshare', [
     ...(isRoot ? [] : ['--map-root-user']),
     '--mount',
@@ -144,6 +146,7 @@ export class Server {
       disk = null,
       data = join(disk?.path ?? directory(t), 'server'),
       http = '127.0.0.1:0',
+      mqtt = '127.0.0.1:0',
     } = {},
   ) {
     const server = new Server();
@@ -162,7 +165,7 @@ export class Server {
       '--http',
       http,
       '--mqtt',
-      '127.0.0.1:0',
+      mqtt,
     ];
     server.process = start(t, `${seen}.log`, path, order, environment);
     const addresses = await eventually('the server to say where it is', () =>
@@ -237,7 +240,7 @@ export class Server {
     );
   }
 
-  enrolmentToken(wanted = {}) {
+  createEnrollmentToken(wanted = {}) {
     return this.ask('POST', '/enrollment-tokens', wanted);
   }
 }
@@ -245,17 +248,23 @@ export class Server {
 let macs = 0;
 const nextMac = () => {
   macs += 1;
-  return `02:00:00:01:${(macs >> 8).toString(16).padStart(2, '0')}:${(macs & 255).toString(16).padStart(2, '0')}`;
+  const [high, low] = [macs >> 8, macs & 255].map((byte) => byte.toString(16).padStart(2, '0'));
+  return `02:00:00:01:${high}:${low}`;
 };
 
-/** A real `task-agent`, enrolled and running. Its tasks end with the test. */
-export async function agent(t, server, name, environment = {}) {
+/**
+ * A real `task-agent`, enrolled and running. Its tasks end with the test. `within` is the command
+ * that starts it in another namespace.
+ */
+export async function agent(t, server, name, environment = {}, within = []) {
+  const [path, ...order] = [...within, program('task-agent')];
   const data = join(directory(t), name);
-  const { token } = await server.enrolmentToken({ uses: 1 });
+  const { token } = await server.createEnrollmentToken({ uses: 1 });
   const asRoot = process.getuid() === 0 ? { TASK_AGENT_TASK_USER: TASK_USER } : {};
   const enrolled = spawnSync(
-    program('task-agent'),
+    path,
     [
+      ...order,
       'enroll',
       '--data',
       data,
@@ -273,7 +282,7 @@ export async function agent(t, server, name, environment = {}) {
   assert.equal(enrolled.status, 0, enrolled.stderr);
   // After the agent's end: tasks outlive it on purpose.
   atEnd(t, () => endProcessesOf(data));
-  const { stop } = start(t, `${data}.log`, program('task-agent'), ['run', '--data', data], {
+  const { stop } = start(t, `${data}.log`, path, [...order, 'run', '--data', data], {
     ...asRoot,
     ...environment,
   });
@@ -287,7 +296,8 @@ export async function ros(t) {
   const home = process.env.TASKD_TEST_ROS;
   assert.ok(
     home,
-    'TASKD_TEST_ROS is not set: run ./scripts/test, or set it to what `scripts/need ros` prints, without /bin/python',
+    'TASKD_TEST_ROS is not set: run ./scripts/test, ' +
+      'or set it to what `scripts/need ros` prints, without /bin/python',
   );
   // A port that no participant of the domain uses is the lock: 7400 + 250 n + 249 would be the
   // 120th participant's.
@@ -369,7 +379,7 @@ export class Puppet {
   #instance = `i${randomBytes(8).toString('hex')}`;
 
   static async enroll(server, name, labels = {}) {
-    const { token } = await server.enrolmentToken({ uses: 1 });
+    const { token } = await server.createEnrollmentToken({ uses: 1 });
     const enrolled = await server.ask(
       'POST',
       '/enroll',
@@ -550,7 +560,7 @@ export async function open(t, server, { on, hash = '', token = server.token, ...
 /** Opens a link with a token, and signs in with that token. */
 export async function followLink(page, server, token) {
   await page.goto(`${server.url}/#token=${token}`);
-  await page.getByRole('button', { name: 'Sign in with it' }).press('Enter');
+  await page.getByRole('button', { name: 'Sign in with token' }).press('Enter');
 }
 
 /** Complaints of the page's browser since the last call. */

@@ -39,7 +39,7 @@ test('nine tabs are live at once', async (t) => {
   assertQuiet(first);
 });
 
-test('what a robot says is text', async (t) => {
+test('robot messages are shown as text', async (t) => {
   const server = await Server.start(t);
   const atlas = await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0', { to: 'atlas' });
@@ -66,7 +66,7 @@ test('what a robot says is text', async (t) => {
   assert.equal(takeComplaints(page).length, 1);
 });
 
-test('a wrong token is refused in words, and a restarted server is found again', async (t) => {
+test('a wrong token shows an error, and the page reconnects to a restarted server', async (t) => {
   const server = await Server.start(t);
   const it = await browser(t);
   const page = await it.newPage();
@@ -75,70 +75,74 @@ test('a wrong token is refused in words, and a restarted server is found again',
   assert.equal(page.url(), `${server.url}/`, 'the token has left the address bar');
   await page.keyboard.press('Enter');
   await page.getByRole('alert').filter({ hasText: 'token: ' }).waitFor();
-  const signIn = async () => {
-    await page.locator('form.by-token input').fill(server.token);
-    await page.getByRole('button', { name: 'Sign in with it' }).click();
-    await live(page);
-  };
-  await signIn();
+  await page.locator('form.by-token input').fill(server.token);
+  await page.getByRole('button', { name: 'Sign in with token' }).click();
+  await live(page);
   await server.process.stop();
-  await page.locator('.stream', { hasText: 'Not live' }).waitFor();
+  await page.locator('.stream', { hasText: 'Disconnected' }).waitFor();
   await Server.start(t, { data: server.data, http: server.http });
-  // Sessions end with the server; the page finds it and asks to sign in again.
-  await page.getByLabel('Name', { exact: true }).waitFor();
-  await page.reload();
-  await page.getByText('With a token').click();
-  await signIn();
+  await live(page);
   await page.getByRole('button', { name: 'Sign out' }).click();
-  await page.getByLabel('Name', { exact: true }).waitFor();
+  await page.getByLabel('Username').waitFor();
   assert.equal(
     await page.evaluate(() => fetch('/api/v1/robots').then(({ status }) => status)),
     401,
   );
 });
 
-test('a restart that ended the session is said, and signing in leads back to the same place', async (t) => {
+test('a page that reloads after a server restart is still signed in', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const place = '#/robots/atlas/logs?level=warn';
   const page = await open(t, server, { hash: place });
   await live(page);
-  const signedOut = () =>
-    page.getByRole('alert').filter({ hasText: 'The server was restarted' }).waitFor();
   await server.process.stop();
   await Server.start(t, { data: server.data, http: server.http });
-  await signedOut();
-  // Also to a page that is loaded only now.
   await page.reload();
-  await signedOut();
-  await page.getByText('With a token').click();
+  await live(page);
+  await page.getByRole('heading', { name: 'atlas' }).waitFor();
+  assert.equal(page.url(), `${server.url}/${place}`);
+});
+
+test('a sign-in after the end of a session returns to the place', async (t) => {
+  const server = await Server.start(t);
+  await Puppet.enroll(server, 'atlas');
+  const place = '#/robots/atlas/logs?level=warn';
+  const page = await open(t, server, { hash: place });
+  await live(page);
+  // Another tab signs out in this way.
+  await page.evaluate(() => fetch('/api/v1/session', { method: 'DELETE' }));
+  await page.getByLabel('Username').waitFor();
+  await page.getByText('Sign in with a token').click();
   await page.locator('form.by-token input').fill(server.token);
-  await page.getByRole('button', { name: 'Sign in with it' }).click();
+  await page.getByRole('button', { name: 'Sign in with token' }).click();
   await live(page);
   assert.equal(page.url(), `${server.url}/${place}`);
   await page.getByRole('heading', { name: 'atlas' }).waitFor();
   await page.getByRole('button', { name: 'Sign out' }).click();
-  await page.getByLabel('Name', { exact: true }).waitFor();
+  await page.getByLabel('Username').waitFor();
   assert.equal(await page.getByRole('alert').innerText(), '');
 });
 
-test('a page whose stream is refused says why, and shows what there is', async (t) => {
+test('a page without its event stream shows the reason and the listed robots', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
   // The tabs' shared worker sends its requests where a test can't answer for the server.
   await page.addInitScript(() => delete window.SharedWorker);
-  const refusal = { error: { code: 'too_many_requests', message: 'too many listen already' } };
+  const refusal = { error: { code: 'too_many_requests', message: 'too many event streams' } };
   await page.route(/\/events$/, (route) => route.fulfill({ status: 429, json: refusal }));
   await page.reload();
-  await page.locator('.stream', { hasText: 'Not live (429: too many listen already)' }).waitFor();
+  await page
+    .locator('.stream', { hasText: 'Disconnected (429: too many event streams)' })
+    .waitFor();
   await page.locator('[data-robot]', { hasText: 'atlas' }).waitFor();
   await page.unrouteAll();
   await live(page);
   assert.ok(takeComplaints(page).every((said) => said.includes('status of 429')));
 });
 
-test('a new server brings a new page, once nobody is asked anything', async (t) => {
+test('a page reloads after an upgrade, but not while a dialog is open', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
@@ -148,7 +152,7 @@ test('a new server brings a new page, once nobody is asked anything', async (t) 
   await page.locator('[data-robot]', { hasText: 'atlas' }).waitFor();
   await page.evaluate(() => (window.isSameDocument = true));
   await page.keyboard.press('?');
-  await page.getByRole('heading', { name: 'Keys' }).waitFor();
+  await page.getByRole('heading', { name: 'Keyboard shortcuts' }).waitFor();
   await page.route(/\/api\/v1\/server$/, async (route) => {
     const response = await route.fetch();
     await route.fulfill({ response, json: { ...(await response.json()), version: '9.9.9' } });
@@ -167,7 +171,7 @@ test('a new server brings a new page, once nobody is asked anything', async (t) 
   assert.ok(takeComplaints(page).every((said) => said.includes('status of 503')));
 });
 
-test('a link with a token signs nobody in by itself', async (t) => {
+test('a link with a token does not sign in by itself', async (t) => {
   const server = await Server.start(t);
   await server.ask('POST', '/users', { name: 'mallory', roles: ['viewer'] });
   const { token } = await server.ask('POST', '/tokens', { user: 'mallory' });
@@ -181,7 +185,7 @@ test('a link with a token signs nobody in by itself', async (t) => {
   const isStillIn = async (one) => {
     await live(one);
     await settled(one);
-    assert.equal(await one.locator('.who').innerText(), 'operator.token');
+    assert.equal(await one.locator('.user').innerText(), 'operator.token');
     assert.equal(
       await one.evaluate(() =>
         fetch('/api/v1/me')
@@ -206,7 +210,7 @@ test('a link with a token signs nobody in by itself', async (t) => {
   // the sign-in already.
   const stranger = await it.newPage();
   const isAsked = async () => {
-    await stranger.getByText('Use it only if you know from whom it comes.').waitFor();
+    await stranger.getByText('Use it only if you trust the sender.').waitFor();
     await until(stranger, () => document.activeElement.matches('.by-token button'));
     assert.equal(
       await stranger.evaluate(() => fetch('/api/v1/me').then(({ status }) => status)),
@@ -216,14 +220,14 @@ test('a link with a token signs nobody in by itself', async (t) => {
   await stranger.goto(link);
   await isAsked();
   await stranger.reload();
-  await stranger.getByLabel('Name', { exact: true }).waitFor();
+  await stranger.getByLabel('Username').waitFor();
   await stranger.goto(link);
   await isAsked();
   await stranger.keyboard.press('Enter');
-  await stranger.locator('.who', { hasText: 'mallory' }).waitFor();
+  await stranger.locator('.user', { hasText: 'mallory' }).waitFor();
 });
 
-test('who signs in hears nothing that was for who was in before', async (t) => {
+test('a new user receives no events of the previous user', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas', { site: 'lab' });
   await server.ask('POST', '/users', {
@@ -235,21 +239,21 @@ test('who signs in hears nothing that was for who was in before', async (t) => {
   const context = await (await browser(t)).newContext();
   const [mine, theirs] = [await context.newPage(), await context.newPage()];
   await mine.goto(server.url);
-  await mine.getByLabel('Name', { exact: true }).fill('alice');
+  await mine.getByLabel('Username').fill('alice');
   await mine.getByLabel('Password').fill(PASSWORD);
   await followLink(theirs, server, server.token);
   await live(theirs);
   await mine.getByRole('button', { name: 'Sign in', exact: true }).click();
   await live(mine);
-  await theirs.getByLabel('Name', { exact: true }).waitFor();
+  await theirs.getByLabel('Username').waitFor();
   await Puppet.enroll(server, 'borea', { site: 'yard' });
   await Puppet.enroll(server, 'corvus', { site: 'lab' });
   await mine.locator('[data-robot]', { hasText: 'corvus' }).waitFor();
   assert.deepEqual(await mine.locator('[data-robot] .name').allInnerTexts(), ['atlas', 'corvus']);
-  assert.match(await mine.locator('.who').innerText(), /^alice/);
+  assert.match(await mine.locator('.user').innerText(), /^alice/);
 });
 
-test('who could not be signed out is told so, and stays in', async (t) => {
+test('a failed sign-out shows an error and keeps the session', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   const signOut = page.getByRole('button', { name: 'Sign out' });
@@ -257,27 +261,27 @@ test('who could not be signed out is told so, and stays in', async (t) => {
     route.request().method() === 'DELETE' ? route.fulfill({ status: 504 }) : route.continue(),
   );
   await signOut.click();
-  await page.getByText('Signing out failed: the server answered 504').waitFor();
-  assert.ok(await signOut.isVisible(), 'the page is still in');
+  await page.getByText('Could not sign out: the server responded with status 504').waitFor();
+  assert.ok(await signOut.isVisible(), 'the user is still signed in');
   await page.unrouteAll();
   await signOut.click();
-  await page.getByLabel('Name', { exact: true }).waitFor();
+  await page.getByLabel('Username').waitFor();
   // A session that has ended already needs no ending.
   await followLink(page, server, server.token);
   await live(page);
   assert.equal(
-    await page.getByText('Signing out failed').count(),
+    await page.getByText('Could not sign out').count(),
     0,
-    'who comes next is told nothing of it',
+    'the next user does not see the error',
   );
   await page.route(/\/session$/, (route) =>
     route.request().method() === 'DELETE' ? route.fulfill({ status: 401 }) : route.continue(),
   );
   await signOut.click();
-  await page.getByLabel('Name', { exact: true }).waitFor();
+  await page.getByLabel('Username').waitFor();
 });
 
-test('a person sees their robots and what they may do with them', async (t) => {
+test('a user sees the robots of their scope and the permitted actions', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea']) await Puppet.enroll(server, name);
   await server.ask('POST', '/users', {
@@ -289,7 +293,7 @@ test('a person sees their robots and what they may do with them', async (t) => {
   const page = await (await browser(t)).newPage();
   await page.goto(server.url);
   const signIn = async (password) => {
-    await page.getByLabel('Name', { exact: true }).fill('alice');
+    await page.getByLabel('Username').fill('alice');
     await page.getByLabel('Password').fill(password);
     await page.getByRole('button', { name: 'Sign in', exact: true }).click();
   };
@@ -297,16 +301,16 @@ test('a person sees their robots and what they may do with them', async (t) => {
   await page.getByRole('alert').filter({ hasText: 'or the password is wrong' }).waitFor();
   await signIn(PASSWORD);
   await live(page);
-  await page.locator('.who', { hasText: 'alice' }).waitFor();
+  await page.locator('.user', { hasText: 'alice' }).waitFor();
   assert.deepEqual(await page.locator('[data-robot] .name').allInnerTexts(), ['atlas']);
   assert.deepEqual(
     await page.locator('[data-robot] .operations button').allInnerTexts(),
     ['Monitor'],
-    'what a viewer may do',
+    'the actions of a viewer',
   );
 });
 
-test('everything is done by keys', async (t) => {
+test('robots can be found, selected and opened by keyboard', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea', 'corvus']) await Puppet.enroll(server, name);
   const page = await open(t, server);
@@ -328,9 +332,9 @@ test('everything is done by keys', async (t) => {
   await page.keyboard.press('Escape');
   await page.getByText('1 selected').waitFor({ state: 'detached' });
   await page.keyboard.press('?');
-  await page.getByRole('heading', { name: 'Keys' }).waitFor();
+  await page.getByRole('heading', { name: 'Keyboard shortcuts' }).waitFor();
   await page.keyboard.press('Escape');
-  await page.getByRole('heading', { name: 'Keys' }).waitFor({ state: 'hidden' });
+  await page.getByRole('heading', { name: 'Keyboard shortcuts' }).waitFor({ state: 'hidden' });
   await page.keyboard.press('Enter');
   await page.waitForURL(/#\/robots\/borea/);
   // Hidden rows are not selected.
@@ -346,7 +350,7 @@ test('everything is done by keys', async (t) => {
   assertQuiet(page);
 });
 
-test('a key right after a question was left is not lost', async (t) => {
+test('a key press right after a dialog closes is not lost', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
@@ -360,13 +364,13 @@ test('a key right after a question was left is not lost', async (t) => {
   assertQuiet(page);
 });
 
-test('robots are chosen one by one, as a range, and all that match', async (t) => {
+test('robots can be selected one by one, as a range, or all that match', async (t) => {
   const server = await Server.start(t);
   for (const name of ['atlas', 'borea', 'corvus', 'delphin', 'echo'])
     await Puppet.enroll(server, name);
   const page = await open(t, server);
   await until(page, () => document.querySelectorAll('[data-robot]').length === 5);
-  const chosen = async (...names) => {
+  const selected = async (...names) => {
     await page.getByText(`${names.length} selected`).waitFor();
     assert.deepEqual(
       await page.locator('[data-robot][aria-selected=true] .name').allInnerTexts(),
@@ -376,41 +380,41 @@ test('robots are chosen one by one, as a range, and all that match', async (t) =
   const box = (name) => page.getByRole('checkbox', { name: `Select ${name}`, exact: true });
   await box('borea').click();
   await box('delphin').click({ modifiers: ['Shift'] });
-  await chosen('borea', 'corvus', 'delphin');
+  await selected('borea', 'corvus', 'delphin');
   await box('corvus').click();
-  await chosen('borea', 'delphin');
+  await selected('borea', 'delphin');
   await page.keyboard.press('Escape');
   await page.getByText('2 selected').waitFor({ state: 'detached' });
   for (const key of ['ArrowUp', 'x', 'ArrowDown', 'ArrowDown', 'Shift+X'])
     await page.keyboard.press(key);
-  await chosen('borea', 'corvus', 'delphin');
-  await page.getByRole('button', { name: 'Select all 5 that match' }).click();
-  await chosen('atlas', 'borea', 'corvus', 'delphin', 'echo');
+  await selected('borea', 'corvus', 'delphin');
+  await page.getByRole('button', { name: 'Select all 5 matching robots' }).click();
+  await selected('atlas', 'borea', 'corvus', 'delphin', 'echo');
   await page.keyboard.press('Escape');
   await page.keyboard.press('/');
   await page.keyboard.type('or');
   await until(page, () => document.querySelectorAll('[data-robot]').length === 2);
   await box('corvus').click();
-  await page.getByRole('button', { name: 'Select all 2 that match' }).click();
-  await chosen('borea', 'corvus');
+  await page.getByRole('button', { name: 'Select all 2 matching robots' }).click();
+  await selected('borea', 'corvus');
   // A range back to a selected row leaves the row selected, and its box shows that.
   await box('corvus').click();
-  await chosen('borea');
+  await selected('borea');
   await box('corvus').click();
   await box('borea').click({ modifiers: ['Shift'] });
-  await chosen('borea', 'corvus');
+  await selected('borea', 'corvus');
   for (const name of ['borea', 'corvus']) assert.ok(await box(name).isChecked(), name);
-  // None are all.
-  await page.getByRole('searchbox').fill('nobody');
-  await page.getByText('No robot is like that.').waitFor();
-  const all = page.getByRole('checkbox', { name: 'Select all that are shown' });
+  // With no rows, the box stays clear.
+  await page.getByRole('searchbox').fill('absent');
+  await page.getByText('No robots match this filter.').waitFor();
+  const all = page.getByRole('checkbox', { name: 'Select all shown robots' });
   await all.click();
   await settled(page);
   assert.equal(await all.isChecked(), false);
   assertQuiet(page);
 });
 
-test('a label and a version that are searched for are meant exactly', async (t) => {
+test('a search for a label or a version matches exactly', async (t) => {
   const server = await Server.start(t);
   const sites = { atlas: 'lab', borea: 'lab2', corvus: 'lab', delphin: 'yard' };
   for (const [name, site] of Object.entries(sites)) await Puppet.enroll(server, name, { site });
@@ -442,7 +446,7 @@ test('a label and a version that are searched for are meant exactly', async (t) 
   assertQuiet(page);
 });
 
-test('robots are found by their agent, their processor and their ROS', async (t) => {
+test('a search finds robots by agent version, architecture and ROS distribution', async (t) => {
   const server = await Server.start(t);
   const hosts = {
     atlas: { agent_version: '0.9.7', arch: 'x86_64', ros_distros: ['jazzy', 'kilted'] },
@@ -469,7 +473,7 @@ test('robots are found by their agent, their processor and their ROS', async (t)
   assertQuiet(page);
 });
 
-test('who is in a row by keys stays in it when it is put elsewhere', async (t) => {
+test('the keyboard focus follows a row that moves', async (t) => {
   const server = await Server.start(t);
   const puppets = [];
   for (const name of ['atlas', 'borea', 'corvus']) puppets.push(await Puppet.enroll(server, name));
@@ -507,19 +511,19 @@ test('who is in a row by keys stays in it when it is put elsewhere', async (t) =
   assertQuiet(page);
 });
 
-test('a question asked right after another was left stays', async (t) => {
+test('a dialog opened right after another closes stays open', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   await page.evaluate(async () => {
-    const { open, close } = await import('/ui/dialog.js');
+    const { openDialog, closeDialog } = await import('/ui/dialog.js');
     const frame = () => new Promise((resume) => requestAnimationFrame(resume));
-    const ask = (title) => open({ title, body: () => '' });
+    const ask = (title) => openDialog({ title, body: () => '' });
     ask('First');
     await frame();
     const wasClosed = new Promise((resume) =>
       document.getElementById('dialog').addEventListener('close', resume),
     );
-    close();
+    closeDialog();
     // In the frame that closes the browser's dialog, after the closing: the browser's event comes
     // later.
     requestAnimationFrame(() => ask('Second'));
@@ -533,7 +537,7 @@ test('a question asked right after another was left stays', async (t) => {
   assertQuiet(page);
 });
 
-test('every page can be used by everybody, light and dark, wide and narrow', async (t) => {
+test('every view is accessible and fits the window, light and dark, wide and narrow', async (t) => {
   const server = await Server.start(t);
   const robots = [];
   for (const [name, site] of [
@@ -594,7 +598,7 @@ test('every page can be used by everybody, light and dark, wide and narrow', asy
   }
 });
 
-test('a long version does not make the page of a robot wider than the window', async (t) => {
+test('a long version does not widen the robot view', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', `1.0.0-${'SNAPSHOT'.repeat(7)}`, { to: 'atlas' });
@@ -611,7 +615,7 @@ test('a long version does not make the page of a robot wider than the window', a
   assertQuiet(page);
 });
 
-test('how machines do comes to the list by itself', async (t) => {
+test('the robot list shows new vitals without a reload', async (t) => {
   const server = await Server.start(t);
   const atlas = await Puppet.enroll(server, 'atlas');
   const page = await open(t, server);
@@ -640,7 +644,7 @@ test('how machines do comes to the list by itself', async (t) => {
   assertQuiet(page);
 });
 
-test('what happens comes to the server page by the stream, not by asking', async (t) => {
+test('the server view receives events from the stream, without polling', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server, { hash: '#/server' });
   await page.getByRole('heading', { name: 'Events' }).waitFor();
@@ -661,17 +665,13 @@ test('what happens comes to the server page by the stream, not by asking', async
   assert.deepEqual(
     asked.filter((path) => path !== '/api/v1/server/status'),
     [],
-    'nothing else was asked for',
+    'no other requests',
   );
-  assert.equal(
-    await page.evaluate(() => window.isSameDocument),
-    true,
-    'the page was never loaded again',
-  );
+  assert.equal(await page.evaluate(() => window.isSameDocument), true, 'the page was not reloaded');
   assert.match(
     await page.locator('.feed .entry').first().innerText(),
     /borea/,
-    'the newest is first',
+    'the newest event is first',
   );
   assertQuiet(page);
 });

@@ -18,16 +18,16 @@ const FAILED = {
   each: () => ({ failure: { code: 'build_failed', text: 'colcon build ended with status 1' } }),
 };
 
-const enrolAll = (server, labels) =>
+const enrollAll = (server, labels) =>
   Promise.all(Object.entries(labels).map(([name, its]) => Puppet.enroll(server, name, its)));
 /** The names of the robots that a deployment is for. */
 const receivers = async (server, id) =>
   (await server.ask('GET', `/deployments/${id}`)).assignments.map(({ name }) => name).sort();
 const newest = async (server) => (await server.ask('GET', '/deployments')).deployments[0].id;
 
-test('who fails while the question is open is not retried with the others', async (t) => {
+test('a robot that fails while the retry dialog is open is not retried', async (t) => {
   const server = await Server.start(t);
-  const [atlas, borea] = await enrolAll(server, { atlas: {}, borea: {} });
+  const [atlas, borea] = await enrollAll(server, { atlas: {}, borea: {} });
   const page = await open(t, server);
   const dialog = page.getByRole('dialog');
   // All that failed, and all that failed for one reason.
@@ -49,9 +49,9 @@ test('who fails while the question is open is not retried with the others', asyn
   assertQuiet(page);
 });
 
-test('who is limited to some robots retries those', async (t) => {
+test('an operator with a scope retries only the robots in it', async (t) => {
   const server = await Server.start(t);
-  const robots = await enrolAll(server, { atlas: { site: 'lab' }, borea: { site: 'yard' } });
+  const robots = await enrollAll(server, { atlas: { site: 'lab' }, borea: { site: 'yard' } });
   const { id } = server.push('talker', '1.0.0', { to: '*' });
   for (const robot of robots) await robot.report('failed', FAILED);
   await server.ask('POST', '/users', { name: 'alice', roles: ['operator'], scope: 'site=lab' });
@@ -64,9 +64,9 @@ test('who is limited to some robots retries those', async (t) => {
   assertQuiet(page);
 });
 
-test('what a newer order has taken the place of is not to be retried', async (t) => {
+test('a superseded deployment cannot be retried', async (t) => {
   const server = await Server.start(t);
-  const robots = await enrolAll(server, { atlas: {}, borea: {} });
+  const robots = await enrollAll(server, { atlas: {}, borea: {} });
   const { id } = server.push('talker', '1.0.0', { to: '*' });
   for (const robot of robots) await robot.report('failed', FAILED);
   const page = await open(t, server, { hash: `#/deployments/${id}` });
@@ -79,9 +79,9 @@ test('what a newer order has taken the place of is not to be retried', async (t)
   assertQuiet(page);
 });
 
-test('labels that somebody else changes while a robot is edited stay', async (t) => {
+test('labels changed by another user during an edit are kept', async (t) => {
   const server = await Server.start(t);
-  const [{ id }] = await enrolAll(server, { atlas: { site: 'lab', floor: '2', zone: 'a' } });
+  const [{ id }] = await enrollAll(server, { atlas: { site: 'lab', floor: '2', zone: 'a' } });
   const page = await open(t, server);
   await page.getByText('Columns').click();
   await page.getByLabel('Labels').check();
@@ -99,8 +99,8 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
       .waitFor();
     await dialog.getByLabel(field).fill(text);
     await dialog.getByRole('button', { name: 'Save' }).click();
-    await page.getByText('is changed.').waitFor();
-    await page.getByRole('button', { name: 'Close the notice' }).click();
+    await page.getByText('updated.').waitFor();
+    await page.getByRole('button', { name: 'Close notification' }).click();
     return (await server.ask('GET', `/robots/${id}`)).labels;
   };
   const first = { cart: 'one', floor: '3', site: 'lab' };
@@ -115,15 +115,15 @@ test('labels that somebody else changes while a robot is edited stay', async (t)
   assertQuiet(page);
 });
 
-test('labels that somebody else changes while a robot’s page is edited stay', async (t) => {
+test('labels changed by another user during an edit in the robot view are kept', async (t) => {
   const server = await Server.start(t);
-  const [{ id }] = await enrolAll(server, { atlas: { site: 'lab' } });
+  const [{ id }] = await enrollAll(server, { atlas: { site: 'lab' } });
   const page = await open(t, server, { hash: '#/robots/atlas/edit' });
   await page.getByRole('textbox', { name: 'Labels' }).fill('site=lab, floor=3');
   await server.ask('PATCH', `/robots/${id}`, { labels: { site: 'lab', quarantine: 'yes' } });
   await page.getByRole('list', { name: 'Labels' }).getByText('quarantine=yes').waitFor();
   await page.getByRole('button', { name: 'Save' }).click();
-  await page.getByText('is changed.').waitFor();
+  await page.getByText('updated.').waitFor();
   assert.deepEqual((await server.ask('GET', `/robots/${id}`)).labels, {
     floor: '3',
     quarantine: 'yes',
@@ -146,9 +146,9 @@ function breakableStream() {
   };
 }
 
-test('what is typed outlives an upgrade of the server, and the page is loaded anew after', async (t) => {
+test('unsaved input outlives a server upgrade; discarding it reloads the page', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(server, { atlas: { site: 'lab' } });
+  await enrollAll(server, { atlas: { site: 'lab' } });
   const page = await open(t, server, { hash: '#/robots/atlas/edit' });
   await page.addInitScript(breakableStream);
   await page.reload();
@@ -168,7 +168,7 @@ test('what is typed outlives an upgrade of the server, and the page is loaded an
   assert.equal(await labels.inputValue(), 'site=yard');
   assert.equal(await page.evaluate(() => window.isSameDocument), true);
   const loaded = page.waitForEvent('load');
-  await page.getByRole('button', { name: 'Undo changes' }).click();
+  await page.getByRole('button', { name: 'Discard changes' }).click();
   await loaded;
   assert.equal(await page.evaluate(() => window.isSameDocument), undefined);
 });
@@ -183,15 +183,15 @@ function stallStream() {
       : fetch(url, options);
 }
 
-test('who comes unseen gets nothing of what is ordered for all', async (t) => {
+test('a robot that enrolls unseen is not part of an action on all shown robots', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(server, { atlas: {}, borea: {} });
+  await enrollAll(server, { atlas: {}, borea: {} });
   server.push('talker', '1.0.0', { to: '*' });
   const page = await open(t, server);
   await page.addInitScript(stallStream);
   await page.reload();
   await live(page);
-  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('checkbox', { name: 'Select all shown robots' }).click();
   await page.getByText('2 selected').waitFor();
   await Puppet.enroll(server, 'corvus');
   server.push('talker', '1.0.0', { to: 'corvus' });
@@ -199,11 +199,11 @@ test('who comes unseen gets nothing of what is ordered for all', async (t) => {
   await page.getByRole('button', { name: 'Label…' }).click();
   await page.getByLabel('Labels to set').fill('floor=2');
   await dialog.getByRole('button', { name: 'Label' }).click();
-  await page.getByText('2 robots labelled.').waitFor();
+  await page.getByText('Labels of 2 robots updated.').waitFor();
   await page.getByRole('button', { name: 'Stop…' }).click();
   await dialog.getByLabel('talker').check();
   await dialog.getByRole('button', { name: 'Stop' }).click();
-  await page.getByText('talker: to be stopped on 2 robots.').waitFor();
+  await page.getByText('Stop requested: talker on 2 robots.').waitFor();
   const corvus = await server.ask('GET', '/robots/corvus');
   assert.deepEqual([corvus.labels, corvus.tasks[0].wanted], [{}, 'running']);
   await page.getByRole('button', { name: 'Push…' }).click();
@@ -214,9 +214,9 @@ test('who comes unseen gets nothing of what is ordered for all', async (t) => {
   assertQuiet(page);
 });
 
-test('an order needs a package, robots that there are, and a word of its own for many', async (t) => {
+test('a deployment needs a package, existing robots and, for many, a confirmation', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(
+  await enrollAll(
     server,
     Object.fromEntries(
       Array.from({ length: 12 }, (_, number) => [
@@ -245,15 +245,15 @@ test('an order needs a package, robots that there are, and a word of its own for
   await page.keyboard.press('Enter');
   await isRefusedAt('order-name');
   await dialog.getByLabel('Package').selectOption('talker');
-  await dialog.getByText('Yes, order it on all 12 robots').waitFor();
+  await dialog.getByText('Yes, deploy to all 12 robots').waitFor();
   await deploy.click();
-  await isRefusedAt('order-many');
-  await assertAccessible(page, 'an order for many');
+  await isRefusedAt('order-confirmation');
+  await assertAccessible(page, 'a deployment to many robots');
   // An unknown name is no order for the other robots, and without a name no robot is meant.
   for (const [selector, said] of [
-    ['r1,r77', 'No robot has the name or id r77.'],
-    ['!r77', 'No robot has the name or id r77.'],
-    ['site=mars', 'No robot is meant.'],
+    ['r1,r77', 'No robot has the name or ID r77.'],
+    ['!r77', 'No robot has the name or ID r77.'],
+    ['site=mars', 'No robots match.'],
   ]) {
     await robots.fill(selector);
     await dialog.locator('#match', { hasText: said }).waitFor();
@@ -262,15 +262,15 @@ test('an order needs a package, robots that there are, and a word of its own for
   }
   // A confirmation for twelve robots does not hold for others; few robots need no confirmation.
   await robots.fill('*');
-  await dialog.getByText('Yes, order it on all 12 robots').click();
+  await dialog.getByText('Yes, deploy to all 12 robots').click();
   await robots.fill('half=odd');
-  await dialog.getByText('6 robots now').waitFor();
-  assert.equal(await dialog.getByText('Yes, order it').count(), 0);
+  await dialog.getByText('6 robots match').waitFor();
+  assert.equal(await dialog.getByText('Yes, deploy to').count(), 0);
   await robots.fill('!r1');
-  await dialog.getByText('Yes, order it on 11 robots').waitFor();
+  await dialog.getByText('Yes, deploy to 11 robots').waitFor();
   await deploy.click();
-  await isRefusedAt('order-many');
-  await dialog.getByText('Yes, order it on 11 robots').click();
+  await isRefusedAt('order-confirmation');
+  await dialog.getByText('Yes, deploy to 11 robots').click();
   await deploy.click();
   await page.waitForURL(/#\/deployments\/d/);
   assert.equal((await receivers(server, await newest(server))).length, 11);
@@ -285,20 +285,18 @@ test('an order needs a package, robots that there are, and a word of its own for
   assertQuiet(page);
 });
 
-test('who waits for approval gets no orders, and is deleted like others', async (t) => {
+test('a robot that awaits approval gets no orders but can be deleted', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(server, { atlas: {} });
+  await enrollAll(server, { atlas: {} });
   server.push('talker', '1.0.0');
-  const { token } = await server.enrolmentToken({ approval: true });
+  const { token } = await server.createEnrollmentToken({ approval: true });
   const wait = (name, mac) => server.ask('POST', '/enroll', { mac, name }, { token });
   await wait('stranger', '02:00:00:00:00:81');
   const page = await open(t, server);
   const dialog = page.getByRole('dialog');
-  const said = dialog.getByText(
-    '1 of those that were chosen waits for approval and gets nothing until then.',
-  );
+  const note = dialog.getByText('1 selected robot awaits approval and is skipped.');
   await page.locator('[data-robot]').nth(1).waitFor();
-  await page.getByRole('checkbox', { name: 'Select all that are shown' }).click();
+  await page.getByRole('checkbox', { name: 'Select all shown robots' }).click();
   for (const [button, title] of [
     ['Label…', 'Label atlas'],
     ['Stop…', 'Stop tasks on atlas'],
@@ -306,17 +304,17 @@ test('who waits for approval gets no orders, and is deleted like others', async 
   ]) {
     await page.getByRole('button', { name: button }).click();
     await dialog.getByRole('heading', { name: title }).waitFor();
-    await said.waitFor();
+    await note.waitFor();
     await page.keyboard.press('Escape');
   }
   // Also of robots matched by a selector.
   await page.goto(`${server.url}/#/packages`);
   await page.getByRole('button', { name: 'Push talker 1.0.0' }).click();
   await dialog.getByLabel('Robots', { exact: true }).fill('*');
-  await dialog.getByText('1 robot now: atlas').waitFor();
+  await dialog.getByText('1 robot matches: atlas').waitFor();
   await page.keyboard.press('Escape');
   await page.goto(`${server.url}/#/settings`);
-  const waiting = page.locator('section', { hasText: 'Robots that wait to be approved' });
+  const waiting = page.locator('section', { hasText: 'Robots awaiting approval' });
   await waiting.getByRole('cell', { name: 'stranger' }).waitFor();
   await wait('second', '02:00:00:00:00:82');
   await waiting.getByRole('cell', { name: 'second' }).waitFor();
@@ -332,9 +330,9 @@ test('who waits for approval gets no orders, and is deleted like others', async 
   assertQuiet(page);
 });
 
-test('what is wrong in a part of the order that is folded is shown', async (t) => {
+test('an invalid value in the collapsed options of a deployment is revealed', async (t) => {
   const server = await Server.start(t);
-  await enrolAll(server, { atlas: {} });
+  await enrollAll(server, { atlas: {} });
   server.push('talker', '1.0.0');
   const page = await open(t, server, { hash: '#/packages' });
   const dialog = page.getByRole('dialog');
@@ -350,16 +348,16 @@ test('what is wrong in a part of the order that is folded is shown', async (t) =
   assertQuiet(page);
 });
 
-test('every order to tasks can be given to all that are chosen, wide and narrow', async (t) => {
+test('every task action works on all selected robots, wide and narrow', async (t) => {
   const server = await Server.start(t);
-  const robots = await enrolAll(server, { atlas: {}, borea: {} });
+  const robots = await enrollAll(server, { atlas: {}, borea: {} });
   const it = await browser(t);
   const orders = [
-    ['Stop', 'stopped'],
-    ['Start', 'started'],
-    ['Restart', 'restarted'],
-    ['Roll back', 'rolled back'],
-    ['Remove task', 'removed'],
+    ['Stop', 'Stop'],
+    ['Start', 'Start'],
+    ['Restart', 'Restart'],
+    ['Roll back', 'Rollback'],
+    ['Remove task', 'Removal'],
   ];
   for (const width of [1280, 375]) {
     for (const version of ['1.0.0', '1.1.0']) {
@@ -371,23 +369,23 @@ test('every order to tasks can be given to all that are chosen, wide and narrow'
     for (const name of ['atlas', 'borea'])
       await page.getByRole('checkbox', { name: `Select ${name}` }).click();
     await page.getByText('2 selected').waitFor();
-    await assertAccessible(page, `what is done with the selected, at ${width}`);
+    await assertAccessible(page, `the actions for selected robots at ${width}`);
     const [inner, outer] = await page.evaluate(() => [
       document.documentElement.scrollWidth,
       document.documentElement.clientWidth,
     ]);
     assert.ok(inner <= outer, `not wider than the window at ${width}: ${inner} > ${outer}`);
-    const bar = page.getByRole('toolbar', { name: 'With the selected robots' });
+    const bar = page.getByRole('toolbar', { name: 'Actions for selected robots' });
     assert.ok(
       (await bar.boundingBox()).height < 120,
       `at ${width} the robots can be seen above the bar`,
     );
-    for (const [button, done] of orders) {
+    for (const [button, noun] of orders) {
       await bar.getByRole('button', { name: `${button}…`, exact: true }).click();
       await dialog.getByLabel('talker').check();
       await dialog.getByRole('button', { name: button.split(' task')[0], exact: true }).click();
-      await page.getByText(`talker: to be ${done} on 2 robots.`).waitFor();
-      await page.getByRole('button', { name: 'Close the notice' }).click();
+      await page.getByText(`${noun} requested: talker on 2 robots.`).waitFor();
+      await page.getByRole('button', { name: 'Close notification' }).click();
     }
     assertQuiet(page);
   }

@@ -3,7 +3,7 @@
 import { test } from 'node:test';
 import { assert, assertQuiet, open, Puppet, Server, until } from './harness.mjs';
 
-test('a map that came back is shown as a picture', async (t) => {
+test('an uploaded map is shown as an image', async (t) => {
   const server = await Server.start(t);
   const atlas = await Puppet.enroll(server, 'atlas');
   const map = Buffer.concat([
@@ -35,7 +35,7 @@ test('a map that came back is shown as a picture', async (t) => {
     return [0, 4, 8, 12, 16, 20].map((at) => data[at]);
   });
   assert.deepEqual(grays, [0, 205, 254, 254, 205, 0]);
-  const ends = "The picture can't be shown: it ends before its last row";
+  const ends = 'Cannot show the image: the file ends before the last row';
   await until(
     page,
     () =>
@@ -44,8 +44,8 @@ test('a map that came back is shown as a picture', async (t) => {
   );
   assert.deepEqual(
     await page.locator('.outputs figure .bad').allInnerTexts(),
-    [ends, ends, "The picture can't be shown: it is too large", ''],
-    'four of many are shown',
+    [ends, ends, 'Cannot show the image: the image is too large', ''],
+    'only four images are shown',
   );
   await page.locator('.outputs', { hasText: '14 more: taskd output get' }).waitFor();
   const link = page.locator('.outputs a[download="corridor.pgm"]');

@@ -1,5 +1,5 @@
-// Packages and deployments in the page: a folder is brought, looked into, compared and ordered;
-// what failed is retried.
+// Packages and deployments in the page: uploading a folder, browsing and comparing versions,
+// deploying, and retrying failures.
 
 import { chmodSync, mkdirSync, writeFileSync } from 'node:fs';
 import { join } from 'node:path';
@@ -34,9 +34,9 @@ const manifest = (name, version, more = 'exec = ["./run.sh"]') =>
   `name = "${name}"\nversion = "${version}"\n\n[run]\n${more}\n`;
 const SCRIPT = '#!/bin/sh\nexec sleep 1000\n';
 
-const bring = (page, path) => page.getByLabel('Folder to upload').setInputFiles(path);
+const uploadFolder = (page, path) => page.getByLabel('Folder to upload').setInputFiles(path);
 
-test('a folder that is brought is the package that the command makes of it, and runs', async (t) => {
+test('an uploaded folder equals the package of the pack command, and runs', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
   const files = {
@@ -48,21 +48,21 @@ test('a folder that is brought is the package that the command makes of it, and 
   };
   const path = folder(t, 'talker', files);
   const page = await open(t, server, { hash: '#/packages' });
-  await page.getByText('No package is here yet.').waitFor();
-  await bring(page, path);
+  await page.getByText('No packages yet').waitFor();
+  await uploadFolder(page, path);
   await page.locator('[data-package="talker@1.0.0"]').waitFor();
-  const [brought] = (await server.ask('GET', '/packages')).packages;
+  const [uploaded] = (await server.ask('GET', '/packages')).packages;
   const packed = JSON.parse(server.operate('pack', path, '-o', 'json'));
-  assert.ok(JSON.stringify(packed).includes(brought.package.manifest.digest), 'the same digest');
+  assert.ok(JSON.stringify(packed).includes(uploaded.package.manifest.digest), 'the same digest');
   await assertAccessible(page, 'the packages');
   await page.locator('[data-package="talker@1.0.0"]').getByRole('button', { name: 'Push' }).click();
   await page.getByRole('dialog').getByLabel('Robots', { exact: true }).fill('*');
-  await page.getByRole('dialog').getByText('1 robot now: atlas').waitFor();
+  await page.getByRole('dialog').getByText('1 robot matches: atlas').waitFor();
   await assertAccessible(page, 'the order');
   await page.getByRole('dialog').getByRole('button', { name: 'Deploy' }).click();
-  await page.locator('[data-part=atlas] .phase', { hasText: 'running' }).waitFor();
+  await page.locator('[data-assignment=atlas] .phase', { hasText: 'running' }).waitFor();
   await page
-    .locator('[data-part=atlas]')
+    .locator('[data-assignment=atlas]')
     .getByRole('button', { name: /^Phases of atlas/ })
     .click();
   await page.locator('.steps', { hasText: 'running' }).waitFor();
@@ -70,12 +70,12 @@ test('a folder that is brought is the package that the command makes of it, and 
   assertQuiet(page);
 });
 
-test('what is wrong with a folder is said with its file and key', async (t) => {
+test('an error in an uploaded folder names the file and the key', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server, { hash: '#/packages' });
-  await bring(page, folder(t, 'notes', { 'readme.md': 'nothing' }));
-  await page.getByText('notes: there is neither a task.toml nor a package.xml in it').waitFor();
-  await bring(
+  await uploadFolder(page, folder(t, 'notes', { 'readme.md': 'nothing' }));
+  await page.getByText('notes: contains neither task.toml nor package.xml').waitFor();
+  await uploadFolder(
     page,
     folder(t, 'talker', { 'task.toml': manifest('talker', '1.0.0', 'exec = ["./absent.sh"]') }),
   );
@@ -91,7 +91,7 @@ test('what is wrong with a folder is said with its file and key', async (t) => {
   await page.locator('.upload', { hasText: 'talker' }).waitFor({ state: 'detached' });
 });
 
-test('versions are looked into, compared and deleted', async (t) => {
+test('versions can be browsed, compared and deleted', async (t) => {
   const server = await Server.start(t);
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, old: 'gone' } });
   server.push('talker', '2.0.0', {
@@ -124,7 +124,7 @@ test('versions are looked into, compared and deleted', async (t) => {
   assertQuiet(page);
 });
 
-test('two packages of one version are told apart', async (t) => {
+test('two packages with the same version are distinguished', async (t) => {
   const server = await Server.start(t);
   const running = (more) => ({
     each: ({ deployment, package: { version, manifest } }) => ({
@@ -178,7 +178,7 @@ test('two packages of one version are told apart', async (t) => {
   assertQuiet(page);
 });
 
-test('what robots should have is not offered to be deleted', async (t) => {
+test('a package that is assigned to robots cannot be deleted', async (t) => {
   const server = await Server.start(t);
   await Puppet.enroll(server, 'atlas');
   server.push('talker', '1.0.0', { files: { 'run.sh': SCRIPT, 'x86_64.so': 'one' } });
@@ -192,10 +192,10 @@ test('what robots should have is not offered to be deleted', async (t) => {
   const remove = dialog.getByRole('button', { name: 'Delete' });
   const ask = () => page.getByRole('button', { name: 'Delete…' }).click();
   await ask();
-  await dialog.getByText('1 robot should have it.').waitFor();
+  await dialog.getByText('It is assigned to 1 robot.').waitFor();
   await dialog.getByText('atlas').waitFor();
   assert.equal(await remove.count(), 0);
-  await assertAccessible(page, 'why not');
+  await assertAccessible(page, 'the refusal to delete');
   await page.keyboard.press('Escape');
   // No robot should have the other package of the same version.
   await page.getByRole('link', { name: /^1\.0\.0 \(/ }).click();
@@ -209,7 +209,7 @@ test('what robots should have is not offered to be deleted', async (t) => {
   assertQuiet(page);
 });
 
-test('failures are told by their reason, and retried', async (t) => {
+test('failures are grouped by reason and can be retried', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas');
   const { id } = server.push('sensor', '0.1.0', {

@@ -1,12 +1,15 @@
 // Makes the pictures of the page in docs/page, light and dark: node
 // crates/server/tests/page/pictures.mjs [DIRECTORY] The server and the browser are real, most
-// robots are puppets with a story, and one has ROS: TASKD_TEST_ROS says where.
+// robots are puppets with a story, and one has ROS: TASKD_TEST_ROS says where. ffmpeg reduces the
+// colours, which halves the files.
 
+import { spawnSync } from 'node:child_process';
 import { randomBytes } from 'node:crypto';
 import { mkdirSync } from 'node:fs';
 import { join } from 'node:path';
 import {
   agent,
+  assert,
   browser,
   eventually,
   open,
@@ -56,7 +59,8 @@ class ScanFilter(Node):
 class Slam(LifecycleNode):
     def __init__(self):
         super().__init__("slam")
-        self.declare_parameters("", [("resolution", 0.05), ("map_frame", "map"), ("loop_closure", True), ("min_travel_m", 0.2)])
+        self.declare_parameters("", [("resolution", 0.05), ("map_frame", "map"),
+                                     ("loop_closure", True), ("min_travel_m", 0.2)])
         self.scans = self.create_subscription(LaserScan, "/scan", lambda _: None, 10)
         self.odometry = self.create_subscription(Odometry, "/odom", lambda _: None, 10)
         self.out = self.create_publisher(OccupancyGrid, "/map", 1)
@@ -67,7 +71,8 @@ class Slam(LifecycleNode):
     def tick(self):
         self.step += 1
         log = self.get_logger()
-        log.info(f"pose {math.sin(self.step / 9) * 3:.2f} {self.step * 0.12:.2f}, {40 + self.step} scans matched")
+        x, y = math.sin(self.step / 9) * 3, self.step * 0.12
+        log.info(f"pose {x:.2f} {y:.2f}, {40 + self.step} scans matched")
         if self.step % 7 == 0:
             log.warning(f"scan {40 + self.step} matched badly (0.41), odometry is used")
         if self.step % 10 == 0:
@@ -163,7 +168,9 @@ async function story() {
       await says('failed', () => ({
         failure: {
           code: 'build_failed',
-          text: 'colcon build ended with status 1: fatal error: nav2_msgs/action/navigate_to_pose.hpp: No such file or directory',
+          text:
+            'colcon build ended with status 1: fatal error: ' +
+            'nav2_msgs/action/navigate_to_pose.hpp: No such file or directory',
         },
       }));
     } else {
@@ -206,7 +213,13 @@ async function story() {
     server: 'server',
     settings: 'settings',
   };
-  await server.enrolmentToken({ labels: { site: 'lab' }, uses: 20 });
+  await server.createEnrollmentToken({ labels: { site: 'lab' }, uses: 20 });
+  // A robot that does not poll is soon shown as offline.
+  const polls = setInterval(
+    () => robots.forEach((robot) => robot.desired().catch(() => {})),
+    10_000,
+  );
+  t.after(() => clearInterval(polls));
   const it = await browser(t);
   for (const colorScheme of ['light', 'dark']) {
     const page = await open(t, server, { on: it, colorScheme, viewport: SIZE });
@@ -222,10 +235,34 @@ async function story() {
       if (name === 'server') await page.waitForTimeout(20_000);
       if (name === 'ros') await page.locator('.parameters .value').first().waitFor();
       if (name === 'logs') await page.locator('.log-line').nth(16).waitFor();
-      await page.screenshot({ path: join(target, `${name}-${colorScheme}.png`) });
+      keep(await page.screenshot(), `${name}-${colorScheme}.png`);
     }
     await page.context().close();
   }
+}
+
+/** Writes a picture with few colours: text and lines need no more. */
+function keep(picture, name) {
+  const filter =
+    'split[all][again];[all]palettegen=reserve_transparent=0:max_colors=128[palette];' +
+    '[again][palette]paletteuse=dither=none';
+  const { status, stderr } = spawnSync(
+    'ffmpeg',
+    [
+      '-v',
+      'error',
+      '-y',
+      '-f',
+      'png_pipe',
+      '-i',
+      '-',
+      '-filter_complex',
+      filter,
+      join(target, name),
+    ],
+    { input: picture, encoding: 'utf8' },
+  );
+  assert.equal(status, 0, stderr);
 }
 
 const running = (pid) => ({

@@ -20,7 +20,8 @@ async function provider(t) {
   const environment = process.env.TASKD_TEST_OIDC;
   assert.ok(
     environment,
-    'TASKD_TEST_OIDC is not set: run ./scripts/test, or set it to the directory that scripts/need oidc prints',
+    'TASKD_TEST_OIDC is not set: run ./scripts/test, ' +
+      'or set it to the directory that scripts/need oidc prints',
   );
   const claims = PEOPLE.flatMap((person) => ['--user-claims', JSON.stringify(person)]);
   const child = spawn(
@@ -52,7 +53,7 @@ async function freePort() {
   return port;
 }
 
-test('the page offers the provider, and says what went wrong there', async (t) => {
+test('the page offers the identity provider and explains a failed sign-in', async (t) => {
   const [issuer, port] = [await provider(t), await freePort()];
   const secret = join(directory(t), 'oidc.secret');
   writeFileSync(secret, 'a secret\n');
@@ -83,10 +84,10 @@ test('the page offers the provider, and says what went wrong there', async (t) =
   await signInAs('2');
   await page
     .getByRole('alert')
-    .filter({ hasText: 'You have no role here. Ask an administrator.' })
+    .filter({ hasText: 'Your account has no role on this server. Ask an administrator.' })
     .waitFor();
   assert.equal(page.url(), `${server.url}/`, 'the problem has left the address bar');
   await signInAs('1');
   await live(page);
-  await page.locator('.who', { hasText: 'alice' }).waitFor();
+  await page.locator('.user', { hasText: 'alice' }).waitFor();
 });

@@ -13,11 +13,12 @@ import {
   Server,
 } from './harness.mjs';
 
-test('nodes are looked at, changed and given parameters', async (t) => {
+test('nodes are listed, change their lifecycle state and take parameters', async (t) => {
   const server = await Server.start(t);
   await agent(t, server, 'atlas', await ros(t));
   const run =
-    '#!/bin/sh\nexec python3 probe.py --node mapper --lifecycle --service /say --topic /ticks --hz 5\n';
+    '#!/bin/sh\nexec python3 probe.py ' +
+    '--node mapper --lifecycle --service /say --topic /ticks --hz 5\n';
   server.push('mapper', '1.0.0', {
     files: { 'run.sh': run, 'probe.py': probe },
     more: "[ready]\nhold_s = 0\ntimeout_s = 60\nlifecycle = ['/mapper']\n",
@@ -30,7 +31,7 @@ test('nodes are looked at, changed and given parameters', async (t) => {
   await row('Table of nodes', '/mapper mapper active').waitFor();
   await row('Table of topics', '/ticks std_msgs/msg/String /mapper none').waitFor();
   await page.getByPlaceholder('Filter nodes and topics').fill('tick');
-  await page.getByText('No node is like that.').waitFor();
+  await page.getByText('No nodes match this filter.').waitFor();
   await page.getByPlaceholder('Filter nodes and topics').fill('');
 
   await page
@@ -47,7 +48,7 @@ test('nodes are looked at, changed and given parameters', async (t) => {
   };
   await page.getByRole('button', { name: 'Change resolution' }).click();
   await set('coarse');
-  await page.getByText('This is no JSON value.').waitFor();
+  await page.getByText('Not a valid JSON value.').waitFor();
   await set('-1');
   await page.getByText('/mapper does not accept resolution = -1: must be positive').waitFor();
   await set('2');

@@ -3,7 +3,7 @@
 import { test } from 'node:test';
 import { assert, assertQuiet, eventually, open, Puppet, Server, settled } from './harness.mjs';
 
-const MB = 1e6;
+const MB = 2 ** 20;
 const HELD = { code: 'held', text: 'a wheel is being changed' };
 const FULL = { code: 'disk_low', text: '1 GB is left' };
 const UNWELL = { code: 'unhealthy', text: 'its health check fails' };
@@ -58,7 +58,8 @@ const watchShifts = (page) =>
     const begun = performance.now();
     const all = [];
     const textOf = (node) =>
-      `${node?.parentElement?.className}: ${node?.textContent.trim().replace(/\s+/g, ' ').slice(0, 40)}`;
+      `${node?.parentElement?.className}: ` +
+      node?.textContent.trim().replace(/\s+/g, ' ').slice(0, 40);
     // A duration that is longer by a digit begins further to the left, and pushes nothing.
     const isPushed = ({ node, previousRect, currentRect }) =>
       node?.parentElement?.closest('.rows') && previousRect.top !== currentRect.top;
@@ -88,7 +89,7 @@ const shifts = async (page) => {
   return page.evaluate(() => window.shifts());
 };
 
-test('nothing jumps while data streams', async (t) => {
+test('rows keep their positions while reports arrive', async (t) => {
   const server = await Server.start(t);
   const robots = [];
   for (let index = 0; index < 20; index += 1)
@@ -133,7 +134,7 @@ test('nothing jumps while data streams', async (t) => {
   for (const page of pages) assertQuiet(page);
 });
 
-test('on a narrow screen robots without a task are as high as they are reckoned', async (t) => {
+test('on a narrow screen robots without tasks have the calculated height', async (t) => {
   const server = await Server.start(t);
   const robots = [];
   for (let index = 0; index < 12; index += 1)

@@ -1,19 +1,18 @@
-// Packs a folder into a plain tar, as POSIX describes it: `ustar` headers, and a pax header where a
-// name does not fit into one. The archive is a list of pieces of files, so however large they are,
-// none of them is read into memory.
+// Packs a folder into a POSIX tar: `ustar` headers, and a pax header for names that do not fit. The
+// archive is a list of file slices, so no file is read into memory.
 
 const BLOCK = 512;
 const NAME_BYTES = 100;
-// As many digits as the header has for a size, in base eight.
+// The size field of the header has this many octal digits.
 const MAX_FILE_BYTES = 8 ** 11 - 1;
-// All times are the same, as in what the commands pack: 2000-01-01.
+// A constant time, as in packages that the commands make: 2000-01-01.
 const TIME_S = 946_684_800;
 const READ_AT_ONCE = 16;
 const text = new TextEncoder();
 
 /**
- * The archive of `entries`, each `{ path, file }`, or a directory without a file. Throws what a
- * person can read.
+ * The archive of `entries`, each `{ path, file }`, or a directory without a file. Throws readable
+ * errors.
  */
 export async function pack(entries) {
   const sorted = [...entries].sort((one, other) => (one.path < other.path ? -1 : 1));
@@ -22,7 +21,7 @@ export async function pack(entries) {
   sorted.forEach(({ path, file }, index) => {
     const size = file?.size ?? 0;
     if (size > MAX_FILE_BYTES)
-      throw new Error(`${path}: too large for the page, push it with taskd push`);
+      throw new Error(`${path}: too large for the browser; use taskd push`);
     const name = file ? path : `${path}/`;
     if (!fits(name)) pieces.push(...paxOf(name));
     pieces.push(
@@ -39,7 +38,7 @@ export async function pack(entries) {
   return new Blob(pieces);
 }
 
-// A header is for certain read alike everywhere only if its name is ASCII.
+// Only ASCII names in headers are read alike everywhere.
 const fits = (name) => name.length <= NAME_BYTES && /^[\x20-\x7e]*$/.test(name);
 
 function paxOf(name) {
@@ -51,7 +50,9 @@ function paxOf(name) {
   ];
 }
 
-/** `27 path=some/where\n`, where the number counts the whole line's bytes, its own too. */
+/**
+ * `27 path=some/where\n`: the number is the length of the whole record in bytes, including itself.
+ */
 function paxRecord(key, value) {
   const rest = text.encode(` ${key}=${value}\n`).length;
   let length = rest;
@@ -82,7 +83,10 @@ function header({ name, mode, size, type }) {
   return block;
 }
 
-/** Browsers do not tell who may execute a file. What begins as a program does is taken for one. */
+/**
+ * Browsers do not report the executable bit. Scripts with a shebang and ELF files count as
+ * executable.
+ */
 async function modesOf(entries) {
   const modes = [];
   for (let from = 0; from < entries.length; from += READ_AT_ONCE) {
@@ -97,7 +101,7 @@ async function modeOf({ path, file }) {
   try {
     head = new Uint8Array(await file.slice(0, 4).arrayBuffer());
   } catch {
-    throw new Error(`${path}: it can't be read`);
+    throw new Error(`${path}: cannot be read`);
   }
   const begins = (bytes) => bytes.every((byte, at) => head[at] === byte);
   return begins([0x23, 0x21]) || begins([0x7f, 0x45, 0x4c, 0x46]) ? 0o755 : 0o644;

@@ -1,22 +1,22 @@
-// The files of a package as a tree whose directories fold: what is in sight of it, as rows.
+// The files of a package as a collapsible tree, flattened to visible rows.
 
-// A small package is shown whole.
-const WHOLE = 60;
+// Trees up to this size start expanded.
+const EXPAND_UP_TO = 60;
 
 export class Tree {
   #children = new Map([['', []]]);
   #nodes = new Map();
-  #unfolded = new Set();
-  /** How many files there are, and their bytes. */
+  #expanded = new Set();
+  /** Number of files, and their total size. */
   files = 0;
   bytes = 0;
 
-  /** `files` as the server lists them, sorted by path; it need not list directories. */
+  /** `files` is the server's list, sorted by path; directories may be missing. */
   constructor(files) {
     for (const file of files) this.#add(file);
     for (const [path, { kind }] of this.#nodes)
-      if (kind === 'directory' && files.length <= WHOLE) this.#unfolded.add(path);
-    for (const children of this.#children.values()) children.sort(inOrder);
+      if (kind === 'directory' && files.length <= EXPAND_UP_TO) this.#expanded.add(path);
+    for (const children of this.#children.values()) children.sort(byKindAndName);
   }
 
   #add({ path, kind, mode, size, target }) {
@@ -47,19 +47,19 @@ export class Tree {
     return parent;
   }
 
-  isUnfolded(path) {
-    return this.#unfolded.has(path);
+  isExpanded(path) {
+    return this.#expanded.has(path);
   }
 
   toggle(path) {
     if (this.#nodes.get(path)?.kind !== 'directory') return;
-    if (!this.#unfolded.delete(path)) this.#unfolded.add(path);
+    if (!this.#expanded.delete(path)) this.#expanded.add(path);
   }
 
-  /** Unfolds all directories, or folds them. */
-  toggleAll(isUnfolded) {
-    this.#unfolded = new Set(
-      isUnfolded
+  /** Expands or collapses all directories. */
+  toggleAll(isExpanded) {
+    this.#expanded = new Set(
+      isExpanded
         ? [...this.#nodes.values()]
             .filter(({ kind }) => kind === 'directory')
             .map(({ path }) => path)
@@ -67,9 +67,7 @@ export class Tree {
     );
   }
 
-  /**
-   * The rows: those that are unfolded, or, with a text to find, the files in whose path it occurs.
-   */
+  /** The visible rows, or, with a search text, the files whose paths contain it. */
   rows(text = '') {
     if (text)
       return [...this.#nodes.values()]
@@ -79,7 +77,7 @@ export class Tree {
     const visit = (path) => {
       for (const node of this.#children.get(path)) {
         rows.push(node);
-        if (this.#unfolded.has(node.path)) visit(node.path);
+        if (this.#expanded.has(node.path)) visit(node.path);
       }
     };
     visit('');
@@ -87,16 +85,16 @@ export class Tree {
   }
 }
 
-// Directories come first, as file managers show them.
-const inOrder = (one, other) =>
+// Directories first, as in file managers.
+const byKindAndName = (one, other) =>
   (other.kind === 'directory') - (one.kind === 'directory') || (one.name < other.name ? -1 : 1);
 
 /** `0755`. */
-export const modeWords = (mode) =>
+export const modeText = (mode) =>
   mode == null ? '' : (mode & 0o7777).toString(8).padStart(4, '0');
 
-/** What differs between two versions, as rows sorted by path, and in all. */
-export function differences({ added, removed, changed }) {
+/** The files that differ between two versions, sorted by path, and the difference in size. */
+export function packageDiff({ added, removed, changed }) {
   const rows = [
     ...added.map((to) => ({ path: to.path, kind: 'added', sign: '+', to, by: to.size })),
     ...removed.map((from) => ({

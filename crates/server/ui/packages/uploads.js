@@ -1,14 +1,14 @@
-// Packages on their way to the server. They go on while somebody looks at other parts of the page.
+// Uploads of packages. They continue while the user visits other views.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { SignedOut, upload } from '../api.js';
 import { bytes } from '../format.js';
 import { change } from '../frame.js';
-import { tell } from '../notice.js';
-import { at } from '../router.js';
+import { notify } from '../notice.js';
+import { hrefTo } from '../router.js';
 import { pack } from './pack.js';
 
-const TYPES = [
+const MEDIA_TYPES = [
   [/\.(tar\.zst|tzst|taskd)$/i, 'application/zstd'],
   [/\.tar$/i, 'application/x-tar'],
 ];
@@ -17,12 +17,9 @@ export class Uploads {
   #all = [];
   #last = Promise.resolve();
 
-  /**
-   * Sends what was chosen, one after the other. That a package has come, everybody hears from the
-   * stream.
-   */
-  add(chosen) {
-    for (const { name, file, entries } of chosen) {
+  /** Uploads these sources one after the other. The event stream reports new packages. */
+  add(sources) {
+    for (const { name, file, entries } of sources) {
       this.#add({ name, file, entries });
     }
   }
@@ -36,12 +33,12 @@ export class Uploads {
       problem: null,
       end: new AbortController(),
     };
-    // A version that is taken is taken over only at somebody's word.
-    one.insist = () => {
+    // An existing version is replaced only after a confirmation.
+    one.retryWithForce = () => {
       this.#forget(one);
       this.#add({ name, file, entries, force: true });
     };
-    // What can't be read is said in its turn.
+    // A read error is reported when its turn comes.
     entries?.catch(() => {});
     change(() => this.#all.push(one));
     this.#last = this.#last.then(() => this.#send(one, { file, entries, force }));
@@ -53,24 +50,27 @@ export class Uploads {
     try {
       change(() => (one.stage = entries ? 'packing' : 'sending'));
       const { blob, type } = entries
-        ? { blob: await packed(name, await entries), type: 'application/x-tar' }
+        ? { blob: await packFolder(name, await entries), type: 'application/x-tar' }
         : { blob: await file, type: typeOf(name) };
       change(() => Object.assign(one, { stage: 'sending', total: blob.size }));
-      const told = (done) =>
+      const onProgress = (done) =>
         change(() =>
           Object.assign(one, { done, stage: done < blob.size ? 'sending' : 'checking' }),
         );
       const view = await upload(force ? '/packages?force=true' : '/packages', blob, type, {
-        told,
+        onProgress,
         signal: end.signal,
       });
       this.#forget(one);
       const { name: stored, version } = view.package;
-      tell(`${stored}@${version} is there.`, [at(['packages', stored], { version }), 'Look at it']);
+      notify(`${stored}@${version} uploaded.`, [hrefTo(['packages', stored], { version }), 'View']);
     } catch (error) {
       if (end.signal.aborted) return this.#forget(one);
       change(() =>
-        Object.assign(one, { problem: problemOf(error), isTaken: error.code === 'version_taken' }),
+        Object.assign(one, {
+          problem: errorText(error),
+          isVersionTaken: error.code === 'version_taken',
+        }),
       );
     }
   }
@@ -79,7 +79,7 @@ export class Uploads {
     change(() => (this.#all = this.#all.filter((other) => other !== one)));
   }
 
-  #end(one) {
+  #cancel(one) {
     one.end.abort();
     this.#forget(one);
   }
@@ -88,18 +88,20 @@ export class Uploads {
     return !this.#all.length;
   }
 
-  /** Breaks all of them off. */
+  /** Cancels all uploads. */
   stop() {
     for (const { end } of this.#all) end.abort();
   }
 
   view() {
     if (!this.#all.length) return nothing;
-    return html`<ul class="uploads" aria-label="Uploads">${this.#all.map((one) => this.#one(one))}</ul>`;
+    return html`<ul class="uploads" aria-label="Uploads">${this.#all.map((one) =>
+      this.#one(one),
+    )}</ul>`;
   }
 
   #one(one) {
-    const { name, stage, done, total, problem, isTaken, insist } = one;
+    const { name, stage, done, total, problem, isVersionTaken, retryWithForce } = one;
     return html`
       <li class="upload">
         <p><strong>${name}</strong>
@@ -107,39 +109,51 @@ export class Uploads {
             problem
               ? nothing
               : html`<span class="quiet">${STAGES[stage]}</span>
-            ${total ? html`<progress max=${total} .value=${done} aria-label=${`${name} sent`}></progress><span class="quiet">${bytes({ done, total })}</span>` : nothing}`
+            ${
+              total
+                ? html`<progress max=${total} .value=${done}
+                    aria-label=${`Upload of ${name}`}></progress><span
+                    class="quiet">${bytes({ done, total })}</span>`
+                : nothing
+            }`
           }
-          <button class="plain link" @click=${() => this.#end(one)}>${problem ? 'Dismiss' : 'Break off'}</button></p>
-        ${isTaken ? html`<p><button class="plain link" @click=${insist}>Replace the version: robots that have the other content are marked as outdated</button></p>` : nothing}
+          <button class="plain link"
+            @click=${() => this.#cancel(one)}>${problem ? 'Dismiss' : 'Cancel'}</button></p>
+        ${
+          isVersionTaken
+            ? html`<p><button class="plain link" @click=${retryWithForce}>Replace this version;
+                robots with the old content are marked as outdated</button></p>`
+            : nothing
+        }
         <p class="bad problem" role="alert">${problem ? `▲ ${problem}` : ''}</p>
       </li>`;
   }
 }
 
 const STAGES = {
-  waiting: 'waits',
-  packing: 'is being packed',
-  sending: 'is being sent',
-  checking: 'is being checked and packed by the server',
+  waiting: 'waiting',
+  packing: 'packing',
+  sending: 'uploading',
+  checking: 'the server is checking the package',
 };
 
-async function packed(name, entries) {
+async function packFolder(name, entries) {
   const isPackage = entries.some(
     ({ path, file }) => file && (path === 'task.toml' || path === 'package.xml'),
   );
-  if (!isPackage) throw new Error(`${name}: there is neither a task.toml nor a package.xml in it`);
+  if (!isPackage) throw new Error(`${name}: contains neither task.toml nor package.xml`);
   return pack(entries);
 }
 
 function typeOf(name) {
-  const type = TYPES.find(([ending]) => ending.test(name))?.[1];
-  if (!type) throw new Error(`${name}: a package is a .tar.zst, a .tar or a folder`);
+  const type = MEDIA_TYPES.find(([ending]) => ending.test(name))?.[1];
+  if (!type) throw new Error(`${name}: not a .tar.zst, a .tar or a folder`);
   return type;
 }
 
-function problemOf(error) {
+function errorText(error) {
   if (error instanceof SignedOut) return 'You are signed out.';
   if (error.status === 404 || error.status === 405)
-    return 'This server takes packages from the command line alone: taskd push DIRECTORY';
+    return 'This server accepts packages only from the command line: taskd push DIRECTORY';
   return error.message;
 }

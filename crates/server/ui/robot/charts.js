@@ -1,5 +1,4 @@
-// Curves over time, one below or beside the other, with one cursor for all of them. It draws
-// samples and asks nobody.
+// Time series charts with a shared cursor. It draws samples and sends no requests.
 
 import { html } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { minute } from '../format.js';
@@ -7,16 +6,18 @@ import { change } from '../frame.js';
 
 const HEIGHT = 128;
 const FONT = '12px system-ui, sans-serif';
-// So far apart two samples are no longer joined: about one a minute comes.
+// Longer gaps between samples break the line; about one sample per minute arrives.
 const GAP_MS = 150_000;
+// The steps between the lines of an axis in bytes.
+const POWERS_OF_TWO = Array.from({ length: 53 }, (_, power) => 2 ** power);
 const scheme = matchMedia('(prefers-color-scheme: dark)');
 
 /**
- * Draws the curves of `figures`, each `{ id, title, most(samples), tick(value), lines: [{ title,
- * of(sample) }] }`.
+ * Draws a chart for each of `figures`, `{ id, title, most(samples), tick(value), isBytes, lines:
+ * [{ title, of(sample) }] }`.
  */
 export class Charts {
-  /** The sample that is pointed at; nothing while none is. */
+  /** The sample under the pointer. */
   pointed = null;
   #figures;
   #key = `charts-${Math.random()}`;
@@ -27,10 +28,10 @@ export class Charts {
   #observer = new ResizeObserver((entries) =>
     entries.forEach(({ target, contentRect }) => this.#resize(target, contentRect.width)),
   );
-  /** Begins anew in the colours of now. */
+  /** Recreates the charts in the current colours. */
   #recolour = () => {
     this.#colours = coloursNow();
-    this.#forget();
+    this.#destroyCharts();
     change();
   };
 
@@ -40,38 +41,38 @@ export class Charts {
     scheme.addEventListener('change', this.#recolour);
   }
 
-  /** Ends it: what is left is not drawn again. */
+  /** Destroys the charts. */
   leave() {
     scheme.removeEventListener('change', this.#recolour);
-    this.#forget();
+    this.#destroyCharts();
   }
 
-  #forget() {
+  #destroyCharts() {
     this.#observer.disconnect();
     for (const { chart } of this.#charts.values()) chart.destroy();
     this.#charts.clear();
   }
 
   /**
-   * The place of a figure's curves. They show nothing that the words beside them do not say, so
-   * they are not read aloud.
+   * The container of a chart. It is hidden from screen readers, since the text beside it has the
+   * same values.
    */
   place = ({ id }) => html`<div class="curves" data-figure=${id} aria-hidden="true"></div>`;
 
-  /** Shows these samples, the oldest first, between these two moments. */
+  /** Shows samples, oldest first, in this time range. */
   show(samples, from, to) {
     this.#window = [from / 1000, to / 1000];
     this.#points = withGaps(samples);
     for (const { id } of this.#figures) this.#charts.get(id)?.chart.setData(this.#dataOf(id));
   }
 
-  /** Puts curves where a place for them has come into the page; to be called after each drawing. */
-  async settle() {
+  /** Creates charts in new containers. Call this after each drawing. */
+  async attach() {
     const places = [...document.querySelectorAll('.curves')].filter(
       (place) => this.#charts.get(place.dataset.figure)?.place !== place,
     );
     if (!places.length) return;
-    // The first robot that is looked at brings the curves; the list of robots does without.
+    // The chart library is loaded on first use.
     const { default: UPlot } = await import('../vendor/uplot-1.6.32/uPlot.esm.js');
     for (const place of places) if (place.isConnected) this.#put(UPlot, place);
   }
@@ -112,7 +113,7 @@ export class Charts {
     ];
   }
 
-  #options({ most, tick, lines }, width) {
+  #options({ most, tick, isBytes, lines }, width) {
     const colour = (name) => () => this.#colours[name];
     const axis = { stroke: colour('--quiet'), font: FONT, ticks: { show: false }, gap: 6 };
     const strokes = ['--accent', '--quiet'];
@@ -145,6 +146,7 @@ export class Charts {
           space: 30,
           grid: { stroke: colour('--hair'), width: 1 },
           values: (_, values) => values.map((value) => (this.#points.length ? tick(value) : '')),
+          ...(isBytes && { incrs: POWERS_OF_TWO }),
         },
       ],
       series: [
@@ -168,7 +170,7 @@ export class Charts {
   }
 }
 
-/** The samples, with a hole wherever none came for long. */
+/** The samples, with gaps marked. */
 function withGaps(samples) {
   return samples.flatMap((sample, index) => {
     const before = samples[index - 1]?.at_ms;
@@ -178,7 +180,7 @@ function withGaps(samples) {
   });
 }
 
-/** A canvas knows no variables of CSS: what they are now is asked of an element. */
+/** A canvas cannot use CSS variables, so their values are read from an element. */
 function coloursNow() {
   const probe = document.createElement('span');
   document.body.append(probe);

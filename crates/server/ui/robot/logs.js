@@ -1,19 +1,19 @@
-// What a robot's tasks, their nodes and its agent say, as they say it. What was said before, and in
-// gaps, is asked of the robot, which keeps its lines; where it can't be asked, the server's memory
-// has the last of them.
+// The Logs tab: live lines of a robot's tasks, nodes and agent. Earlier lines and gaps are fetched
+// from the robot, which stores its lines, or from the server's memory if the robot cannot be
+// reached.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { get, SignedOut } from '../api.js';
 import { duration, number, plural } from '../format.js';
 import { change } from '../frame.js';
-import { sign } from '../signs.js';
+import { statusDot } from '../status.js';
 import { openStream } from '../stream.js';
-import { Sheet, textOf } from './sheet.js';
+import { LogView, textOf } from './log-view.js';
 
-const KEPT = 5_000;
-const FETCHED = 1_000;
-// A browser allows six connections to a server. A tab nobody looks at lets go of its own, and
-// fetches what it missed later.
+const MAX_LINES = 5_000;
+const FETCH_LINES = 1_000;
+// A browser allows six connections per server, so a hidden tab disconnects and fetches missed lines
+// later.
 const HIDDEN_MS = 20_000;
 
 const LEVELS = [
@@ -26,16 +26,18 @@ const LEVELS = [
 
 export class Logs {
   #page;
-  /** All that is known, the oldest first. */
+  /** All known lines, oldest first. */
   #lines = [];
-  #sheet = new Sheet(KEPT, (act) => change(act));
-  /** What the sheet does not have yet; `null`: it has to be filled anew. */
-  #fresh = null;
-  /** While it is set, the sheet stays as it is; so many lines have come since. */
+  #view = new LogView(MAX_LINES, (act) => change(act));
+  /** How many lines with this key a fetch brought, which the stream may bring as well. */
+  #fetched = new Map();
+  /** Lines to append to the view; `null` to replace all its lines. */
+  #pending = null;
+  /** Number of new lines since the view was paused; `null` if it is not paused. */
   #paused = null;
-  /** Where the lines come from now, in words, and whether that is what one would want. */
+  /** The state of the connection. */
   #state = { text: 'Connecting…' };
-  #memory = null;
+  #fallback = null;
   #end = null;
   #hidden = null;
   #isFetching = false;
@@ -48,40 +50,41 @@ export class Logs {
   enter() {
     this.#filter = null;
     this.#follow();
-    document.addEventListener('visibilitychange', this.#look);
+    document.addEventListener('visibilitychange', this.#onVisibilityChange);
   }
 
   leave() {
-    this.#hangUp();
+    this.#disconnect();
     clearTimeout(this.#hidden);
-    document.removeEventListener('visibilitychange', this.#look);
+    document.removeEventListener('visibilitychange', this.#onVisibilityChange);
   }
 
-  arrive() {
+  onNavigate() {
     this.#follow();
   }
 
-  // Listening
+  // Connection
 
-  #look = () => {
+  #onVisibilityChange = () => {
     clearTimeout(this.#hidden);
-    if (document.hidden) this.#hidden = setTimeout(() => this.#hangUp(), HIDDEN_MS);
+    if (document.hidden) this.#hidden = setTimeout(() => this.#disconnect(), HIDDEN_MS);
     else if (!this.#end) this.#listen();
   };
 
-  /** Follows the lines that the place's query wants. */
+  /** Follows the lines that the route's query selects. */
   #follow() {
     const { level = '', task = '', q = '' } = this.#page.query;
-    this.#sheet.search(q);
+    this.#view.search(q);
     const filter = { level, task };
     if (this.#filter?.level === level && this.#filter?.task === task) return;
-    this.#hangUp();
+    this.#disconnect();
     this.#filter = filter;
     this.#lines = [];
-    this.#fresh = null;
+    this.#fetched.clear();
+    this.#pending = null;
     this.#paused = null;
-    this.#memory = null;
-    this.#sheet.isAtEnd = true;
+    this.#fallback = null;
+    this.#view.isAtEnd = true;
     this.#listen();
   }
 
@@ -89,76 +92,84 @@ export class Logs {
     const given = Object.entries({ ...this.#filter, follow: true }).filter(([, value]) => value);
     const url = `/api/v1/robots/${this.#page.robot.id}/logs?${new URLSearchParams(given)}`;
     this.#state = { text: 'Connecting…' };
-    const end = openStream((message) => this.#end === end && this.#hear(message), url);
+    const end = openStream((message) => this.#end === end && this.#onMessage(message), url);
     this.#end = end;
     this.#fetch();
   }
 
-  #hangUp() {
+  #disconnect() {
     this.#end?.();
     this.#end = null;
   }
 
-  #hear({ state, events = [] }) {
+  #onMessage({ state, events = [] }) {
     change(() => {
-      if (state === 'waiting') this.#state = { text: 'Not connected; trying again', isBad: true };
-      for (const event of events) this.#take(event);
+      if (state === 'waiting') this.#state = { text: 'Disconnected; retrying', isBad: true };
+      for (const event of events) this.#applyEvent(event);
     });
   }
 
-  #take({ type, reason, lines, suppressed }) {
+  #applyEvent({ type, reason, lines, suppressed }) {
     if (type === 'away')
-      this.#state = { text: `Nothing comes: ${this.#page.inWords(reason)}`, isBad: true };
+      this.#state = { text: `No live lines: ${this.#page.withRobotName(reason)}`, isBad: true };
     if (type === 'following') {
       this.#state = { text: 'Following', isOn: true };
-      // Also after a gap: what was said in it is to be had by asking.
+      // Fetches missed lines, also after a gap.
       this.#fetch();
     }
     if (type !== 'lines') return;
     if (suppressed)
-      this.#add([
+      this.#append([
         {
           at_ms: lines[0]?.at_ms ?? this.#page.app.now(),
-          note: `${plural(suppressed, 'line')} left out here because they were too many. The robot keeps them.`,
+          note: `${plural(suppressed, 'line')} skipped by the rate limit. The robot keeps them.`,
         },
       ]);
-    this.#add(lines);
+    this.#append(lines.filter((line) => !this.#takeFetched(line)));
   }
 
-  #add(lines) {
+  /** Whether a fetch has brought this line already. */
+  #takeFetched(line) {
+    const count = this.#fetched.get(keyOf(line)) ?? 0;
+    if (count) this.#fetched.set(keyOf(line), count - 1);
+    return count > 0;
+  }
+
+  #append(lines) {
     this.#lines.push(...lines);
-    this.#bound();
+    this.#trim();
     if (this.#paused !== null) this.#paused += lines.length;
-    else this.#fresh?.push(...lines);
+    else this.#pending?.push(...lines);
   }
 
-  #bound() {
-    if (this.#lines.length > KEPT) this.#lines = this.#lines.slice(-KEPT);
+  #trim() {
+    if (this.#lines.length > MAX_LINES) this.#lines = this.#lines.slice(-MAX_LINES);
   }
 
-  /**
-   * Asks for the newest lines there are, and puts those that are not known yet where they belong.
-   */
+  /** Fetches the newest lines and merges unknown ones by time. */
   async #fetch() {
     if (this.#isFetching) return;
     this.#isFetching = true;
     const filter = this.#filter;
-    const said = await get(`/robots/${this.#page.robot.id}/logs`, {
+    const answer = await get(`/robots/${this.#page.robot.id}/logs`, {
       ...filter,
-      max_lines: FETCHED,
+      max_lines: FETCH_LINES,
     }).catch((error) => (error instanceof SignedOut ? null : { error }));
     this.#isFetching = false;
     if (filter !== this.#filter) return this.#end && this.#fetch();
-    if (!said) return;
+    if (!answer) return;
     change(() => {
-      if (said.error) this.#memory = { text: '', whole: this.#page.inWords(said.error.message) };
-      else this.#merge(said);
+      if (answer.error)
+        this.#fallback = { text: '', full: this.#page.withRobotName(answer.error.message) };
+      else this.#merge(answer);
     });
   }
 
   #merge({ from, age_ms: age, reason, lines }) {
-    this.#memory =
-      from === 'server' ? remembered(lines, age, reason && this.#page.inWords(reason)) : null;
+    this.#fallback =
+      from === 'server'
+        ? fallbackNote(lines, age, reason && this.#page.withRobotName(reason))
+        : null;
     const known = new Map();
     for (const line of this.#lines) known.set(keyOf(line), (known.get(keyOf(line)) ?? 0) + 1);
     const unknown = lines.filter((line) => {
@@ -166,10 +177,13 @@ export class Logs {
       if (count) known.set(keyOf(line), count - 1);
       return !count;
     });
-    if (!unknown.length && this.#fresh) return;
+    if (this.#fetched.size > MAX_LINES) this.#fetched.clear();
+    for (const line of unknown)
+      this.#fetched.set(keyOf(line), (this.#fetched.get(keyOf(line)) ?? 0) + 1);
+    if (!unknown.length && this.#pending) return;
     this.#lines = [...unknown, ...this.#lines].sort((one, other) => one.at_ms - other.at_ms);
-    this.#bound();
-    if (this.#paused === null) this.#fresh = null;
+    this.#trim();
+    if (this.#paused === null) this.#pending = null;
     else this.#paused += unknown.length;
   }
 
@@ -181,50 +195,74 @@ export class Logs {
       ...new Set([...robot.tasks.map((one) => one.task), task].filter(Boolean)),
     ].sort();
     const isPaused = this.#paused !== null;
-    const said = this.#state.isBad ? this.#memory?.text : this.#memory?.whole;
+    const note = this.#state.isBad ? this.#fallback?.text : this.#fallback?.full;
     return html`
       <section class="logs" aria-label="Logs">
         <div class="tools">
-          <label><span>Level</span> <select @change=${({ currentTarget }) => this.#say({ level: currentTarget.value })}>${LEVELS.map(([id, title]) => html`<option value=${id} .selected=${id === level}>${title}</option>`)}</select></label>
-          <label><span>Task</span> <select @change=${({ currentTarget }) => this.#say({ task: currentTarget.value })}><option value="" .selected=${!task}>All tasks</option>${tasks.map((name) => html`<option value=${name} .selected=${name === task}>${name}</option>`)}</select></label>
-          <input type="search" placeholder="Search within" aria-label="Search within the lines" aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${q} @input=${({ currentTarget }) => this.#say({ q: currentTarget.value })}>
-          <span class="acts">
-            <button class="quiet-button pause" aria-pressed=${isPaused} @click=${() => this.#pause()}>${isPaused ? `Go on (${number(this.#paused)} wait)` : 'Pause'}</button>
-            <button class="quiet-button" ?disabled=${!this.#sheet.shown} @click=${() => this.#download(robot)}>Download</button>
+          <label><span>Level</span> <select
+            @change=${({ currentTarget }) => this.#setQuery({ level: currentTarget.value })}>
+            ${LEVELS.map(
+              ([id, title]) =>
+                html`<option value=${id} .selected=${id === level}>${title}</option>`,
+            )}</select></label>
+          <label><span>Task</span> <select
+            @change=${({ currentTarget }) => this.#setQuery({ task: currentTarget.value })}>
+            <option value="" .selected=${!task}>All tasks</option>
+            ${tasks.map(
+              (name) => html`<option value=${name} .selected=${name === task}>${name}</option>`,
+            )}</select></label>
+          <input type="search" placeholder="Search" aria-label="Search log lines"
+            aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${q}
+            @input=${({ currentTarget }) => this.#setQuery({ q: currentTarget.value })}>
+          <span class="actions">
+            <button class="quiet-button pause" aria-pressed=${isPaused}
+              @click=${() => this.#pause()}
+              >${isPaused ? `Resume (${number(this.#paused)} new)` : 'Pause'}</button>
+            <button class="quiet-button" ?disabled=${!this.#view.shown}
+              @click=${() => this.#download(robot)}>Download</button>
           </span>
         </div>
-        <p class="log-state"><span role="status">${this.#state.isBad ? html`<span class="bad"><span aria-hidden="true">▲ </span>${this.#state.text}</span>` : sign(Boolean(this.#state.isOn), this.#state.text)}</span>${said ? html`<span class="quiet"> · ${said}</span>` : nothing}</p>
-        <div class="log-place" role="log" aria-live="off" aria-label="Lines" tabindex="0"></div>
-        <p class="log-foot quiet"><span>${this.#count(q)}</span>${this.#sheet.isAtEnd ? nothing : html`<button class="plain link" @click=${() => this.#sheet.toEnd()}>To the newest ↓</button>`}</p>
+        <p class="log-state"><span role="status">${
+          this.#state.isBad
+            ? html`<span class="bad"><span aria-hidden="true">▲ </span>${this.#state.text}</span>`
+            : statusDot(Boolean(this.#state.isOn), this.#state.text)
+        }</span>${note ? html`<span class="quiet"> · ${note}</span>` : nothing}</p>
+        <div class="log-view" role="log" aria-live="off" aria-label="Log lines" tabindex="0"></div>
+        <p class="log-footer quiet"><span>${this.#count(q)}</span>${
+          this.#view.isAtEnd
+            ? nothing
+            : html`<button class="plain link"
+                @click=${() => this.#view.toEnd()}>Jump to newest ↓</button>`
+        }</p>
       </section>`;
   }
 
-  drawn() {
-    this.#sheet.settle(document.querySelector('.log-place'));
+  afterDraw() {
+    this.#view.attach(document.querySelector('.log-view'));
     if (this.#paused !== null) return;
-    if (this.#fresh?.length === 0) return;
-    if (this.#fresh) this.#sheet.add(this.#fresh);
-    else this.#sheet.show(this.#lines);
-    this.#fresh = [];
-    // How many there are is said above.
+    if (this.#pending?.length === 0) return;
+    if (this.#pending) this.#view.add(this.#pending);
+    else this.#view.show(this.#lines);
+    this.#pending = [];
+    // The line count is drawn above the view.
     change();
   }
 
   #count(q) {
-    const { shown } = this.#sheet;
-    if (q) return `${plural(shown, 'line')} with “${q}”`;
+    const { shown } = this.#view;
+    if (q) return `${plural(shown, 'line')} matching “${q}”`;
     if (!shown)
       return this.#isFetching
-        ? 'Asking for what was said before…'
-        : this.#memory
+        ? 'Loading earlier lines…'
+        : this.#fallback
           ? ''
-          : 'Nothing has been said yet.';
-    return `${plural(shown, 'line')}${shown >= KEPT ? '; older ones are no longer shown' : ''}`;
+          : 'No log lines yet.';
+    return `${plural(shown, 'line')}${shown >= MAX_LINES ? '; older lines are not shown' : ''}`;
   }
 
-  #say(query) {
+  #setQuery(query) {
     change(() => {
-      this.#page.say(query);
+      this.#page.setQuery(query);
       this.#follow();
     });
   }
@@ -233,26 +271,27 @@ export class Logs {
     change(() => {
       const isPaused = this.#paused !== null;
       this.#paused = isPaused ? null : 0;
-      if (isPaused) this.#fresh = null;
+      if (isPaused) this.#pending = null;
     });
   }
 
   #download({ name }) {
-    const lines = this.#sheet.lines.map(textOf);
+    const lines = this.#view.lines.map(textOf);
     const link = document.createElement('a');
     link.href = URL.createObjectURL(new Blob([`${lines.join('\n')}\n`], { type: 'text/plain' }));
-    link.download = `${name}-${new Date(this.#page.app.now()).toISOString().slice(0, 19).replaceAll(':', '')}.log`;
+    const time = new Date(this.#page.app.now()).toISOString().slice(0, 19).replaceAll(':', '');
+    link.download = `${name}-${time}.log`;
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
   }
 }
 
-/** That the robot could not be asked: shortly, where why is said already, and as a whole. */
-function remembered(lines, age, reason) {
+/** Explains lines from the server's memory: as `text`, and with the reason as `full`. */
+function fallbackNote(lines, age, reason) {
   const text = lines.length
-    ? `What is here is from the server’s memory, last heard ${duration(age)} ago`
-    : 'The server remembers no line of it';
-  return { text, whole: reason ? `${text}: ${reason}` : text };
+    ? `Showing lines from the server’s memory, last received ${duration(age)} ago`
+    : 'The server has no lines of this robot in memory';
+  return { text, full: reason ? `${text}: ${reason}` : text };
 }
 
 const keyOf = ({ at_ms: then, level, source, task, node, text, note }) =>

@@ -1,21 +1,17 @@
-// Pictures of occupancy grids: browsers show PNG by themselves, but not the PGM of ROS's
-// map_server.
+// Images of occupancy grids. Browsers show PNG, but not the PGM of map_server.
 
 const MAX_PIXELS = 16e6;
 
 export const isMap = (path) => /\.(pgm|png)$/i.test(path);
 
-/**
- * Fetches the picture at `canvas.dataset.source` and draws it, pixel by pixel. Throws what a person
- * can read.
- */
+/** Fetches the image at `canvas.dataset.source` and draws it. Throws readable errors. */
 export async function drawMap(canvas) {
   const { source } = canvas.dataset;
   const response = await fetch(source);
-  if (!response.ok) throw new Error(`the server answered ${response.status}`);
+  if (!response.ok) throw new Error(`the server responded with status ${response.status}`);
   const bytes = new Uint8Array(await response.arrayBuffer());
   const picture = bytes[0] === 0x50 ? gray(bytes) : await colours(bytes);
-  // Meanwhile the place may have become another picture's.
+  // The canvas may show another image by now.
   if (canvas.dataset.source !== source) return;
   Object.assign(canvas, { width: picture.width, height: picture.height });
   const context = canvas.getContext('2d');
@@ -23,19 +19,20 @@ export async function drawMap(canvas) {
   else context.drawImage(picture, 0, 0);
 }
 
-/** A PNG. How large it becomes is asked of its head: a few bytes can be a picture of any size. */
+/** Decodes a PNG. Its size is checked in the header first: a few bytes can claim any size. */
 function colours(bytes) {
   const head = [0x89, 0x50, 0x4e, 0x47];
   if (bytes.length < 24 || head.some((byte, at) => bytes[at] !== byte))
-    throw new Error('it is no PNG picture');
+    throw new Error('not a PNG image');
   const view = new DataView(bytes.buffer);
-  if (view.getUint32(16) * view.getUint32(20) > MAX_PIXELS) throw new Error('it is too large');
+  if (view.getUint32(16) * view.getUint32(20) > MAX_PIXELS)
+    throw new Error('the image is too large');
   return createImageBitmap(new Blob([bytes], { type: 'image/png' })).catch(() => {
-    throw new Error('it is no PNG picture');
+    throw new Error('not a PNG image');
   });
 }
 
-/** A PGM, text (P2) or bytes (P5), as Netpbm describes it. */
+/** Decodes a PGM, text (P2) or binary (P5), as specified by Netpbm. */
 function gray(bytes) {
   let at = 0;
   const isSpace = (byte) => byte === 0x20 || (byte >= 0x09 && byte <= 0x0d);
@@ -55,13 +52,13 @@ function gray(bytes) {
     (kind === 'P5' || kind === 'P2') &&
     [width, height, most].every((count) => Number.isInteger(count) && count > 0) &&
     most < 65536;
-  if (!isSane) throw new Error('it is no PGM picture');
-  if (width * height > MAX_PIXELS) throw new Error('it is too large');
+  if (!isSane) throw new Error('not a PGM image');
+  if (width * height > MAX_PIXELS) throw new Error('the image is too large');
   at += 1;
   const wide = most > 255 ? 2 : 1;
-  // In text each pixel takes a digit and what parts it from the next one.
+  // In P2 each pixel takes at least a digit and a separator.
   if (bytes.length - at < (kind === 'P5' ? width * height * wide : 2 * width * height - 1))
-    throw new Error('it ends before its last row');
+    throw new Error('the file ends before the last row');
   const picture = new ImageData(width, height);
   const { data } = picture;
   for (let pixel = 0; pixel < width * height; pixel += 1) {

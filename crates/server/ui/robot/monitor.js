@@ -1,13 +1,12 @@
-// How a robot does: its machine over the last hour and from now on, what it works on, and what is
-// known of it.
+// The Monitor tab: vitals of the last hour and live, tasks, and facts.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { askRobot, get, SignedOut } from '../api.js';
 import { ago, clock, duration, moment, number, plural, size, words } from '../format.js';
 import { change } from '../frame.js';
-import { at } from '../router.js';
-import { phaseSign, progressBar, remarks, robotState, sign } from '../signs.js';
+import { hrefTo } from '../router.js';
+import { phaseBadge, progressBar, taskNotes, robotState, statusDot } from '../status.js';
 import { Charts } from './charts.js';
 
 const HOUR_MS = 3_600_000;
@@ -15,41 +14,42 @@ const RANGES = [
   { id: '', title: 'Hour', ms: HOUR_MS },
   { id: '5min', title: '5 minutes', ms: 300_000 },
 ];
-const ASK_EVERY_MS = 2_000;
-const ASK_AGAIN_MS = 15_000;
-const ASK_LATER_MS = 60_000;
-// An hour of them, one every two seconds.
-const KEPT_SAMPLES = 1_900;
+const POLL_MS = 2_000;
+const RETRY_MS = 15_000;
+const OFFLINE_RETRY_MS = 60_000;
+// One hour, one sample every two seconds.
+const MAX_SAMPLES = 1_900;
 
-// Under which accounts tasks run, as the robot says.
-const accounts = {
-  per_task: 'one for each task',
-  shared: 'one for all tasks',
-  agent: 'none: tasks run as the agent',
+// The accounts that tasks run under, as reported by the robot.
+const ACCOUNTS = {
+  per_task: 'one per task',
+  shared: 'shared by all tasks',
+  agent: 'the agent’s own account',
 };
 const percent = (value) => `${Math.round(value)} %`;
-/** Three digits, so that a text that changes every two seconds keeps its width. */
-const rate = (value) => `${size(value).replace(/^(\d{3})\.\d/, '$1')}/s`;
+/** No fraction from three digits on, so that the width is stable. */
+const rate = (value) => `${size(value).replace(/^(\d{3,})\.\d/, '$1')}/s`;
 const short = (text) => text.replace('.0 ', ' ');
 
-/** What has a curve. `say` puts one value in words, `tick` as short as an axis wants it. */
+/** The charts. `text` formats a value, `tick` formats it for an axis of a number or of bytes. */
 const FIGURES = [
   {
     id: 'cpu',
     title: 'CPU',
-    say: percent,
+    text: percent,
     tick: percent,
     most: () => 100,
     lines: [{ of: (vitals) => vitals.cpu_percent }],
   },
-  ofWhole('memory', 'Memory', 'memory_used_bytes', 'memory_total_bytes'),
-  ofWhole('disk', 'Disk', 'disk_used_bytes', 'disk_total_bytes'),
+  usageFigure('memory', 'Memory', 'memory_used_bytes', 'memory_total_bytes'),
+  usageFigure('disk', 'Disk', 'disk_used_bytes', 'disk_total_bytes'),
   {
     id: 'network',
     title: 'Network',
-    say: rate,
+    text: rate,
     tick: (value) => short(rate(value)),
-    most: (_, highest) => Math.max(1_000, (highest ?? 0) * 1.1),
+    isBytes: true,
+    most: (_, highest) => Math.max(1_024, (highest ?? 0) * 1.1),
     lines: [
       { title: 'in', of: (vitals) => vitals.network_in_bytes_per_s },
       { title: 'out', of: (vitals) => vitals.network_out_bytes_per_s },
@@ -59,21 +59,22 @@ const FIGURES = [
     id: 'battery',
     title: 'Battery',
     isOptional: true,
-    say: percent,
+    text: percent,
     tick: percent,
     most: () => 100,
     lines: [{ of: (vitals) => vitals.battery_percent }],
   },
 ];
 
-function ofWhole(id, title, used, total) {
+function usageFigure(id, title, used, total) {
   const most = (samples, highest) =>
     samples.findLast((vitals) => vitals[total])?.[total] ?? Math.max(1, highest ?? 1);
   return {
     id,
     title,
-    say: size,
+    text: size,
     tick: (value) => short(size(value)),
+    isBytes: true,
     most,
     lines: [{ of: (vitals) => vitals[used] }],
     whole: (vitals) => vitals[total],
@@ -85,10 +86,10 @@ export class Monitor {
   #samples = [];
   #charts = null;
   #timer;
-  /** The figures have changed, or the time they are shown for. */
+  /** Whether the charts need an update. */
   #isDue = false;
   #isFetched = false;
-  /** Why nothing comes every two seconds. */
+  /** Why there are no live vitals. */
   #problem = null;
   #mqtt = null;
   #isOnline = false;
@@ -101,7 +102,7 @@ export class Monitor {
     this.#charts = new Charts(FIGURES);
     this.#isDue = true;
     this.refresh();
-    this.#timer = setTimeout(() => this.#ask());
+    this.#timer = setTimeout(() => this.#poll());
   }
 
   leave() {
@@ -111,12 +112,12 @@ export class Monitor {
     this.#charts = null;
   }
 
-  arrive() {
+  onNavigate() {
     this.#isDue = true;
   }
 
-  hear({ vitals, online }) {
-    if (vitals) this.#take([vitals]);
+  onEvent({ vitals, online }) {
+    if (vitals) this.#addSamples([vitals]);
     if (online && !this.#isOnline) this.refresh();
     this.#isOnline = online;
   }
@@ -130,52 +131,52 @@ export class Monitor {
     change(() => {
       this.#isFetched = true;
       this.#mqtt = robot?.mqtt ?? null;
-      this.#take(past?.samples ?? []);
+      this.#addSamples(past?.samples ?? []);
     });
   }
 
-  /** Asks the robot how it does now, and then again, as long as somebody looks. */
-  async #ask() {
+  /** Polls the vitals while the tab is visible. */
+  async #poll() {
     const timer = this.#timer;
     const { robot } = this.#page;
-    // One that only polls can't be asked.
+    // Robots in poll mode cannot be queried.
     const isLive = robot?.online && (this.#mqtt || robot.vitals) && !document.hidden;
-    const pause = isLive ? await this.#askOnce(robot) : ASK_EVERY_MS;
-    if (this.#timer === timer && pause) this.#timer = setTimeout(() => this.#ask(), pause);
+    const pause = isLive ? await this.#fetchVitals(robot) : POLL_MS;
+    if (this.#timer === timer && pause) this.#timer = setTimeout(() => this.#poll(), pause);
   }
 
-  /** Answers how soon to ask again; nothing if that is of no use. */
-  async #askOnce({ id }) {
+  /** Returns the pause before the next poll; nothing if polling is pointless. */
+  async #fetchVitals({ id }) {
     try {
       const vitals = await askRobot(id, { type: 'vitals' });
       change(() => {
         this.#problem = null;
-        // Whoever looks at robots hears of the same sample.
-        this.#take([vitals]);
+        // The event stream carries the same sample.
+        this.#addSamples([vitals]);
       });
-      return ASK_EVERY_MS;
+      return POLL_MS;
     } catch (error) {
       if (error instanceof SignedOut) return null;
-      const isUseless = error.status === 400 || error.code === 'unsupported';
+      const isUnsupported = error.status === 400 || error.code === 'unsupported';
       change(
         () =>
-          (this.#problem = isUseless
-            ? 'This robot does not say more often how it does.'
-            : this.#page.inWords(error.message)),
+          (this.#problem = isUnsupported
+            ? 'This robot does not report live vitals.'
+            : this.#page.withRobotName(error.message)),
       );
-      if (isUseless) return null;
-      return error.code === 'robot_offline' ? ASK_LATER_MS : ASK_AGAIN_MS;
+      if (isUnsupported) return null;
+      return error.code === 'robot_offline' ? OFFLINE_RETRY_MS : RETRY_MS;
     }
   }
 
-  /** Takes samples in, whichever way they come, each once and the oldest first. */
-  #take(samples) {
+  /** Adds samples from any source, without duplicates, oldest first. */
+  #addSamples(samples) {
     const since = this.#page.app.now() - HOUR_MS;
     const all = new Map([...this.#samples, ...samples].map((sample) => [sample.at_ms, sample]));
     this.#samples = [...all.values()]
       .filter(({ at_ms: then }) => then >= since)
       .sort((one, other) => one.at_ms - other.at_ms)
-      .slice(-KEPT_SAMPLES);
+      .slice(-MAX_SAMPLES);
     this.#isDue = true;
   }
 
@@ -196,7 +197,11 @@ export class Monitor {
         <header>
           <h2 id="vitals">Machine</h2>
           <p class="quiet state">${this.#state(robot, now)}</p>
-          <p class="range" role="group" aria-label="Show the last">${RANGES.map(({ id, title }) => html`<button class="plain" aria-pressed=${id === this.#range.id} @click=${() => this.#choose(id)}>${title}</button>`)}</p>
+          <p class="range" role="group" aria-label="Time range">${RANGES.map(
+            ({ id, title }) =>
+              html`<button class="plain" aria-pressed=${id === this.#range.id}
+                @click=${() => this.#setRange(id)}>${title}</button>`,
+          )}</p>
         </header>
         <div class="charts">${repeat(
           figures,
@@ -205,60 +210,82 @@ export class Monitor {
         )}</div>
       </section>
       <div class="two-columns">
-        <section aria-labelledby="work"><header><h2 id="work">Tasks</h2></header>${robot.tasks.length ? robot.tasks.map((task) => this.#task(task)) : html`<p class="quiet">Nothing has been ordered of it.</p>`}</section>
-        <section aria-labelledby="facts"><header><h2 id="facts">Facts</h2></header><dl class="facts">${this.#facts(robot, now).map(([term, fact]) => html`<dt>${term}</dt><dd>${fact}</dd>`)}</dl></section>
+        <section aria-labelledby="work"><header><h2 id="work">Tasks</h2></header>${
+          robot.tasks.length
+            ? robot.tasks.map((task) => this.#task(task))
+            : html`<p class="quiet">No tasks.</p>`
+        }</section>
+        <section aria-labelledby="facts"><header><h2 id="facts">Facts</h2></header>
+          <dl class="facts">${this.#facts(robot, now).map(
+            ([term, fact]) => html`<dt>${term}</dt><dd>${fact}</dd>`,
+          )}</dl></section>
       </div>`;
   }
 
-  drawn() {
-    this.#charts?.settle();
+  afterDraw() {
+    this.#charts?.attach();
   }
 
-  #choose(id) {
+  #setRange(id) {
     change(() => {
       this.#isDue = true;
-      this.#page.say({ range: id });
+      this.#page.setQuery({ range: id });
     });
   }
 
-  /**
-   * What the figures are: those of a moment that is pointed at, live ones, or the last there were.
-   */
+  /** The time of the shown values: under the pointer, live, or the last known. */
   #state({ online }, now) {
     const { pointed } = this.#charts;
     if (pointed) return `at ${clock(pointed.at_ms)}`;
     const last = this.#samples.at(-1);
-    if (online && last && now - last.at_ms < 3 * ASK_EVERY_MS) return sign(true, 'Live');
-    if (!last)
-      return this.#isFetched ? 'It has not said how it does since the server started.' : '';
+    if (online && last && now - last.at_ms < 3 * POLL_MS) return statusDot(true, 'Live');
+    if (!last) return this.#isFetched ? 'No vitals since the server started.' : '';
     const age = `as of ${ago(last.at_ms, now)}`;
-    return online ? [age, this.#problem].filter(Boolean).join('. ') : `${age}; it is offline`;
+    return online
+      ? [age, this.#problem].filter(Boolean).join('. ')
+      : `${age}; the robot is offline`;
   }
 
   #figure(figure, samples) {
-    const { title, lines, say, whole } = figure;
-    const looked = this.#charts.pointed ?? this.#samples.at(-1) ?? {};
-    const total = whole?.(looked);
+    const { title, lines, text, whole } = figure;
+    const sample = this.#charts.pointed ?? this.#samples.at(-1) ?? {};
+    const total = whole?.(sample);
     return html`
       <figure>
         <figcaption>
           <h3>${title}</h3>
-          ${lines.map(({ title: line, of }, index) => html`<p class="value">${line ? html`<svg class="key" viewBox="0 0 16 2" aria-hidden="true"><line class=${index ? 'second' : 'first'} x1="0" x2="16" y1="1" y2="1"></line></svg><span class="quiet">${line} </span>` : nothing}${of(looked) == null ? '–' : say(of(looked))}${total ? html`<span class="quiet"> of ${say(total)}</span>` : nothing}</p>`)}
-          <p class="quiet span">${span(samples, lines, say)}</p>
+          ${lines.map(
+            ({ title: line, of }, index) =>
+              html`<p class="value">${line ? lineKey(line, index) : nothing}${
+                of(sample) == null ? '–' : text(of(sample))
+              }${total ? html`<span class="quiet"> of ${text(total)}</span>` : nothing}</p>`,
+          )}
+          <p class="quiet span">${rangeText(samples, lines, text)}</p>
         </figcaption>
         ${this.#charts.place(figure)}
       </figure>`;
   }
 
   #task(task) {
+    const { delivery } = task;
+    const notes = [
+      `run ${task.run}`,
+      task.active && `process ${task.active.pid}`,
+      ...taskNotes(task),
+    ].filter(Boolean);
     return html`
-      <article class="task-now" data-task=${task.task}>
-        <h3>${task.task}<span class="quiet">@${task.version}</span> ${phaseSign(task.phase)}</h3>
+      <article class="current-task" data-task=${task.task}>
+        <h3>${task.task}<span class="quiet">@${task.version}</span> ${phaseBadge(task.phase)}</h3>
         ${progressBar(task)}
-        ${task.failure ? why(task.failure) : nothing}
-        ${task.degraded ? why(task.degraded, 'degraded: ') : nothing}
-        <p class="quiet">${[`run ${task.run}`, task.active && `process ${task.active.pid}`, ...remarks(task)].filter(Boolean).join(' · ')}${task.delivery ? html` · <span class="delivery">${task.delivery.mechanism}: ${task.delivery.because}</span>` : nothing}</p>
-        <p><a href=${at(['deployments', task.deployment])}>Deployment</a> · <a href=${this.#page.at('logs', { task: task.task })}>Log</a></p>
+        ${task.failure ? failureText(task.failure) : nothing}
+        ${task.degraded ? failureText(task.degraded, 'degraded: ') : nothing}
+        <p class="quiet">${notes.join(' · ')}${
+          delivery
+            ? html` · <span class="delivery">${delivery.mechanism}: ${delivery.because}</span>`
+            : nothing
+        }</p>
+        <p><a href=${hrefTo(['deployments', task.deployment])}>Deployment</a>
+          · <a href=${this.#page.hrefTo('logs', { task: task.task })}>Log</a></p>
       </article>`;
   }
 
@@ -273,7 +300,7 @@ export class Monitor {
       ],
       ['ID', code(robot.id)],
       ['MAC', code(robot.mac)],
-      ['IP and port', robot.address && code(robot.address)],
+      ['Address', robot.address && code(robot.address)],
       [
         'Labels',
         Object.entries(robot.labels)
@@ -285,67 +312,73 @@ export class Monitor {
         'Generation',
         robot.generation === robot.observed_generation
           ? robot.generation
-          : `${robot.generation}, the robot has ${robot.observed_generation}`,
+          : `${robot.generation} (on the robot: ${robot.observed_generation})`,
       ],
       ['Host', host && `${host.hostname}, ${host.arch}, agent ${host.agent_version}`],
       ['ROS', host && ros(host)],
       ['Isolation', host?.isolation && words(host.isolation)],
-      ['Accounts', host?.accounts && (accounts[host.accounts] ?? words(host.accounts))],
+      ['Accounts', host?.accounts && (ACCOUNTS[host.accounts] ?? words(host.accounts))],
       ['Free disk', host?.disk_free_bytes && size(host.disk_free_bytes)],
-      ['Load', vitals?.load_1m != null && `${vitals.load_1m.toFixed(2)} over a minute`],
+      ['Load', vitals?.load_1m != null && `${vitals.load_1m.toFixed(2)} (1 min)`],
       ['Temperature', vitals?.temperature_c != null && `${Math.round(vitals.temperature_c)} °C`],
       ['Battery', host?.battery_percent != null && percent(host.battery_percent)],
       [
         'Publishers',
         host?.publishers != null &&
           (host.publishers
-            ? `asks for signatures, list ${host.publishers}`
-            : 'asks for signatures, by its own list'),
+            ? `signatures required, list ${host.publishers}`
+            : 'signatures required, own list'),
       ],
       ['Network', link && network(link)],
-      [
-        'MQTT',
-        this.#mqtt &&
-          `connected for ${duration(now - this.#mqtt.since_ms)}, ${number(this.#mqtt.traffic.messages_in)} messages in, ${number(this.#mqtt.traffic.messages_out)} out`,
-      ],
+      ['MQTT', this.#mqtt && connectionText(this.#mqtt, now)],
     ];
     return given.filter(([, fact]) => fact || fact === 0);
   }
 }
 
-/** A failure in full: what it is called, and what the robot said. */
-export const why = ({ code, text }, before = '') => html`
+/** A failure with its code and its full text. */
+export const failureText = ({ code, text }, before = '') => html`
   <p class="bad"><span aria-hidden="true">▲ </span>${before}${words(code)}</p>
   ${text ? html`<pre class="why" tabindex="0">${text}</pre>` : nothing}`;
 
-/** Between what the values were; of several lines the most of each. */
-function span(samples, lines, say) {
+/** The name of a line, beside a piece of it. */
+const lineKey = (title, index) =>
+  html`<svg class="key" viewBox="0 0 16 2" aria-hidden="true"><line
+    class=${index ? 'second' : 'first'} x1="0" x2="16" y1="1" y2="1"></line></svg><span
+    class="quiet">${title} </span>`;
+
+/** The range of the values; of several lines the maximum of each. */
+function rangeText(samples, lines, text) {
   const of = (line) => samples.map(line.of).filter((value) => value != null);
   if (lines.length > 1)
     return lines
       .filter((line) => of(line).length)
-      .map((line, index) => `${index ? '' : 'up to '}${say(Math.max(...of(line)))} ${line.title}`)
+      .map((line, index) => `${index ? '' : 'up to '}${text(Math.max(...of(line)))} ${line.title}`)
       .join(', ');
   const values = of(lines[0]);
   if (!values.length) return '';
-  const [least, most] = [Math.min(...values), Math.max(...values)].map(say);
-  return least === most ? `${least} throughout` : `${least} to ${most}`;
+  const [least, most] = [Math.min(...values), Math.max(...values)].map(text);
+  return least === most ? `constant ${least}` : `${least} to ${most}`;
 }
 
 function ros({ ros: used, ros_distros: found }) {
   if (!used) return found.join(', ') || 'none found';
   const domain =
     used.domain_id != null &&
-    `domain ${used.domain_id}${used.localhost_only ? ' on this host only' : ''}`;
+    `domain ${used.domain_id}${used.localhost_only ? ', localhost only' : ''}`;
   return [used.distro, used.rmw, domain].filter(Boolean).join(', ');
 }
 
+const connectionText = ({ since_ms: then, traffic }, now) =>
+  `connected for ${duration(now - then)}, ` +
+  `${number(traffic.messages_in)} messages in, ${number(traffic.messages_out)} out`;
+
 function network({ throughput_bytes_per_s: throughput, rtt_ms: rtt, reconnects, losses }) {
   return [
-    throughput != null && `fetches at ${rate(throughput)}`,
-    rtt != null && `${rtt} ms to the server`,
+    throughput != null && `downloads at ${rate(throughput)}`,
+    rtt != null && `RTT ${rtt} ms`,
     reconnects ? `${plural(reconnects, 'session')} lost in the last hour` : null,
-    losses ? `${plural(losses, 'transfer')} broken off in the last hour` : null,
+    losses ? `${plural(losses, 'transfer')} interrupted in the last hour` : null,
   ]
     .filter(Boolean)
     .join(', ');

@@ -1,34 +1,34 @@
-// A robot's ROS graph as it is now: nodes with their lifecycle and parameters, and topics with who
-// is at their ends. All of it is asked of the robot, and says how old it is.
+// The ROS tab: nodes with lifecycle and parameters, and topics with their publishers and
+// subscribers. All data comes from the robot and shows its age.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { askRobot } from '../api.js';
-import { open } from '../dialog.js';
+import { openDialog } from '../dialog.js';
 import { number, words } from '../format.js';
 import { change } from '../frame.js';
-import { tell } from '../notice.js';
-import { Asked } from './asked.js';
+import { notify } from '../notice.js';
+import { RobotRequest } from './request.js';
 
-/** What a lifecycle node can be asked for in each state, as `lifecycle_msgs` has it. */
+/** The transitions in each lifecycle state, as in `lifecycle_msgs`. */
 const TRANSITIONS = {
   unconfigured: ['configure', 'shutdown'],
   inactive: ['activate', 'cleanup', 'shutdown'],
   active: ['deactivate', 'shutdown'],
 };
 
-/** What each does to a node. */
-const TRANSITION_WORDS = {
-  configure: 'It reads its parameters and becomes inactive.',
-  activate: 'It begins its work.',
-  deactivate: 'It stops its work until it is activated.',
-  cleanup: 'It gives up what it has and becomes unconfigured.',
-  shutdown: 'It ends its work for good: only a start of its task brings it back.',
+/** The effects of the transitions. */
+const TRANSITION_EFFECTS = {
+  configure: 'The node reads its parameters and becomes inactive.',
+  activate: 'The node starts processing.',
+  deactivate: 'The node stops processing until it is activated.',
+  cleanup: 'The node releases its resources and becomes unconfigured.',
+  shutdown: 'The node shuts down for good; only a restart of its task brings it back.',
 };
 
 /**
- * Keeps numbers as they were written: to ROS 1.0 and 1 are of different types, and 64 bits are more
- * than a number has here.
+ * Keeps numbers as written: in ROS, 1.0 and 1 have different types, and 64-bit integers exceed the
+ * precision of numbers here.
  */
 const exactly = (_, value, context) =>
   typeof value === 'number' && context?.source && JSON.rawJSON
@@ -39,93 +39,115 @@ export class Ros {
   #page;
   #nodes;
   #topics;
-  /** The chosen node's name, what is asked about it, and the parameter that is being changed. */
-  #chosen = null;
+  /** The selected node, its requests, and the parameter being edited. */
+  #selected = null;
   #detail = null;
   #parameters = null;
   #editing = null;
-  /** The node that is changing its state at our word, and why it did not. */
-  #changing = null;
-  #refused = null;
-  #text = '';
+  /** The running transition, and the error of the last one. */
+  #transition = null;
+  #transitionError = null;
+  #filter = '';
   #isOnline = false;
-  /** The parameter whose form has gone: the keyboard goes back to where it came from. */
-  #left = null;
+  /** The parameter whose editor was closed: the focus returns to its button. */
+  #closedParameter = null;
   #isRevealDue = false;
 
   constructor(page) {
     this.#page = page;
-    this.#nodes = new Asked(page, { type: 'nodes' });
-    this.#topics = new Asked(page, { type: 'topics' });
+    this.#nodes = new RobotRequest(page, { type: 'nodes' });
+    this.#topics = new RobotRequest(page, { type: 'topics' });
   }
 
   enter() {
     this.#isOnline = this.#page.robot.online;
-    this.#askAll();
-    this.arrive();
+    this.#refreshAll();
+    this.onNavigate();
   }
 
-  arrive() {
+  onNavigate() {
     const name = this.#page.query.node ?? null;
-    if (name === this.#chosen) return;
-    this.#chosen = name;
+    if (name === this.#selected) return;
+    this.#selected = name;
     this.#editing = null;
-    this.#refused = null;
+    this.#transitionError = null;
     this.#isRevealDue = name !== null;
-    this.#detail = name && new Asked(this.#page, { type: 'node', name });
-    this.#parameters = name && new Asked(this.#page, { type: 'parameters', node: name }, exactly);
-    this.#detail?.ask();
-    this.#parameters?.ask();
+    this.#detail = name && new RobotRequest(this.#page, { type: 'node', name });
+    this.#parameters =
+      name && new RobotRequest(this.#page, { type: 'parameters', node: name }, exactly);
+    this.#detail?.send();
+    this.#parameters?.send();
   }
 
-  /** A robot that has come back is asked once more what it could not answer. */
-  hear({ online }) {
-    if (online && !this.#isOnline) for (const asked of this.#asked) if (asked.problem) asked.ask();
+  /** Repeats failed requests when the robot is back online. */
+  onEvent({ online }) {
+    if (online && !this.#isOnline)
+      for (const request of this.#requests) if (request.problem) request.send();
     this.#isOnline = online;
   }
 
-  get #asked() {
+  get #requests() {
     return [this.#nodes, this.#topics, this.#detail, this.#parameters].filter(Boolean);
   }
 
-  #askAll() {
-    for (const asked of this.#asked) asked.ask();
+  #refreshAll() {
+    for (const request of this.#requests) request.send();
   }
 
   draw(robot, now) {
     const { problem } = this.#nodes;
-    // One refusal for all is said once.
+    // A common error is shown once.
     if (problem && problem.code === this.#topics.problem?.code && !this.#nodes.answer) {
-      return html`<section class="ros">${this.#nodes.refusal()}<p><button class="quiet-button" ?disabled=${this.#nodes.isBusy} @click=${() => this.#askAll()}>Ask again</button></p></section>`;
+      return html`<section class="ros">${this.#nodes.error()}<p><button class="quiet-button"
+        ?disabled=${this.#nodes.isBusy}
+        @click=${() => this.#refreshAll()}>Retry</button></p></section>`;
     }
     return html`
       <div class="ros">
-        <p class="tools"><input type="search" placeholder="Filter nodes and topics" aria-label="Filter nodes and topics" aria-keyshortcuts="/" autocomplete="off" spellcheck="false" .value=${this.#text} @input=${({ currentTarget }) => change(() => (this.#text = currentTarget.value.trim().toLowerCase()))}></p>
-        <div class="two-columns ${this.#chosen ? 'has-chosen' : ''}">
+        <p class="tools"><input type="search" placeholder="Filter nodes and topics"
+          aria-label="Filter nodes and topics" aria-keyshortcuts="/" autocomplete="off"
+          spellcheck="false" .value=${this.#filter}
+          @input=${({ currentTarget }) => this.#setFilter(currentTarget.value)}></p>
+        <div class="two-columns ${this.#selected ? 'has-selection' : ''}">
           ${this.#nodeTable(now)}
-          ${this.#chosen ? this.#node(now) : html`<section class="hint"><p class="quiet">Choose a node to see its topics, services and parameters.</p></section>`}
+          ${
+            this.#selected
+              ? this.#node(now)
+              : html`<section class="hint"><p class="quiet">Select a node to see its topics,
+                  services and parameters.</p></section>`
+          }
         </div>
         ${this.#topicTable(now)}
       </div>`;
+  }
+
+  #setFilter(text) {
+    change(() => (this.#filter = text.trim().toLowerCase()));
   }
 
   // Nodes
 
   #nodeTable(now) {
     const all = this.#nodes.answer?.nodes ?? [];
-    const nodes = all.filter(({ name }) => name.toLowerCase().includes(this.#text));
+    const nodes = all.filter(({ name }) => name.toLowerCase().includes(this.#filter));
     const hasLifecycle = all.some(({ lifecycle }) => lifecycle);
     return html`
       <section aria-labelledby="nodes">
-        <header><h2 id="nodes">Nodes${this.#nodes.answer ? html` <span class="count">${number(all.length)}</span>` : nothing}</h2>${this.#nodes.line('nodes', now)}</header>
-        ${this.#nodes.refusal()}
+        <header><h2 id="nodes">Nodes${
+          this.#nodes.answer ? html` <span class="count">${number(all.length)}</span>` : nothing
+        }</h2>${this.#nodes.status('nodes', now)}</header>
+        ${this.#nodes.error()}
         ${
           nodes.length
-            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of nodes"><table>
-              <thead><tr><th>Node</th><th>Task</th>${hasLifecycle ? html`<th>State</th>` : nothing}</tr></thead>
+            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of nodes">
+              <table>
+              <thead><tr><th>Node</th><th>Task</th>${
+                hasLifecycle ? html`<th>State</th>` : nothing
+              }</tr></thead>
               <tbody>${nodes.map(
                 (node) => html`
-                <tr aria-selected=${node.name === this.#chosen ? 'true' : nothing} class=${node.name === this.#chosen ? 'chosen' : ''}>
+                <tr aria-selected=${node.name === this.#selected ? 'true' : nothing}
+                  class=${node.name === this.#selected ? 'selected' : ''}>
                   <td>${this.#link(node.name)}</td>
                   <td>${node.task ?? html`<span class="quiet">–</span>`}</td>
                   ${hasLifecycle ? html`<td>${lifecycleState(node)}</td>` : nothing}
@@ -133,31 +155,42 @@ export class Ros {
               )}</tbody>
             </table></div>`
             : this.#nodes.answer
-              ? html`<p class="quiet">${all.length ? 'No node is like that.' : 'There is no node on its graph.'}</p>`
+              ? html`<p class="quiet">${
+                  all.length ? 'No nodes match this filter.' : 'No nodes in the graph.'
+                }</p>`
               : nothing
         }
       </section>`;
   }
 
   #link = (name) =>
-    html`<a class="code" href=${this.#page.at('ros', { node: name })} aria-current=${name === this.#chosen ? 'true' : nothing}>${name}</a>`;
+    html`<a class="code" href=${this.#page.hrefTo('ros', { node: name })}
+      aria-current=${name === this.#selected ? 'true' : nothing}>${name}</a>`;
 
   #node(now) {
     const detail = this.#detail.answer?.nodes ?? [];
-    const node = this.#nodes.answer?.nodes.find(({ name }) => name === this.#chosen) ?? detail[0];
+    const node = this.#nodes.answer?.nodes.find(({ name }) => name === this.#selected) ?? detail[0];
     return html`
       <section class="node" aria-labelledby="node">
-        <header><h2 id="node" class="code">${this.#chosen}</h2><a href=${this.#page.at('ros')}>Close</a></header>
+        <header><h2 id="node" class="code">${this.#selected}</h2>
+          <a href=${this.#page.hrefTo('ros')}>Close</a></header>
         ${this.#lifecycle(node)}
         <section aria-labelledby="parameters">
-          <header><h3 id="parameters">Parameters</h3>${this.#parameters.line('parameters', now)}</header>
-          ${this.#parameters.refusal()}
+          <header><h3 id="parameters">Parameters</h3>
+            ${this.#parameters.status('parameters', now)}</header>
+          ${this.#parameters.error()}
           ${this.#parameterList()}
         </section>
-        <section aria-labelledby="ends">
-          <header><h3 id="ends">Topics and services</h3>${this.#detail.line('topics and services', now)}</header>
-          ${this.#detail.refusal()}
-          ${detail.length > 1 ? html`<p class="bad"><span aria-hidden="true">▲ </span>${number(detail.length)} nodes have this name.</p>` : nothing}
+        <section aria-labelledby="endpoints">
+          <header><h3 id="endpoints">Topics and services</h3>
+            ${this.#detail.status('topics and services', now)}</header>
+          ${this.#detail.error()}
+          ${
+            detail.length > 1
+              ? html`<p class="bad"><span aria-hidden="true">▲ </span>${number(detail.length)} nodes
+                  have this name.</p>`
+              : nothing
+          }
           ${detail.map(({ publishers, subscriptions, services, clients }) =>
             [
               ['Publishes', publishers],
@@ -165,11 +198,8 @@ export class Ros {
               ['Offers', services],
               ['Calls', clients],
             ]
-              .filter(([, ends]) => ends.length)
-              .map(
-                ([title, ends]) =>
-                  html`<details><summary>${title} <span class="count">${ends.length}</span></summary><ul class="ends">${ends.map(({ name, type }) => html`<li class="code">${name} <span class="quiet">${type}</span></li>`)}</ul></details>`,
-              ),
+              .filter(([, endpoints]) => endpoints.length)
+              .map(([title, endpoints]) => endpointList(title, endpoints)),
           )}
         </section>
       </section>`;
@@ -180,28 +210,40 @@ export class Ros {
     const transitions = this.#page.app.can('operate') ? (TRANSITIONS[node.lifecycle] ?? []) : [];
     return html`
       <p class="lifecycle">Lifecycle: ${lifecycleState(node)}
-        ${transitions.map((transition) => html`<button class="quiet-button" ?disabled=${this.#changing !== null} @click=${() => this.#askChange(node, transition)}>${transition}…</button>`)}
-        <span role="status">${this.#changing ? `${this.#changing}…` : ''}</span></p>
-      ${this.#refused ? html`<p class="bad" role="alert"><span aria-hidden="true">▲ </span>${this.#refused}</p>` : nothing}`;
+        ${transitions.map(
+          (transition) =>
+            html`<button class="quiet-button" ?disabled=${this.#transition !== null}
+              @click=${() => this.#openTransitionDialog(node, transition)}>${transition}…</button>`,
+        )}
+        <span role="status">${this.#transition ? `${this.#transition}…` : ''}</span></p>
+      ${
+        this.#transitionError
+          ? html`<p class="bad" role="alert"><span
+              aria-hidden="true">▲ </span>${this.#transitionError}</p>`
+          : nothing
+      }`;
   }
 
-  #askChange({ name, lifecycle, task }, transition) {
+  #openTransitionDialog({ name, lifecycle, task }, transition) {
     const robot = this.#page.robot.name;
     const title = transition.charAt(0).toUpperCase() + transition.slice(1);
-    open({
+    openDialog({
       title: `${title} ${name}?`,
-      action: title,
+      submitLabel: title,
       isDangerous: ['shutdown', 'cleanup', 'deactivate'].includes(transition),
       body: () =>
-        html`<p>The node <code>${name}</code>${task ? html` of the task <strong>${task}</strong>` : nothing} on <strong>${robot}</strong> is ${words(lifecycle)}. ${TRANSITION_WORDS[transition]}</p>`,
-      act: () => void this.#change(name, transition),
+        html`<p>The node <code>${name}</code>${
+          task ? html` of the task <strong>${task}</strong>` : nothing
+        } on <strong>${robot}</strong> is ${words(lifecycle)}.
+          ${TRANSITION_EFFECTS[transition]}</p>`,
+      onSubmit: () => void this.#runTransition(name, transition),
     });
   }
 
-  async #change(name, transition) {
+  async #runTransition(name, transition) {
     change(() => {
-      this.#changing = transition;
-      this.#refused = null;
+      this.#transition = transition;
+      this.#transitionError = null;
     });
     try {
       const { state } = await askRobot(this.#page.robot.id, {
@@ -209,15 +251,15 @@ export class Ros {
         node: name,
         transition,
       });
-      tell(`${name} is ${words(state)}.`);
+      notify(`${name} is ${words(state)}.`);
       for (const answer of [this.#nodes.answer, this.#detail?.answer])
         for (const node of answer?.nodes ?? []) if (node.name === name) node.lifecycle = state;
     } catch (error) {
-      this.#refused = this.#page.inWords(error.message);
+      this.#transitionError = this.#page.withRobotName(error.message);
     }
-    change(() => (this.#changing = null));
-    // What it publishes and offers may be something else now.
-    this.#askAll();
+    change(() => (this.#transition = null));
+    // Topics and services may have changed.
+    this.#refreshAll();
   }
 
   // Parameters
@@ -225,7 +267,7 @@ export class Ros {
   #parameterList() {
     const { answer } = this.#parameters;
     if (!answer) return nothing;
-    if (!answer.parameters.length) return html`<p class="quiet">It has none.</p>`;
+    if (!answer.parameters.length) return html`<p class="quiet">No parameters.</p>`;
     return html`<ul class="parameters">${repeat(
       answer.parameters,
       ({ name }) => name,
@@ -240,11 +282,16 @@ export class Ros {
       <li>
         <span class="code name">${name}</span>
         <span class="code value">${text}</span>
-        ${this.#page.app.can('operate') ? html`<button class="plain link" data-parameter=${name} aria-label=${`Change ${name}`} @click=${() => this.#edit(name, text)}>Change</button>` : nothing}
+        ${
+          this.#page.app.can('operate')
+            ? html`<button class="plain link" data-parameter=${name} aria-label=${`Change ${name}`}
+                @click=${() => this.#openEditor(name, text)}>Change</button>`
+            : nothing
+        }
       </li>`;
   }
 
-  #edit(name, text) {
+  #openEditor(name, text) {
     change(() => (this.#editing = { name, text, problem: null, isBusy: false, isNew: true }));
   }
 
@@ -253,35 +300,41 @@ export class Ros {
     const { name, text, problem, isBusy } = editing;
     return html`
       <li>
-        <form @submit=${(event) => this.#set(event)}>
+        <form @submit=${(event) => this.#setParameter(event)}>
           <label for="parameter" class="code">${name}</label>
-          <input id="parameter" class="code" required autocomplete="off" autocapitalize="none" spellcheck="false" .value=${text} aria-invalid=${problem ? 'true' : nothing} aria-describedby="parameter-problem parameter-hint"
-            @input=${({ currentTarget }) => (editing.text = currentTarget.value)} @keydown=${(event) => this.#giveUp(event)}>
+          <input id="parameter" class="code" required autocomplete="off" autocapitalize="none"
+            spellcheck="false" .value=${text} aria-invalid=${problem ? 'true' : nothing}
+            aria-describedby="parameter-problem parameter-hint"
+            @input=${({ currentTarget }) => (editing.text = currentTarget.value)}
+            @keydown=${(event) => this.#onEditKey(event)}>
           <button class="primary" ?disabled=${isBusy}>Set</button>
-          <button type="button" class="quiet-button" @click=${() => this.#close()}>Cancel</button>
+          <button type="button" class="quiet-button"
+            @click=${() => this.#closeEditor()}>Cancel</button>
           <p id="parameter-problem" class="bad" role="alert">${problem ? `▲ ${problem}` : ''}</p>
-          <p id="parameter-hint" class="quiet">As JSON: <code>true</code>, <code>7</code>, <code>7.0</code>, <code>"text"</code>, <code>[1, 2]</code>. It holds until the node starts again.</p>
+          <p id="parameter-hint" class="quiet">A JSON value: <code>true</code>, <code>7</code>,
+            <code>7.0</code>, <code>"text"</code>, <code>[1, 2]</code>. The change lasts until the
+            node restarts.</p>
         </form>
       </li>`;
   }
 
-  #giveUp(event) {
+  #onEditKey(event) {
     if (event.key !== 'Escape') return;
     event.stopPropagation();
-    this.#close();
+    this.#closeEditor();
   }
 
-  #close() {
+  #closeEditor() {
     change(() => {
-      this.#left = this.#editing?.name;
+      this.#closedParameter = this.#editing?.name;
       this.#editing = null;
     });
   }
 
-  async #set(event) {
+  async #setParameter(event) {
     event.preventDefault();
     const editing = this.#editing;
-    const node = this.#chosen;
+    const node = this.#selected;
     change(() => Object.assign(editing, { problem: null, isBusy: true }));
     try {
       const parameter = { name: editing.name, value: valueOf(editing.text) };
@@ -292,28 +345,28 @@ export class Ros {
       );
       change(() => {
         const shown =
-          this.#chosen === node &&
+          this.#selected === node &&
           this.#parameters.answer?.parameters.find(({ name }) => name === now.name);
         if (shown) shown.value = now.value;
-        if (this.#editing === editing) this.#close();
+        if (this.#editing === editing) this.#closeEditor();
       });
-      tell(`${now.name} is ${JSON.stringify(now.value)}.`);
+      notify(`${now.name} set to ${JSON.stringify(now.value)}.`);
     } catch (error) {
       change(() =>
-        Object.assign(editing, { problem: this.#page.inWords(error.message), isBusy: false }),
+        Object.assign(editing, { problem: this.#page.withRobotName(error.message), isBusy: false }),
       );
     }
   }
 
-  drawn() {
+  afterDraw() {
     if (this.#isRevealDue)
       document.querySelector('.ros .node')?.scrollIntoView({ block: 'nearest' });
     this.#isRevealDue = false;
-    if (this.#left)
+    if (this.#closedParameter)
       [...document.querySelectorAll('.parameters [data-parameter]')]
-        .find(({ dataset }) => dataset.parameter === this.#left)
+        .find(({ dataset }) => dataset.parameter === this.#closedParameter)
         ?.focus();
-    this.#left = null;
+    this.#closedParameter = null;
     if (!this.#editing?.isNew) return;
     this.#editing.isNew = false;
     document.getElementById('parameter')?.select();
@@ -324,39 +377,53 @@ export class Ros {
   #topicTable(now) {
     const all = this.#topics.answer?.topics ?? [];
     const topics = all.filter(({ name, types }) =>
-      [name, ...types].some((text) => text.toLowerCase().includes(this.#text)),
+      [name, ...types].some((text) => text.toLowerCase().includes(this.#filter)),
     );
-    const ends = (names) =>
+    const endpoints = (names) =>
       names.length
         ? names.map((name) => html`<div>${this.#link(name)}</div>`)
         : html`<span class="quiet">none</span>`;
     return html`
       <section aria-labelledby="topics">
-        <header><h2 id="topics">Topics${this.#topics.answer ? html` <span class="count">${number(all.length)}</span>` : nothing}</h2>${this.#topics.line('topics', now)}</header>
-        ${this.#topics.refusal()}
+        <header><h2 id="topics">Topics${
+          this.#topics.answer ? html` <span class="count">${number(all.length)}</span>` : nothing
+        }</h2>${this.#topics.status('topics', now)}</header>
+        ${this.#topics.error()}
         ${
           topics.length
-            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of topics"><table class="topics">
-              <thead><tr><th>Topic</th><th>Type</th><th>Publishers</th><th>Subscribers</th></tr></thead>
+            ? html`<div class="scroll" tabindex="0" role="region" aria-label="Table of topics">
+              <table class="topics">
+              <thead><tr><th>Topic</th><th>Type</th>
+                <th>Publishers</th><th>Subscribers</th></tr></thead>
               <tbody>${topics.map(
                 ({ name, types, publishers, subscriptions }) => html`
                 <tr>
                   <td class="code">${name}</td>
-                  <td class="code">${types.map((type) => html`<div>${type}</div>`)}${types.length > 1 ? html`<div class="bad">▲ its ends disagree</div>` : nothing}</td>
-                  <td>${ends(publishers)}</td>
-                  <td>${ends(subscriptions)}</td>
+                  <td class="code">${types.map((type) => html`<div>${type}</div>`)}${
+                    types.length > 1 ? html`<div class="bad">▲ conflicting types</div>` : nothing
+                  }</td>
+                  <td>${endpoints(publishers)}</td>
+                  <td>${endpoints(subscriptions)}</td>
                 </tr>`,
               )}</tbody>
             </table></div>`
             : this.#topics.answer
-              ? html`<p class="quiet">${all.length ? 'No topic is like that.' : 'There is no topic on its graph.'}</p>`
+              ? html`<p class="quiet">${
+                  all.length ? 'No topics match this filter.' : 'No topics in the graph.'
+                }</p>`
               : nothing
         }
       </section>`;
   }
 }
 
-const LIFECYCLE_SIGNS = {
+const endpointList = (title, endpoints) =>
+  html`<details><summary>${title} <span class="count">${endpoints.length}</span></summary><ul
+    class="endpoints">${endpoints.map(
+      ({ name, type }) => html`<li class="code">${name} <span class="quiet">${type}</span></li>`,
+    )}</ul></details>`;
+
+const LIFECYCLE_SYMBOLS = {
   active: '● ',
   inactive: '○ ',
   unconfigured: '○ ',
@@ -366,14 +433,15 @@ const LIFECYCLE_SIGNS = {
 
 const lifecycleState = ({ lifecycle }) =>
   lifecycle
-    ? html`<span class="lifecycle-state ${lifecycle}"><span aria-hidden="true">${LIFECYCLE_SIGNS[lifecycle] ?? ''}</span>${words(lifecycle)}</span>`
+    ? html`<span class="lifecycle-state ${lifecycle}"><span
+        aria-hidden="true">${LIFECYCLE_SYMBOLS[lifecycle] ?? ''}</span>${words(lifecycle)}</span>`
     : html`<span class="quiet">–</span>`;
 
-/** The value that somebody has typed. */
+/** Parses the entered value. */
 function valueOf(text) {
   try {
     return JSON.parse(text, exactly);
   } catch {
-    throw new Error('This is no JSON value. A text is written in quotation marks.');
+    throw new Error('Not a valid JSON value. Enclose strings in quotation marks.');
   }
 }

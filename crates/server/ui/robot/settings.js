@@ -1,32 +1,24 @@
-// The settings that a robot may be given here: how each is written, read, and what holds of it on
-// the robot.
+// The settings of a robot: how each is formatted and parsed, and which value is in effect.
 
-const UNITS = [
-  ['GiB', 2 ** 30],
-  ['GB', 1e9],
-  ['MiB', 2 ** 20],
-  ['MB', 1e6],
-  ['KiB', 2 ** 10],
-  ['kB', 1e3],
-  ['B', 1],
-];
+import { SIZES } from '../format.js';
 
-/** A number of bytes as people write it, exactly. */
+/** A byte size in the largest unit that is exact. */
 const bytesText = (bytes) => {
-  const [unit, length] = UNITS.find(([, length]) => bytes && bytes % length === 0) ?? UNITS.at(-1);
+  const [unit, length] = SIZES.find(([, length]) => bytes && bytes % length === 0) ?? SIZES.at(-1);
   return `${bytes / length} ${unit}`;
 };
 
 function bytesOf(text) {
-  const [, value, unit = 'B'] = /^([\d.]+)\s*([a-z]*)$/i.exec(text) ?? [];
-  const length = UNITS.find(([name]) => name.toLowerCase() === (unit || 'B').toLowerCase())?.[1];
+  // GiB is accepted for GB, and so on.
+  const [, value, letter = ''] = /^([\d.]+)\s*(?:([kmg])i?)?b?$/i.exec(text) ?? [];
+  const length = SIZES.find(([unit]) => unit === `${letter.toUpperCase()}B`)?.[1];
   const bytes = Math.round(Number(value) * length);
-  if (!Number.isSafeInteger(bytes)) throw new Error('Write a size as 512 MB, 2 GiB or 4096.');
+  if (!Number.isSafeInteger(bytes)) throw new Error('Enter a size such as 512 MB, 2 GB or 4096.');
   return bytes;
 }
 
 function countOf(text) {
-  if (!/^\d+$/.test(text)) throw new Error('Write a whole number.');
+  if (!/^\d+$/.test(text)) throw new Error('Enter a whole number.');
   return Number(text);
 }
 
@@ -39,23 +31,23 @@ function pathsOf(text) {
 }
 
 function pathOf(text) {
-  if (!text.startsWith('/')) throw new Error(`${text}: write a path that begins with /`);
+  if (!text.startsWith('/')) throw new Error(`${text}: enter an absolute path`);
   return text;
 }
 
 const count = { write: String, read: countOf };
 const bytes = { write: bytesText, read: bytesOf, isBytes: true };
 
-/** Each by its key, as the robot's own file and the server's refusals name it. */
+/** The settings by key, as in the robot's own file and in server errors. */
 export const SETTINGS = [
   {
     key: 'underlays',
     title: 'ROS underlays',
-    hint: 'Setup files, one a line, sourced in this order before a task is built or run.',
+    hint: 'Setup files, one per line, sourced in this order before a task is built or run.',
     write: (paths) => paths.join('\n'),
     read: pathsOf,
     isLong: true,
-    fallback: 'what is found in /opt/ros',
+    fallback: 'found in /opt/ros',
   },
   {
     key: 'workspace',
@@ -69,28 +61,30 @@ export const SETTINGS = [
   { key: 'ros_domain_id', title: 'ROS_DOMAIN_ID', hint: '0 to 232', ...count },
   {
     key: 'forward_level',
-    title: 'Log lines sent while nobody follows',
+    title: 'Log level to forward',
+    hint: 'Sent to the server even when the log is not open in a page or command.',
     write: String,
     read: String,
     choices: ['debug', 'info', 'warn', 'error', 'fatal'],
   },
-  { key: 'limits.archive_bytes', title: 'Unpacked package', ...bytes },
-  { key: 'limits.archive_entries', title: 'Files of a package', ...count },
-  { key: 'limits.disk_reserve_bytes', title: 'Disk that stays free', ...bytes },
-  { key: 'limits.log_bytes', title: 'Log file of a task', ...bytes },
-  { key: 'limits.output_bytes', title: 'Files a run brings back', ...bytes },
-  { key: 'limits.build_memory_bytes', title: 'Memory of a build', ...bytes },
-  { key: 'limits.build_timeout_s', title: 'Seconds a build may take', ...count },
-  { key: 'limits.parallel_tasks', title: 'Tasks prepared at once', ...count },
-  { key: 'limits.task_memory_mb', title: 'Memory of a task, in MiB', ...count },
-  { key: 'limits.task_pids', title: 'Processes of a task', ...count },
+  { key: 'limits.archive_bytes', title: 'Unpacked package size', ...bytes },
+  { key: 'limits.archive_entries', title: 'Files per package', ...count },
+  { key: 'limits.disk_reserve_bytes', title: 'Reserved disk space', ...bytes },
+  { key: 'limits.log_bytes', title: 'Log size per task', ...bytes },
+  { key: 'limits.output_bytes', title: 'Output size per run', ...bytes },
+  { key: 'limits.build_memory_bytes', title: 'Build memory', ...bytes },
+  { key: 'limits.build_timeout_s', title: 'Build timeout (seconds)', ...count },
+  { key: 'limits.parallel_tasks', title: 'Tasks prepared in parallel', ...count },
+  { key: 'limits.task_memory_mb', title: 'Memory per task (MB)', ...count },
+  { key: 'limits.task_pids', title: 'Processes per task', ...count },
 ];
 
 export const valueAt = (settings, key) =>
   key.split('.').reduce((value, part) => value?.[part], settings);
 
 /**
- * The settings with these texts instead; what is empty is no longer set. Throws `{ key, message }`.
+ * The settings with these texts parsed; an empty text clears a setting. Throws an error with a
+ * `key`.
  */
 export function settingsWith(settings, texts) {
   const next = { ...settings, limits: { ...settings?.limits } };
@@ -113,34 +107,36 @@ export function settingsWith(settings, texts) {
 
 const isSame = (one, other) => JSON.stringify(one) === JSON.stringify(other);
 
-/** What holds on the robot, and where that is from: `{ text, isBad }`. */
-export function holding(
-  { key, write, fallback = 'the agent’s default' },
+/** The effective value and its origin: `{ text, isBad }`. */
+export function effectiveValue(
+  { key, write, fallback = 'set by the agent' },
   { settings, effective_settings: effective, online },
 ) {
   const set = valueAt(settings, key);
-  const held = valueAt(effective, key);
+  const current = valueAt(effective, key);
   const isSet = set !== undefined;
   if (effective?.refused?.includes(key))
     return {
-      text: 'The robot does not take this: its own settings do not allow it, or it can not use the value.',
+      text: 'Rejected by the robot: its own settings do not allow it, or the value is unusable.',
       isBad: true,
     };
-  if (effective?.own?.includes(key))
+  if (effective?.own?.includes(key)) {
+    const origin = `the robot’s own file${isSet ? ', which takes precedence' : ''}`;
     return {
-      text: `Holds: ${shown(held, write)}, from the robot’s own file${isSet ? ', which wins' : ''}.`,
-      isBad: isSet && !isSame(set, held),
+      text: `In effect: ${shown(current, write)}, from ${origin}.`,
+      isBad: isSet && !isSame(set, current),
     };
-  if (isSet && isSame(set, held)) return { text: 'Holds on the robot, from here.' };
+  }
+  if (isSet && isSame(set, current)) return { text: 'In effect on the robot.' };
   if (isSet)
     return {
       text: online
-        ? 'Set here; the robot has not said yet that it holds.'
-        : 'Set here; the robot takes it when it is back.',
+        ? 'Set here; not yet confirmed by the robot.'
+        : 'Set here; takes effect when the robot is back online.',
     };
-  if (held !== undefined) return { text: `Holds: ${shown(held, write)}.` };
-  return { text: `Holds: ${fallback}.` };
+  if (current !== undefined) return { text: `In effect: ${shown(current, write)}.` };
+  return { text: `Default: ${fallback}.` };
 }
 
 const shown = (value, write) =>
-  value === undefined ? 'nothing' : write(value).replaceAll('\n', ', ');
+  value === undefined ? 'not set' : write(value).replaceAll('\n', ', ');

@@ -1,24 +1,23 @@
-// Everything that was ordered of a robot, the newest first: how each order went, phase by phase,
-// and why it failed.
+// The Tasks tab: all assignments of a robot, newest first, with phases and failures.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from '../vendor/lit-html-3.3.3/directives/repeat.js';
 import { get, SignedOut } from '../api.js';
 import { plural } from '../format.js';
 import { change } from '../frame.js';
-import { at } from '../router.js';
-import { phaseSign, progressBar, since } from '../signs.js';
-import { list, steps, strip } from '../timeline.js';
-import { why } from './monitor.js';
+import { hrefTo } from '../router.js';
+import { phaseBadge, progressBar, timeAgo } from '../status.js';
+import { timelineList, timelineSteps, timelineBar } from '../timeline.js';
+import { failureText } from './monitor.js';
 
 const SHOWN = 25;
-// A robot that works says more than a person can read.
+// A busy robot changes more often than users can read.
 const REFETCH_PAUSE_MS = 2_000;
 
 export class Tasks {
   #page;
   #assignments = null;
-  /** What comes before is asked for with this. */
+  /** The `before` parameter of the next older page. */
   #next = null;
   #problem = null;
   #timer = null;
@@ -36,14 +35,14 @@ export class Tasks {
     this.#timer = null;
   }
 
-  hear() {
+  onEvent() {
     this.#timer ??= setTimeout(() => {
       this.#timer = null;
       this.refresh();
     }, REFETCH_PAUSE_MS);
   }
 
-  /** Fetches the newest again; older ones that were asked for stay. */
+  /** Fetches the newest assignments; older pages stay. */
   refresh() {
     return this.#fetch();
   }
@@ -73,20 +72,24 @@ export class Tasks {
     if (!this.#assignments && this.#problem) {
       const text =
         this.#problem.status === 404
-          ? 'This server keeps no history of tasks. What is ordered now is on Monitor.'
+          ? 'This server keeps no task history. The Monitor tab lists the current tasks.'
           : this.#problem.message;
       return html`<p class="empty quiet">${text}</p>`;
     }
-    if (!this.#assignments) return html`<p class="empty quiet">Fetching…</p>`;
-    if (!this.#assignments.length)
-      return html`<p class="empty quiet">Nothing has been ordered of it.</p>`;
+    if (!this.#assignments) return html`<p class="empty quiet">Loading…</p>`;
+    if (!this.#assignments.length) return html`<p class="empty quiet">No tasks yet.</p>`;
     const current = this.#assignments.filter(({ wanted }) => wanted);
     const past = this.#assignments.filter(({ wanted }) => !wanted);
     return html`
       ${this.#problem ? html`<p class="bad" role="alert">▲ ${this.#problem.message}</p>` : nothing}
-      ${this.#list('Now', current, now)}
-      ${this.#list('Before', past, now)}
-      ${this.#next ? html`<p><button class="quiet-button" @click=${() => this.#fetch(this.#next)}>Show older</button></p>` : nothing}`;
+      ${this.#list('Current', current, now)}
+      ${this.#list('Previous', past, now)}
+      ${
+        this.#next
+          ? html`<p><button class="quiet-button"
+              @click=${() => this.#fetch(this.#next)}>Show older</button></p>`
+          : nothing
+      }`;
   }
 
   #list(title, assignments, now) {
@@ -103,7 +106,7 @@ export class Tasks {
   }
 
   #assignment(assignment, now) {
-    const course = steps(assignment.timeline ?? [], assignment.kind, now);
+    const course = timelineSteps(assignment.timeline ?? [], assignment.kind, now);
     const {
       deployment,
       package: { name, version },
@@ -115,16 +118,35 @@ export class Tasks {
       superseded_by: newer,
       created_at_ms: then,
     } = assignment;
+    const notes = [
+      attempts > 1 && plural(attempts, 'attempt'),
+      !assignment.released && 'waiting for its batch',
+    ].filter(Boolean);
     return html`
       <article class="assignment" data-deployment=${deployment}>
-        <h3>${name}<span class="quiet">@${version}</span> ${phaseSign(phase)}${wanted === 'stopped' && phase !== 'stopped' ? html`<span class="quiet"> stop ordered</span>` : nothing}</h3>
-        <p class="quiet when">${since(then, now)}</p>
-        ${strip(course)}
-        ${list(course)}
+        <h3>${name}<span class="quiet">@${version}</span> ${phaseBadge(phase)}${
+          wanted === 'stopped' && phase !== 'stopped'
+            ? html`<span class="quiet"> stop requested</span>`
+            : nothing
+        }</h3>
+        <p class="quiet time">${timeAgo(then, now)}</p>
+        ${timelineBar(course)}
+        ${timelineList(course)}
         ${progressBar({ ...assignment, task: name })}
-        ${failure ? why(failure) : nothing}
-        <p class="quiet">${[attempts > 1 && plural(attempts, 'attempt'), !assignment.released && 'waits for its batch'].filter(Boolean).map((said) => `${said} · `)}${delivery ? html`${delivery.mechanism}, because ${delivery.because} <span class="rule">(rule: ${delivery.rule})</span>` : 'delivery not decided yet'}</p>
-        <p><a href=${at(['deployments', deployment])}>Deployment</a> · <a href=${this.#page.at('logs', { task: name })}>Log</a>${newer ? html` · <a href=${at(['deployments', newer])}>what took its place</a>` : nothing}</p>
+        ${failure ? failureText(failure) : nothing}
+        <p class="quiet">${notes.map((said) => `${said} · `)}${
+          delivery
+            ? html`${delivery.mechanism}: ${delivery.because}
+                <span class="rule">(rule: ${delivery.rule})</span>`
+            : 'delivery not decided yet'
+        }</p>
+        <p><a href=${hrefTo(['deployments', deployment])}>Deployment</a>
+          · <a href=${this.#page.hrefTo('logs', { task: name })}>Log</a>${
+            newer
+              ? html` · superseded by a
+                  <a href=${hrefTo(['deployments', newer])}>newer deployment</a>`
+              : nothing
+          }</p>
       </article>`;
   }
 }

@@ -11,16 +11,16 @@ use subtle::ConstantTimeEq as _;
 const SECRET_BYTES: usize = 32;
 
 #[derive(Clone, PartialEq, Eq)]
-pub struct Attempt([u8; SECRET_BYTES]);
+pub struct SignInAttempt([u8; SECRET_BYTES]);
 
-impl Attempt {
+impl SignInAttempt {
     /// A new attempt with a random secret.
     pub fn random() -> Self {
         Self(rand::random())
     }
 
     /// The attempt that the browser kept; `None` if the text is invalid.
-    pub fn kept(text: &str) -> Option<Self> {
+    pub fn from_cookie(text: &str) -> Option<Self> {
         URL_SAFE_NO_PAD.decode(text).ok()?.try_into().ok().map(Self)
     }
 
@@ -66,30 +66,30 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_answer_belongs_to_one_attempt() {
-        let (attempt, other) = (Attempt::random(), Attempt::random());
-        let kept = Attempt::kept(&attempt.reveal()).expect("it was kept");
-        assert!(kept.has_state(&attempt.state()) && kept.nonce() == attempt.nonce());
+    fn answer_belongs_to_one_attempt() {
+        let (attempt, other) = (SignInAttempt::random(), SignInAttempt::random());
+        let restored = SignInAttempt::from_cookie(&attempt.reveal()).expect("it is valid");
+        assert!(restored.has_state(&attempt.state()) && restored.nonce() == attempt.nonce());
         assert!(
             !other.has_state(&attempt.state())
                 && !attempt.has_state("")
                 && other.nonce() != attempt.nonce()
         );
-        let told = [
+        let texts = [
             attempt.state(),
             attempt.nonce(),
             attempt.verifier(),
             attempt.challenge(),
             attempt.reveal(),
         ];
-        let different: std::collections::BTreeSet<&String> = told.iter().collect();
-        assert_eq!(different.len(), told.len());
+        let different: std::collections::BTreeSet<&String> = texts.iter().collect();
+        assert_eq!(different.len(), texts.len());
         assert!(
-            told.iter().all(|text| text.len() == 43),
-            "as long as RFC 7636 wants a verifier at least"
+            texts.iter().all(|text| text.len() == 43),
+            "RFC 7636 requires at least 43 characters"
         );
         for bad in ["", "x", &"A".repeat(42), &"A".repeat(44), &"!".repeat(43)] {
-            assert!(Attempt::kept(bad).is_none(), "{bad:?}");
+            assert!(SignInAttempt::from_cookie(bad).is_none(), "{bad:?}");
         }
     }
 }

@@ -10,9 +10,9 @@ use subtle::ConstantTimeEq as _;
 use super::keys::{Algorithm, KeySet};
 
 /// Maximum size of a token.
-const MOST_BYTES: usize = 64 * 1024;
+const MAX_TOKEN_BYTES: usize = 64 * 1024;
 /// Maximum length of a subject (OpenID Connect Core, 2).
-const MOST_SUBJECT_BYTES: usize = 255;
+const MAX_SUBJECT_BYTES: usize = 255;
 /// Permitted difference of the provider's clock.
 const SKEW_S: f64 = 60.0;
 
@@ -20,13 +20,13 @@ const SKEW_S: f64 = 60.0;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum IdTokenError {
     /// The text is not a token.
-    #[error("it is not a signed JWT")]
+    #[error("not a signed JWT")]
     Malformed,
     /// The signature's algorithm proves nothing, or is not supported.
-    #[error("its algorithm is neither RS256 nor ES256")]
+    #[error("the algorithm is neither RS256 nor ES256")]
     Algorithm,
     /// None of the provider's keys made the signature.
-    #[error("none of the provider's keys made its signature")]
+    #[error("none of the provider's keys made the signature")]
     Signature,
     /// A claim has an unexpected value.
     #[error("{claim}: {reason}")]
@@ -52,7 +52,7 @@ pub(super) struct IdToken<'a> {
 
 impl<'a> IdToken<'a> {
     pub(super) fn parse(text: &'a str) -> Result<Self, IdTokenError> {
-        if text.len() > MOST_BYTES {
+        if text.len() > MAX_TOKEN_BYTES {
             return Err(IdTokenError::Malformed);
         }
         let (signed, signature) = text.rsplit_once('.').ok_or(IdTokenError::Malformed)?;
@@ -80,7 +80,7 @@ impl<'a> IdToken<'a> {
         keys: &KeySet,
         expected: &Expected<'_>,
     ) -> Result<Claims, IdTokenError> {
-        if !keys.made(
+        if !keys.verifies(
             self.key_id.as_deref(),
             self.algorithm,
             self.signed.as_bytes(),
@@ -120,14 +120,14 @@ impl Claims {
 
     /// Whether the claim equals this value, or is a list that contains it.
     pub fn has(&self, name: &str, value: &str) -> bool {
-        let is_it = |found: &Value| match found {
+        let is_value = |found: &Value| match found {
             Value::String(text) => text == value,
             Value::Bool(yes) => value == if *yes { "true" } else { "false" },
             _ => false,
         };
         match self.get(name) {
-            Some(Value::Array(values)) => values.iter().any(is_it),
-            Some(found) => is_it(found),
+            Some(Value::Array(values)) => values.iter().any(is_value),
+            Some(found) => is_value(found),
             None => false,
         }
     }
@@ -139,7 +139,7 @@ impl Claims {
     fn check(&self, expected: &Expected<'_>) -> Result<(), IdTokenError> {
         let wrong = |claim, reason| Err(IdTokenError::Claim { claim, reason });
         if self.text("iss") != Some(expected.issuer) {
-            return wrong("iss", "it is another issuer's");
+            return wrong("iss", "unexpected issuer");
         }
         let audiences: Vec<&str> = match self.0.get("aud") {
             Some(Value::String(one)) => vec![one],
@@ -147,14 +147,14 @@ impl Claims {
             _ => Vec::new(),
         };
         if !audiences.contains(&expected.client_id) {
-            return wrong("aud", "it is for another client");
+            return wrong("aud", "issued for another client");
         }
         match self.text("azp") {
             Some(client) if client != expected.client_id => {
-                return wrong("azp", "it was given to another client");
+                return wrong("azp", "issued to another client");
             }
             None if audiences.len() > 1 => {
-                return wrong("azp", "it is missing, and there are several audiences");
+                return wrong("azp", "missing, although there are several audiences");
             }
             _ => {}
         }
@@ -162,21 +162,21 @@ impl Claims {
         let time = |name: &str| self.0.get(name).and_then(Value::as_f64);
         match time("exp") {
             Some(ends_s) if now_s < ends_s + SKEW_S => {}
-            _ => return wrong("exp", "it has expired"),
+            _ => return wrong("exp", "expired"),
         }
         match time("iat") {
             Some(made_s) if made_s <= now_s + SKEW_S => {}
-            _ => return wrong("iat", "it is from the future"),
+            _ => return wrong("iat", "issued in the future"),
         }
         if time("nbf").is_some_and(|begins_s| now_s + SKEW_S < begins_s) {
-            return wrong("nbf", "it is not valid yet");
+            return wrong("nbf", "not valid yet");
         }
         let nonce = self.text("nonce").unwrap_or_default();
         if !bool::from(nonce.as_bytes().ct_eq(expected.nonce.as_bytes())) {
-            return wrong("nonce", "it is of another attempt");
+            return wrong("nonce", "belongs to another sign-in attempt");
         }
         let subject = self.subject();
-        let is_subject = (1..=MOST_SUBJECT_BYTES).contains(&subject.len());
+        let is_subject = (1..=MAX_SUBJECT_BYTES).contains(&subject.len());
         if !is_subject || !subject.bytes().all(|byte| (b' '..=b'~').contains(&byte)) {
             return wrong("sub", "expected 1 to 255 printable ASCII characters");
         }
@@ -248,7 +248,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_believed_if_all_of_it_is_right() {
+    fn id_token_is_accepted_only_if_every_claim_is_valid() {
         let signer = Signer::new();
         let claims_with = |changes: Value| {
             let mut claims = claims();
@@ -264,8 +264,8 @@ mod tests {
             json!({ "exp": NOW_S - 59, "iat": NOW_S + 59, "nbf": NOW_S + 59 }),
             json!({ "exp": NOW_S as f64 + 0.5 }),
         ] {
-            let said = signer.verified(&signer.sign(&header(), &claims_with(good.clone())));
-            assert_eq!(said.expect("believed").subject(), "248289761001", "{good}");
+            let verified = signer.verified(&signer.sign(&header(), &claims_with(good.clone())));
+            assert_eq!(verified.expect("valid").subject(), "248289761001", "{good}");
         }
         for (claim, bad) in [
             ("iss", json!({ "iss": "https://id.example/" })),
@@ -299,7 +299,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_that_nobody_signed_is_nothing() {
+    fn id_token_without_a_valid_signature_is_refused() {
         let (signer, other) = (Signer::new(), Signer::new());
         let good = signer.sign(&header(), &claims());
         let (signed, signature) = good.rsplit_once('.').expect("parts");
@@ -331,7 +331,7 @@ mod tests {
             Err(IdTokenError::Malformed)
         );
         for bad in
-            ["", "a", "a.b", "a.b.c", "..", &format!("{good}.x"), &"x".repeat(MOST_BYTES + 1)]
+            ["", "a", "a.b", "a.b.c", "..", &format!("{good}.x"), &"x".repeat(MAX_TOKEN_BYTES + 1)]
         {
             assert_eq!(signer.verified(bad), Err(IdTokenError::Malformed), "{bad:.40}");
         }

@@ -9,7 +9,7 @@ use ring::signature::{
 use serde_json::Value;
 
 /// Maximum number of keys that are read.
-const MOST_KEYS: usize = 64;
+const MAX_KEYS: usize = 64;
 /// Length of a coordinate of a point on P-256, in bytes.
 const COORDINATE_BYTES: usize = 32;
 
@@ -50,7 +50,7 @@ impl KeySet {
     /// The document's keys for supported signatures; others are ignored.
     pub(super) fn read(document: &Value) -> Self {
         let keys = document["keys"].as_array().map(Vec::as_slice).unwrap_or_default();
-        Self(keys.iter().take(MOST_KEYS).filter_map(key).collect())
+        Self(keys.iter().take(MAX_KEYS).filter_map(parse_key).collect())
     }
 
     /// Whether there is a key of this id for the algorithm.
@@ -59,19 +59,19 @@ impl KeySet {
     }
 
     /// Whether the key of this id, or any key if there is no id, made the signature.
-    pub(super) fn made(
+    pub(super) fn verifies(
         &self,
         id: Option<&str>,
         algorithm: Algorithm,
         message: &[u8],
         signature: &[u8],
     ) -> bool {
-        self.candidates(id, algorithm).any(|key| key.public.made(message, signature))
+        self.candidates(id, algorithm).any(|key| key.public.verifies(message, signature))
     }
 
     fn candidates(&self, id: Option<&str>, algorithm: Algorithm) -> impl Iterator<Item = &Key> {
-        let is_meant = move |key: &&Key| id.is_none() || key.id.as_deref() == id;
-        self.0.iter().filter(move |key| key.public.algorithm() == algorithm).filter(is_meant)
+        let has_id = move |key: &&Key| id.is_none() || key.id.as_deref() == id;
+        self.0.iter().filter(move |key| key.public.algorithm() == algorithm).filter(has_id)
     }
 }
 
@@ -83,7 +83,7 @@ impl Public {
         }
     }
 
-    fn made(&self, message: &[u8], signature: &[u8]) -> bool {
+    fn verifies(&self, message: &[u8], signature: &[u8]) -> bool {
         match self {
             Self::Rsa { modulus, exponent } => {
                 let key = RsaPublicKeyComponents { n: modulus, e: exponent };
@@ -96,16 +96,17 @@ impl Public {
     }
 }
 
-fn key(key: &Value) -> Option<Key> {
+fn parse_key(key: &Value) -> Option<Key> {
     let text = |name: &str| key[name].as_str();
     let number = |name: &str| URL_SAFE_NO_PAD.decode(text(name)?.trim_end_matches('=')).ok();
     if text("use").is_some_and(|purpose| purpose != "sig") {
         return None;
     }
     let public = match text("kty")? {
-        "RSA" => {
-            Public::Rsa { modulus: significant(number("n")?), exponent: significant(number("e")?) }
-        }
+        "RSA" => Public::Rsa {
+            modulus: without_leading_zeros(number("n")?),
+            exponent: without_leading_zeros(number("e")?),
+        },
         "EC" if text("crv") == Some("P-256") => {
             let (x, y) = (number("x")?, number("y")?);
             if (x.len(), y.len()) != (COORDINATE_BYTES, COORDINATE_BYTES) {
@@ -122,7 +123,7 @@ fn key(key: &Value) -> Option<Key> {
 }
 
 /// Removes leading zeros, which some providers write.
-fn significant(bytes: Vec<u8>) -> Vec<u8> {
+fn without_leading_zeros(bytes: Vec<u8>) -> Vec<u8> {
     bytes.into_iter().skip_while(|byte| *byte == 0).collect()
 }
 
@@ -143,21 +144,21 @@ mod tests {
          hBQn6A6ZrmYmK_ehHsYCZ-kOtXmuKPtndUFwlDmVnQ";
 
     #[test]
-    fn a_signature_is_of_one_key_one_text_and_one_algorithm() {
+    fn signature_binds_key_text_and_algorithm() {
         let set = KeySet::read(
             &json!({ "keys": [{ "kty": "RSA", "kid": "k", "n": MODULUS, "e": "AQAB" }] }),
         );
         let signature = URL_SAFE_NO_PAD.decode(SIGNATURE).expect("base64");
-        assert!(set.made(Some("k"), Algorithm::Rs256, b"taskd", &signature));
-        assert!(set.made(None, Algorithm::Rs256, b"taskd", &signature));
-        assert!(!set.made(Some("other"), Algorithm::Rs256, b"taskd", &signature));
-        assert!(!set.made(Some("k"), Algorithm::Es256, b"taskd", &signature));
-        assert!(!set.made(Some("k"), Algorithm::Rs256, b"taske", &signature));
-        assert!(!set.made(Some("k"), Algorithm::Rs256, b"taskd", &signature[1..]));
+        assert!(set.verifies(Some("k"), Algorithm::Rs256, b"taskd", &signature));
+        assert!(set.verifies(None, Algorithm::Rs256, b"taskd", &signature));
+        assert!(!set.verifies(Some("other"), Algorithm::Rs256, b"taskd", &signature));
+        assert!(!set.verifies(Some("k"), Algorithm::Es256, b"taskd", &signature));
+        assert!(!set.verifies(Some("k"), Algorithm::Rs256, b"taske", &signature));
+        assert!(!set.verifies(Some("k"), Algorithm::Rs256, b"taskd", &signature[1..]));
     }
 
     #[test]
-    fn only_keys_for_known_signatures_are_kept() {
+    fn keys_for_unsupported_signatures_are_ignored() {
         let (n, e, x) = ("AQAB".repeat(8), "AQAB", URL_SAFE_NO_PAD.encode([1; 32]));
         let set = KeySet::read(&json!({ "keys": [
             { "kty": "RSA", "kid": "rsa", "n": n, "e": e },

@@ -18,52 +18,52 @@ use tokio::sync::{Mutex, Semaphore};
 
 use crate::config::{OidcSettings, RoleRule, private_url};
 
-pub use attempt::Attempt;
+pub use attempt::SignInAttempt;
 pub use id_token::{Claims, IdTokenError};
 
 use id_token::{Expected, IdToken};
 use keys::KeySet;
 
 /// Time limit for one answer of the provider.
-const PATIENCE: Duration = Duration::from_secs(10);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Maximum size of an answer.
-const MOST_BYTES: usize = 1024 * 1024;
+const MAX_ANSWER_BYTES: usize = 1024 * 1024;
 /// Maximum concurrent code exchanges; a further one is refused.
-const MOST_EXCHANGES: usize = 16;
+const MAX_EXCHANGES: usize = 16;
 /// Lifetime of the provider's documents in the cache.
-const LIFETIME_MS: u64 = 60 * 60 * 1000;
+const CACHE_LIFETIME_MS: u64 = 60 * 60 * 1000;
 /// Pause before the documents are fetched again, after a failure or when a key was missing.
-const PAUSE_MS: u64 = 10_000;
+const BACKOFF_MS: u64 = 10_000;
 /// Maximum length of the secret in the file.
-const MOST_SECRET_BYTES: u64 = 4096;
+const MAX_SECRET_BYTES: u64 = 4096;
 
 /// The reason why no user was signed in.
 #[derive(Debug, thiserror::Error)]
 pub enum OidcError {
     /// The provider did not answer.
-    #[error("the provider's {what} can't be reached")]
-    Unreachable { what: &'static str, source: reqwest::Error },
+    #[error("the provider's {resource} can't be reached")]
+    Unreachable { resource: &'static str, source: reqwest::Error },
     /// The provider's answer is unusable.
-    #[error("the provider's {what} can't be used: {reason}")]
+    #[error("the provider's {resource} can't be used: {reason}")]
     Unusable {
-        what: &'static str,
+        resource: &'static str,
         /// The error in the answer.
         reason: String,
     },
     /// The provider's documents could not be fetched a moment ago.
-    #[error("the provider failed a moment ago and is not asked again yet")]
-    Resting,
+    #[error("the provider failed recently and is not contacted again yet")]
+    BackingOff,
     /// The maximum number of exchanges is running.
-    #[error("too many sign-ins at once")]
+    #[error("too many concurrent sign-ins")]
     Busy,
     /// The ID token failed validation.
-    #[error("the provider's ID token is not to be believed")]
+    #[error("the provider's ID token is invalid")]
     IdToken(#[from] IdTokenError),
 }
 
 /// The reason why the settings can't be used.
 #[derive(Debug, thiserror::Error)]
-pub enum OidcSetUpError {
+pub enum OidcSetupError {
     /// The file with the secret can't be read.
     #[error("oidc.client_secret_file: {} can't be read", path.display())]
     SecretFile {
@@ -72,10 +72,10 @@ pub enum OidcSetUpError {
         source: std::io::Error,
     },
     /// The file contains no secret.
-    #[error("oidc.client_secret_file: {} holds no secret: expected one line", path.display())]
+    #[error("oidc.client_secret_file: {} contains no secret: expected one line", path.display())]
     NoSecret { path: PathBuf },
     /// The HTTP client can't be created.
-    #[error("oidc: the provider can't be asked")]
+    #[error("oidc: the HTTP client can't be created")]
     Client(#[source] reqwest::Error),
 }
 
@@ -83,12 +83,12 @@ pub struct Provider {
     settings: OidcSettings,
     secret: Option<String>,
     http: Client,
-    known: Mutex<Known>,
+    cache: Mutex<Cache>,
     exchanges: Semaphore,
 }
 
 #[derive(Default)]
-struct Known {
+struct Cache {
     document: Option<(Document, u64)>,
     keys: Option<(KeySet, u64)>,
     failed_ms: Option<u64>,
@@ -106,33 +106,33 @@ struct Document {
 }
 
 #[derive(Deserialize)]
-struct TokenAnswer {
+struct TokenResponse {
     id_token: String,
 }
 
 #[derive(Deserialize)]
-struct TokenRefusal {
+struct TokenErrorResponse {
     error: String,
 }
 
 impl Provider {
     /// Creates the provider from these settings. Nothing is requested yet.
-    pub fn new(settings: OidcSettings) -> Result<Self, OidcSetUpError> {
+    pub fn new(settings: OidcSettings) -> Result<Self, OidcSetupError> {
         let secret = settings.client_secret_file.as_ref().map(read_secret).transpose()?;
         // A second installation fails because the first is in place, which is sufficient.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = Client::builder()
-            .timeout(PATIENCE)
+            .timeout(ANSWER_TIMEOUT)
             .redirect(reqwest::redirect::Policy::none())
             .user_agent(concat!("taskd/", env!("CARGO_PKG_VERSION")))
             .build()
-            .map_err(OidcSetUpError::Client)?;
+            .map_err(OidcSetupError::Client)?;
         Ok(Self {
             settings,
             secret,
             http,
-            known: Mutex::default(),
-            exchanges: Semaphore::new(MOST_EXCHANGES),
+            cache: Mutex::default(),
+            exchanges: Semaphore::new(MAX_EXCHANGES),
         })
     }
 
@@ -146,11 +146,15 @@ impl Provider {
     }
 
     /// The authorization URL for the browser.
-    pub async fn address(&self, attempt: &Attempt, now_ms: u64) -> Result<String, OidcError> {
+    pub async fn authorization_url(
+        &self,
+        attempt: &SignInAttempt,
+        now_ms: u64,
+    ) -> Result<String, OidcError> {
         let document = self.document(now_ms).await?;
-        let what = "authorization endpoint";
+        let resource = "authorization endpoint";
         let mut url = Url::parse(&document.authorization_endpoint)
-            .map_err(|error| OidcError::Unusable { what, reason: error.to_string() })?;
+            .map_err(|error| OidcError::Unusable { resource, reason: error.to_string() })?;
         url.query_pairs_mut()
             .append_pair("response_type", "code")
             .append_pair("client_id", &self.settings.client_id)
@@ -164,13 +168,13 @@ impl Provider {
     }
 
     /// The user identified by the code that the attempt returned.
-    pub async fn who(
+    pub async fn authenticate(
         &self,
-        attempt: &Attempt,
+        attempt: &SignInAttempt,
         code: &str,
         now_ms: u64,
     ) -> Result<Claims, OidcError> {
-        let _turn = self.exchanges.try_acquire().map_err(|_| OidcError::Busy)?;
+        let _permit = self.exchanges.try_acquire().map_err(|_| OidcError::Busy)?;
         let document = self.document(now_ms).await?;
         let token = self.exchange(&document, attempt, code).await?;
         let token = IdToken::parse(&token)?;
@@ -188,10 +192,10 @@ impl Provider {
     async fn exchange(
         &self,
         document: &Document,
-        attempt: &Attempt,
+        attempt: &SignInAttempt,
         code: &str,
     ) -> Result<String, OidcError> {
-        let what = "token endpoint";
+        let resource = "token endpoint";
         let (redirect_uri, verifier) = (self.settings.redirect_uri(), attempt.verifier());
         let mut form = vec![
             ("grant_type", "authorization_code"),
@@ -210,40 +214,41 @@ impl Provider {
             ]),
             None => form.push(("client_id", &self.settings.client_id)),
         }
-        let (status, body) = read(what, request.form(&form)).await?;
+        let (status, body) = read(resource, request.form(&form)).await?;
         if status.is_success() {
-            return Ok(parsed::<TokenAnswer>(what, &body)?.id_token);
+            return Ok(parsed::<TokenResponse>(resource, &body)?.id_token);
         }
-        let said =
-            parsed::<TokenRefusal>(what, &body).map_or(String::new(), |refusal| refusal.error);
-        let said: String = said.chars().filter(|c| c.is_ascii_graphic()).take(40).collect();
-        Err(OidcError::Unusable { what, reason: format!("it answered {status} {said}") })
+        let code_text = parsed::<TokenErrorResponse>(resource, &body)
+            .map_or(String::new(), |refusal| refusal.error);
+        let code_text: String =
+            code_text.chars().filter(|c| c.is_ascii_graphic()).take(40).collect();
+        Err(OidcError::Unusable { resource, reason: format!("HTTP {status} {code_text}") })
     }
 
     async fn document(&self, now_ms: u64) -> Result<Document, OidcError> {
-        let mut known = self.known.lock().await;
-        if let Some((document, since_ms)) = &known.document
-            && now_ms.saturating_sub(*since_ms) < LIFETIME_MS
+        let mut cache = self.cache.lock().await;
+        if let Some((document, since_ms)) = &cache.document
+            && now_ms.saturating_sub(*since_ms) < CACHE_LIFETIME_MS
         {
             return Ok(document.clone());
         }
-        if known.is_resting(now_ms) {
-            return Err(OidcError::Resting);
+        if cache.is_backing_off(now_ms) {
+            return Err(OidcError::BackingOff);
         }
         let document =
-            self.fetch_document().await.inspect_err(|_| known.failed_ms = Some(now_ms))?;
-        known.document = Some((document.clone(), now_ms));
+            self.fetch_document().await.inspect_err(|_| cache.failed_ms = Some(now_ms))?;
+        cache.document = Some((document.clone(), now_ms));
         Ok(document)
     }
 
     async fn fetch_document(&self) -> Result<Document, OidcError> {
-        let what = "discovery document";
+        let resource = "discovery document";
         let url = format!(
             "{}/.well-known/openid-configuration",
             self.settings.issuer.trim_end_matches('/')
         );
-        let document: Document = self.fetch(what, &url).await?;
-        let unusable = |reason: String| Err(OidcError::Unusable { what, reason });
+        let document: Document = self.fetch(resource, &url).await?;
+        let unusable = |reason: String| Err(OidcError::Unusable { resource, reason });
         // Otherwise one provider could speak for another.
         if document.issuer != self.settings.issuer {
             return unusable(format!(
@@ -270,41 +275,41 @@ impl Provider {
         token: &IdToken<'_>,
         now_ms: u64,
     ) -> Result<KeySet, OidcError> {
-        let mut known = self.known.lock().await;
-        if let Some((keys, since_ms)) = &known.keys {
+        let mut cache = self.cache.lock().await;
+        if let Some((keys, since_ms)) = &cache.keys {
             let age_ms = now_ms.saturating_sub(*since_ms);
             // The provider may have a new key; but unknown key names must not make the server fetch
             // again and again.
-            let is_enough = age_ms < PAUSE_MS || token.has_key_in(keys);
-            if age_ms < LIFETIME_MS && is_enough {
+            let is_enough = age_ms < BACKOFF_MS || token.has_key_in(keys);
+            if age_ms < CACHE_LIFETIME_MS && is_enough {
                 return Ok(keys.clone());
             }
         }
-        if known.is_resting(now_ms) {
-            return Err(OidcError::Resting);
+        if cache.is_backing_off(now_ms) {
+            return Err(OidcError::BackingOff);
         }
         let fetched = self.fetch::<serde_json::Value>("keys", &document.jwks_uri).await;
-        let keys = KeySet::read(&fetched.inspect_err(|_| known.failed_ms = Some(now_ms))?);
-        known.keys = Some((keys.clone(), now_ms));
+        let keys = KeySet::read(&fetched.inspect_err(|_| cache.failed_ms = Some(now_ms))?);
+        cache.keys = Some((keys.clone(), now_ms));
         Ok(keys)
     }
 
     async fn fetch<T: DeserializeOwned>(
         &self,
-        what: &'static str,
+        resource: &'static str,
         url: &str,
     ) -> Result<T, OidcError> {
-        let (status, body) = read(what, self.http.get(url)).await?;
+        let (status, body) = read(resource, self.http.get(url)).await?;
         if !status.is_success() {
-            return Err(OidcError::Unusable { what, reason: format!("it answered {status}") });
+            return Err(OidcError::Unusable { resource, reason: format!("HTTP {status}") });
         }
-        parsed(what, &body)
+        parsed(resource, &body)
     }
 }
 
-impl Known {
-    fn is_resting(&self, now_ms: u64) -> bool {
-        self.failed_ms.is_some_and(|failed_ms| now_ms.saturating_sub(failed_ms) < PAUSE_MS)
+impl Cache {
+    fn is_backing_off(&self, now_ms: u64) -> bool {
+        self.failed_ms.is_some_and(|failed_ms| now_ms.saturating_sub(failed_ms) < BACKOFF_MS)
     }
 }
 
@@ -319,17 +324,17 @@ impl Document {
 }
 
 async fn read(
-    what: &'static str,
+    resource: &'static str,
     request: RequestBuilder,
 ) -> Result<(StatusCode, Vec<u8>), OidcError> {
-    let unreachable = |source| OidcError::Unreachable { what, source };
+    let unreachable = |source| OidcError::Unreachable { resource, source };
     let mut response = request.send().await.map_err(unreachable)?;
     let mut body = Vec::new();
     while let Some(chunk) = response.chunk().await.map_err(unreachable)? {
-        if body.len() + chunk.len() > MOST_BYTES {
+        if body.len() + chunk.len() > MAX_ANSWER_BYTES {
             return Err(OidcError::Unusable {
-                what,
-                reason: format!("it has more than {MOST_BYTES} bytes"),
+                resource,
+                reason: format!("it has more than {MAX_ANSWER_BYTES} bytes"),
             });
         }
         body.extend_from_slice(&chunk);
@@ -337,12 +342,12 @@ async fn read(
     Ok((response.status(), body))
 }
 
-fn parsed<T: DeserializeOwned>(what: &'static str, body: &[u8]) -> Result<T, OidcError> {
+fn parsed<T: DeserializeOwned>(resource: &'static str, body: &[u8]) -> Result<T, OidcError> {
     // The error text of serde may repeat a secret.
     let reason =
         |error: serde_json::Error| format!("line {}: {:?}", error.line(), error.classify());
     serde_json::from_slice(body)
-        .map_err(|error| OidcError::Unusable { what, reason: reason(error) })
+        .map_err(|error| OidcError::Unusable { resource, reason: reason(error) })
 }
 
 /// Both values are form-encoded before they are joined (RFC 6749, 2.3.1).
@@ -355,15 +360,15 @@ fn basic(client_id: &str, secret: &str) -> String {
     format!("Basic {}", STANDARD.encode(format!("{}:{}", form(client_id), form(secret))))
 }
 
-fn read_secret(path: &PathBuf) -> Result<String, OidcSetUpError> {
+fn read_secret(path: &PathBuf) -> Result<String, OidcSetupError> {
     use std::io::Read as _;
-    let unreadable = |source| OidcSetUpError::SecretFile { path: path.clone(), source };
+    let unreadable = |source| OidcSetupError::SecretFile { path: path.clone(), source };
     let file = std::fs::File::open(path).map_err(unreadable)?;
     let mut text = String::new();
-    file.take(MOST_SECRET_BYTES).read_to_string(&mut text).map_err(unreadable)?;
+    file.take(MAX_SECRET_BYTES).read_to_string(&mut text).map_err(unreadable)?;
     let secret = text.trim();
     match secret.is_empty() || secret.contains(char::is_control) {
-        true => Err(OidcSetUpError::NoSecret { path: path.clone() }),
+        true => Err(OidcSetupError::NoSecret { path: path.clone() }),
         false => Ok(secret.to_owned()),
     }
 }
@@ -373,7 +378,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_secret_goes_as_a_form_would_have_it() {
+    fn client_secret_is_form_encoded() {
         assert_eq!(
             basic("taskd", "a b:c%&ä"),
             format!("Basic {}", STANDARD.encode("taskd:a+b%3Ac%25%26%C3%A4"))
@@ -381,10 +386,10 @@ mod tests {
     }
 
     #[test]
-    fn a_secret_is_one_line_of_a_file() {
+    fn client_secret_is_one_line_of_a_file() {
         let directory = tempfile::tempdir().expect("a directory");
         let path = directory.path().join("secret");
-        assert!(matches!(read_secret(&path), Err(OidcSetUpError::SecretFile { .. })));
+        assert!(matches!(read_secret(&path), Err(OidcSetupError::SecretFile { .. })));
         for (text, expected) in
             [("s3cret\n", Some("s3cret")), ("", None), (" \n", None), ("a\nb", None)]
         {

@@ -5,9 +5,9 @@
 //! the broker's access control list does: the robot that its topic names. Reports never use this
 //! path (see docs/decisions).
 
-mod crowd;
+mod fan_out;
+mod online_robots;
 mod outbox;
-mod present;
 mod session;
 
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -16,19 +16,19 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::api::MqttTraffic;
-use task_proto::topic::{Topic, TopicPrefix};
+use task_proto::messages::topic::{Topic, TopicPrefix};
 use task_proto::{CaPin, Digest, RobotId};
 use task_transport::{Route, Trust};
 use tokio::sync::{Notify, Semaphore, watch};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{Health, Inbox, NotAsked, NotConnected, PartQos};
+use super::{Health, Inbox, NotConnected, NotSent, PartQos};
 use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
 use crate::system::clock::Clock;
-pub(super) use crowd::Crowd;
-use outbox::{Letter, Outbox};
-use present::Present;
+pub(super) use fan_out::ExternalFanOut;
+use online_robots::OnlineRobots;
+use outbox::{Outbox, OutgoingMessage};
 
 /// The last level of the topic on which the server receives its own message.
 pub const CANARY_LEVEL: &str = "server";
@@ -68,7 +68,7 @@ pub fn external_route(url: &BrokerUrl, pin: Option<CaPin>) -> Route {
 }
 
 /// One of the brokers.
-pub(super) struct Place {
+pub(super) struct BrokerEndpoint {
     /// Its number in the list.
     number: usize,
     url: BrokerUrl,
@@ -87,7 +87,7 @@ pub(super) struct External {
     taken: Notify,
     /// Free KiB of the window.
     window: Arc<Semaphore>,
-    present: Mutex<Present>,
+    online: Mutex<OnlineRobots>,
     traffic: Mutex<MqttTraffic>,
     stop: CancellationToken,
     sessions: TaskTracker,
@@ -111,7 +111,7 @@ impl External {
             filled: Notify::new(),
             taken: Notify::new(),
             window: Arc::new(Semaphore::new(WINDOW_KIB as usize)),
-            present: Mutex::default(),
+            online: Mutex::default(),
             traffic: Mutex::default(),
             stop: CancellationToken::new(),
             sessions: TaskTracker::new(),
@@ -123,32 +123,32 @@ impl External {
 
     /// Runs one session after another.
     async fn run(self: Arc<Self>, health: watch::Sender<Health>) {
-        let places = self.places();
+        let endpoints = self.endpoints();
         let (mut failures, mut number) = (0u32, 0);
         // The last error of each broker: an unchanged error is not logged again.
-        let mut said = vec![None; places.len()];
+        let mut logged = vec![None; endpoints.len()];
         loop {
-            let (place, begun) = (&places[number], tokio::time::Instant::now());
-            let ended = session::run(&self, place, &health).await;
-            let was_up = self.leave();
+            let (endpoint, begun) = (&endpoints[number], tokio::time::Instant::now());
+            let ended = session::run(&self, endpoint, &health).await;
+            let was_up = self.end_session();
             let Some(ended) = ended else { return };
             lock(&self.traffic).connections_refused += u64::from(ended.is_refusal());
             failures = if begun.elapsed() >= GOOD_SESSION { 0 } else { failures.saturating_add(1) };
-            let seen = ended.text(&place.url);
+            let seen = ended.text(&endpoint.url);
             if was_up {
-                said.fill(None);
+                logged.fill(None);
             }
-            if said[number].as_ref() != Some(&seen) {
+            if logged[number].as_ref() != Some(&seen) {
                 tracing::warn!("{seen}; robots poll until it is back");
             }
-            let finding = Health::Recovering(seen.clone());
-            health.send_if_modified(|health| std::mem::replace(health, finding.clone()) != finding);
-            said[number] = Some(seen);
+            let new = Health::Recovering(seen.clone());
+            health.send_if_modified(|health| std::mem::replace(health, new.clone()) != new);
+            logged[number] = Some(seen);
             if !was_up {
-                number = (number + 1) % places.len();
+                number = (number + 1) % endpoints.len();
             }
             // The pause grows with each round of all brokers.
-            let rounds = failures / places.len() as u32;
+            let rounds = failures / endpoints.len() as u32;
             tokio::select! {
                 () = tokio::time::sleep(pause(rounds, rand::random())) => {}
                 () = self.stop.cancelled() => return,
@@ -156,18 +156,18 @@ impl External {
         }
     }
 
-    fn places(&self) -> Vec<Place> {
-        let place = |(number, url): (usize, &BrokerUrl)| Place {
+    fn endpoints(&self) -> Vec<BrokerEndpoint> {
+        let endpoint = |(number, url): (usize, &BrokerUrl)| BrokerEndpoint {
             number,
             url: url.clone(),
             route: external_route(url, self.config.pin),
         };
-        self.config.brokers.all().iter().enumerate().map(place).collect()
+        self.config.brokers.all().iter().enumerate().map(endpoint).collect()
     }
 
     /// Marks the session as ended: no robot is reachable, and the next session determines presence
     /// anew. Returns whether there was a session.
-    fn leave(&self) -> bool {
+    fn end_session(&self) -> bool {
         let was_up = {
             let mut outbox = lock(&self.outbox);
             let was_up = outbox.is_open();
@@ -175,29 +175,29 @@ impl External {
             was_up
         };
         self.taken.notify_waiters();
-        let gone = lock(&self.present).clear();
+        let gone = lock(&self.online).clear();
         for (robot, number) in gone {
             self.inbox.disconnected(&robot, number);
         }
         was_up
     }
 
-    pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
-        lock(&self.outbox).ring(robot, payload)?;
+    pub(super) fn send_desired(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
+        lock(&self.outbox).set_desired(robot, payload)?;
         self.filled.notify_one();
         Ok(())
     }
 
-    pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
-        if !lock(&self.present).contains(robot) {
-            return Err(NotAsked::NotConnected);
+    pub(super) fn send_request(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotSent> {
+        if !lock(&self.online).contains(robot) {
+            return Err(NotSent::NotConnected);
         }
-        lock(&self.outbox).ask(robot, payload)?;
+        lock(&self.outbox).add_request(robot, payload)?;
         self.filled.notify_one();
         Ok(())
     }
 
-    /// Whether the session is live. Any robot may be subscribed then, known to be present or not.
+    /// Whether the session is live. Any robot may be subscribed then, known to be online or not.
     pub(super) fn is_up(&self) -> bool {
         lock(&self.outbox).is_open()
     }
@@ -227,11 +227,16 @@ impl External {
     ) -> Result<(), NotConnected> {
         let kib = u32::try_from(payload.len().div_ceil(1024))
             .map_or(WINDOW_KIB, |kib| kib.min(WINDOW_KIB));
-        let place =
+        let permit =
             tokio::time::timeout(PART_PATIENCE, self.window.clone().acquire_many_owned(kib)).await;
-        let place = place.map_err(|_| NotConnected)?.map_err(|_| NotConnected)?;
+        let permit = permit.map_err(|_| NotConnected)?.map_err(|_| NotConnected)?;
         let topic = Topic::Package(digest);
-        lock(&self.outbox).part(Letter { topic, payload, qos, place: Some(place) })?;
+        lock(&self.outbox).add_part(OutgoingMessage {
+            topic,
+            payload,
+            qos,
+            permit: Some(permit),
+        })?;
         self.filled.notify_one();
         Ok(())
     }
@@ -249,7 +254,7 @@ impl External {
     /// Marks the robot as gone. Its session remains: an MQTT 3.1.1 client can't end another
     /// client's session.
     pub(super) fn disconnect(&self, robot: &RobotId) {
-        let number = lock(&self.present).forget(robot);
+        let number = lock(&self.online).remove(robot);
         if let Some(number) = number {
             self.inbox.disconnected(robot, number);
         }
@@ -260,7 +265,7 @@ impl External {
     }
 
     pub(super) fn connected_count(&self) -> usize {
-        lock(&self.present).count()
+        lock(&self.online).count()
     }
 
     pub(super) fn address(&self) -> String {

@@ -3,7 +3,6 @@
 //! Then it receives robots' messages and publishes the outbox.
 
 use std::collections::VecDeque;
-use std::error::Error;
 use std::net::SocketAddr;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -13,16 +12,17 @@ use rumqttc::{
     QoS, SubscribeFilter, Transport,
 };
 use task_proto::RobotId;
-use task_proto::report::Status;
-use task_proto::topic::{RobotTopic, Topic};
-use task_transport::{Line, LineError};
+use task_proto::error_chain::chain;
+use task_proto::messages::report::Status;
+use task_proto::messages::topic::{RobotTopic, Topic};
+use task_transport::{Relay, RelayError};
 use tokio::sync::{OwnedSemaphorePermit, mpsc, watch};
 use tokio::time::Instant;
 
 use super::super::{Health, MAX_PART_BYTES, PartQos, RobotMessage};
-use super::outbox::Letter;
-use super::present::Turn;
-use super::{CANARY_LEVEL, External, Place, lock};
+use super::online_robots::PresenceChange;
+use super::outbox::OutgoingMessage;
+use super::{BrokerEndpoint, CANARY_LEVEL, External, lock};
 use crate::domain::broker_url::BrokerUrl;
 
 const KEEP_ALIVE: Duration = Duration::from_secs(20);
@@ -38,29 +38,29 @@ const MAX_IN_FLIGHT: u16 = 256;
 const QUEUED: usize = 64;
 /// Maximum size of a received message. A larger one ends the session, so the broker should refuse
 /// it earlier: see docs/broker.md.
-const MAX_TAKEN_BYTES: usize = 4 * 1024 * 1024;
+const MAX_RECEIVED_BYTES: usize = 4 * 1024 * 1024;
 /// Maximum size of a sent message: a part and its overhead.
 const MAX_SENT_BYTES: usize = MAX_PART_BYTES + 1024;
 /// Maximum size of a status.
 const MAX_STATUS_BYTES: usize = 4 * 1024;
 /// Robots' topics other than reports.
-const HEARD: [RobotTopic; 4] =
+const RECEIVED_TOPICS: [RobotTopic; 4] =
     [RobotTopic::Status, RobotTopic::Reply, RobotTopic::Log, RobotTopic::Telemetry];
 /// Maximum size of MQTT's fixed header plus the packet id.
 const HEADER_BYTES: usize = 7;
 
 /// The reason why a session ended.
-pub(super) enum Ended {
+pub(super) enum SessionEnd {
     /// The broker refused the server's CONNECT.
     Refused(ConnectReturnCode),
     /// The TLS connection failed.
-    Unreachable(LineError),
+    Unreachable(RelayError),
     /// The server's own message did not come back.
-    Deaf,
+    NoEcho,
     Lost(ConnectionError),
 }
 
-impl Ended {
+impl SessionEnd {
     pub(super) fn is_refusal(&self) -> bool {
         matches!(self, Self::Refused(_))
     }
@@ -79,9 +79,9 @@ impl Ended {
             }
             Self::Refused(code) => format!("{broker} refuses the server: {code:?}"),
             Self::Unreachable(error) => {
-                format!("{broker} can't be reached: {}", with_causes(error))
+                format!("{broker} can't be reached: {}", chain(error))
             }
-            Self::Deaf => {
+            Self::NoEcho => {
                 format!(
                     "{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`"
                 )
@@ -96,18 +96,18 @@ impl Ended {
 /// Runs one session to its end; `None`: the server stops.
 pub(super) async fn run(
     external: &External,
-    place: &Place,
+    endpoint: &BrokerEndpoint,
     health: &watch::Sender<Health>,
-) -> Option<Ended> {
-    let line = tokio::select! {
-        line = Line::open(&place.route, NETWORK_TIMEOUT) => line,
+) -> Option<SessionEnd> {
+    let relay = tokio::select! {
+        relay = Relay::open(&endpoint.route, NETWORK_TIMEOUT) => relay,
         () = external.stop.cancelled() => return None,
     };
-    let line = match line {
-        Ok(line) => line,
-        Err(error) => return Some(Ended::Unreachable(error)),
+    let relay = match relay {
+        Ok(relay) => relay,
+        Err(error) => return Some(SessionEnd::Unreachable(error)),
     };
-    let (client, mut event_loop) = AsyncClient::new(options(external, place, &line), QUEUED);
+    let (client, mut event_loop) = AsyncClient::new(options(external, endpoint, &relay), QUEUED);
     event_loop.network_options.set_connection_timeout(NETWORK_TIMEOUT.as_secs());
     let (events_in, mut events) = mpsc::channel(QUEUED);
     // rumqttc's poll must not be dropped half way, so one future runs it for as long as the session
@@ -117,14 +117,14 @@ pub(super) async fn run(
             match event_loop.poll().await {
                 // The receiver lives as long as this future.
                 Ok(event) => drop(events_in.send(event).await),
-                Err(ConnectionError::ConnectionRefused(code)) => return Ended::Refused(code),
-                Err(error) => return Ended::Lost(error),
+                Err(ConnectionError::ConnectionRefused(code)) => return SessionEnd::Refused(code),
+                Err(error) => return SessionEnd::Lost(error),
             }
         }
     };
-    let carrying = line.carry();
-    tokio::pin!(pump, carrying);
-    let mut session = Session::new(external, place, client);
+    let relaying = relay.run();
+    tokio::pin!(pump, relaying);
+    let mut session = Session::new(external, endpoint, client);
     let deadline = Instant::now() + NETWORK_TIMEOUT + CANARY_PATIENCE;
     let ended = loop {
         tokio::select! {
@@ -133,7 +133,7 @@ pub(super) async fn run(
             ended = &mut pump => break Some(ended),
             // Cancel-safe: the future is pinned outside of the loop. It does not end before the
             // session does.
-            () = &mut carrying => {}
+            () = &mut relaying => {}
             // Cancel-safe: an event stays in the channel until received.
             Some(event) = events.recv() => {
                 if session.take(event).await {
@@ -143,7 +143,7 @@ pub(super) async fn run(
             // Cancel-safe: a permit that was not taken stays.
             () = external.filled.notified() => {}
             // Cancel-safe: the timer is recreated with the same deadline.
-            () = tokio::time::sleep_until(deadline), if !session.is_up => break Some(Ended::Deaf),
+            () = tokio::time::sleep_until(deadline), if !session.is_up => break Some(SessionEnd::NoEcho),
             // Cancel-safe: a token can be awaited again.
             () = external.stop.cancelled() => break None,
         }
@@ -156,7 +156,7 @@ pub(super) async fn run(
         let goodbye = async {
             tokio::select! {
                 _ = goodbye => {}
-                () = &mut carrying => {}
+                () = &mut relaying => {}
             }
         };
         let _ = tokio::time::timeout(GOODBYE_PATIENCE, goodbye).await;
@@ -164,31 +164,21 @@ pub(super) async fn run(
     ended
 }
 
-/// The error with its chain of causes, in one line.
-fn with_causes(error: &dyn Error) -> String {
-    let (mut text, mut cause) = (error.to_string(), error.source());
-    while let Some(error) = cause {
-        text.push_str(&format!(": {error}"));
-        cause = error.source();
-    }
-    text
-}
-
-fn options(external: &External, place: &Place, line: &Line) -> MqttOptions {
-    let url = &place.url;
-    let mut options = MqttOptions::new(&external.config.client_id, line.name(), url.port);
+fn options(external: &External, endpoint: &BrokerEndpoint, relay: &Relay) -> MqttOptions {
+    let url = &endpoint.url;
+    let mut options = MqttOptions::new(&external.config.client_id, relay.name(), url.port);
     options.set_transport(Transport::Unix);
     options.set_credentials(&url.user_name, &url.password);
     options.set_clean_session(true);
     options.set_keep_alive(KEEP_ALIVE);
     options.set_inflight(MAX_IN_FLIGHT);
-    options.set_max_packet_size(MAX_TAKEN_BYTES, MAX_SENT_BYTES);
+    options.set_max_packet_size(MAX_RECEIVED_BYTES, MAX_SENT_BYTES);
     options
 }
 
 struct Session<'a> {
     external: &'a External,
-    place: &'a Place,
+    endpoint: &'a BrokerEndpoint,
     client: AsyncClient,
     canary: String,
     is_up: bool,
@@ -199,11 +189,11 @@ struct Session<'a> {
 }
 
 impl<'a> Session<'a> {
-    fn new(external: &'a External, place: &'a Place, client: AsyncClient) -> Self {
+    fn new(external: &'a External, endpoint: &'a BrokerEndpoint, client: AsyncClient) -> Self {
         let canary = format!("{}/{CANARY_LEVEL}", external.config.prefix);
         Self {
             external,
-            place,
+            endpoint,
             client,
             canary,
             is_up: false,
@@ -218,15 +208,15 @@ impl<'a> Session<'a> {
         match event {
             Event::Incoming(Packet::ConnAck(_)) => self.begin(),
             Event::Incoming(Packet::Publish(message)) if message.topic == self.canary => {
-                return self.come_up();
+                return self.mark_up();
             }
-            Event::Incoming(Packet::Publish(message)) => self.hear(message).await,
+            Event::Incoming(Packet::Publish(message)) => self.receive(message).await,
             Event::Incoming(Packet::PubAck(ack)) => self.acknowledged(ack.pkid),
             Event::Incoming(Packet::PubComp(complete)) => self.acknowledged(complete.pkid),
             Event::Outgoing(Outgoing::Publish(id)) => {
                 // Without a packet id there is no acknowledgement: the permit is free at once.
-                if let Some(place) = self.unsent.pop_front().filter(|_| id != 0) {
-                    self.sent.push_back((id, place));
+                if let Some(permit) = self.unsent.pop_front().filter(|_| id != 0) {
+                    self.sent.push_back((id, permit));
                 }
             }
             _ => {}
@@ -242,8 +232,8 @@ impl<'a> Session<'a> {
 
     fn begin(&mut self) {
         let prefix = &self.external.config.prefix;
-        let heard = HEARD.map(|topic| format!("{prefix}/r/+/{}", topic.as_str()));
-        let filters = heard.into_iter().chain([self.canary.clone()]);
+        let filters = RECEIVED_TOPICS.map(|topic| format!("{prefix}/r/+/{}", topic.as_str()));
+        let filters = filters.into_iter().chain([self.canary.clone()]);
         // The queue is empty at the start of a session, and a lost session is noticed by the pump.
         let _ = self
             .client
@@ -253,22 +243,22 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// The server has received its own message. From here on robots are reachable, and a doorbell
+    /// The server has received its own message. From here on robots are reachable, and a notice
     /// asks each robot to report its presence.
-    fn come_up(&mut self) -> bool {
+    fn mark_up(&mut self) -> bool {
         if self.is_up {
             return false;
         }
         self.is_up = true;
-        self.external.config.current.store(self.place.number, Ordering::Relaxed);
-        tracing::info!(broker = %self.place.url.address(), "connected to the MQTT broker");
+        self.external.config.current.store(self.endpoint.number, Ordering::Relaxed);
+        tracing::info!(broker = %self.endpoint.url.address(), "connected to the MQTT broker");
         lock(&self.external.traffic).connections_accepted += 1;
         lock(&self.external.outbox).open();
-        self.external.inbox.everyone_may_be_there();
+        self.external.inbox.external_broker_connected();
         true
     }
 
-    async fn hear(&mut self, message: Publish) {
+    async fn receive(&mut self, message: Publish) {
         // We retain nothing: this message is old, and its sender is unknown.
         if message.retain {
             return;
@@ -277,23 +267,23 @@ impl<'a> Session<'a> {
         else {
             return;
         };
-        if !HEARD.contains(&topic) {
+        if !RECEIVED_TOPICS.contains(&topic) {
             return;
         }
         let status = (topic == RobotTopic::Status && message.payload.len() <= MAX_STATUS_BYTES)
             .then(|| serde_json::from_slice::<Status>(&message.payload).ok());
-        let turn = {
-            let mut present = lock(&self.external.present);
+        let change = {
+            let mut online = lock(&self.external.online);
             match &status {
-                Some(Some(status)) => present.status(&robot, status),
+                Some(Some(status)) => online.status(&robot, status),
                 // An unreadable message carries no information; the inbox reports the error.
-                Some(None) => Turn::default(),
-                None => present.heard(&robot),
+                Some(None) => PresenceChange::default(),
+                None => online.message(&robot),
             }
         };
-        self.tell(&robot, &turn);
+        self.notify_inbox(&robot, &change);
         // The status that announced the end belongs to no connection.
-        let connection = lock(&self.external.present).connection(&robot).unwrap_or_default();
+        let connection = lock(&self.external.online).connection(&robot).unwrap_or_default();
         let message = RobotMessage {
             robot,
             topic,
@@ -306,12 +296,12 @@ impl<'a> Session<'a> {
         let _ = self.external.inbox.receive(message).await;
     }
 
-    fn tell(&self, robot: &RobotId, turn: &Turn) {
+    fn notify_inbox(&self, robot: &RobotId, change: &PresenceChange) {
         const UNKNOWN: Option<SocketAddr> = None;
-        if let Some(number) = turn.ended {
+        if let Some(number) = change.ended {
             self.external.inbox.disconnected(robot, number);
         }
-        if let Some(number) = turn.begun {
+        if let Some(number) = change.begun {
             self.external.inbox.connected(robot, UNKNOWN, number);
         }
     }
@@ -319,8 +309,8 @@ impl<'a> Session<'a> {
     /// Hands over the waiting messages, as many as rumqttc can certainly accept at once.
     fn publish_waiting(&mut self) {
         while self.is_up && self.unsent.len() < QUEUED / 2 {
-            let Some(letter) = lock(&self.external.outbox).next() else { break };
-            let Letter { topic, payload, qos, place } = letter;
+            let Some(message) = lock(&self.external.outbox).next() else { break };
+            let OutgoingMessage { topic, payload, qos, permit } = message;
             let name = self.external.config.prefix.format(&topic);
             let bytes = HEADER_BYTES + name.len() + payload.len();
             let qos = match qos {
@@ -330,7 +320,7 @@ impl<'a> Session<'a> {
             };
             if self.client.try_publish(name, qos, false, payload).is_ok() {
                 lock(&self.external.traffic).all.bytes_out += bytes as u64;
-                self.unsent.push_back(place);
+                self.unsent.push_back(permit);
             }
             self.external.taken.notify_waiters();
         }

@@ -1,14 +1,14 @@
 //! Topic permissions: pure functions of the client and the topic. This module never looks anything
 //! up.
 
-use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_proto::messages::topic::{RobotTopic, Topic, TopicPrefix};
 use task_proto::{Digest, RobotId, UserName};
 
 use crate::broker::router::CANARY_TOPIC;
 
 /// The owner of a session.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) enum Visitor {
+pub(super) enum Client {
     Robot { robot: RobotId, token_number: u64 },
     Operator(UserName),
     Canary,
@@ -25,10 +25,10 @@ pub(super) enum Route {
 
 /// The source of messages for a permitted subscription.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Hearing {
-    /// The server's messages to this robot, straight from its doorbell.
+pub(super) enum MessageSource {
+    /// The server's messages to this robot, straight from its mailbox.
     Desired,
-    /// The server's questions to this robot, straight from its doorbell.
+    /// The server's requests to this robot, straight from its mailbox.
     Request,
     /// A package's parts, for permitted robots: the session checks the permission.
     Package(Digest),
@@ -38,11 +38,11 @@ pub(super) enum Hearing {
 
 /// The destination of the client's message on `topic`; `None` if the client may not publish there.
 /// A robot publishes on its own from-robot topics only, an operator not at all.
-pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
-    match visitor {
-        Visitor::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
-        Visitor::Operator(_) => None,
-        Visitor::Robot { robot, .. } => match prefix.parse(topic)? {
+pub(super) fn may_publish(client: &Client, prefix: &TopicPrefix, topic: &str) -> Option<Route> {
+    match client {
+        Client::Canary => (topic == CANARY_TOPIC).then_some(Route::Canary),
+        Client::Operator(_) => None,
+        Client::Robot { robot, .. } => match prefix.parse(topic)? {
             Topic::Robot(owner, last) if owner == *robot => match last {
                 RobotTopic::Report
                 | RobotTopic::Status
@@ -60,20 +60,24 @@ pub(super) fn may_publish(visitor: &Visitor, prefix: &TopicPrefix, topic: &str) 
 /// robot subscribes to its own topics by exact name, an operator to any filter whose first levels
 /// are the prefix.
 pub(super) fn may_subscribe(
-    visitor: &Visitor,
+    client: &Client,
     prefix: &TopicPrefix,
     filter: &str,
-) -> Option<Hearing> {
-    match visitor {
-        Visitor::Canary => (filter == CANARY_TOPIC).then_some(Hearing::Router),
-        Visitor::Operator(_) => filter
+) -> Option<MessageSource> {
+    match client {
+        Client::Canary => (filter == CANARY_TOPIC).then_some(MessageSource::Router),
+        Client::Operator(_) => filter
             .strip_prefix(prefix.as_str())
             .is_some_and(|rest| rest.starts_with('/'))
-            .then_some(Hearing::Router),
-        Visitor::Robot { robot, .. } => match prefix.parse(filter)? {
-            Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => Some(Hearing::Desired),
-            Topic::Robot(owner, RobotTopic::Request) if owner == *robot => Some(Hearing::Request),
-            Topic::Package(digest) => Some(Hearing::Package(digest)),
+            .then_some(MessageSource::Router),
+        Client::Robot { robot, .. } => match prefix.parse(filter)? {
+            Topic::Robot(owner, RobotTopic::Desired) if owner == *robot => {
+                Some(MessageSource::Desired)
+            }
+            Topic::Robot(owner, RobotTopic::Request) if owner == *robot => {
+                Some(MessageSource::Request)
+            }
+            Topic::Package(digest) => Some(MessageSource::Package(digest)),
             Topic::Robot(..) => None,
         },
     }
@@ -82,12 +86,12 @@ pub(super) fn may_subscribe(
 /// Whether a valid filter matches a valid topic name, by MQTT 3.1.1 section 4.7.
 pub(super) fn matches(filter: &str, topic: &str) -> bool {
     let mut levels = topic.split('/');
-    for wanted in filter.split('/') {
-        match (wanted, levels.next()) {
+    for expected in filter.split('/') {
+        match (expected, levels.next()) {
             ("#", _) => return true,
             (_, None) => return false,
             ("+", Some(_)) => {}
-            (wanted, Some(level)) if wanted == level => {}
+            (expected, Some(level)) if expected == level => {}
             _ => return false,
         }
     }
@@ -98,16 +102,16 @@ pub(super) fn matches(filter: &str, topic: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn robot() -> Visitor {
-        Visitor::Robot { robot: "r00000000000000a1".parse().expect("valid"), token_number: 0 }
+    fn robot() -> Client {
+        Client::Robot { robot: "r00000000000000a1".parse().expect("valid"), token_number: 0 }
     }
 
-    fn operator() -> Visitor {
-        Visitor::Operator("alice".parse().expect("valid"))
+    fn operator() -> Client {
+        Client::Operator("alice".parse().expect("valid"))
     }
 
     #[test]
-    fn a_robot_speaks_on_its_own_topics_only() {
+    fn robot_publishes_on_its_own_topics_only() {
         let prefix = TopicPrefix::default();
         let route = |topic: &str| may_publish(&robot(), &prefix, topic);
         assert_eq!(
@@ -135,13 +139,13 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_hears_only_what_is_said_to_it() {
+    fn robot_subscribes_to_its_own_topics_only() {
         let prefix = TopicPrefix::default();
-        let hearing = |filter: &str| may_subscribe(&robot(), &prefix, filter);
-        assert_eq!(hearing("taskd/v1/r/r00000000000000a1/desired"), Some(Hearing::Desired));
-        assert_eq!(hearing("taskd/v1/r/r00000000000000a1/request"), Some(Hearing::Request));
+        let source = |filter: &str| may_subscribe(&robot(), &prefix, filter);
+        assert_eq!(source("taskd/v1/r/r00000000000000a1/desired"), Some(MessageSource::Desired));
+        assert_eq!(source("taskd/v1/r/r00000000000000a1/request"), Some(MessageSource::Request));
         let package = Digest::of(b"x");
-        assert_eq!(hearing(&format!("taskd/v1/p/{package}")), Some(Hearing::Package(package)));
+        assert_eq!(source(&format!("taskd/v1/p/{package}")), Some(MessageSource::Package(package)));
         for denied in [
             "#",
             "+/+/+/+/+",
@@ -155,17 +159,17 @@ mod tests {
             "taskd/v1/p/+",
             "taskd/v1/p/#",
         ] {
-            assert_eq!(hearing(denied), None, "{denied}");
+            assert_eq!(source(denied), None, "{denied}");
         }
     }
 
     #[test]
-    fn an_operator_hears_what_lies_below_the_prefix() {
+    fn operator_subscribes_below_the_prefix_only() {
         let prefix = TopicPrefix::default();
-        let hearing = |filter: &str| may_subscribe(&operator(), &prefix, filter);
+        let source = |filter: &str| may_subscribe(&operator(), &prefix, filter);
         for allowed in ["taskd/v1/#", "taskd/v1/r/+/report", "taskd/v1/r/r00000000000000a1/status"]
         {
-            assert_eq!(hearing(allowed), Some(Hearing::Router), "{allowed}");
+            assert_eq!(source(allowed), Some(MessageSource::Router), "{allowed}");
         }
         for denied in [
             "#",
@@ -177,7 +181,7 @@ mod tests {
             "$SYS/#",
             CANARY_TOPIC,
         ] {
-            assert_eq!(hearing(denied), None, "{denied}");
+            assert_eq!(source(denied), None, "{denied}");
         }
     }
 

@@ -84,11 +84,11 @@ pub struct Publish {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
     /// An MQTT version of this protocol level, which we do not support.
-    #[error("asks for protocol level {0}, and only MQTT 3.1.1 (level 4) is spoken")]
+    #[error("requests protocol level {0}; only MQTT 3.1.1 (level 4) is supported")]
     UnknownProtocol(u8),
     /// A server must keep a retained message of QoS 1 or 2 (MQTT-3.3.1-5), and this server keeps
     /// none. A retained message without a payload asks to keep nothing.
-    #[error("sends a message to be retained, and nothing is retained here")]
+    #[error("publishes a retained message; retained messages are not supported")]
     Retained,
     /// The packet has this many bytes, more than permitted.
     #[error("sends a packet of {0} bytes, which is too large")]
@@ -313,11 +313,11 @@ struct Body(Bytes);
 
 impl Body {
     fn byte(&mut self) -> Result<u8, DecodeError> {
-        self.0.try_get_u8().map_err(|_| Malformed("it ends too early"))
+        self.0.try_get_u8().map_err(|_| Malformed("the packet ends too early"))
     }
 
     fn number(&mut self) -> Result<u16, DecodeError> {
-        self.0.try_get_u16().map_err(|_| Malformed("it ends too early"))
+        self.0.try_get_u16().map_err(|_| Malformed("the packet ends too early"))
     }
 
     fn packet_id(&mut self) -> Result<u16, DecodeError> {
@@ -330,7 +330,7 @@ impl Body {
     fn binary(&mut self) -> Result<Bytes, DecodeError> {
         let length = usize::from(self.number()?);
         if length > self.0.len() {
-            return Err(Malformed("it ends too early"));
+            return Err(Malformed("the packet ends too early"));
         }
         Ok(self.0.split_to(length))
     }

@@ -1,13 +1,16 @@
 //! Accepts connections and spawns a task for each, so that no client waits for another: the task
-//! also performs the TLS handshake. This module reads no byte.
+//! also reads a proxy's header and performs the TLS handshake. This module reads no byte of a
+//! client.
 
 use std::future::ready;
+use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpStream};
 
 use super::Front;
+use super::admission::PendingPermit;
 use crate::net::tls::ClientProof;
 
 /// Pause until the operating system has file descriptors again.
@@ -28,16 +31,46 @@ pub(super) async fn run(front: Arc<Front>, listener: TcpListener) {
                 continue;
             }
         };
-        let Some(claim) = front.claim() else {
-            tracing::debug!(%peer, "as many MQTT connections as there may be, one more is closed");
+        let Some(permit) = front.acquire() else {
+            tracing::debug!(%peer, "the MQTT connection limit is reached, closing a new connection");
             continue;
         };
         // Packets are small and awaited by the other side. If this fails, they arrive a little
         // later.
         let _ = stream.set_nodelay(true);
-        match front.context.tls.clone() {
-            None => front.attend(peer, claim, ready(Ok((stream, ClientProof::NotAsked)))),
-            Some(tls) => front.attend(peer, claim, async move { tls.accept(stream).await }),
+        if front.context.proxy_protocol.applies_to(peer.ip()) {
+            front.sessions.spawn(serve_proxied(front.clone(), stream, peer, permit));
+        } else {
+            spawn_session(&front, stream, peer, permit);
         }
+    }
+}
+
+/// Reads the header of a proxy's connection, then serves the proxy's client.
+async fn serve_proxied(
+    front: Arc<Front>,
+    mut stream: TcpStream,
+    proxy: SocketAddr,
+    permit: PendingPermit,
+) {
+    let context = &front.context;
+    let silent = context.unauthenticated.add_proxied(Instant::now());
+    let time_limit = context.limits.connect_timeout;
+    let client = tokio::select! {
+        client = context.proxy_protocol.client(&mut stream, proxy, time_limit) => client,
+        () = silent.evicted().cancelled() => None,
+        () = context.stop.cancelled() => return,
+    };
+    drop(silent);
+    match client {
+        Some(peer) => spawn_session(&front, stream, peer, permit),
+        None => context.totals.refuse(None),
+    }
+}
+
+fn spawn_session(front: &Front, stream: TcpStream, peer: SocketAddr, permit: PendingPermit) {
+    match front.context.tls.clone() {
+        None => front.spawn_session(peer, permit, ready(Ok((stream, ClientProof::NotRequested)))),
+        Some(tls) => front.spawn_session(peer, permit, async move { tls.accept(stream).await }),
     }
 }

@@ -5,19 +5,12 @@
 //! request for a persistent session is ignored.
 
 mod access;
-mod attendance;
+mod admission;
 pub mod codec;
-mod doorbell;
-mod entrance;
-mod laggard;
 mod listener;
-mod other_protocol;
-mod outgoing;
-mod output;
 mod parts;
-mod places;
 mod session;
-mod takeover;
+mod slots;
 mod traffic;
 
 use std::io;
@@ -27,25 +20,24 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::api::{MqttTraffic, Subscription, Traffic};
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 use task_proto::{RobotId, UserName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::router::Router;
-use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotAsked, NotConnected};
-use crate::limits::conduct::Conduct;
-use crate::net::anteroom::Anteroom;
+use super::{BrokerConfig, BrokerError, Gatekeeper, Inbox, Limits, NotConnected, NotSent};
+use crate::domain::limits::robot_limiter::RobotLimiter;
 use crate::net::backlog::listen;
+use crate::net::proxy_protocol::ProxyProtocol;
 use crate::net::tls::{ClientProof, Tls};
-use entrance::{Arrival, Rejection};
-pub(super) use entrance::{CANARY_ID, CanaryPass};
-use other_protocol::OtherProtocols;
+use crate::net::unauthenticated::UnauthenticatedConnections;
+pub(super) use admission::{CANARY_ID, CanaryPass};
+use admission::{ConnectionLimit, OtherProtocols, PendingConnection, PendingPermit, Rejection};
 use parts::Grants;
 pub(super) use parts::{Grant, NotGranted};
-use places::{Claim, Places};
-use takeover::Seats;
+use slots::SessionSlots;
 use traffic::Totals;
 
 pub(super) struct Front {
@@ -58,20 +50,21 @@ pub(super) struct Front {
 struct Context {
     prefix: TopicPrefix,
     limits: Limits,
-    conduct: Arc<Conduct>,
+    robot_limiter: Arc<RobotLimiter>,
     gatekeeper: Arc<dyn Gatekeeper>,
     inbox: Arc<dyn Inbox>,
     router: Arc<Router>,
-    seats: Arc<Seats>,
+    slots: Arc<SessionSlots>,
     totals: Totals,
     grants: Grants,
     canary_pass: Arc<CanaryPass>,
     /// Connections that have not sent CONNECT yet.
-    anteroom: Arc<Anteroom>,
+    unauthenticated: Arc<UnauthenticatedConnections>,
     /// The limit on connections.
-    places: Places,
+    connection_limit: ConnectionLimit,
     /// The TLS configuration, if the listener encrypts.
     tls: Option<Tls>,
+    proxy_protocol: ProxyProtocol,
     /// Clients of other MQTT versions.
     other_protocols: OtherProtocols,
     stop: CancellationToken,
@@ -89,21 +82,24 @@ impl Front {
         let listener = listen(config.listen).map_err(failed)?;
         let local_addr = listener.local_addr().map_err(failed)?;
         let limits = &config.limits;
-        let anteroom = Anteroom::new(limits.max_silent_per_address.min(limits.max_connections / 4));
+        let unauthenticated = UnauthenticatedConnections::new(
+            limits.max_silent_per_address.min(limits.max_connections / 4),
+        );
         let context = Arc::new(Context {
             prefix: config.prefix,
-            places: Places::new(config.limits.max_connections),
-            seats: Seats::new(config.limits.max_sessions_per_person),
+            connection_limit: ConnectionLimit::new(config.limits.max_connections),
+            slots: SessionSlots::new(config.limits.max_sessions_per_person),
             limits: config.limits,
             tls: config.tls,
-            conduct: config.conduct,
+            proxy_protocol: config.proxy_protocol,
+            robot_limiter: config.robot_limiter,
             gatekeeper,
             inbox,
             router,
             totals: Totals::default(),
             grants: Grants::default(),
             canary_pass: Arc::default(),
-            anteroom,
+            unauthenticated,
             other_protocols: OtherProtocols::default(),
             stop: CancellationToken::new(),
         });
@@ -112,18 +108,18 @@ impl Front {
         Ok(front)
     }
 
-    pub(super) fn ring(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
-        self.context.seats.doorbell(robot).ok_or(NotConnected)?.ring(payload);
+    pub(super) fn send_desired(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotConnected> {
+        self.context.slots.mailbox(robot).ok_or(NotConnected)?.set_desired(payload);
         Ok(())
     }
 
     pub(super) fn has_session(&self, robot: &RobotId) -> bool {
-        self.context.seats.doorbell(robot).is_some()
+        self.context.slots.mailbox(robot).is_some()
     }
 
-    pub(super) fn ask(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotAsked> {
-        let doorbell = self.context.seats.doorbell(robot).ok_or(NotAsked::NotConnected)?;
-        if doorbell.ask(payload) { Ok(()) } else { Err(NotAsked::Busy) }
+    pub(super) fn send_request(&self, robot: &RobotId, payload: Bytes) -> Result<(), NotSent> {
+        let mailbox = self.context.slots.mailbox(robot).ok_or(NotSent::NotConnected)?;
+        if mailbox.add_request(payload) { Ok(()) } else { Err(NotSent::Busy) }
     }
 
     pub(super) fn grants(&self) -> &Grants {
@@ -131,11 +127,11 @@ impl Front {
     }
 
     pub(super) fn disconnect(&self, robot: &RobotId) {
-        self.context.seats.ask_to_leave(robot);
+        self.context.slots.evict(robot);
     }
 
     pub(super) fn disconnect_person(&self, user: &UserName) {
-        self.context.seats.ask_person_to_leave(user);
+        self.context.slots.evict_person(user);
     }
 
     pub(super) fn traffic(&self) -> MqttTraffic {
@@ -147,15 +143,15 @@ impl Front {
     }
 
     pub(super) fn traffic_of(&self, robot: &RobotId) -> Option<Traffic> {
-        self.context.seats.meter(robot).map(|meter| meter.read())
+        self.context.slots.meter(robot).map(|meter| meter.read())
     }
 
     pub(super) fn subscriptions_of(&self, robot: &RobotId) -> Vec<Subscription> {
-        self.context.seats.subscriptions(robot)
+        self.context.slots.subscriptions(robot)
     }
 
     pub(super) fn connected_count(&self) -> usize {
-        self.context.seats.robots()
+        self.context.slots.robot_count()
     }
 
     pub(super) fn local_addr(&self) -> SocketAddr {
@@ -168,7 +164,7 @@ impl Front {
 
     /// Serves the connection that `handshake` returns, if it completes in time. False: there are
     /// too many connections.
-    pub(super) fn take_in<S>(
+    pub(super) fn serve_connection<S>(
         &self,
         peer: SocketAddr,
         handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
@@ -176,48 +172,48 @@ impl Front {
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Some(claim) = self.claim() else { return false };
-        self.attend(peer, claim, handshake);
+        let Some(permit) = self.acquire() else { return false };
+        self.spawn_session(peer, permit, handshake);
         true
     }
 
-    /// A place for one more connection, if there is one.
-    fn claim(&self) -> Option<Claim> {
-        let claim = self.context.places.claim(&self.context.anteroom);
-        if claim.is_none() {
+    /// A permit for one more connection, if there is one.
+    fn acquire(&self) -> Option<PendingPermit> {
+        let permit = self.context.connection_limit.acquire(&self.context.unauthenticated);
+        if permit.is_none() {
             self.context.totals.refuse(None);
         }
-        claim
+        permit
     }
 
-    fn attend<S>(
+    fn spawn_session<S>(
         &self,
         peer: SocketAddr,
-        claim: Claim,
+        permit: PendingPermit,
         handshake: impl Future<Output = io::Result<(S, ClientProof)>> + Send + 'static,
     ) where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
         let context = self.context.clone();
-        let mut arrival = Arrival::new(&context, peer);
+        let mut pending = PendingConnection::new(&context, peer);
         self.sessions.spawn(async move {
-            let entering = async {
-                let place = arrival.find_place(claim).await?;
-                let (stream, proof) = arrival.shake_hands(handshake).await?;
-                Ok::<_, Rejection>((place, stream, proof))
+            let opening = async {
+                let permit = pending.acquire_permit(permit).await?;
+                let (stream, proof) = pending.handshake(handshake).await?;
+                Ok::<_, Rejection>((permit, stream, proof))
             };
-            let entered = tokio::select! {
-                entered = entering => entered,
+            let opened = tokio::select! {
+                opened = opening => opened,
                 () = context.stop.cancelled() => return,
             };
-            match entered {
-                Ok((place, stream, proof)) => {
-                    arrival.proof = proof;
-                    session::serve(context, stream, arrival).await;
-                    drop(place);
+            match opened {
+                Ok((permit, stream, proof)) => {
+                    pending.proof = proof;
+                    session::serve(context, stream, pending).await;
+                    drop(permit);
                 }
                 Err(rejection) => {
-                    tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+                    tracing::debug!(%peer, "MQTT client rejected: {rejection}");
                     context.totals.refuse(None);
                 }
             }
@@ -226,6 +222,10 @@ impl Front {
 
     pub(super) fn tls(&self) -> Option<&Tls> {
         self.context.tls.as_ref()
+    }
+
+    pub(super) fn proxy_protocol(&self) -> &ProxyProtocol {
+        &self.context.proxy_protocol
     }
 
     pub(super) fn stop(&self) -> CancellationToken {

@@ -3,6 +3,8 @@
 //! of them. A publisher waits for the slowest subscriber, and removes subscribers that hold up the
 //! others. This module never touches a socket.
 
+mod laggard;
+
 use std::collections::{BTreeSet, HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -11,15 +13,18 @@ use task_proto::{Digest, RobotId};
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use super::laggard::{Hold, Waiting};
+use self::laggard::{LagTimer, WaitTime};
 use crate::broker::Part;
 
+/// Maximum parts among the messages in flight of a session: a new desired state never waits behind
+/// parts.
+pub(super) const MAX_PARTS_IN_FLIGHT: usize = 24;
 /// Maximum packages in fan-out at the same time.
 const MAX_FAN_OUTS: usize = 4;
 /// Maximum lag of the slowest subscriber in parts, and the bytes of these parts, unless it is a
 /// single part. Fewer than the in-flight messages of a session, so that there is always room for a
 /// new desired state.
-const WINDOW_PARTS: u64 = super::outgoing::MAX_PARTS_IN_FLIGHT as u64;
+const WINDOW_PARTS: u64 = MAX_PARTS_IN_FLIGHT as u64;
 const WINDOW_BYTES: u64 = 4 * 1024 * 1024;
 
 /// All packages in fan-out.
@@ -32,7 +37,7 @@ pub(in crate::broker) struct Grant {
     qos: QoS,
     window: u64,
     progress: Mutex<Progress>,
-    moved: Notify,
+    progressed: Notify,
     joined: Notify,
 }
 
@@ -42,43 +47,43 @@ struct Progress {
     /// The last parts, up to a window.
     parts: VecDeque<Part>,
     robots: HashMap<RobotId, Permit>,
-    listeners: usize,
+    subscribers: usize,
     /// Subscribers that are a whole window behind.
     behind: usize,
     /// Subscribers that have finished all parts sent so far.
     idle: usize,
     /// How long the finished subscribers have waited for the slow ones.
-    waiting: Waiting,
+    wait_time: WaitTime,
     /// Total time for which the subscribers, one after another, have held up the rest.
-    all: Hold,
-    /// Robots that were removed and not yet returned by `take_put_out`.
-    put_out: Vec<RobotId>,
+    all: LagTimer,
+    /// Robots that were removed and not yet returned by `take_evicted`.
+    evicted: Vec<RobotId>,
 }
 
 /// A robot's permission to subscribe.
 #[derive(Default)]
 struct Permit {
     /// The subscriber's progress, if the robot subscribes.
-    listening: Option<Listening>,
+    subscriber: Option<Subscriber>,
     /// How long the robot had held up the others when it last left; after a return the count
     /// continues from there.
-    held: Option<Hold>,
+    past_timer: Option<LagTimer>,
 }
 
 /// The progress of a subscriber.
-struct Listening {
+struct Subscriber {
     /// The last part that the subscriber's session took.
     taken: u64,
     /// Parts that the session took and the robot has not acknowledged.
     open: BTreeSet<u64>,
-    hold: Hold,
+    timer: LagTimer,
     /// Wakes the subscriber's session for news.
     news: Arc<Notify>,
 }
 
-impl Listening {
+impl Subscriber {
     /// The number of sent parts that are not finished.
-    fn lacks(&self, sent: u64) -> u64 {
+    fn lag(&self, sent: u64) -> u64 {
         sent - self.open.first().map_or(self.taken, |first| first - 1)
     }
 }
@@ -87,7 +92,7 @@ impl Listening {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::broker) enum NotGranted {
     /// This package is already in fan-out.
-    UnderWay,
+    AlreadyOpen,
     /// The maximum number of packages is in fan-out.
     Full,
 }
@@ -104,16 +109,22 @@ impl Grants {
     ) -> Result<Arc<Grant>, NotGranted> {
         let mut table = lock(&self.0);
         if table.contains_key(&digest) {
-            return Err(NotGranted::UnderWay);
+            return Err(NotGranted::AlreadyOpen);
         }
         if table.len() >= MAX_FAN_OUTS {
             return Err(NotGranted::Full);
         }
         let window = (WINDOW_BYTES / part_bytes.max(1) as u64).clamp(1, WINDOW_PARTS);
         let progress = Progress::begin(robots, now);
-        let (moved, joined) = (Notify::new(), Notify::new());
-        let grant =
-            Arc::new(Grant { digest, qos, window, progress: Mutex::new(progress), moved, joined });
+        let (progressed, joined) = (Notify::new(), Notify::new());
+        let grant = Arc::new(Grant {
+            digest,
+            qos,
+            window,
+            progress: Mutex::new(progress),
+            progressed,
+            joined,
+        });
         table.insert(digest, grant.clone());
         Ok(grant)
     }
@@ -123,12 +134,13 @@ impl Grants {
         lock(&self.0).remove(&grant.digest);
         let mut progress = grant.progress();
         progress.parts.clear();
-        for listening in
-            std::mem::take(&mut progress.robots).into_values().filter_map(|permit| permit.listening)
+        for subscriber in std::mem::take(&mut progress.robots)
+            .into_values()
+            .filter_map(|permit| permit.subscriber)
         {
-            listening.news.notify_one();
+            subscriber.news.notify_one();
         }
-        (progress.listeners, progress.behind, progress.idle) = (0, 0, 0);
+        (progress.subscribers, progress.behind, progress.idle) = (0, 0, 0);
     }
 
     /// The package's grant, if `robot` has one.
@@ -165,17 +177,17 @@ impl Grant {
     /// Closes the package to one robot.
     pub(in crate::broker) fn withdraw(&self, robot: &RobotId, now: Instant) {
         self.progress().remove(robot, self.window, now);
-        self.moved.notify_one();
+        self.progressed.notify_one();
     }
 
     /// The number of robots that subscribe now.
-    pub(in crate::broker) fn listeners(&self) -> usize {
-        self.progress().listeners
+    pub(in crate::broker) fn subscribers(&self) -> usize {
+        self.progress().subscribers
     }
 
     /// Whether the robot subscribes now.
-    pub(in crate::broker) fn is_listening(&self, robot: &RobotId) -> bool {
-        self.progress().robots.get(robot).is_some_and(|permit| permit.listening.is_some())
+    pub(in crate::broker) fn is_subscribed(&self, robot: &RobotId) -> bool {
+        self.progress().robots.get(robot).is_some_and(|permit| permit.subscriber.is_some())
     }
 
     /// The bytes of the parts that are held for subscribers.
@@ -192,7 +204,7 @@ impl Grant {
     /// Waits until no subscriber is a whole window behind. For one caller at a time; cancel-safe.
     pub(in crate::broker) async fn room(&self) {
         while self.progress().behind > 0 {
-            self.moved.notified().await;
+            self.progressed.notified().await;
         }
     }
 
@@ -201,11 +213,11 @@ impl Grant {
         loop {
             {
                 let progress = self.progress();
-                if progress.idle == progress.listeners {
+                if progress.idle == progress.subscribers {
                     return;
                 }
             }
-            self.moved.notified().await;
+            self.progressed.notified().await;
         }
     }
 
@@ -217,40 +229,42 @@ impl Grant {
             progress.parts.pop_front();
         }
         progress.parts.push_back(part);
-        let Progress { sent, waiting, .. } = *progress;
+        let Progress { sent, wait_time, .. } = *progress;
         let mut behind = 0;
-        for listening in progress.robots.values_mut().filter_map(|permit| permit.listening.as_mut())
+        for subscriber in
+            progress.robots.values_mut().filter_map(|permit| permit.subscriber.as_mut())
         {
-            listening.news.notify_one();
-            if listening.lacks(sent) >= self.window {
-                listening.hold.set(true, &waiting, now);
+            subscriber.news.notify_one();
+            if subscriber.lag(sent) >= self.window {
+                subscriber.timer.set(true, &wait_time, now);
                 behind += 1;
             }
         }
         (progress.behind, progress.idle) = (behind, 0);
-        progress.measure(now);
+        progress.update_wait_time(now);
     }
 
     /// Closes the package to robots that have held up all others for too long, and returns them.
-    pub(in crate::broker) fn put_out_laggards(&self, now: Instant) -> Vec<RobotId> {
+    pub(in crate::broker) fn evict_laggards(&self, now: Instant) -> Vec<RobotId> {
         let mut progress = self.progress();
-        let Progress { all, waiting, .. } = *progress;
-        let is_laggard = |listening: &Listening| listening.hold.is_too_long(&all, &waiting, now);
+        let Progress { all, wait_time, .. } = *progress;
+        let is_laggard =
+            |subscriber: &Subscriber| subscriber.timer.is_exceeded(&all, &wait_time, now);
         let slow = progress
             .robots
             .iter()
-            .filter(|(_, permit)| permit.listening.as_ref().is_some_and(is_laggard));
+            .filter(|(_, permit)| permit.subscriber.as_ref().is_some_and(is_laggard));
         let laggards: Vec<RobotId> = slow.map(|(robot, _)| robot.clone()).collect();
         for robot in &laggards {
             progress.remove(robot, self.window, now);
         }
-        progress.put_out.extend(laggards.iter().cloned());
+        progress.evicted.extend(laggards.iter().cloned());
         laggards
     }
 
     /// The robots removed since the last call.
-    pub(in crate::broker) fn take_put_out(&self) -> Vec<RobotId> {
-        std::mem::take(&mut self.progress().put_out)
+    pub(in crate::broker) fn take_evicted(&self) -> Vec<RobotId> {
+        std::mem::take(&mut self.progress().evicted)
     }
 
     fn progress(&self) -> MutexGuard<'_, Progress> {
@@ -260,86 +274,86 @@ impl Grant {
 
 impl Progress {
     fn begin(robots: Vec<RobotId>, now: Instant) -> Self {
-        let waiting = Waiting::default();
-        let mut all = Hold::new(&waiting, now);
-        all.set(true, &waiting, now);
+        let wait_time = WaitTime::default();
+        let mut all = LagTimer::new(&wait_time, now);
+        all.set(true, &wait_time, now);
         Self {
             sent: 0,
             parts: VecDeque::new(),
             robots: robots.into_iter().map(|robot| (robot, Permit::default())).collect(),
-            listeners: 0,
+            subscribers: 0,
             behind: 0,
             idle: 0,
-            waiting,
+            wait_time,
             all,
-            put_out: Vec::new(),
+            evicted: Vec::new(),
         }
     }
 
-    fn listening(&mut self, robot: &RobotId) -> Option<&mut Listening> {
-        self.robots.get_mut(robot)?.listening.as_mut()
+    fn subscriber(&mut self, robot: &RobotId) -> Option<&mut Subscriber> {
+        self.robots.get_mut(robot)?.subscriber.as_mut()
     }
 
     /// Removes the robot's permission and tells its session.
     fn remove(&mut self, robot: &RobotId, window: u64, now: Instant) {
-        if let Some(listening) = self.robots.remove(robot).and_then(|permit| permit.listening) {
-            listening.news.notify_one();
-            self.discount(&listening, window, now);
+        if let Some(subscriber) = self.robots.remove(robot).and_then(|permit| permit.subscriber) {
+            subscriber.news.notify_one();
+            self.uncount(&subscriber, window, now);
         }
     }
 
     /// The robot's subscription ends, if there is one. The robot may come back.
     fn leave(&mut self, robot: &RobotId, window: u64, now: Instant) {
-        let waiting = self.waiting;
+        let wait_time = self.wait_time;
         let Some(permit) = self.robots.get_mut(robot) else { return };
-        let Some(mut listening) = permit.listening.take() else { return };
-        listening.hold.leave(&waiting, now);
-        permit.held = Some(listening.hold);
-        self.discount(&listening, window, now);
+        let Some(mut subscriber) = permit.subscriber.take() else { return };
+        subscriber.timer.leave(&wait_time, now);
+        permit.past_timer = Some(subscriber.timer);
+        self.uncount(&subscriber, window, now);
     }
 
     /// Removes the subscriber from the counts.
-    fn discount(&mut self, listening: &Listening, window: u64, now: Instant) {
-        let lacks = listening.lacks(self.sent);
-        self.listeners -= 1;
-        self.behind -= usize::from(lacks >= window);
-        self.idle -= usize::from(lacks == 0);
-        self.measure(now);
+    fn uncount(&mut self, subscriber: &Subscriber, window: u64, now: Instant) {
+        let lag = subscriber.lag(self.sent);
+        self.subscribers -= 1;
+        self.behind -= usize::from(lag >= window);
+        self.idle -= usize::from(lag == 0);
+        self.update_wait_time(now);
     }
 
     /// Updates whether the other subscribers wait from now on.
-    fn measure(&mut self, now: Instant) {
-        self.waiting.set(self.behind > 0 && self.idle * 2 >= self.listeners, now);
+    fn update_wait_time(&mut self, now: Instant) {
+        self.wait_time.set(self.behind > 0 && self.idle * 2 >= self.subscribers, now);
     }
 }
 
 /// A robot's session that subscribes; it counts as behind until this is dropped.
-pub(super) struct Member {
+pub(super) struct PartSubscription {
     grant: Arc<Grant>,
     robot: RobotId,
 }
 
-/// The next action of a member's session.
+/// The next action of a subscriber's session.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Due {
-    /// Send this part, and call `Member::take`.
+    /// Send this part, and call `PartSubscription::take`.
     Part(u64, Part),
     End,
     Nothing,
 }
 
-impl Member {
+impl PartSubscription {
     /// The robot receives all parts from now on; `news` wakes its session. `None` if the grant was
     /// withdrawn meanwhile.
     pub(super) fn join(grant: Arc<Grant>, robot: &RobotId, news: Arc<Notify>) -> Option<Self> {
         let (now, mut progress) = (Instant::now(), grant.progress());
         progress.leave(robot, grant.window, now);
-        let Progress { sent, waiting, .. } = *progress;
+        let Progress { sent, wait_time, .. } = *progress;
         let permit = progress.robots.get_mut(robot)?;
-        let hold = permit.held.take().unwrap_or_else(|| Hold::new(&waiting, now));
-        permit.listening = Some(Listening { taken: sent, open: BTreeSet::new(), hold, news });
-        (progress.listeners, progress.idle) = (progress.listeners + 1, progress.idle + 1);
-        progress.measure(now);
+        let timer = permit.past_timer.take().unwrap_or_else(|| LagTimer::new(&wait_time, now));
+        permit.subscriber = Some(Subscriber { taken: sent, open: BTreeSet::new(), timer, news });
+        (progress.subscribers, progress.idle) = (progress.subscribers + 1, progress.idle + 1);
+        progress.update_wait_time(now);
         drop(progress);
         grant.joined.notify_one();
         Some(Self { grant, robot: robot.clone() })
@@ -353,10 +367,10 @@ impl Member {
     pub(super) fn due(&self) -> Due {
         let progress = self.grant.progress();
         let permit = progress.robots.get(&self.robot);
-        let Some(listening) = permit.and_then(|permit| permit.listening.as_ref()) else {
+        let Some(subscriber) = permit.and_then(|permit| permit.subscriber.as_ref()) else {
             return Due::End;
         };
-        let number = listening.taken + 1;
+        let number = subscriber.taken + 1;
         let from_the_end =
             progress.sent.checked_sub(number).and_then(|distance| usize::try_from(distance).ok());
         let part = from_the_end.and_then(|distance| progress.parts.iter().rev().nth(distance));
@@ -365,41 +379,41 @@ impl Member {
 
     /// Records that the session sends the part of this number.
     pub(super) fn take(&self, number: u64) {
-        if let Some(listening) = self.grant.progress().listening(&self.robot) {
-            listening.taken = number;
-            listening.open.insert(number);
+        if let Some(subscriber) = self.grant.progress().subscriber(&self.robot) {
+            subscriber.taken = number;
+            subscriber.open.insert(number);
         }
     }
 
     /// Records that the robot has the part.
     pub(super) fn acknowledged(&self, number: u64) {
         let (now, mut progress) = (Instant::now(), self.grant.progress());
-        let (window, sent, waiting) = (self.grant.window, progress.sent, progress.waiting);
-        let Some(listening) = progress.listening(&self.robot) else { return };
-        let before = listening.lacks(sent);
-        listening.open.remove(&number);
-        let after = listening.lacks(sent);
+        let (window, sent, wait_time) = (self.grant.window, progress.sent, progress.wait_time);
+        let Some(subscriber) = progress.subscriber(&self.robot) else { return };
+        let before = subscriber.lag(sent);
+        subscriber.open.remove(&number);
+        let after = subscriber.lag(sent);
         if before == after {
             return;
         }
         let caught_up = before >= window && after < window;
         if after < window {
-            listening.hold.set(false, &waiting, now);
+            subscriber.timer.set(false, &wait_time, now);
         }
         progress.behind -= usize::from(caught_up);
         progress.idle += usize::from(after == 0);
-        progress.measure(now);
-        if caught_up || progress.idle == progress.listeners {
+        progress.update_wait_time(now);
+        if caught_up || progress.idle == progress.subscribers {
             drop(progress);
-            self.grant.moved.notify_one();
+            self.grant.progressed.notify_one();
         }
     }
 }
 
-impl Drop for Member {
+impl Drop for PartSubscription {
     fn drop(&mut self) {
         self.grant.progress().leave(&self.robot, self.grant.window, Instant::now());
-        self.grant.moved.notify_one();
+        self.grant.progressed.notify_one();
     }
 }
 
@@ -416,17 +430,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_slowest_listener_holds_the_publisher_up_until_it_goes() {
+    fn publisher_waits_for_the_slowest_subscriber_until_it_leaves() {
         let (grants, now) = (Grants::default(), Instant::now());
         let (quick, slow) = (RobotId::random(), RobotId::random());
         let (digest, qos) = (Digest::of(b"package"), QoS::AtLeastOnce);
         let grant = grants.open(digest, 1024 * 1024, qos, vec![quick.clone()], now).expect("room");
-        assert_eq!(grants.open(digest, 1, qos, Vec::new(), now).err(), Some(NotGranted::UnderWay));
+        assert_eq!(
+            grants.open(digest, 1, qos, Vec::new(), now).err(),
+            Some(NotGranted::AlreadyOpen)
+        );
         assert!(grants.of(&digest, &slow).is_none());
         grant.admit([slow.clone()]);
         let join = |robot| {
             let grant = grants.of(&digest, robot).expect("granted");
-            Member::join(grant, robot, Arc::default()).expect("granted")
+            PartSubscription::join(grant, robot, Arc::default()).expect("granted")
         };
         let part = |number: u8| Part {
             header: vec![number].into(),
@@ -457,15 +474,15 @@ mod tests {
         let later = now + std::time::Duration::from_secs(60);
         first.take(5);
         first.acknowledged(5);
-        assert_eq!(grant.put_out_laggards(later), std::slice::from_ref(&slow));
-        assert_eq!(grant.take_put_out(), [slow]);
+        assert_eq!(grant.evict_laggards(later), std::slice::from_ref(&slow));
+        assert_eq!(grant.take_evicted(), [slow]);
         assert_eq!(second.due(), Due::End);
         assert!(send());
         drop(first);
         assert_eq!(
-            (grant.listeners(), (0..100).filter(|_| send()).count()),
+            (grant.subscribers(), (0..100).filter(|_| send()).count()),
             (0, 100),
-            "nobody to wait for"
+            "no subscriber to wait for"
         );
         grants.close(&grant);
         assert!(grants.of(&digest, &quick).is_none());
@@ -473,7 +490,7 @@ mod tests {
     }
 
     #[test]
-    fn who_subscribes_again_is_as_far_behind_as_before() {
+    fn resubscribe_keeps_the_backlog() {
         let seconds = std::time::Duration::from_secs;
         let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
         let long_ago = now.checked_sub(seconds(20)).expect("the machine has run for that long");
@@ -481,42 +498,44 @@ mod tests {
         let grant = grants
             .open(digest, 64 * 1024, QoS::AtLeastOnce, vec![robot.clone()], long_ago)
             .expect("room");
-        let join = || Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
+        let join =
+            || PartSubscription::join(grant.clone(), &robot, Arc::default()).expect("granted");
         let fill = |now| {
             for _ in 0..WINDOW_PARTS {
                 grant.send(Part { header: Default::default(), bytes: Default::default() }, now);
             }
         };
-        let member = join();
+        let subscription = join();
         fill(long_ago);
-        drop(member);
+        drop(subscription);
         let _member = join();
         fill(now);
-        assert!(grant.put_out_laggards(now + seconds(5)).is_empty());
-        assert_eq!(grant.put_out_laggards(now + seconds(11)), std::slice::from_ref(&robot));
+        assert!(grant.evict_laggards(now + seconds(5)).is_empty());
+        assert_eq!(grant.evict_laggards(now + seconds(11)), std::slice::from_ref(&robot));
         assert!(grants.of(&digest, &robot).is_none(), "it has to get the rest in another way");
     }
 
     #[test]
-    fn acknowledgements_may_come_in_any_order() {
+    fn acknowledgements_in_any_order_are_accepted() {
         let (grants, now, robot) = (Grants::default(), Instant::now(), RobotId::random());
         let digest = Digest::of(b"package");
         let grant = grants
             .open(digest, 64 * 1024, QoS::ExactlyOnce, vec![robot.clone()], now)
             .expect("room");
-        let member = Member::join(grant.clone(), &robot, Arc::default()).expect("granted");
+        let subscription =
+            PartSubscription::join(grant.clone(), &robot, Arc::default()).expect("granted");
         for number in 1..=WINDOW_PARTS {
             assert!(grant.room().now_or_never().is_some());
             grant.send(Part { header: Default::default(), bytes: Default::default() }, now);
-            member.take(number);
+            subscription.take(number);
         }
         for number in (2..=WINDOW_PARTS).rev() {
-            member.acknowledged(number);
+            subscription.acknowledged(number);
             assert!(
                 grant.room().now_or_never().is_none() && grant.all_idle().now_or_never().is_none()
             );
         }
-        member.acknowledged(1);
+        subscription.acknowledged(1);
         assert!(grant.room().now_or_never().is_some() && grant.all_idle().now_or_never().is_some());
     }
 }

@@ -2,6 +2,14 @@
 //! answers and enforces timeouts. All its buffers are bounded; it stops reading while a message is
 //! being stored or while the client leaves answers unread.
 
+mod outgoing;
+mod output;
+mod parts;
+mod presence_guard;
+mod subscriptions;
+mod unreleased;
+mod violations;
+
 use std::collections::HashMap;
 use std::io;
 use std::net::SocketAddr;
@@ -14,34 +22,30 @@ use rumqttd::protocol::{
     ConnectReturnCode, Packet, PingResp, PubAck, PubAckReason, PubComp, PubCompReason, PubRec,
     PubRecReason, PubRel, PubRelReason, QoS,
 };
-use task_proto::topic::{RobotTopic, Topic};
+use task_proto::messages::topic::{RobotTopic, Topic};
 use task_proto::{Digest, RobotId};
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, ReadHalf, WriteHalf};
 use tokio::time::{Instant, sleep_until, timeout};
 
+use self::outgoing::Outgoing;
+use self::output::{Output, release_if_idle};
+use self::parts::{Parts, due};
+use self::presence_guard::PresenceGuard;
+use self::subscriptions::lower;
+use self::unreleased::Unreleased;
+use self::violations::until;
 use super::Context;
-use super::access::{Hearing, Route, Visitor, may_publish};
-use super::attendance::Attendance;
+use super::access::{Client, MessageSource, Route, may_publish};
+use super::admission::{
+    AuthenticatedClient, PendingConnection, Rejection, authenticate, connack, reject,
+};
 use super::codec::{DecodeError, Publish, Received, Will, decode, encode, encode_publish};
-use super::entrance::{Arrival, Guest, Rejection, connack, reject, welcome};
-use super::outgoing::Outgoing;
-use super::output::{Output, give_back};
 use super::parts::Due;
-use super::takeover::Seat;
+use super::slots::SessionSlot;
 use super::traffic::{Count, Meter, Metered};
-use crate::broker::router::{Heard, Listener, Listening, RouterError};
+use crate::broker::router::{Message, RouterError, Subscriber, Topics};
 use crate::broker::{NotStored, RobotMessage};
-use crate::limits::conduct::Watched;
-
-mod conduct;
-mod parts;
-mod subscriptions;
-mod unreleased;
-
-use conduct::until;
-use parts::{Parts, due};
-use subscriptions::lower;
-use unreleased::Unreleased;
+use crate::domain::limits::robot_limiter::RobotChannel;
 
 /// Maximum unread answers before we stop reading from the client.
 const MAX_UNREAD_BYTES: usize = 64 * 1024;
@@ -52,60 +56,61 @@ const LINGER: Duration = Duration::from_secs(1);
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 enum End {
     /// DISCONNECT: the only end that discards the will.
-    #[error("says goodbye")]
-    Goodbye,
-    #[error("goes away without a word")]
-    Gone,
-    #[error("is silent for longer than its keepalive")]
-    Silent,
-    #[error("does not read, or does not acknowledge, what it is sent")]
-    Deaf,
-    #[error("{0}")]
+    #[error("the client sent DISCONNECT")]
+    Disconnected,
+    #[error("the connection was lost")]
+    ConnectionLost,
+    #[error("keepalive timeout")]
+    KeepAliveTimeout,
+    #[error("write timeout: the client does not read, or does not acknowledge messages")]
+    WriteTimeout,
+    #[error("the client {0}")]
     Malformed(#[from] DecodeError),
-    #[error("{0}")]
+    #[error("the client {0}")]
     Violation(&'static str),
-    #[error("sent a message that could not be stored")]
+    #[error("a message of the client could not be stored")]
     NotStored,
-    #[error("goes on sending more than it may")]
-    Flood,
-    #[error("must leave: a newer session, or the server's decision")]
-    Asked,
+    #[error("the client keeps exceeding its rate limit")]
+    RateLimited,
+    #[error("evicted, by a newer session or by the server")]
+    Evicted,
     /// In the middle of a part.
-    #[error("may no longer have what it is being sent")]
+    #[error("the permission for the part being sent was withdrawn")]
     Withdrawn,
-    #[error("lost the router")]
+    #[error("the link to the router was lost")]
     RouterLost,
-    #[error("ends with the server")]
+    #[error("the server is shutting down")]
     Stopped,
 }
 
 /// Serves one connection to its end. For TLS, `stream` is what the handshake returns.
-pub(super) async fn serve<S>(context: Arc<Context>, stream: S, arrival: Arrival)
+pub(super) async fn serve<S>(context: Arc<Context>, stream: S, pending: PendingConnection)
 where
     S: AsyncRead + AsyncWrite + Send + Unpin,
 {
-    let peer = arrival.peer;
+    let peer = pending.peer;
     let meter = Arc::new(Meter::default());
     let mut stream = Metered { stream, meter: meter.clone() };
-    let entered = tokio::select! {
-        entered = enter(&context, &mut stream, arrival, &meter) => entered,
+    let established = tokio::select! {
+        established = establish(&context, &mut stream, pending, &meter) => established,
         () = context.stop.cancelled() => return,
     };
-    match entered {
+    match established {
         Err(rejection) => {
-            tracing::debug!(%peer, "MQTT client turned away: {rejection}");
+            tracing::debug!(%peer, "MQTT client rejected: {rejection}");
             if let Rejection::Malformed(DecodeError::UnknownProtocol(level)) = rejection {
                 context.other_protocols.refused(peer, level);
             }
             context.totals.refuse(Some(&meter));
             reject(&context, &mut stream, rejection).await;
         }
-        Ok((guest, seat, listener)) => {
-            if guest.visitor != Visitor::Canary {
+        Ok((authenticated, slot, subscriber)) => {
+            if authenticated.client != Client::Canary {
                 context.totals.accept(&meter);
             }
-            let end = live(&context, &mut stream, peer, guest, seat, listener).await;
-            tracing::debug!(%peer, "MQTT client {end}");
+            let end =
+                run_session(&context, &mut stream, peer, authenticated, slot, subscriber).await;
+            tracing::debug!(%peer, "MQTT session ended: {end}");
         }
     }
     linger(&mut stream).await;
@@ -113,89 +118,89 @@ where
 
 /// All steps before the session is live: the client's identity, the slot, and a link to the router
 /// if the session needs one.
-async fn enter<S>(
+async fn establish<S>(
     context: &Arc<Context>,
     stream: &mut S,
-    arrival: Arrival,
+    pending: PendingConnection,
     meter: &Arc<Meter>,
-) -> Result<(Guest, Seat, Option<Listener>), Rejection>
+) -> Result<(AuthenticatedClient, SessionSlot, Option<Subscriber>), Rejection>
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    let guest = welcome(context, stream, arrival).await?;
+    let authenticated = authenticate(context, stream, pending).await?;
     let unavailable =
         |reason| Rejection::Answered { code: ConnectReturnCode::ServiceUnavailable, reason };
-    let seat = context.seats.take(guest.seat_name.clone(), meter.clone()).await;
-    let seat = seat.ok_or(unavailable("the person has as many sessions as there may be"))?;
-    guest.check_again(context).await?;
-    let listening = match guest.visitor {
-        Visitor::Robot { .. } => return Ok((guest, seat, None)),
-        Visitor::Operator(_) => Listening::Everything,
-        Visitor::Canary => Listening::Canary,
+    let slot = context.slots.take(authenticated.slot_key.clone(), meter.clone()).await;
+    let slot = slot.ok_or(unavailable("the person has the maximum number of sessions"))?;
+    authenticated.recheck(context).await?;
+    let topics = match authenticated.client {
+        Client::Robot { .. } => return Ok((authenticated, slot, None)),
+        Client::Operator(_) => Topics::Everything,
+        Client::Canary => Topics::Canary,
     };
-    let listener = context.router.listen(listening).await.map_err(|error| match error {
-        RouterError::Full => unavailable("there are as many operators as there may be"),
+    let subscriber = context.router.subscribe(topics).await.map_err(|error| match error {
+        RouterError::Full => unavailable("the maximum number of operators is connected"),
         RouterError::Gone | RouterError::Stuck => unavailable("the router does not answer"),
     })?;
-    Ok((guest, seat, Some(listener)))
+    Ok((authenticated, slot, Some(subscriber)))
 }
 
 /// Runs the session, and then its cleanup in this order: the link to the router ends, the will is
 /// published, the inbox is told of the end, and the slot is free.
-async fn live<S>(
+async fn run_session<S>(
     context: &Context,
     stream: &mut S,
     peer: SocketAddr,
-    guest: Guest,
-    seat: Seat,
-    listener: Option<Listener>,
+    authenticated: AuthenticatedClient,
+    slot: SessionSlot,
+    subscriber: Option<Subscriber>,
 ) -> End
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
     // The payload may have been meant for the previous session of the slot. The code that is told
-    // of this session rings again.
-    seat.doorbell().forget_state();
-    let _attendance = Attendance::begin(context, &guest.visitor, peer, seat.number());
+    // of this session sends it again.
+    slot.mailbox().clear_desired();
+    let _presence = PresenceGuard::begin(context, &authenticated.client, peer, slot.number());
     let (reader, writer) = tokio::io::split(stream);
     let mut output = Output::default();
     connack(ConnectReturnCode::Success, output.packets());
-    seat.meter().add(Count::PacketsIn, 1);
-    seat.meter().add(Count::PacketsOut, 1);
+    slot.meter().add(Count::PacketsIn, 1);
+    slot.meter().add(Count::PacketsOut, 1);
     let now = Instant::now();
     let mut session = Session {
         context,
-        visitor: guest.visitor,
+        client: authenticated.client,
         peer,
-        seat: &seat,
+        slot: &slot,
         reader,
         writer,
-        input: guest.input,
+        input: authenticated.input,
         output,
         is_flushed: true,
-        listener,
-        hearing: HashMap::new(),
-        watched: guest.watched.as_ref(),
+        subscriber,
+        subscriptions: HashMap::new(),
+        rate_limit: authenticated.rate_limit.as_ref(),
         slowed_until: None,
         refused_filters: 0,
         parts: Parts::default(),
         outgoing: Outgoing::default(),
         unreleased: Unreleased::default(),
         storing: None,
-        keep_alive: guest.keep_alive.unwrap_or(context.limits.max_silence),
-        heard_at: now,
-        heard_bytes: 0,
+        keep_alive: authenticated.keep_alive.unwrap_or(context.limits.max_silence),
+        received_at: now,
+        received_bytes: 0,
         progress_at: now,
     };
     let end = session.run().await;
-    if let (Some(watched), Some(offence)) = (session.watched, end.offence()) {
-        watched.offends(offence, Instant::now());
+    if let (Some(rate_limit), Some(violation)) = (session.rate_limit, end.violation()) {
+        rate_limit.cut_off(violation, Instant::now());
     }
-    session.listener = None;
-    if !matches!(end, End::Goodbye | End::Stopped)
-        && let Some(will) = guest.will
+    session.subscriber = None;
+    if !matches!(end, End::Disconnected | End::Stopped)
+        && let Some(will) = authenticated.will
     {
-        session.say_will(will).await;
+        session.publish_will(will).await;
     }
     end
 }
@@ -215,19 +220,19 @@ async fn linger<S: AsyncRead + AsyncWrite + Unpin>(stream: &mut S) {
 
 struct Session<'a, S> {
     context: &'a Context,
-    visitor: Visitor,
+    client: Client,
     peer: SocketAddr,
-    seat: &'a Seat,
+    slot: &'a SessionSlot,
     reader: ReadHalf<&'a mut S>,
     writer: WriteHalf<&'a mut S>,
     input: BytesMut,
     output: Output,
     /// Whether the bytes that left `output` have left the stream's own buffers as well.
     is_flushed: bool,
-    listener: Option<Listener>,
-    hearing: HashMap<String, (Hearing, QoS)>,
+    subscriber: Option<Subscriber>,
+    subscriptions: HashMap<String, (MessageSource, QoS)>,
     /// The rate limits of the robot.
-    watched: Option<&'a Watched>,
+    rate_limit: Option<&'a RobotChannel>,
     /// Nothing more is read from the robot before this time.
     slowed_until: Option<Instant>,
     refused_filters: u32,
@@ -237,9 +242,9 @@ struct Session<'a, S> {
     storing: Option<Storing<'a>>,
     keep_alive: Duration,
     /// When the last packet arrived, or enough of the incoming one.
-    heard_at: Instant,
+    received_at: Instant,
     /// Bytes of the incoming packet that were present at that time.
-    heard_bytes: usize,
+    received_bytes: usize,
     /// When the client last read some of our bytes, or there was nothing to read.
     progress_at: Instant,
 }
@@ -251,36 +256,36 @@ struct Storing<'a> {
 }
 
 /// An event that wakes a session.
-enum Woken {
+enum Event {
     Read(io::Result<usize>),
     Wrote(io::Result<()>),
     Stored(Result<(), NotStored>),
-    Rung(Bytes),
-    Asked(Bytes),
-    Heard(Result<Heard, RouterError>),
+    Desired(Bytes),
+    Request(Bytes),
+    RouterMessage(Result<Message, RouterError>),
     /// The slowed period is over.
-    Due,
+    Resumed,
     PartDue(Digest, Due),
-    Late(End),
+    Timeout(End),
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     async fn run(&mut self) -> End {
         let end = loop {
-            if let Err(end) = self.act_on_input() {
+            if let Err(end) = self.handle_input() {
                 break end;
             }
-            let woken = tokio::select! {
+            let event = tokio::select! {
                 biased;
-                () = self.seat.leave().cancelled() => return End::Asked,
+                () = self.slot.evicted().cancelled() => return End::Evicted,
                 () = self.context.stop.cancelled() => return End::Stopped,
-                woken = self.wait() => woken,
+                event = self.wait() => event,
             };
-            if let Err(end) = self.act_on(woken) {
+            if let Err(end) = self.handle(event) {
                 break end;
             }
         };
-        if !matches!(end, End::Deaf | End::Withdrawn) {
+        if !matches!(end, End::WriteTimeout | End::Withdrawn) {
             // Answers from before the end are still due. If the client can't receive them, the
             // connection is over anyway.
             let _ = timeout(LINGER, self.writer.write_all_buf(&mut self.output)).await;
@@ -289,35 +294,35 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     /// Waits for the first event. Every branch is cancel-safe: bytes stay in the socket or the
-    /// buffers, payloads in the doorbell or the link, and the message that is being stored is
+    /// buffers, payloads in the mailbox or the link, and the message that is being stored is
     /// polled in place.
-    async fn wait(&mut self) -> Woken {
-        let (deadline, lateness) = self.deadline();
+    async fn wait(&mut self) -> Event {
+        let (deadline, reason) = self.deadline();
         let may_read = self.may_read();
         let may_write = !self.output.is_empty() || !self.is_flushed;
         let may_send = self.caught_up();
         let may_send_part = may_send && self.outgoing.has_room_for_part();
-        let hears_desired = self.qos_of(Hearing::Desired).is_some();
-        let hears_request = self.qos_of(Hearing::Request).is_some();
+        let wants_desired = self.qos_of(MessageSource::Desired).is_some();
+        let wants_requests = self.qos_of(MessageSource::Request).is_some();
         if may_read {
             self.input.reserve(1024);
         }
-        let woken = tokio::select! {
-            stored = stored(&mut self.storing) => Woken::Stored(stored),
-            wrote = write(&mut self.writer, &mut self.output, &mut self.is_flushed), if may_write => Woken::Wrote(wrote),
-            read = self.reader.read_buf(&mut self.input), if may_read => Woken::Read(read),
-            payload = self.seat.doorbell().answer(), if may_send && hears_desired => Woken::Rung(payload),
-            payload = self.seat.doorbell().question(), if may_send && hears_request => Woken::Asked(payload),
-            (digest, due) = due(&self.parts, may_send_part) => Woken::PartDue(digest, due),
-            heard = heard(&mut self.listener), if may_send => Woken::Heard(heard),
-            () = until(self.slowed_until) => Woken::Due,
-            () = sleep_until(deadline) => Woken::Late(lateness),
+        let event = tokio::select! {
+            stored = stored(&mut self.storing) => Event::Stored(stored),
+            wrote = write(&mut self.writer, &mut self.output, &mut self.is_flushed), if may_write => Event::Wrote(wrote),
+            read = self.reader.read_buf(&mut self.input), if may_read => Event::Read(read),
+            payload = self.slot.mailbox().next_desired(), if may_send && wants_desired => Event::Desired(payload),
+            payload = self.slot.mailbox().next_request(), if may_send && wants_requests => Event::Request(payload),
+            (digest, due) = due(&self.parts, may_send_part) => Event::PartDue(digest, due),
+            message = next_message(&mut self.subscriber), if may_send => Event::RouterMessage(message),
+            () = until(self.slowed_until) => Event::Resumed,
+            () = sleep_until(deadline) => Event::Timeout(reason),
         };
         if may_send {
             // Until now there was nothing to read, for any length of time.
             self.progress_at = Instant::now();
         }
-        woken
+        event
     }
 
     /// The next deadline, and the reason for ending the session if the deadline passes.
@@ -326,12 +331,12 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
             self.progress_at = Instant::now();
         }
         let unread_until = self.progress_at + self.context.limits.write_timeout;
-        let silent_until = self.heard_at + self.keep_alive;
+        let silent_until = self.received_at + self.keep_alive;
         // While we don't read, the client is not responsible for its silence.
         if self.may_read() && silent_until < unread_until || self.caught_up() && !self.is_busy() {
-            (silent_until, End::Silent)
+            (silent_until, End::KeepAliveTimeout)
         } else {
-            (unread_until, End::Deaf)
+            (unread_until, End::WriteTimeout)
         }
     }
 
@@ -349,46 +354,50 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         self.storing.is_some() || self.slowed_until.is_some()
     }
 
-    fn act_on(&mut self, woken: Woken) -> Result<(), End> {
-        match woken {
-            Woken::Read(Ok(0) | Err(_)) | Woken::Wrote(Err(_)) => return Err(End::Gone),
-            Woken::Read(Ok(_)) => {}
-            Woken::Wrote(Ok(())) => {
+    fn handle(&mut self, event: Event) -> Result<(), End> {
+        match event {
+            Event::Read(Ok(0) | Err(_)) | Event::Wrote(Err(_)) => return Err(End::ConnectionLost),
+            Event::Read(Ok(_)) => {}
+            Event::Wrote(Ok(())) => {
                 self.progress_at = Instant::now();
-                self.output.give_back();
+                self.output.release_if_idle();
                 if self.output.is_empty() {
                     self.parts.written();
                 }
             }
-            Woken::Stored(stored) => self.acknowledge_stored(stored)?,
-            Woken::Rung(payload) => self.send_own(RobotTopic::Desired, Hearing::Desired, payload),
-            Woken::Asked(payload) => self.send_own(RobotTopic::Request, Hearing::Request, payload),
-            Woken::PartDue(digest, due) => self.act_on_part(digest, due)?,
-            Woken::Heard(heard) => self.pass_on(heard.map_err(|_| End::RouterLost)?),
+            Event::Stored(stored) => self.acknowledge_stored(stored)?,
+            Event::Desired(payload) => {
+                self.send_own(RobotTopic::Desired, MessageSource::Desired, payload)
+            }
+            Event::Request(payload) => {
+                self.send_own(RobotTopic::Request, MessageSource::Request, payload)
+            }
+            Event::PartDue(digest, due) => self.handle_part(digest, due)?,
+            Event::RouterMessage(message) => self.deliver(message.map_err(|_| End::RouterLost)?),
             // We did not read, so the silence does not count.
-            Woken::Due => (self.slowed_until, self.heard_at) = (None, Instant::now()),
-            Woken::Late(end) => return Err(end),
+            Event::Resumed => (self.slowed_until, self.received_at) = (None, Instant::now()),
+            Event::Timeout(end) => return Err(end),
         }
         Ok(())
     }
 
-    fn act_on_input(&mut self) -> Result<(), End> {
+    fn handle_input(&mut self) -> Result<(), End> {
         while self.may_read() {
             let before = self.input.len();
             let Some(received) = decode(&mut self.input, self.context.limits.max_packet_bytes)?
             else {
-                self.hear_progress();
+                self.note_progress();
                 break;
             };
-            (self.heard_at, self.heard_bytes) = (Instant::now(), 0);
-            self.weigh(&received, before - self.input.len())?;
-            self.act_on_packet(received)?;
+            (self.received_at, self.received_bytes) = (Instant::now(), 0);
+            self.count_packet(&received, before - self.input.len())?;
+            self.handle_packet(received)?;
         }
-        give_back(&mut self.input);
+        release_if_idle(&mut self.input);
         Ok(())
     }
 
-    fn act_on_packet(&mut self, received: Received) -> Result<(), End> {
+    fn handle_packet(&mut self, received: Received) -> Result<(), End> {
         self.count(Count::PacketsIn);
         match received {
             Received::Connect(_) => return Err(End::Violation("sends a second CONNECT")),
@@ -398,11 +407,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 if self.outgoing.acknowledged(id) {
                     self.parts.acknowledged(id);
                 }
-                self.progress_at = self.heard_at;
+                self.progress_at = self.received_at;
             }
             Received::PubRec(pkid) => {
                 self.outgoing.received(pkid);
-                self.progress_at = self.heard_at;
+                self.progress_at = self.received_at;
                 self.send(Packet::PubRel(PubRel { pkid, reason: PubRelReason::Success }, None));
             }
             Received::PubRel(pkid) => {
@@ -413,28 +422,28 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
                 if self.outgoing.completed(id) {
                     self.parts.acknowledged(id);
                 }
-                self.progress_at = self.heard_at;
+                self.progress_at = self.received_at;
             }
             Received::Subscribe { packet_id, filters } => self.subscribe(packet_id, filters)?,
             Received::Unsubscribe { packet_id, filters } => self.unsubscribe(packet_id, &filters),
             Received::PingReq => self.send(Packet::PingResp(PingResp)),
-            Received::Disconnect => return Err(End::Goodbye),
+            Received::Disconnect => return Err(End::Disconnected),
         }
         Ok(())
     }
 
     fn publish(&mut self, publish: Publish) -> Result<(), End> {
         self.count(Count::MessagesIn);
-        let Some(route) = may_publish(&self.visitor, &self.context.prefix, &publish.topic) else {
+        let Some(route) = may_publish(&self.client, &self.context.prefix, &publish.topic) else {
             self.context.totals.refuse_message();
-            return Err(End::Violation("publishes where it may not"));
+            return Err(End::Violation("publishes to a topic that it may not write"));
         };
         if publish.qos == QoS::ExactlyOnce && self.unreleased.contains(publish.packet_id) {
             self.acknowledge(&publish);
             return Ok(());
         }
-        match (route, &self.visitor) {
-            (Route::Inbox(topic), &Visitor::Robot { ref robot, token_number }) => {
+        match (route, &self.client) {
+            (Route::Inbox(topic), &Client::Robot { ref robot, token_number }) => {
                 let message = self.message(robot, token_number, topic, publish.payload.clone());
                 let stored = Box::pin(store(self.context, message));
                 self.storing = Some(Storing { publish, stored });
@@ -455,7 +464,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
         self.acknowledge(&publish);
         self.context.router.publish(&publish.topic, publish.qos, publish.payload);
-        self.heard_at = Instant::now();
+        self.received_at = Instant::now();
         Ok(())
     }
 
@@ -474,14 +483,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
     }
 
-    fn qos_of(&self, wanted: Hearing) -> Option<QoS> {
-        self.hearing.values().find(|(hearing, _)| *hearing == wanted).map(|(_, qos)| *qos)
+    fn qos_of(&self, source: MessageSource) -> Option<QoS> {
+        self.subscriptions
+            .values()
+            .find(|(subscribed, _)| *subscribed == source)
+            .map(|(_, qos)| *qos)
     }
 
     /// Sends a message that is for this robot alone.
-    fn send_own(&mut self, last: RobotTopic, hearing: Hearing, payload: Bytes) {
-        if let (Visitor::Robot { robot, .. }, Some(granted)) = (&self.visitor, self.qos_of(hearing))
-        {
+    fn send_own(&mut self, last: RobotTopic, source: MessageSource, payload: Bytes) {
+        if let (Client::Robot { robot, .. }, Some(granted)) = (&self.client, self.qos_of(source)) {
             let topic = self.context.prefix.format(&Topic::Robot(robot.clone(), last));
             self.send_message(topic, payload, lower(granted, QoS::AtLeastOnce));
         }
@@ -495,7 +506,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn count(&self, count: Count) {
-        self.seat.meter().add(count, 1);
+        self.slot.meter().add(count, 1);
     }
 
     fn send(&mut self, packet: Packet) {
@@ -510,7 +521,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         topic: RobotTopic,
         payload: Bytes,
     ) -> RobotMessage {
-        let (peer, connection) = (Some(self.peer), self.seat.number());
+        let (peer, connection) = (Some(self.peer), self.slot.number());
         RobotMessage {
             robot: robot.clone(),
             topic,
@@ -521,9 +532,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
         }
     }
 
-    async fn say_will(&mut self, will: Will) {
-        match (may_publish(&self.visitor, &self.context.prefix, &will.topic), &self.visitor) {
-            (Some(Route::Inbox(topic)), &Visitor::Robot { ref robot, token_number }) => {
+    async fn publish_will(&mut self, will: Will) {
+        match (may_publish(&self.client, &self.context.prefix, &will.topic), &self.client) {
+            (Some(Route::Inbox(topic)), &Client::Robot { ref robot, token_number }) => {
                 if store(
                     self.context,
                     self.message(robot, token_number, topic, will.payload.clone()),
@@ -577,9 +588,9 @@ async fn stored(storing: &mut Option<Storing<'_>>) -> Result<(), NotStored> {
 }
 
 /// The next message from the router; never if there is no link.
-async fn heard(listener: &mut Option<Listener>) -> Result<Heard, RouterError> {
-    match listener {
-        Some(listener) => listener.next().await,
+async fn next_message(subscriber: &mut Option<Subscriber>) -> Result<Message, RouterError> {
+    match subscriber {
+        Some(subscriber) => subscriber.next().await,
         None => std::future::pending().await,
     }
 }

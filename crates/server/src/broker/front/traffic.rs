@@ -80,14 +80,14 @@ impl Totals {
     /// Counts an admitted client.
     pub(super) fn accept(&self, meter: &Meter) {
         self.accepted.fetch_add(1, Ordering::Relaxed);
-        self.take_in(meter);
+        self.add_to_totals(meter);
     }
 
     /// Counts a refused client; without a meter the client was refused before any byte was read.
     pub(super) fn refuse(&self, meter: Option<&Meter>) {
         self.refused.fetch_add(1, Ordering::Relaxed);
         if let Some(meter) = meter {
-            self.take_in(meter);
+            self.add_to_totals(meter);
         }
     }
 
@@ -108,7 +108,7 @@ impl Totals {
     }
 
     /// A connection's own task calls this, so nothing is counted between its lines.
-    fn take_in(&self, meter: &Meter) {
+    fn add_to_totals(&self, meter: &Meter) {
         let Traffic { bytes_in, bytes_out, packets_in, packets_out, .. } = meter.read();
         let so_far = [
             (Count::BytesIn, bytes_in),

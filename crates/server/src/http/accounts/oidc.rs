@@ -9,40 +9,43 @@ use axum::extract::{ConnectInfo, State};
 use axum::response::{AppendHeaders, IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
+use task_macros::operation;
 use task_proto::UserName;
 use utoipa::IntoParams;
 
-use super::session::{begin_session, cookie, set_cookie};
-use crate::auth::oidc::{Attempt, OidcError, Provider};
-use crate::http::App;
+use super::session::{PageCookies, PageSignIn};
+use crate::auth::oidc::{OidcError, Provider, SignInAttempt};
+use crate::broker::Broker;
+use crate::http::auth::cookie;
 use crate::http::error::ApiError;
 use crate::http::extract::QueryParams;
-use crate::orders::actions::ActionError;
-use crate::orders::actions::sign_in::ProviderUser;
+use crate::orders::actions::{PersonActions, PersonError, ProviderUser};
 
 /// The cookie of a browser that is away at the provider. The cookie has to be sent when the
 /// provider redirects the browser back.
 const COOKIE: &str = "taskd_sign_in";
 const COOKIE_ATTRIBUTES: &str = "HttpOnly; SameSite=Lax; Path=/api/v1/oidc";
 /// How long the browser may be away, in seconds.
-const AWAY_S: u64 = 600;
+const ATTEMPT_LIFETIME_S: u64 = 600;
 
 /// Redirects the browser to the OpenID provider.
-#[utoipa::path(get, path = "/api/v1/oidc/sign-in", tag = "session",
-    responses((status = 303, description = "To the provider; or to the page, which says what is wrong."),
+#[operation(tag = "session",
+    responses((status = 303, description = "Redirect to the provider, or to the page with a problem code."),
         (status = 404, description = "No provider is configured.")))]
-pub(in crate::http) async fn begin(State(app): State<App>) -> Result<Response, ApiError> {
-    let provider = configured(&app)?;
-    let attempt = Attempt::random();
-    Ok(match provider.address(&attempt, app.clock.now_ms()).await {
-        Ok(address) => sent_to(&address, &[kept(&app, &attempt.reveal(), AWAY_S)]),
-        Err(error) => problem(&app, failed(&error)),
+pub(in crate::http) async fn begin(State(page): State<PageSignIn>) -> Result<Response, ApiError> {
+    let (provider, cookies) = (configured_provider(&page)?, page.cookies);
+    let attempt = SignInAttempt::random();
+    Ok(match provider.authorization_url(&attempt, page.clock.now_ms()).await {
+        Ok(address) => {
+            redirect(&address, &[sign_in_cookie(cookies, &attempt.reveal(), ATTEMPT_LIFETIME_S)])
+        }
+        Err(error) => redirect_with_problem(cookies, provider_failure(&error)),
     })
 }
 
 /// The provider's authorization response, delivered by the browser. Other parameters are allowed.
 #[derive(Deserialize, IntoParams)]
-pub(in crate::http) struct Answered {
+pub(in crate::http) struct AuthorizationResponse {
     /// The state sent with the authorization request.
     state: Option<String>,
     /// Authorization code, exchanged for the user's identity.
@@ -54,107 +57,112 @@ pub(in crate::http) struct Answered {
 }
 
 /// Completes the sign-in when the provider redirects the browser back.
-#[utoipa::path(get, path = "/api/v1/oidc/callback", tag = "session",
-    responses((status = 303, description = "To the page, signed in or told why not."),
+#[operation(tag = "session",
+    responses((status = 303, description = "Redirect to the page, with a session or a problem code."),
         (status = 404, description = "No provider is configured.")))]
 pub(in crate::http) async fn finish(
-    State(app): State<App>,
+    State(page): State<PageSignIn>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     headers: HeaderMap,
-    QueryParams(answered): QueryParams<Answered>,
+    QueryParams(answer): QueryParams<AuthorizationResponse>,
 ) -> Result<Response, ApiError> {
-    let provider = configured(&app)?;
+    let (provider, cookies) = (configured_provider(&page)?, page.cookies);
     let address = peer.ip().to_canonical();
-    Ok(match sign_in(&app, provider, &headers, answered, address).await {
-        Ok(session) => sent_to("/", &[kept(&app, "", 0), session]),
-        Err(code) => problem(&app, code),
+    let signed_in = sign_in(&page, &people, &broker, provider, &headers, answer, address).await;
+    Ok(match signed_in {
+        Ok(session) => redirect("/", &[sign_in_cookie(cookies, "", 0), session]),
+        Err(code) => redirect_with_problem(cookies, code),
     })
 }
 
-fn configured(app: &App) -> Result<&Provider, ApiError> {
-    app.provider
-        .as_deref()
-        .ok_or_else(|| ApiError::not_found("no provider is configured to sign in by"))
+fn configured_provider(page: &PageSignIn) -> Result<&Provider, ApiError> {
+    page.provider.as_deref().ok_or_else(|| ApiError::not_found("no OpenID provider is configured"))
 }
 
 /// The session's cookie, or the error code for the page to explain.
 async fn sign_in(
-    app: &App,
+    page: &PageSignIn,
+    people: &PersonActions,
+    broker: &Broker,
     provider: &Provider,
     headers: &HeaderMap,
-    answered: Answered,
+    answer: AuthorizationResponse,
     address: IpAddr,
 ) -> Result<String, &'static str> {
     // An answer is valid only once and only in the browser that began the sign-in: no user can sign
     // another person in.
-    let attempt = cookie(headers, COOKIE).and_then(Attempt::kept);
-    let is_own =
-        |attempt: &Attempt| answered.state.as_deref().is_some_and(|state| attempt.has_state(state));
+    let attempt = cookie(headers, COOKIE).and_then(SignInAttempt::from_cookie);
+    let is_own = |attempt: &SignInAttempt| {
+        answer.state.as_deref().is_some_and(|state| attempt.has_state(state))
+    };
     let attempt = attempt.filter(is_own).ok_or("expired")?;
     // Counted only after this check: otherwise a foreign page could get its visitors' address
     // blocked.
-    app.actions.begin_provider_sign_in(address).await.map_err(|error| refused(app, error))?;
-    if answered.iss.is_some_and(|issuer| issuer != provider.settings().issuer) {
-        return Err(failed(&OidcError::Unusable {
-            what: "answer",
-            reason: "it is another issuer's".to_owned(),
+    people.begin_provider_sign_in(address).await.map_err(|error| refusal_code(broker, error))?;
+    if answer.iss.is_some_and(|issuer| issuer != provider.settings().issuer) {
+        return Err(provider_failure(&OidcError::Unusable {
+            resource: "answer",
+            reason: "unexpected issuer".to_owned(),
         }));
     }
-    let code = match (answered.code, answered.error) {
+    let code = match (answer.code, answer.error) {
         (Some(code), None) => code,
         _ => return Err("refused"),
     };
-    let now_ms = app.clock.now_ms();
-    let claims = provider.who(&attempt, &code, now_ms).await.map_err(|error| failed(&error))?;
+    let now_ms = page.clock.now_ms();
+    let claims = provider
+        .authenticate(&attempt, &code, now_ms)
+        .await
+        .map_err(|error| provider_failure(&error))?;
     let name = claims.get(&provider.settings().name_claim).and_then(|name| name.as_str());
     let name: Option<UserName> = name.and_then(|name| name.to_lowercase().parse().ok());
-    let who = ProviderUser {
+    let user = ProviderUser {
         subject: format!("{} {}", provider.settings().issuer, claims.subject()),
         name,
     };
     let signed_in =
-        app.actions.sign_in_by_provider(&who, provider.rule_for(&claims), address).await;
-    let signed_in = signed_in.map_err(|error| refused(app, error))?;
-    if signed_in.has_other_rights {
-        app.broker.disconnect_person(&signed_in.user);
+        people.sign_in_through_provider(&user, provider.rule_for(&claims), address).await;
+    let signed_in = signed_in.map_err(|error| refusal_code(broker, error))?;
+    if signed_in.rights_changed {
+        broker.disconnect_person(&signed_in.user);
     }
-    app.actions.provider_sign_in_succeeded(address);
-    Ok(begin_session(app, headers, signed_in.token, signed_in.user, now_ms))
+    people.provider_sign_in_succeeded(address);
+    let cookie = page.begin_session(headers, &signed_in.token, &signed_in.user, now_ms).await;
+    cookie.map_err(|error| refusal_code(broker, error.into()))
 }
 
-fn failed(error: &OidcError) -> &'static str {
-    tracing::warn!(error = error as &dyn Error, "somebody could not be signed in by the provider");
+fn provider_failure(error: &OidcError) -> &'static str {
+    tracing::warn!(error = error as &dyn Error, "sign-in by the OpenID provider failed");
     "failed"
 }
 
-fn refused(app: &App, error: ActionError) -> &'static str {
-    if let ActionError::NoRole { removed: Some(user) } = &error {
-        app.broker.disconnect_person(user);
+fn refusal_code(broker: &Broker, error: PersonError) -> &'static str {
+    if let PersonError::NoRole { removed: Some(user) } = &error {
+        broker.disconnect_person(user);
     }
     match error {
-        ActionError::SignInBlocked { .. } => "blocked",
-        ActionError::NoRole { .. } => "no_role",
-        ActionError::NoName => "no_name",
-        ActionError::UserExists(_) => "name_taken",
+        PersonError::SignInBlocked { .. } => "blocked",
+        PersonError::NoRole { .. } => "no_role",
+        PersonError::NoName => "no_name",
+        PersonError::UserExists(_) => "name_taken",
         error => {
-            tracing::error!(
-                error = &error as &dyn Error,
-                "somebody could not be signed in by the provider"
-            );
+            tracing::error!(error = &error as &dyn Error, "sign-in by the OpenID provider failed");
             "failed"
         }
     }
 }
 
-fn problem(app: &App, code: &str) -> Response {
-    sent_to(&format!("/#problem={code}"), &[kept(app, "", 0)])
+fn redirect_with_problem(cookies: PageCookies, code: &str) -> Response {
+    redirect(&format!("/#problem={code}"), &[sign_in_cookie(cookies, "", 0)])
 }
 
-fn kept(app: &App, value: &str, max_age_s: u64) -> String {
-    set_cookie(app, COOKIE, value, COOKIE_ATTRIBUTES, max_age_s)
+fn sign_in_cookie(cookies: PageCookies, value: &str, max_age_s: u64) -> String {
+    cookies.set(COOKIE, value, COOKIE_ATTRIBUTES, max_age_s)
 }
 
-fn sent_to(address: &str, cookies: &[String]) -> Response {
+fn redirect(address: &str, cookies: &[String]) -> Response {
     let cookies = cookies.iter().map(|cookie| (header::SET_COOKIE, cookie.clone()));
     let headers: Vec<_> =
         [(header::LOCATION, address.to_owned())].into_iter().chain(cookies).collect();

@@ -7,23 +7,26 @@ use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::NoContent;
 use serde::Deserialize;
+use task_macros::operation;
 use task_proto::api::{
     AccessToken, AddUser, AuditPage, AuditQuery, ChangePassword, CreateToken, EditUser, LogIn, Me,
     SetPassword, TokenList, TokenOrigin, UserList, UserView,
 };
-use task_proto::person::Permission;
+use task_proto::people::roles::Permission;
 use task_proto::{TokenId, UserName};
 use utoipa::IntoParams;
 
+use crate::broker::Broker;
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::auth::not_permitted;
 use crate::http::error::ApiError;
 use crate::http::extract::{JsonBody, PathParam, QueryParams};
 use crate::http::openapi::Created;
+use crate::orders::actions::PersonActions;
+use crate::store::Store;
 
 /// Shows the caller's identity and permissions.
-#[utoipa::path(get, path = "/api/v1/me", tag = "people")]
+#[operation(tag = "people")]
 pub(in crate::http) async fn me(by: Person) -> Json<Me> {
     let permissions =
         Permission::ALL.into_iter().filter(|&permission| by.may(permission)).collect();
@@ -32,89 +35,92 @@ pub(in crate::http) async fn me(by: Person) -> Json<Me> {
 }
 
 /// Lists the users.
-#[utoipa::path(get, path = "/api/v1/users", tag = "people")]
-pub(in crate::http) async fn users(State(app): State<App>) -> Result<Json<UserList>, ApiError> {
-    let users = app.store.users().await?;
+#[operation(tag = "people")]
+pub(in crate::http) async fn users(State(store): State<Store>) -> Result<Json<UserList>, ApiError> {
+    let users = store.users().list().await?;
     Ok(Json(UserList { users: users.into_iter().map(crate::store::User::view).collect() }))
 }
 
 /// Adds a user.
-#[utoipa::path(post, path = "/api/v1/users", tag = "people",
+#[operation(tag = "people",
     responses((status = 409, description = "`user_exists`: the name is taken.")))]
 pub(in crate::http) async fn add_user(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
     by: Person,
     JsonBody(order): JsonBody<AddUser>,
 ) -> Result<Created<UserView>, ApiError> {
-    Ok(Created(app.actions.add_user(&by, &order).await?))
+    Ok(Created(people.add_user(&by, &order).await?))
 }
 
 /// Changes a user's permissions.
-#[utoipa::path(patch, path = "/api/v1/users/{user}", tag = "people",
-    responses((status = 409, description = "`last_administrator`, or `of_provider`: the provider says what they may.")))]
+#[operation(tag = "people",
+    responses((status = 409, description = "`last_administrator`, or `of_provider`: the OpenID provider determines the user's permissions.")))]
 pub(in crate::http) async fn edit_user(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     by: Person,
     PathParam(user): PathParam<UserName>,
     JsonBody(edit): JsonBody<EditUser>,
 ) -> Result<Json<UserView>, ApiError> {
-    let view = app.actions.edit_user(&by, &user, &edit).await?;
-    app.broker.disconnect_person(&user);
+    let view = people.edit_user(&by, &user, &edit).await?;
+    broker.disconnect_person(&user);
     Ok(Json(view))
 }
 
 /// Removes a user and ends their tokens and sessions.
-#[utoipa::path(delete, path = "/api/v1/users/{user}", tag = "people",
-    responses((status = 409, description = "`last_administrator`: somebody has to be able to administer.")))]
+#[operation(tag = "people",
+    responses((status = 409, description = "`last_administrator`: one administrator must remain.")))]
 pub(in crate::http) async fn remove_user(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     by: Person,
     PathParam(user): PathParam<UserName>,
 ) -> Result<NoContent, ApiError> {
-    app.actions.remove_user(&by, &user).await?;
-    app.broker.disconnect_person(&user);
+    people.remove_user(&by, &user).await?;
+    broker.disconnect_person(&user);
     Ok(NoContent)
 }
 
 /// Sets any user's password and ends the sign-ins made with the old one.
-#[utoipa::path(put, path = "/api/v1/users/{user}/password", tag = "people",
-    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here.")))]
+#[operation(tag = "people",
+    responses((status = 409, description = "`of_provider`: users who sign in by the OpenID provider have no password here.")))]
 pub(in crate::http) async fn set_password(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     by: Person,
     PathParam(user): PathParam<UserName>,
     JsonBody(order): JsonBody<SetPassword>,
 ) -> Result<NoContent, ApiError> {
-    app.actions.set_password(&by, &user, &order.password).await?;
-    app.broker.disconnect_person(&user);
+    people.set_password(&by, &user, &order.password).await?;
+    broker.disconnect_person(&user);
     Ok(NoContent)
 }
 
 /// Sets the caller's own password and ends the sign-ins made with the old one.
-#[utoipa::path(put, path = "/api/v1/password", tag = "people",
-    responses((status = 409, description = "`of_provider`: who signs in by the provider has no password here."),
+#[operation(tag = "people",
+    responses((status = 409, description = "`of_provider`: users who sign in by the OpenID provider have no password here."),
         (status = 429, description = "The old password was wrong too often.")))]
 pub(in crate::http) async fn change_password(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     by: Person,
     JsonBody(order): JsonBody<ChangePassword>,
 ) -> Result<NoContent, ApiError> {
-    app.actions.change_password(&by, &order).await?;
-    app.broker.disconnect_person(&by.name);
+    people.change_password(&by, &order).await?;
+    broker.disconnect_person(&by.name);
     Ok(NoContent)
 }
 
 /// Exchanges a name and a password for a token.
-#[utoipa::path(post, path = "/api/v1/login", tag = "session",
-    responses((status = 401, description = "Name or password is not right."),
-        (status = 429, description = "Too many attempts failed, of this user or from this address.")))]
+#[operation(tag = "session",
+    responses((status = 401, description = "The name or the password is wrong."),
+        (status = 429, description = "Too many failed attempts of this user or from this address.")))]
 pub(in crate::http) async fn log_in(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     JsonBody(order): JsonBody<LogIn>,
 ) -> Result<Created<AccessToken>, ApiError> {
-    let signed_in =
-        app.actions.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
+    let signed_in = people.sign_in(&order, TokenOrigin::Login, peer.ip().to_canonical()).await?;
     let id = signed_in.token.id().parse().map_err(|error| ApiError::internal(&error))?;
     let (token, expires_at_ms) = (signed_in.token.reveal(), signed_in.expires_at_ms);
     Ok(Created(AccessToken { id, token, user: signed_in.user, expires_at_ms }))
@@ -130,52 +136,53 @@ pub(in crate::http) struct TokensQuery {
 }
 
 /// Lists the caller's own tokens, or those of all users.
-#[utoipa::path(get, path = "/api/v1/tokens", tag = "people")]
+#[operation(tag = "people")]
 pub(in crate::http) async fn tokens(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
     by: Person,
     QueryParams(query): QueryParams<TokensQuery>,
 ) -> Result<Json<TokenList>, ApiError> {
     if query.all && !by.may(Permission::Administer) {
         return Err(not_permitted(&by, Permission::Administer));
     }
-    Ok(Json(app.actions.tokens(&by, query.all).await?))
+    Ok(Json(people.tokens(&by, query.all).await?))
 }
 
 /// Creates a token with the caller's permissions or fewer.
-#[utoipa::path(post, path = "/api/v1/tokens", tag = "people",
+#[operation(tag = "people",
     responses((status = 404, description = "There is no such user.")))]
 pub(in crate::http) async fn create_token(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
     by: Person,
     JsonBody(order): JsonBody<CreateToken>,
 ) -> Result<Created<AccessToken>, ApiError> {
-    Ok(Created(app.actions.create_token(&by, &order).await?))
+    Ok(Created(people.create_token(&by, &order).await?))
 }
 
 /// Revokes a token.
-#[utoipa::path(delete, path = "/api/v1/tokens/{token}", tag = "people")]
+#[operation(tag = "people")]
 pub(in crate::http) async fn revoke_token(
-    State(app): State<App>,
+    State(people): State<PersonActions>,
+    State(broker): State<Broker>,
     by: Person,
     PathParam(token): PathParam<TokenId>,
 ) -> Result<NoContent, ApiError> {
-    let user = app.actions.revoke_token(&by, &token).await?;
-    app.broker.disconnect_person(&user);
+    let user = people.revoke_token(&by, &token).await?;
+    broker.disconnect_person(&user);
     Ok(NoContent)
 }
 
 /// Lists the audit log: actions with their user and source.
-#[utoipa::path(get, path = "/api/v1/audit", tag = "people")]
+#[operation(tag = "people")]
 pub(in crate::http) async fn audit(
-    State(app): State<App>,
+    State(store): State<Store>,
     QueryParams(query): QueryParams<AuditQuery>,
 ) -> Result<Json<AuditPage>, ApiError> {
     let texts = [("who", &query.who), ("target", &query.target), ("act", &query.act)];
     if let Some((key, _)) =
         texts.iter().find(|(_, text)| text.as_ref().is_some_and(|text| text.contains('\0')))
     {
-        return Err(ApiError::invalid(format!("{key}: it has a control character")));
+        return Err(ApiError::invalid(format!("{key}: contains a control character")));
     }
-    Ok(Json(app.store.audit(&query).await?))
+    Ok(Json(store.audit().page(&query).await?))
 }

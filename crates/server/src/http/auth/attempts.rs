@@ -9,10 +9,10 @@ use std::sync::{Mutex, PoisonError};
 const WINDOW_MS: u64 = 60_000;
 /// Failures per address and window that are answered in the ordinary way. The number is high
 /// because a NAT may hide a fleet.
-const MOST_FAILURES: u32 = 1_000;
-const MOST_ADDRESSES: usize = 4_096;
+const MAX_FAILURES: u32 = 1_000;
+const MAX_ADDRESSES: usize = 4_096;
 /// The shared count of addresses beyond the limit.
-const EVERYBODY_ELSE: IpAddr = IpAddr::V4(std::net::Ipv4Addr::UNSPECIFIED);
+const OTHER_ADDRESSES: IpAddr = IpAddr::V4(std::net::Ipv4Addr::UNSPECIFIED);
 
 /// The counts of the current window.
 #[derive(Debug, Default)]
@@ -32,11 +32,11 @@ impl FailedAttempts {
             *window = Window { began_ms: now_ms, failures: HashMap::new() };
         }
         let is_full =
-            window.failures.len() >= MOST_ADDRESSES && !window.failures.contains_key(&address);
+            window.failures.len() >= MAX_ADDRESSES && !window.failures.contains_key(&address);
         let count =
-            window.failures.entry(if is_full { EVERYBODY_ELSE } else { address }).or_default();
+            window.failures.entry(if is_full { OTHER_ADDRESSES } else { address }).or_default();
         *count = count.saturating_add(1);
-        *count > MOST_FAILURES
+        *count > MAX_FAILURES
     }
 }
 
@@ -45,10 +45,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn too_many_failures_are_over_after_a_minute_and_concern_one_address() {
+    fn failure_limit_is_per_address_and_ends_after_a_minute() {
         let attempts = FailedAttempts::default();
         let (one, other) = (IpAddr::from([10, 0, 0, 1]), IpAddr::from([10, 0, 0, 2]));
-        for _ in 0..MOST_FAILURES {
+        for _ in 0..MAX_FAILURES {
             assert!(!attempts.record(one, 1_000_000));
         }
         assert!(attempts.record(one, 1_000_001));
@@ -59,9 +59,9 @@ mod tests {
     #[test]
     fn many_addresses_take_no_more_memory() {
         let attempts = FailedAttempts::default();
-        for n in 0..2 * MOST_ADDRESSES as u32 {
+        for n in 0..2 * MAX_ADDRESSES as u32 {
             attempts.record(IpAddr::from(n.to_be_bytes()), 1_000_000);
         }
-        assert!(attempts.0.lock().expect("whole").failures.len() <= MOST_ADDRESSES + 1);
+        assert!(attempts.0.lock().expect("whole").failures.len() <= MAX_ADDRESSES + 1);
     }
 }

@@ -4,8 +4,8 @@
 //! Every route names its [`Access`]; the guard finds the [`Caller`] and refuses all others.
 
 pub mod attempts;
-pub(super) mod conduct;
 pub mod person_limits;
+pub(super) mod robot_limits;
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -21,18 +21,18 @@ use futures_util::{StreamExt as _, stream};
 use http::request::Parts;
 use http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode, header};
 use http_body::Body as _;
-use task_proto::person::Permission;
-use task_proto::token::Token;
-use task_proto::{RobotId, UserName};
+use task_proto::people::roles::Permission;
+use task_proto::trust::token::Token;
+use task_proto::{Digest, RobotId, UserName};
 use tokio::time::{Instant, timeout_at};
 
-use self::conduct::hold_up;
-use self::person_limits::{RequestKind, UnderWay};
+use self::person_limits::{RequestKind, RequestPermit};
+use self::robot_limits::throttle;
 use super::App;
 use super::error::{ApiError, ROBOT_REVOKED};
+use crate::domain::limits::robot_limiter::Channel;
 use crate::domain::person::Person;
-use crate::limits::conduct::Way;
-use crate::link::gatekeeper::ended_others;
+use crate::link::gatekeeper::announce_new_token;
 use crate::net::http_connections::{Connection, Holder};
 use crate::net::tls::ClientProof;
 use crate::store::{Admitted, Fault, StoreError, TokenHolder, with_shared_reads};
@@ -51,7 +51,7 @@ pub enum Access {
     /// Only the robot that the path's `{robot}` names.
     OwnRobot,
     /// A machine with a valid enrollment token.
-    Enrolment,
+    Enrollment,
     /// A person or any robot; the handler narrows the access of each.
     PersonOrRobot,
 }
@@ -69,7 +69,7 @@ pub enum Caller {
     Person(Person),
     Robot(RobotId),
     /// The holder of an enrollment token.
-    Enrolment(Box<Token>),
+    Enrollment(Box<Token>),
 }
 
 impl Caller {
@@ -96,7 +96,7 @@ impl Caller {
             Self::Anyone => None,
             Self::Person(person) => Some(Holder::Person(person.name.clone())),
             Self::Robot(robot) => Some(Holder::Robot(robot.clone())),
-            Self::Enrolment(token) => Some(Holder::Enrolment(token.id())),
+            Self::Enrollment(token) => Some(Holder::Enrolment(token.id())),
         }
     }
 
@@ -107,7 +107,7 @@ impl Caller {
                 matches!(self, Self::Person(person) if person.may(permission))
             }
             Access::OwnRobot => self.robot().is_some_and(|robot| own == Some(robot.as_str())),
-            Access::Enrolment => matches!(self, Self::Enrolment(_)),
+            Access::Enrollment => matches!(self, Self::Enrollment(_)),
             Access::PersonOrRobot => matches!(self, Self::Person(_) | Self::Robot(_)),
         }
     }
@@ -132,14 +132,14 @@ impl<S: Sync> FromRequestParts<S> for Person {
     async fn from_request_parts(parts: &mut Parts, state: &S) -> Result<Self, ApiError> {
         match Caller::from_request_parts(parts, state).await? {
             Caller::Person(person) => Ok(person),
-            _ => Err(ApiError::forbidden("only people may do that")),
+            _ => Err(ApiError::forbidden("this route is for people")),
         }
     }
 }
 
 /// State of one route's guard.
 #[derive(Clone)]
-pub(super) struct Gate {
+pub(super) struct GuardState {
     pub(super) app: App,
     pub(super) access: Access,
     pub(super) deadline: Option<Duration>,
@@ -149,7 +149,7 @@ pub(super) struct Gate {
 /// Runs before every handler: authenticates the caller, refuses callers without access, and
 /// enforces the route's deadline.
 pub(super) async fn guard(
-    State(gate): State<Gate>,
+    State(guard_state): State<GuardState>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     params: Result<RawPathParams, RawPathParamsRejection>,
     mut request: Request,
@@ -159,14 +159,15 @@ pub(super) async fn guard(
     // A path that is not text names no robot; the handler answers with "not found".
     let own = params.iter().flatten().find(|(name, _)| *name == "robot").map(|(_, value)| value);
     let proof = request.extensions().get::<ClientProof>().cloned().unwrap_or_default();
-    let begun = match admit(&gate, peer, own, Showing::of(&request, &proof)).await {
-        Ok((caller, token_number)) => {
-            begin(&gate, caller, request.method()).await.map(|begun| (begun, token_number))
-        }
-        Err(error) => Err(error),
-    };
-    let (Begun { mut caller, counted }, token_number) = match begun {
-        Ok(begun) => begun,
+    let admitted_request =
+        match admit(&guard_state, peer, own, Credentials::of(&request, &proof)).await {
+            Ok((caller, token_number)) => check_limits(&guard_state, caller, request.method())
+                .await
+                .map(|admitted_request| (admitted_request, token_number)),
+            Err(error) => Err(error),
+        };
+    let (AdmittedRequest { mut caller, counted_request }, token_number) = match admitted_request {
+        Ok(admitted_request) => admitted_request,
         Err(error) if is_oci => return error.into_oci_response(),
         Err(error) => return error.into_response(),
     };
@@ -175,59 +176,69 @@ pub(super) async fn guard(
     }
     request.extensions_mut().insert(caller);
     request.extensions_mut().insert(token_number);
-    let answer =
-        answered(request, next, gate.deadline, counted.map(|counted| (gate.app.clone(), counted)));
-    let Some(deadline) = gate.deadline else { return answer.await };
+    let answer = run_with_deadline(
+        request,
+        next,
+        guard_state.deadline,
+        counted_request.map(|counted_request| (guard_state.app.clone(), counted_request)),
+    );
+    let Some(deadline) = guard_state.deadline else { return answer.await };
     tokio::time::timeout(deadline, answer).await.unwrap_or_else(|_| {
-        if !gate.app.store.state().is_there() {
-            return ApiError::from(Fault::Away).into_response();
+        if !guard_state.app.store.state().is_available() {
+            return ApiError::from(Fault::Unreachable).into_response();
         }
-        let message = "the request took too long to arrive or to be answered";
+        let message = "the request took too long";
         ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message).into_response()
     })
 }
 
 /// A request that passed the rate limits.
-struct Begun {
+struct AdmittedRequest {
     caller: Caller,
-    counted: Option<Counted>,
+    counted_request: Option<CountedRequest>,
 }
 
 /// A person's request, counted while under way.
-struct Counted {
+struct CountedRequest {
     person: UserName,
     kind: RequestKind,
-    under_way: UnderWay,
+    permit: RequestPermit,
 }
 
 /// Delays or refuses a caller that exceeds a rate limit.
-async fn begin(gate: &Gate, caller: Caller, method: &Method) -> Result<Begun, ApiError> {
-    let counted = match &caller {
+async fn check_limits(
+    guard_state: &GuardState,
+    caller: Caller,
+    method: &Method,
+) -> Result<AdmittedRequest, ApiError> {
+    let counted_request = match &caller {
         Caller::Person(person) => {
-            let kind = match gate.waits_for_robot {
+            let kind = match guard_state.waits_for_robot {
                 true => RequestKind::Question,
-                false => RequestKind::of(gate.access, method, gate.deadline.is_none()),
+                false => {
+                    RequestKind::of(guard_state.access, method, guard_state.deadline.is_none())
+                }
             };
-            let under_way = gate.app.people.begin(&person.name, kind).await?;
-            Some(Counted { person: person.name.clone(), kind, under_way })
+            let permit = guard_state.app.people.begin(&person.name, kind).await?;
+            Some(CountedRequest { person: person.name.clone(), kind, permit })
         }
         Caller::Robot(robot) => {
-            if let Some(way) = way_of(gate.access, method) {
-                hold_up(&gate.app, robot, way, method).await?;
+            if let Some(channel) = rate_limited_as(guard_state.access, method) {
+                throttle(&guard_state.app, robot, channel, method).await?;
             }
             None
         }
-        Caller::Anyone | Caller::Enrolment(_) => None,
+        Caller::Anyone | Caller::Enrollment(_) => None,
     };
-    Ok(Begun { caller, counted })
+    Ok(AdmittedRequest { caller, counted_request })
 }
 
-/// The way under which a robot's request is rate-limited. `None` for pulls of package bytes, which
+/// The channel under which a robot's request is rate-limited. `None` for pulls of package bytes, which
 /// have limits of their own.
-fn way_of(access: Access, method: &Method) -> Option<Way> {
+fn rate_limited_as(access: Access, method: &Method) -> Option<Channel> {
     match access {
-        Access::OwnRobot => Some(Way::Http),
-        Access::PersonOrRobot if *method != Method::GET => Some(Way::Outputs),
+        Access::OwnRobot => Some(Channel::Http),
+        Access::PersonOrRobot if *method != Method::GET => Some(Channel::Outputs),
         _ => None,
     }
 }
@@ -235,20 +246,20 @@ fn way_of(access: Access, method: &Method) -> Option<Way> {
 /// Runs the handler. A request that changes state runs to its end even if the client disconnects,
 /// because steps after the commit, such as cutting off callers without rights, belong to the
 /// request. Only its body has to arrive within the deadline.
-async fn answered(
+async fn run_with_deadline(
     request: Request,
     next: Next,
     deadline: Option<Duration>,
-    counted: Option<(App, Counted)>,
+    counted_request: Option<(App, CountedRequest)>,
 ) -> Response {
     if request.method().is_safe() {
-        return run(request, next, counted).await;
+        return run(request, next, counted_request).await;
     }
     let request = match deadline {
-        Some(deadline) => request.map(|body| arriving_within(deadline, body)),
+        Some(deadline) => request.map(|body| with_body_deadline(deadline, body)),
         None => request,
     };
-    match tokio::spawn(run(request, next, counted)).await {
+    match tokio::spawn(run(request, next, counted_request)).await {
         Ok(response) => response,
         Err(panic) => std::panic::resume_unwind(panic.into_panic()),
     }
@@ -256,8 +267,12 @@ async fn answered(
 
 /// Runs the handler. People's requests other than orders leave some of the database connections to
 /// robots and orders.
-async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> Response {
-    let Some((app, Counted { person, kind, under_way })) = counted else {
+async fn run(
+    request: Request,
+    next: Next,
+    counted_request: Option<(App, CountedRequest)>,
+) -> Response {
+    let Some((app, CountedRequest { person, kind, permit })) = counted_request else {
         return next.run(request).await;
     };
     let response = match kind {
@@ -265,14 +280,14 @@ async fn run(request: Request, next: Next, counted: Option<(App, Counted)>) -> R
         _ => with_shared_reads(next.run(request)).await,
     };
     if kind != RequestKind::Stream {
-        app.people.answered(&person, kind, response.body().size_hint().lower());
+        app.people.charge_answer(&person, kind, response.body().size_hint().lower());
     }
-    drop(under_way);
+    drop(permit);
     response
 }
 
 /// A body that fails when its end has not arrived by the deadline.
-fn arriving_within(deadline: Duration, body: Body) -> Body {
+fn with_body_deadline(deadline: Duration, body: Body) -> Body {
     let end = Instant::now() + deadline;
     Body::from_stream(stream::unfold(body.into_data_stream(), move |mut chunks| async move {
         match timeout_at(end, chunks.next()).await {
@@ -283,14 +298,14 @@ fn arriving_within(deadline: Duration, body: Body) -> Body {
 }
 
 /// The parts of a request that identify its sender.
-struct Showing<'a> {
+struct Credentials<'a> {
     method: &'a Method,
     headers: &'a HeaderMap,
     proof: &'a ClientProof,
     connection: Option<&'a Connection>,
 }
 
-impl<'a> Showing<'a> {
+impl<'a> Credentials<'a> {
     fn of(request: &'a Request, proof: &'a ClientProof) -> Self {
         Self {
             method: request.method(),
@@ -302,29 +317,32 @@ impl<'a> Showing<'a> {
 }
 
 async fn admit(
-    gate: &Gate,
+    guard_state: &GuardState,
     peer: SocketAddr,
     own: Option<&str>,
-    showing: Showing<'_>,
+    credentials: Credentials<'_>,
 ) -> Result<(Caller, TokenNumber), ApiError> {
-    if gate.access == Access::Anyone {
+    if guard_state.access == Access::Anyone {
         return Ok((Caller::Anyone, TokenNumber(0)));
     }
-    match identify_on_connection(&gate.app, &showing).await {
-        Ok((caller, token_number)) if caller.may(gate.access, own) => Ok((caller, token_number)),
-        Ok((Caller::Anyone, _)) => {
-            Err(ApiError::unauthorized("a token is needed: Authorization: Bearer …"))
+    match identify_on_connection(&guard_state.app, &credentials).await {
+        Ok((caller, token_number)) if caller.may(guard_state.access, own) => {
+            Ok((caller, token_number))
         }
-        Ok((Caller::Person(person), _)) if let Access::Person(permission) = gate.access => {
+        Ok((Caller::Anyone, _)) => {
+            Err(ApiError::unauthorized("a token is required: Authorization: Bearer …"))
+        }
+        Ok((Caller::Person(person), _)) if let Access::Person(permission) = guard_state.access => {
             Err(not_permitted(&person, permission))
         }
-        Ok(_) => Err(ApiError::forbidden("this token may not do that")),
+        Ok(_) => Err(ApiError::forbidden("this token does not permit the request")),
         // The robot's token was known, so this is no guessing attempt.
         Err(error) if error.code == ROBOT_REVOKED => Err(error),
         Err(error) if error.status == StatusCode::UNAUTHORIZED => {
-            let is_too_many = gate.app.attempts.record(peer.ip(), gate.app.clock.now_ms());
+            let is_too_many =
+                guard_state.app.attempts.record(peer.ip(), guard_state.app.clock.now_ms());
             Err(if is_too_many {
-                ApiError::too_many("too many wrong tokens from this address")
+                ApiError::too_many("too many invalid tokens from this address")
             } else {
                 error
             })
@@ -338,7 +356,7 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
     let (name, roles) = (&person.name, &person.roles);
     ApiError::forbidden(if person.roles.allow(permission) {
         format!(
-            "{name} is limited to the robots {:?}, and this concerns all of them",
+            "{name} is limited to the robots {:?}, and this request concerns all robots",
             person.scope.to_string()
         )
     } else {
@@ -351,52 +369,54 @@ pub(super) fn not_permitted(person: &Person, permission: Permission) -> ApiError
 /// stays with the last token shown.
 async fn identify_on_connection(
     app: &App,
-    showing: &Showing<'_>,
+    credentials: &Credentials<'_>,
 ) -> Result<(Caller, TokenNumber), ApiError> {
     let arrival = app.http_connections.arrival();
-    let identified = identify(app, showing).await?;
-    let (Some(connection), Some(holder)) = (showing.connection, identified.0.holder()) else {
+    let identified = identify(app, credentials).await?;
+    let (Some(connection), Some(holder)) = (credentials.connection, identified.0.holder()) else {
         return Ok(identified);
     };
     let is_still_good = arrival.identified(&holder, connection);
     if is_still_good || !matches!(holder, Holder::Robot(_)) {
         Ok(identified)
     } else {
-        identify(app, showing).await
+        identify(app, credentials).await
     }
 }
 
 /// Identifies the sender of a request. `Anyone` without credentials; an error for invalid
 /// credentials.
-async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumber), ApiError> {
-    let &Showing { method, headers, .. } = showing;
+async fn identify(
+    app: &App,
+    credentials: &Credentials<'_>,
+) -> Result<(Caller, TokenNumber), ApiError> {
+    let &Credentials { method, headers, .. } = credentials;
     let now_ms = app.clock.now_ms();
     let is_read = matches!(*method, Method::GET | Method::HEAD);
     let token = if let Some(value) = headers.get(header::AUTHORIZATION) {
-        let Presented { text, is_from_browser } = presented(value)?;
+        let PresentedToken { text, is_from_browser } = parse_authorization(value)?;
         // Browsers keep a site's password and attach it to requests that another page triggers.
         // Programs send no origin.
-        if is_from_browser && !is_read && comes_from_page(headers) {
+        if is_from_browser && !is_read && is_from_browser_page(headers) {
             require_same_origin(headers)?;
         }
-        parsed(&text)?
-    } else if let Some(session) = app.sessions.find(headers, now_ms) {
-        if !is_read {
-            require_same_origin(headers)?;
-        }
-        session.token
+        parse_token(&text)?
     } else {
-        return Ok((Caller::Anyone, TokenNumber(0)));
+        let person = find_session(app, credentials, now_ms).await?;
+        if person.is_some() && !is_read {
+            require_same_origin(headers)?;
+        }
+        return Ok((person.map_or(Caller::Anyone, Caller::Person), TokenNumber(0)));
     };
-    let Some(holder) = let_in(app, &token, showing, now_ms).await? else {
-        if app.store.is_of_revoked_robot(&token).await? {
+    let Some(holder) = authenticate(app, &token, credentials, now_ms).await? else {
+        if app.store.tokens().belongs_to_revoked_robot(&token).await? {
             return Err(ApiError::robot_revoked());
         }
         return Err(ApiError::unauthorized("the token is unknown, expired or revoked"));
     };
     Ok(match holder {
         TokenHolder::Person(person) => (Caller::Person(person), TokenNumber(0)),
-        TokenHolder::Enrolment => (Caller::Enrolment(Box::new(token)), TokenNumber(0)),
+        TokenHolder::Enrollment => (Caller::Enrollment(Box::new(token)), TokenNumber(0)),
         TokenHolder::Pending { .. } => return Err(ApiError::awaits_approval()),
         TokenHolder::Robot { robot, token_number, .. } => {
             (Caller::Robot(robot), TokenNumber(token_number))
@@ -407,21 +427,21 @@ async fn identify(app: &App, showing: &Showing<'_>) -> Result<(Caller, TokenNumb
 /// The holder of this token, if valid. Runs to the end even if the client disconnects: a robot's
 /// first use of a token has then ended its other tokens, and connections made with those have to be
 /// closed.
-async fn let_in(
+async fn authenticate(
     app: &App,
     token: &Token,
-    showing: &Showing<'_>,
+    credentials: &Credentials<'_>,
     now_ms: u64,
 ) -> Result<Option<TokenHolder>, StoreError> {
-    let (app, token, proof) = (app.clone(), token.clone(), showing.proof.clone());
-    let connection = showing.connection.cloned();
+    let (app, token, proof) = (app.clone(), token.clone(), credentials.proof.clone());
+    let connection = credentials.connection.cloned();
     let _lookup = match &connection {
         Some(connection) => Some(connection.lookup().await),
         None => None,
     };
     let admitting = tokio::spawn(async move {
         let Some(Admitted { holder, is_first_use }) =
-            app.store.admit(&token, &proof, now_ms).await?
+            app.store.tokens().admit(&token, &proof, now_ms).await?
         else {
             return Ok(None);
         };
@@ -439,7 +459,7 @@ async fn let_in(
             if let Some(connection) = connection {
                 connection.release();
             }
-            ended_others(&app.presence, &app.http_connections, &app.changes, robot);
+            announce_new_token(&app.presence, &app.http_connections, &app.changes, robot);
         }
         Ok(Some(holder))
     });
@@ -449,51 +469,86 @@ async fn let_in(
     }
 }
 
-/// The token in these headers.
-pub(super) fn shown_token(headers: &HeaderMap) -> Result<Token, ApiError> {
-    let value = headers.get(header::AUTHORIZATION);
-    let value = value.ok_or_else(|| ApiError::unauthorized("Authorization: it is missing"))?;
-    parsed(&presented(value)?.text)
+/// The person of the page session whose cookie the request has, if any.
+async fn find_session(
+    app: &App,
+    credentials: &Credentials<'_>,
+    now_ms: u64,
+) -> Result<Option<Person>, StoreError> {
+    let Some(session) = session_digest(credentials.headers) else { return Ok(None) };
+    let _lookup = match credentials.connection {
+        Some(connection) => Some(connection.lookup().await),
+        None => None,
+    };
+    let person = app.store.page_sessions().admit(&session, now_ms).await?;
+    if person.is_some()
+        && let Some(connection) = credentials.connection
+    {
+        connection.authenticate();
+    }
+    Ok(person)
 }
 
-fn parsed(token: &str) -> Result<Token, ApiError> {
+/// The digest of a request's session cookie, under which the session is stored.
+pub(super) fn session_digest(headers: &HeaderMap) -> Option<Digest> {
+    let id = cookie(headers, COOKIE).filter(|id| !id.is_empty())?;
+    Some(Digest::of(id.as_bytes()))
+}
+
+/// The value of a request's cookie.
+pub(super) fn cookie<'a>(headers: &'a HeaderMap, wanted: &str) -> Option<&'a str> {
+    let lines = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
+    let mut pairs =
+        lines.flat_map(|line| line.split(';')).filter_map(|pair| pair.trim().split_once('='));
+    pairs.find(|(name, _)| *name == wanted).map(|(_, value)| value)
+}
+
+/// The token in these headers.
+pub(super) fn authorization_token(headers: &HeaderMap) -> Result<Token, ApiError> {
+    let value = headers.get(header::AUTHORIZATION);
+    let value =
+        value.ok_or_else(|| ApiError::unauthorized("Authorization: the header is missing"))?;
+    parse_token(&parse_authorization(value)?.text)
+}
+
+fn parse_token(token: &str) -> Result<Token, ApiError> {
     token.parse().map_err(|error| ApiError::unauthorized(format!("Authorization: {error}")))
 }
 
 /// The token in an `Authorization` header.
 #[derive(Debug, PartialEq, Eq)]
-struct Presented {
+struct PresentedToken {
     text: String,
     /// True for a password (`Basic`), which a browser attaches by itself once the user has entered
     /// one.
     is_from_browser: bool,
 }
 
-fn presented(value: &HeaderValue) -> Result<Presented, ApiError> {
-    let presented = value.to_str().ok().and_then(presented_token);
-    presented.ok_or_else(|| {
+fn parse_authorization(value: &HeaderValue) -> Result<PresentedToken, ApiError> {
+    let token = value.to_str().ok().and_then(parse_credentials);
+    token.ok_or_else(|| {
         ApiError::unauthorized("Authorization: expected Bearer or Basic and a token")
     })
 }
 
 /// The token of `Bearer TOKEN` or `Basic base64(anything:TOKEN)`.
-fn presented_token(value: &str) -> Option<Presented> {
+fn parse_credentials(value: &str) -> Option<PresentedToken> {
     let (scheme, rest) = value.trim().split_once(' ')?;
     if scheme.eq_ignore_ascii_case("bearer") {
-        return Some(Presented { text: rest.trim().to_owned(), is_from_browser: false });
+        return Some(PresentedToken { text: rest.trim().to_owned(), is_from_browser: false });
     }
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
     let decoded = String::from_utf8(STANDARD.decode(rest.trim()).ok()?).ok()?;
     let (_, password) = decoded.split_once(':')?;
-    Some(Presented { text: password.to_owned(), is_from_browser: true })
+    Some(PresentedToken { text: password.to_owned(), is_from_browser: true })
 }
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 
 /// True if a browser sent this request for a page.
-fn comes_from_page(headers: &HeaderMap) -> bool {
+fn is_from_browser_page(headers: &HeaderMap) -> bool {
     headers.contains_key(SEC_FETCH_SITE) || headers.contains_key(header::ORIGIN)
 }
 
@@ -519,23 +574,36 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tokens_come_as_bearer_or_as_a_password() {
+    fn token_is_read_from_bearer_and_basic() {
         let token = |text: &str, is_from_browser| {
-            Some(Presented { text: text.to_owned(), is_from_browser })
+            Some(PresentedToken { text: text.to_owned(), is_from_browser })
         };
-        assert_eq!(presented_token("Bearer abc"), token("abc", false));
-        assert_eq!(presented_token("bearer  abc "), token("abc", false));
+        assert_eq!(parse_credentials("Bearer abc"), token("abc", false));
+        assert_eq!(parse_credentials("bearer  abc "), token("abc", false));
         let basic = format!("Basic {}", STANDARD.encode("anyone:a:b"));
-        assert_eq!(presented_token(&basic), token("a:b", true));
+        assert_eq!(parse_credentials(&basic), token("a:b", true));
         for bad in
             ["", "Bearer", "Basic !", "Digest abc", &format!("Basic {}", STANDARD.encode("abc"))]
         {
-            assert_eq!(presented_token(bad), None, "{bad:?}");
+            assert_eq!(parse_credentials(bad), None, "{bad:?}");
         }
     }
 
     #[test]
-    fn only_the_page_itself_may_change_things() {
+    fn session_digest_is_of_the_cookies_value() {
+        let with = |text: &'static str| {
+            HeaderMap::from_iter([(header::COOKIE, HeaderValue::from_static(text))])
+        };
+        let digest = Some(Digest::of(b"abc"));
+        assert_eq!(session_digest(&with("theme=dark; taskd_session=abc")), digest);
+        for none in ["theme=dark", "taskd_session=", "xtaskd_session=abc"] {
+            assert_eq!(session_digest(&with(none)), None, "{none}");
+        }
+        assert_eq!(session_digest(&HeaderMap::new()), None);
+    }
+
+    #[test]
+    fn changes_require_the_same_origin() {
         let check = |pairs: &[(&'static str, &'static str)]| {
             let headers: HeaderMap = pairs
                 .iter()

@@ -9,24 +9,24 @@ use std::time::Duration;
 
 use http::Method;
 use task_proto::UserName;
-use task_proto::person::Permission;
+use task_proto::people::roles::Permission;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::{Instant, sleep_until, timeout};
 
 use super::Access;
 use crate::config::PersonRates;
+use crate::domain::limits::rate_limit::{Admission, RateLimiter};
 use crate::http::error::ApiError;
-use crate::limits::rate_limit::{RateLimiter, Turn};
 
 /// Limit on one person's requests of one kind under way. A browser sends up to six in parallel.
-const UNDER_WAY: usize = 8;
+const MAX_CONCURRENT: usize = 8;
 /// Limit on one person's questions to robots under way; each may wait for long. The server allows
 /// 1,024 in all.
-const QUESTIONS_UNDER_WAY: usize = 64;
+const MAX_CONCURRENT_QUESTIONS: usize = 64;
 /// How long a request above the limit waits for another to end.
-const PATIENCE: Duration = Duration::from_secs(15);
+const QUEUE_TIMEOUT: Duration = Duration::from_secs(15);
 /// A long answer counts as one further request for each of these bytes.
-const BYTES_A_REQUEST: u64 = 64 * 1024;
+const BYTES_PER_REQUEST: u64 = 64 * 1024;
 /// Above this number of entries, one per person and kind, we drop those without requests under way.
 const SWEEP_ABOVE: usize = 1_024;
 
@@ -63,8 +63,8 @@ impl RequestKind {
     /// The most requests of this kind that one person may have under way.
     fn limit(self) -> usize {
         match self {
-            Self::Order | Self::Change | Self::Read | Self::Upload => UNDER_WAY,
-            Self::Question => QUESTIONS_UNDER_WAY,
+            Self::Order | Self::Change | Self::Read | Self::Upload => MAX_CONCURRENT,
+            Self::Question => MAX_CONCURRENT_QUESTIONS,
             Self::Stream => Semaphore::MAX_PERMITS,
         }
     }
@@ -75,12 +75,12 @@ impl RequestKind {
 pub struct PersonLimits {
     orders: RateLimiter<UserName>,
     others: RateLimiter<UserName>,
-    under_way: Mutex<HashMap<(UserName, RequestKind), Arc<Semaphore>>>,
+    semaphores: Mutex<HashMap<(UserName, RequestKind), Arc<Semaphore>>>,
 }
 
 /// Guard of a request under way; dropping it frees the slot.
 #[derive(Debug)]
-pub(in crate::http) struct UnderWay(
+pub(in crate::http) struct RequestPermit(
     #[expect(dead_code, reason = "it is held, not read")] Option<OwnedSemaphorePermit>,
 );
 
@@ -88,7 +88,7 @@ impl PersonLimits {
     /// Limits without any counted requests.
     pub fn new(rates: PersonRates) -> Self {
         let limiter = || RateLimiter::new(rates.requests_per_s);
-        Self { orders: limiter(), others: limiter(), under_way: Mutex::default() }
+        Self { orders: limiter(), others: limiter(), semaphores: Mutex::default() }
     }
 
     /// Waits until the rate and the number of requests under way admit this request. The wait is
@@ -97,12 +97,12 @@ impl PersonLimits {
         &self,
         person: &UserName,
         kind: RequestKind,
-    ) -> Result<UnderWay, ApiError> {
+    ) -> Result<RequestPermit, ApiError> {
         let now = Instant::now();
-        match self.limiter(kind).ask(person.clone(), now) {
-            Turn::At(at) if at > now => sleep_until(at).await,
-            Turn::At(_) => {}
-            Turn::Refused(until) => {
+        match self.limiter(kind).admit(person.clone(), now) {
+            Admission::At(at) if at > now => sleep_until(at).await,
+            Admission::At(_) => {}
+            Admission::Refused(until) => {
                 let seconds = until.duration_since(now).as_secs() + 1;
                 let error = ApiError::too_many(format!(
                     "{person} sends too many requests: try again in {seconds} s"
@@ -110,10 +110,10 @@ impl PersonLimits {
                 return Err(ApiError { retry_after_s: seconds, ..error });
             }
         }
-        let ended = timeout(PATIENCE, self.under_way(person, kind).acquire_owned()).await;
-        ended.map(|permit| UnderWay(permit.ok())).map_err(|_| {
+        let ended = timeout(QUEUE_TIMEOUT, self.semaphores(person, kind).acquire_owned()).await;
+        ended.map(|permit| RequestPermit(permit.ok())).map_err(|_| {
             let message = format!(
-                "{person} has {} requests under way already: try again when one has ended",
+                "{person} already has {} requests in progress: try again when one has ended",
                 kind.limit()
             );
             ApiError { retry_after_s: 1, ..ApiError::too_many(message) }
@@ -121,8 +121,8 @@ impl PersonLimits {
     }
 
     /// Charges a long answer of this many bytes to the person's rate.
-    pub(in crate::http) fn answered(&self, person: &UserName, kind: RequestKind, bytes: u64) {
-        let more = bytes / BYTES_A_REQUEST;
+    pub(in crate::http) fn charge_answer(&self, person: &UserName, kind: RequestKind, bytes: u64) {
+        let more = bytes / BYTES_PER_REQUEST;
         if more > 0 {
             self.limiter(kind).charge(person.clone(), more, Instant::now());
         }
@@ -132,7 +132,7 @@ impl PersonLimits {
         if kind == RequestKind::Order { &self.orders } else { &self.others }
     }
 
-    fn under_way(&self, person: &UserName, kind: RequestKind) -> Arc<Semaphore> {
+    fn semaphores(&self, person: &UserName, kind: RequestKind) -> Arc<Semaphore> {
         let mut all = self.lock();
         if all.len() >= SWEEP_ABOVE {
             // Each holder of a permit and each waiter also holds the semaphore.
@@ -146,7 +146,7 @@ impl PersonLimits {
     fn lock(&self) -> MutexGuard<'_, HashMap<(UserName, RequestKind), Arc<Semaphore>>> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves no
         // inconsistent state.
-        self.under_way.lock().unwrap_or_else(PoisonError::into_inner)
+        self.semaphores.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -164,14 +164,14 @@ mod tests {
         limits: &PersonLimits,
         name: &str,
         kind: RequestKind,
-    ) -> Option<Result<UnderWay, ApiError>> {
+    ) -> Option<Result<RequestPermit, ApiError>> {
         limits.begin(&person(name), kind).now_or_never()
     }
 
     #[tokio::test]
     async fn reads_that_use_up_their_rate_leave_orders_and_others_theirs() {
         let limits = PersonLimits::new(PersonRates { requests_per_s: 1 });
-        limits.answered(&person("alice"), RequestKind::Read, 1 << 30);
+        limits.charge_answer(&person("alice"), RequestKind::Read, 1 << 30);
         let refused =
             begun(&limits, "alice", RequestKind::Change).expect("at once").expect_err("refused");
         assert_eq!(refused.status, http::StatusCode::TOO_MANY_REQUESTS);
@@ -186,7 +186,7 @@ mod tests {
         let limits = PersonLimits::new(PersonRates::default());
         let start =
             |_| begun(&limits, "alice", RequestKind::Read).expect("at once").expect("begun");
-        let mut reads: Vec<_> = (0..UNDER_WAY).map(start).collect();
+        let mut reads: Vec<_> = (0..MAX_CONCURRENT).map(start).collect();
         assert!(begun(&limits, "alice", RequestKind::Read).is_none(), "it waits");
         for (name, kind) in [
             ("alice", RequestKind::Order),
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn stop_and_cancel_are_orders_and_a_list_is_none() {
+    fn orders_changes_and_reads_are_classified() {
         let kind = |permission, method| RequestKind::of(Access::Person(permission), &method, false);
         assert_eq!(kind(Permission::Operate, Method::POST), RequestKind::Order);
         assert_eq!(kind(Permission::Maintain, Method::DELETE), RequestKind::Order);

@@ -15,17 +15,17 @@ use http::header;
 use http_body::{Frame, SizeHint};
 
 /// Time limit for the rest of the body.
-const PATIENCE: Duration = Duration::from_secs(30);
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(30);
 /// How long the sender may be silent.
-const SILENCE: Duration = Duration::from_secs(5);
+const IDLE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Time by which the refusal has gone out. A client that has announced its body would send the
 /// whole body if asked for more before the refusal.
 const HEAD_START: Duration = Duration::from_millis(100);
 
 /// Wraps the body of a request; for `axum::middleware::map_request`, outermost.
 pub async fn drain_unread(request: Request) -> Request {
-    let announced = request.headers().contains_key(header::EXPECT);
-    request.map(|body| Body::new(DrainedBody { body: Some(body), announced }))
+    let expects_continue = request.headers().contains_key(header::EXPECT);
+    request.map(|body| Body::new(DrainedBody { body: Some(body), expects_continue }))
 }
 
 struct DrainedBody {
@@ -33,7 +33,7 @@ struct DrainedBody {
     body: Option<Body>,
     /// The client sends no body before the server asks for the body, or before the client's wait
     /// for that request ends.
-    announced: bool,
+    expects_continue: bool,
 }
 
 impl http_body::Body for DrainedBody {
@@ -44,7 +44,7 @@ impl http_body::Body for DrainedBody {
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
     ) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
-        self.announced = false;
+        self.expects_continue = false;
         let Some(body) = self.body.as_mut() else { return Poll::Ready(None) };
         let frame = ready!(Pin::new(body).poll_frame(context));
         if !matches!(frame, Some(Ok(_))) {
@@ -65,9 +65,9 @@ impl http_body::Body for DrainedBody {
 impl Drop for DrainedBody {
     fn drop(&mut self) {
         let rest = self.body.take().filter(|body| !http_body::Body::is_end_stream(body));
-        let head_start = if self.announced { HEAD_START } else { Duration::ZERO };
+        let head_start = if self.expects_continue { HEAD_START } else { Duration::ZERO };
         if let (Some(rest), Ok(runtime)) = (rest, tokio::runtime::Handle::try_current()) {
-            runtime.spawn(tokio::time::timeout(PATIENCE, drain(rest, head_start)));
+            runtime.spawn(tokio::time::timeout(DRAIN_TIMEOUT, drain(rest, head_start)));
         }
     }
 }
@@ -75,5 +75,5 @@ impl Drop for DrainedBody {
 async fn drain(rest: Body, head_start: Duration) {
     tokio::time::sleep(head_start).await;
     let mut rest = rest.into_data_stream();
-    while let Ok(Some(Ok(_))) = tokio::time::timeout(SILENCE, rest.next()).await {}
+    while let Ok(Some(Ok(_))) = tokio::time::timeout(IDLE_TIMEOUT, rest.next()).await {}
 }

@@ -1,5 +1,5 @@
 //! The accept loop: limits the number of connections, bounds the time a client may take, including
-//! the TLS handshake, and closes connections. Knows no routes.
+//! a proxy's header and the TLS handshake, and closes connections. Knows no routes.
 
 use std::convert::Infallible;
 use std::io;
@@ -28,11 +28,12 @@ use tokio_util::task::TaskTracker;
 use tower::ServiceExt as _;
 
 use super::traffic::HttpTotals;
-use crate::net::anteroom::{Anteroom, Place};
 use crate::net::http_connections::{Connection, HttpConnections};
+use crate::net::proxy_protocol::ProxyProtocol;
 use crate::net::tls::{ClientProof, Tls};
+use crate::net::unauthenticated::{UnauthenticatedConnection, UnauthenticatedConnections};
 
-/// Grace period for a connection without a valid token when its place is needed: enough to sign in
+/// Grace period for a connection without a valid token when its slot is needed: enough to sign in
 /// or to load a page.
 const GRACE: Duration = Duration::from_secs(3);
 /// Time limit for a request's head, including the first one of a connection, and for an idle
@@ -41,17 +42,17 @@ const HEAD_TIMEOUT: Duration = Duration::from_secs(20);
 /// Longest pause of a client within a request body.
 const BODY_PAUSE: Duration = Duration::from_secs(30);
 /// Minimum number of body bytes per [`BODY_PAUSE`] of waiting. Even the slowest links deliver more.
-const LEAST_BODY_BYTES: usize = 16 * 1024;
+const MIN_BODY_BYTES: usize = 16 * 1024;
 /// How long a client may leave sent bytes unread.
 const WRITE_PAUSE: Duration = Duration::from_secs(60);
 /// Largest request head, in bytes.
-const MOST_HEAD_BYTES: usize = 64 * 1024;
+const MAX_HEAD_BYTES: usize = 64 * 1024;
 /// One in this many connections is reserved for holders that are within their share.
 const RESERVED_SHARE: usize = 16;
 /// Pause of the listener after it has cut one connection for another.
-const CUT_PAUSE: Duration = Duration::from_millis(1);
-/// How long the listener waits for a free place before it checks the holders again.
-const LOOK_AGAIN: Duration = Duration::from_millis(250);
+const EVICTION_PAUSE: Duration = Duration::from_millis(1);
+/// How long the listener waits for a free slot before it checks the holders again.
+const RECHECK_INTERVAL: Duration = Duration::from_millis(250);
 /// Pause after an accept that failed for a local reason, for example a lack of file descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
@@ -68,7 +69,9 @@ pub struct Limits {
     /// Addresses of reverse proxies, which carry many clients per connection. A proxy's connections
     /// count as silent until their first request, and are closed between requests only.
     pub proxies: Arc<[IpAddr]>,
-    /// Time limit for a TLS handshake.
+    /// The balancers, which begin each connection with the address of its client.
+    pub proxy_protocol: ProxyProtocol,
+    /// Time limit for a proxy's header, and for a TLS handshake.
     pub handshake_timeout: Duration,
 }
 
@@ -84,26 +87,39 @@ pub struct Service {
 }
 
 /// State shared by all connections.
-struct Site {
+struct ServerContext {
     router: Router,
     /// TLS settings; `None` serves plain HTTP.
     tls: Option<Tls>,
     handshake_timeout: Duration,
     proxies: Arc<[IpAddr]>,
+    proxy_protocol: ProxyProtocol,
+    unauthenticated: Arc<UnauthenticatedConnections>,
+    /// The tasks of all connections.
+    connections: TaskTracker,
     traffic: Arc<HttpTotals>,
     stop: CancellationToken,
     /// Aborts the connections that are still open after the patience of `stop`.
     abort: CancellationToken,
 }
 
-/// A newly accepted client.
-struct Guest {
+/// A newly accepted connection.
+struct Accepted {
+    stream: TcpStream,
     peer: SocketAddr,
-    silent: Place,
+    permit: Option<OwnedSemaphorePermit>,
+    /// True while the connection's slot is needed.
+    at_capacity: watch::Receiver<bool>,
+}
+
+/// A newly accepted client.
+struct AcceptedClient {
+    peer: SocketAddr,
+    silent: UnauthenticatedConnection,
     /// The identity that the client has proven in the TLS handshake.
     proof: ClientProof,
-    /// True while the connection's place is needed.
-    crowded: watch::Receiver<bool>,
+    /// True while the connection's slot is needed.
+    at_capacity: watch::Receiver<bool>,
     handle: Connection,
 }
 
@@ -116,47 +132,34 @@ pub async fn serve(
     patience: Duration,
 ) {
     let Service { router, tls, connections: registry, traffic } = service;
-    let places = Places::new(limits.max_connections, registry);
-    let anteroom = Anteroom::new(limits.max_silent_per_address);
+    let limit = ConnectionLimit::new(limits.max_connections, registry);
+    let unauthenticated = UnauthenticatedConnections::new(limits.max_silent_per_address);
     let connections = TaskTracker::new();
     let abort = CancellationToken::new();
-    let Limits { handshake_timeout, proxies, .. } = limits;
-    let site = Arc::new(Site {
+    let Limits { handshake_timeout, proxies, proxy_protocol, .. } = limits;
+    let context = Arc::new(ServerContext {
         router,
         tls,
         handshake_timeout,
         proxies,
+        proxy_protocol,
+        unauthenticated,
+        connections: connections.clone(),
         traffic,
         stop,
         abort: abort.clone(),
     });
     loop {
-        let (stream, peer, place) = tokio::select! {
-            () = site.stop.cancelled() => break,
-            accepted = accept(&listener, &places) => accepted,
+        let (stream, peer, permit) = tokio::select! {
+            () = context.stop.cancelled() => break,
+            accepted = accept(&listener, &limit) => accepted,
         };
-        let silent = anteroom.enter(peer.ip(), Instant::now());
-        let proof = ClientProof::NotAsked;
-        let guest = Guest {
-            peer,
-            silent,
-            proof,
-            crowded: places.crowded.subscribe(),
-            handle: Connection::default(),
-        };
-        let site = site.clone();
-        // Two kinds of task: the task of a plain connection then does not reserve the memory of an
-        // encrypted one.
-        if site.tls.is_some() {
-            connections.spawn(async move {
-                site.attend_encrypted(stream, guest).await;
-                drop(place);
-            });
+        let at_capacity = limit.at_capacity.subscribe();
+        let accepted = Accepted { stream, peer, permit, at_capacity };
+        if context.proxy_protocol.applies_to(peer.ip()) {
+            connections.spawn(context.clone().serve_proxied(accepted));
         } else {
-            connections.spawn(async move {
-                site.attend(site.patient(stream, guest.handle.clone()), guest).await;
-                drop(place);
-            });
+            context.clone().spawn_client(accepted);
         }
     }
     drop(listener);
@@ -167,45 +170,85 @@ pub async fn serve(
     abort.cancel();
 }
 
-impl Site {
-    fn patient(&self, stream: TcpStream, handle: Connection) -> PatientStream {
+impl ServerContext {
+    /// Reads the header of a proxy's connection, then serves the proxy's client.
+    async fn serve_proxied(self: Arc<Self>, mut accepted: Accepted) {
+        let Accepted { stream, peer, at_capacity, .. } = &mut accepted;
+        let silent = self.unauthenticated.add_proxied(Instant::now());
+        let client = tokio::select! {
+            client = self.proxy_protocol.client(stream, *peer, self.handshake_timeout) => client,
+            () = evicted(&silent, at_capacity.clone()) => None,
+            () = self.stop.cancelled() => None,
+        };
+        drop(silent);
+        if let Some(peer) = client {
+            self.spawn_client(Accepted { peer, ..accepted });
+        }
+    }
+
+    fn spawn_client(self: Arc<Self>, accepted: Accepted) {
+        let Accepted { stream, peer, permit, at_capacity } = accepted;
+        let client = AcceptedClient {
+            peer,
+            silent: self.unauthenticated.add(peer.ip(), Instant::now()),
+            proof: ClientProof::NotRequested,
+            at_capacity,
+            handle: Connection::default(),
+        };
+        let connections = self.connections.clone();
+        // Two kinds of task: the task of a plain connection then does not reserve the memory of an
+        // encrypted one.
+        if self.tls.is_some() {
+            connections.spawn(async move {
+                self.serve_tls_client(stream, client).await;
+                drop(permit);
+            });
+        } else {
+            connections.spawn(async move {
+                self.serve_client(self.timed_stream(stream, client.handle.clone()), client).await;
+                drop(permit);
+            });
+        }
+    }
+
+    fn timed_stream(&self, stream: TcpStream, handle: Connection) -> TimedStream {
         // Answers are small and latency-sensitive. A failure here costs only latency.
         let _ = stream.set_nodelay(true);
         self.traffic.connection();
-        PatientStream { stream, stalled: None, traffic: self.traffic.clone(), handle }
+        TimedStream { stream, stalled: None, traffic: self.traffic.clone(), handle }
     }
 
     /// Completes the TLS handshake, then serves the connection until its end.
-    async fn attend_encrypted(&self, stream: TcpStream, guest: Guest) {
+    async fn serve_tls_client(&self, stream: TcpStream, client: AcceptedClient) {
         let Some(tls) = &self.tls else { return };
-        let shaken = tokio::select! {
-            shaken = timeout(self.handshake_timeout, tls.accept(self.patient(stream, guest.handle.clone()))) => shaken,
-            () = gives_way(&guest.silent, guest.crowded.clone()) => return,
+        let handshake = tokio::select! {
+            handshake = timeout(self.handshake_timeout, tls.accept(self.timed_stream(stream, client.handle.clone()))) => handshake,
+            () = evicted(&client.silent, client.at_capacity.clone()) => return,
             () = self.stop.cancelled() => return,
         };
         // Failed handshakes are not logged.
-        if let Ok(Ok((stream, proof))) = shaken {
-            self.attend(stream, Guest { proof, ..guest }).await;
+        if let Ok(Ok((stream, proof))) = handshake {
+            self.serve_client(stream, AcceptedClient { proof, ..client }).await;
         }
     }
 
     /// Serves one connection until its end.
-    async fn attend<S>(&self, stream: S, guest: Guest)
+    async fn serve_client<S>(&self, stream: S, client: AcceptedClient)
     where
         S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
     {
-        let Guest { peer, silent, proof, crowded, handle } = guest;
-        let (spoken, is_proxy) =
+        let AcceptedClient { peer, silent, proof, at_capacity, handle } = client;
+        let (has_request, is_proxy) =
             (CancellationToken::new(), self.proxies.contains(&peer.ip().to_canonical()));
         let (router, traffic) = (self.router.clone(), self.traffic.clone());
         let origin =
-            Origin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
-        let mut connection = pin!(connection(stream, origin, spoken.clone(), router, traffic));
-        let stranger = async {
+            RequestOrigin { peer, is_encrypted: self.tls.is_some(), proof, handle: handle.clone() };
+        let mut connection = pin!(connection(stream, origin, has_request.clone(), router, traffic));
+        let evicted_if_unauthenticated = async {
             tokio::select! {
                 () = handle.authenticated() => {}
-                () = spoken.cancelled(), if is_proxy => {}
-                () = gives_way(&silent, crowded.clone()) => {
+                () = has_request.cancelled(), if is_proxy => {}
+                () = evicted(&silent, at_capacity.clone()) => {
                     // A connection is not cut while our own token lookup is under way.
                     if !handle.is_authenticated_after_lookup().await {
                         return;
@@ -218,86 +261,86 @@ impl Site {
         let ended = async {
             tokio::select! {
                 _ = connection.as_mut() => return,
-                () = asked_to_end(&self.stop, &spoken, crowded.clone()) => connection.as_mut().graceful_shutdown(),
+                () = graceful_end(&self.stop, &has_request, at_capacity.clone()) => connection.as_mut().graceful_shutdown(),
             }
             // Clients that disconnect or stall are not logged.
             let _ = connection.await;
         };
         tokio::select! {
             () = ended => {}
-            () = stranger => {}
+            () = evicted_if_unauthenticated => {}
             () = handle.cut() => {}
             () = self.abort.cancelled() => {}
         }
     }
 }
 
-/// The limited set of connection places.
-struct Places {
+/// The limited set of connection slots.
+struct ConnectionLimit {
     free: Arc<Semaphore>,
-    most: usize,
-    /// True from the moment all places are taken until more than an eighth are free.
-    crowded: watch::Sender<bool>,
-    /// The holders of the places.
+    max: usize,
+    /// True from the moment all slots are taken until more than an eighth are free.
+    at_capacity: watch::Sender<bool>,
+    /// The holders of the slots.
     registry: Arc<HttpConnections>,
 }
 
-impl Places {
-    fn new(most: usize, registry: Arc<HttpConnections>) -> Self {
+impl ConnectionLimit {
+    fn new(max: usize, registry: Arc<HttpConnections>) -> Self {
         Self {
-            free: Arc::new(Semaphore::new(most)),
-            most,
-            crowded: watch::Sender::new(false),
+            free: Arc::new(Semaphore::new(max)),
+            max,
+            at_capacity: watch::Sender::new(false),
             registry,
         }
     }
 
-    /// Takes a place. The last places are reserved for holders within their share: a holder above
+    /// Takes a slot. The last slots are reserved for holders within their share: a holder above
     /// its share loses its oldest connection for each new one. When no holder exceeds its share and
-    /// no place is left, connections without a request have to end.
+    /// no slot is left, connections without a request have to end.
     async fn take(&self) -> Option<OwnedSemaphorePermit> {
-        if let Ok(place) = self.free.clone().try_acquire_owned() {
+        if let Ok(permit) = self.free.clone().try_acquire_owned() {
             let left = self.free.available_permits();
-            self.crowded
-                .send_if_modified(|crowded| left > self.most / 8 && std::mem::take(crowded));
-            if left < self.most / RESERVED_SHARE {
-                self.cut_one().await;
+            self.at_capacity
+                .send_if_modified(|at_capacity| left > self.max / 8 && std::mem::take(at_capacity));
+            if left < self.max / RESERVED_SHARE {
+                self.evict_one().await;
             }
-            return Some(place);
+            return Some(permit);
         }
         loop {
-            if !self.cut_one().await {
-                self.crowded.send_replace(true);
+            if !self.evict_one().await {
+                self.at_capacity.send_replace(true);
             }
             // By the next check, strangers may have authenticated. The semaphore is never closed,
             // so a permit always arrives; without a permit the connection would only be uncounted.
-            if let Ok(place) = timeout(LOOK_AGAIN, self.free.clone().acquire_owned()).await {
-                return place.ok();
+            if let Ok(permit) = timeout(RECHECK_INTERVAL, self.free.clone().acquire_owned()).await {
+                return permit.ok();
             }
         }
     }
 
     /// Cuts the oldest connection of the largest holder, if that holder exceeds its share. The
     /// pause keeps a holder that reconnects immediately from occupying the whole server.
-    async fn cut_one(&self) -> bool {
-        let is_cut = self.registry.cut_oldest_of_largest(self.most);
-        if is_cut {
-            tokio::time::sleep(CUT_PAUSE).await;
+    async fn evict_one(&self) -> bool {
+        let is_evicted = self.registry.cut_oldest_of_largest(self.max);
+        if is_evicted {
+            tokio::time::sleep(EVICTION_PAUSE).await;
         }
-        is_cut
+        is_evicted
     }
 }
 
-/// Resolves when a connection has to end after its current request: the server stops, or the places
+/// Resolves when a connection has to end after its current request: the server stops, or the slots
 /// are needed and this connection has served a request.
-async fn asked_to_end(
+async fn graceful_end(
     stop: &CancellationToken,
-    spoken: &CancellationToken,
-    crowded: watch::Receiver<bool>,
+    has_request: &CancellationToken,
+    at_capacity: watch::Receiver<bool>,
 ) {
     let needed = async {
-        spoken.cancelled().await;
-        needed(crowded).await;
+        has_request.cancelled().await;
+        needed(at_capacity).await;
     };
     tokio::select! {
         () = stop.cancelled() => {}
@@ -306,36 +349,36 @@ async fn asked_to_end(
 }
 
 /// Resolves when an unauthenticated connection has to end, even during a request: a neighbour or,
-/// after [`GRACE`], any other connection needs its place. Waiting for the request would not be
+/// after [`GRACE`], any other connection needs its slot. Waiting for the request would not be
 /// bounded, because the client decides how long a request takes.
-async fn gives_way(silent: &Place, crowded: watch::Receiver<bool>) {
+async fn evicted(silent: &UnauthenticatedConnection, at_capacity: watch::Receiver<bool>) {
     let needed = async {
-        needed(crowded).await;
+        needed(at_capacity).await;
         tokio::time::sleep(GRACE).await;
     };
     tokio::select! {
-        () = silent.leave().cancelled() => {}
+        () = silent.evicted().cancelled() => {}
         () = needed => {}
     }
 }
 
-/// Resolves when places are needed.
-async fn needed(mut crowded: watch::Receiver<bool>) {
-    if crowded.wait_for(|crowded| *crowded).await.is_err() {
-        // No connection takes places any more.
+/// Resolves when slots are needed.
+async fn needed(mut at_capacity: watch::Receiver<bool>) {
+    if at_capacity.wait_for(|at_capacity| *at_capacity).await.is_err() {
+        // No connection takes slots any more.
         std::future::pending().await
     }
 }
 
 async fn accept(
     listener: &TcpListener,
-    places: &Places,
+    limit: &ConnectionLimit,
 ) -> (TcpStream, SocketAddr, Option<OwnedSemaphorePermit>) {
-    let place = places.take().await;
+    let permit = limit.take().await;
     loop {
         match listener.accept().await {
-            Ok((stream, peer)) => return (stream, peer, place),
-            Err(error) if is_the_clients_fault(&error) => {}
+            Ok((stream, peer)) => return (stream, peer, permit),
+            Err(error) if is_client_error(&error) => {}
             Err(error) => {
                 tracing::warn!(%error, "a connection could not be accepted");
                 tokio::time::sleep(ACCEPT_PAUSE).await;
@@ -344,7 +387,7 @@ async fn accept(
     }
 }
 
-fn is_the_clients_fault(error: &io::Error) -> bool {
+fn is_client_error(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
@@ -354,15 +397,15 @@ fn is_the_clients_fault(error: &io::Error) -> bool {
 pub(in crate::http) struct Unencrypted;
 
 /// The connection's facts that are attached to each request.
-struct Origin {
+struct RequestOrigin {
     peer: SocketAddr,
     is_encrypted: bool,
     proof: ClientProof,
     handle: Connection,
 }
 
-impl Origin {
-    fn mark<B>(&self, request: &mut Request<B>) {
+impl RequestOrigin {
+    fn attach_to<B>(&self, request: &mut Request<B>) {
         request.extensions_mut().insert(ConnectInfo(self.peer));
         request.extensions_mut().insert(self.proof.clone());
         request.extensions_mut().insert(self.handle.clone());
@@ -374,8 +417,8 @@ impl Origin {
 
 fn connection<S>(
     stream: S,
-    origin: Origin,
-    spoken: CancellationToken,
+    origin: RequestOrigin,
+    has_request: CancellationToken,
     router: Router,
     traffic: Arc<HttpTotals>,
 ) -> http1::UpgradeableConnection<
@@ -391,29 +434,29 @@ where
     S: AsyncRead + AsyncWrite + Send + Unpin + 'static,
 {
     let service = hyper::service::service_fn(move |request: Request<Incoming>| {
-        spoken.cancel();
+        has_request.cancel();
         traffic.request();
-        let mut request = request.map(|body| Body::new(PatientBody::new(body)));
-        origin.mark(&mut request);
+        let mut request = request.map(|body| Body::new(TimedBody::new(body)));
+        origin.attach_to(&mut request);
         router.clone().oneshot(request)
     });
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(HEAD_TIMEOUT)
-        .max_buf_size(MOST_HEAD_BYTES)
+        .max_buf_size(MAX_HEAD_BYTES)
         .serve_connection(TokioIo::new(stream), service)
         .with_upgrades()
 }
 
 /// A socket that counts its bytes. Writes fail once the peer has read nothing for [`WRITE_PAUSE`].
-struct PatientStream {
+struct TimedStream {
     stream: TcpStream,
     stalled: Option<Pin<Box<Sleep>>>,
     traffic: Arc<HttpTotals>,
     handle: Connection,
 }
 
-impl PatientStream {
+impl TimedStream {
     fn watch_write(
         &mut self,
         context: &mut Context<'_>,
@@ -431,7 +474,7 @@ impl PatientStream {
     }
 }
 
-impl AsyncRead for PatientStream {
+impl AsyncRead for TimedStream {
     fn poll_read(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -444,7 +487,7 @@ impl AsyncRead for PatientStream {
     }
 }
 
-impl AsyncWrite for PatientStream {
+impl AsyncWrite for TimedStream {
     fn poll_write(
         mut self: Pin<&mut Self>,
         context: &mut Context<'_>,
@@ -478,14 +521,14 @@ impl AsyncWrite for PatientStream {
 
 /// A request body that fails once the client has sent nothing for [`BODY_PAUSE`] of waiting, or too
 /// little in the total time of waiting.
-struct PatientBody {
+struct TimedBody {
     body: Incoming,
-    waiting: Option<Wait>,
+    waiting: Option<PendingRead>,
     pace: BodyPace,
 }
 
 /// A wait for more of a body.
-struct Wait {
+struct PendingRead {
     since: Instant,
     timer: Pin<Box<Sleep>>,
 }
@@ -506,17 +549,17 @@ impl BodyPace {
         if self.waited < BODY_PAUSE {
             return true;
         }
-        std::mem::take(self).bytes >= LEAST_BODY_BYTES
+        std::mem::take(self).bytes >= MIN_BODY_BYTES
     }
 }
 
-impl PatientBody {
+impl TimedBody {
     fn new(body: Incoming) -> Self {
         Self { body, waiting: None, pace: BodyPace::default() }
     }
 }
 
-impl http_body::Body for PatientBody {
+impl http_body::Body for TimedBody {
     type Data = Bytes;
     type Error = axum::BoxError;
 
@@ -534,8 +577,10 @@ impl http_body::Body for PatientBody {
                 _ => Poll::Ready(frame.map(|frame| frame.map_err(Into::into))),
             };
         }
-        let new =
-            || Wait { since: Instant::now(), timer: Box::pin(tokio::time::sleep(BODY_PAUSE)) };
+        let new = || PendingRead {
+            since: Instant::now(),
+            timer: Box::pin(tokio::time::sleep(BODY_PAUSE)),
+        };
         ready!(self.waiting.get_or_insert_with(new).timer.poll_unpin(context));
         too_slow()
     }
@@ -554,14 +599,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn body_that_trickles_is_refused_and_a_slow_link_is_not() {
+    fn trickling_body_is_refused_and_a_slow_link_is_not() {
         const SECOND: Duration = Duration::from_secs(1);
         let refused_after = |bytes_per_s: usize| {
             let mut pace = BodyPace::default();
             (1..=300).find(|_| !pace.count(SECOND, bytes_per_s))
         };
         assert_eq!(refused_after(1), Some(30));
-        assert_eq!(refused_after(LEAST_BODY_BYTES / 30 - 1), Some(30));
+        assert_eq!(refused_after(MIN_BODY_BYTES / 30 - 1), Some(30));
         assert_eq!(refused_after(1024), None);
         let mut pace = BodyPace::default();
         assert!((0..300).all(|_| pace.count(Duration::ZERO, 1)), "it is the server that is slow");

@@ -10,8 +10,9 @@ use http::HeaderMap;
 /// The addresses of trusted proxies.
 pub(in crate::http) type TrustedProxies = Arc<[IpAddr]>;
 
-/// Replaces the proxy's address by the address of the proxy's client. The client's port is unknown.
-pub(in crate::http) async fn see_through(
+/// Replaces the proxy's address by the address of the proxy's client, with port 0: the client's port
+/// is unknown.
+pub(in crate::http) async fn resolve_client_address(
     State(trusted): State<TrustedProxies>,
     mut request: Request,
 ) -> Request {
@@ -64,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn only_what_a_trusted_proxy_wrote_counts() {
+    fn only_entries_of_a_trusted_proxy_count() {
         assert_eq!(found("10.0.0.1", &["192.0.2.7"]).as_deref(), Some("192.0.2.7"));
         assert_eq!(found("::ffff:10.0.0.1", &["192.0.2.7"]).as_deref(), Some("192.0.2.7"));
         assert_eq!(
@@ -79,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_before_it_hides_nothing() {
+    fn malformed_entries_before_the_client_are_ignored() {
         let foreign: &[u8] = b"caf\xe9, \xff";
         assert_eq!(found_in("10.0.0.1", &[foreign, b"192.0.2.7"]).as_deref(), Some("192.0.2.7"));
         assert_eq!(

@@ -3,56 +3,53 @@
 use axum::Json;
 use axum::extract::State;
 use http::HeaderMap;
-use task_proto::api::{BulkLabels, BulkRemove, IDEMPOTENCY_KEY, MatchedRobot, MatchedRobots};
+use task_macros::operation;
+use task_proto::api::{BulkLabels, BulkRemove, IDEMPOTENCY_KEY, MatchedRobots};
 
-use super::robots::gone;
+use super::live_robots::LiveRobots;
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::{JsonBody, idempotency_key};
-use crate::http::openapi::OrderKey;
-use crate::http::views::complete_matched;
-use crate::orders::actions::IdempotencyKey;
+use crate::http::openapi::{OrderKey, OrderRefusals};
+use crate::http::views::Views;
+use crate::orders::actions::{IdempotencyKey, RobotActions};
 
 /// Sets and removes labels of many robots: of all the selected robots or of none.
-#[utoipa::path(post, path = "/api/v1/bulk/labels", tag = "robots", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "robots", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn labels(
-    State(app): State<App>,
+    State(robots): State<RobotActions>,
+    State(views): State<Views>,
     by: Person,
     headers: HeaderMap,
     JsonBody(order): JsonBody<BulkLabels>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    Ok(completed(&app, app.actions.label_robots(&by, order_key(&headers)?.as_ref(), &order).await?))
+    let labelled = robots.label_selected(&by, order_key(&headers)?.as_ref(), &order).await?;
+    Ok(Json(views.matched(labelled)))
 }
 
 /// Removes many robots: all the selected robots or none.
-#[utoipa::path(post, path = "/api/v1/bulk/remove", tag = "robots", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "robots", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn remove(
-    State(app): State<App>,
+    State(robots): State<RobotActions>,
+    State(views): State<Views>,
+    State(live): State<LiveRobots>,
     by: Person,
     headers: HeaderMap,
     JsonBody(order): JsonBody<BulkRemove>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
     if order.dry_run {
-        return Ok(completed(&app, app.actions.matching_robots(&by, &order.selector).await?));
+        let selected = robots.preview_removal(&by, &order.selector).await?;
+        return Ok(Json(views.matched(selected)));
     }
     let removed =
-        app.actions.remove_robots(&by, order_key(&headers)?.as_ref(), &order.selector).await?;
-    let answer = completed(&app, removed);
-    answer.robots.iter().for_each(|robot| gone(&app, &robot.id));
-    Ok(answer)
+        robots.remove_selected(&by, order_key(&headers)?.as_ref(), &order.selector).await?;
+    // Their last presence is part of the answer.
+    let answer = views.matched(removed);
+    answer.robots.iter().for_each(|robot| live.removed(&robot.id));
+    Ok(Json(answer))
 }
 
 /// The idempotency key of an order, if present: it identifies a repeated order.
 fn order_key(headers: &HeaderMap) -> Result<Option<IdempotencyKey>, ApiError> {
     headers.get(IDEMPOTENCY_KEY).map(|key| idempotency_key(Some(key))).transpose()
-}
-
-fn completed(app: &App, mut robots: Vec<MatchedRobot>) -> Json<MatchedRobots> {
-    complete_matched(&mut robots, &app.presence, app.clock.now_ms());
-    Json(MatchedRobots { robots })
 }

@@ -5,18 +5,17 @@ use std::collections::HashSet;
 use axum::Json;
 use axum::extract::State;
 use serde::Deserialize;
+use task_macros::operation;
 use task_proto::api::{FeedPage, MAX_FEED_ENTRIES};
 use utoipa::IntoParams;
 
 use crate::domain::person::{Person, Scope};
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::QueryParams;
-use crate::orders::feed::FeedAudience;
-use crate::store::KnownRobot;
+use crate::store::{FeedAudience, KnownRobot, Store};
 
 /// Default number of listed entries.
-const LISTED: usize = 100;
+const DEFAULT_LIMIT: usize = 100;
 
 /// The query of `GET /feed`.
 #[derive(Deserialize, IntoParams)]
@@ -30,39 +29,39 @@ pub(in crate::http) struct Query {
 }
 
 /// Lists fleet events: the newest, or with `after` the next ones after that number.
-#[utoipa::path(get, path = "/api/v1/feed", tag = "server")]
+#[operation(tag = "server")]
 pub(in crate::http) async fn feed(
-    State(app): State<App>,
+    State(store): State<Store>,
     by: Person,
     QueryParams(query): QueryParams<Query>,
 ) -> Result<Json<FeedPage>, ApiError> {
-    let limit = query.limit.map_or(LISTED, |limit| limit as usize);
+    let limit = query.limit.map_or(DEFAULT_LIMIT, |limit| limit as usize);
     if !(1..=MAX_FEED_ENTRIES).contains(&limit) {
         return Err(ApiError::invalid(format!(
             "limit: expected 1 to {MAX_FEED_ENTRIES}, not {limit}"
         )));
     }
-    let mut theirs = HashSet::new();
+    let mut own_robots = HashSet::new();
     let mut known = HashSet::new();
     if !by.scope.is_everything() {
-        theirs.extend(app.store.robots_in(&by.scope).await?);
-        known.extend(app.store.robots_in(&Scope::everything()).await?);
+        own_robots.extend(store.robots().ids_in(&by.scope).await?);
+        known.extend(store.robots().ids_in(&Scope::everything()).await?);
     }
     // A robot's current labels decide, as everywhere else. An entry also holds the labels at its
     // time: for a removed robot, those are all that is left.
-    let is_theirs_now = |robot: &KnownRobot| match known.contains(&robot.id) {
-        true => theirs.contains(&robot.id),
+    let is_in_scope = |robot: &KnownRobot| match known.contains(&robot.id) {
+        true => own_robots.contains(&robot.id),
         false => by.scope.covers(&robot.id, &robot.name, &robot.labels),
     };
     let mut entries = Vec::new();
-    for (entry, audience) in app.feed.after(query.after.unwrap_or(0)) {
-        let is_theirs = match audience {
+    for (entry, audience) in store.feed().after(query.after.unwrap_or(0)).await? {
+        let is_visible = match audience {
             FeedAudience::Everybody => true,
             _ if by.scope.is_everything() => true,
             FeedAudience::Unlimited => false,
-            FeedAudience::Robot(robot) => is_theirs_now(&robot),
+            FeedAudience::Robot(robot) => is_in_scope(&robot),
         };
-        if is_theirs {
+        if is_visible {
             entries.push(entry);
         }
     }

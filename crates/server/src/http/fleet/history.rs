@@ -3,20 +3,20 @@
 use axum::Json;
 use axum::extract::State;
 use serde::Deserialize;
+use task_macros::operation;
 use task_proto::api::TaskHistory;
 use task_proto::{DeploymentId, RobotName, TaskName};
 use utoipa::IntoParams;
 
 use super::robots::find;
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::{PathParam, QueryParams};
-use crate::store::HistoryQuery;
+use crate::store::{HistoryQuery, Store};
 
 /// The default and the largest number of listed assignments.
-const LISTED: u32 = 50;
-const MOST_LISTED: u32 = 200;
+const DEFAULT_LIMIT: u32 = 50;
+const MAX_LIMIT: u32 = 200;
 
 /// The query of `GET /robots/{robot}/tasks`.
 #[derive(Deserialize, IntoParams)]
@@ -34,23 +34,22 @@ pub(in crate::http) struct Query {
 }
 
 /// Lists a robot's past and present assignments with their outcomes, the newest first.
-#[utoipa::path(get, path = "/api/v1/robots/{robot}/tasks", tag = "robots",
+#[operation(tag = "robots",
     responses((status = 404, description = "There is no such robot, or no deployment `before`.")))]
 pub(in crate::http) async fn tasks(
-    State(app): State<App>,
+    State(store): State<Store>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
     QueryParams(query): QueryParams<Query>,
 ) -> Result<Json<TaskHistory>, ApiError> {
-    let id = find(&app, &by, &robot).await?;
-    let limit = query.limit.unwrap_or(LISTED);
-    if !(1..=MOST_LISTED).contains(&limit) {
-        return Err(ApiError::invalid(format!(
-            "limit: {limit} is not between 1 and {MOST_LISTED}"
-        )));
+    let id = find(&store, &by, &robot).await?;
+    let limit = query.limit.unwrap_or(DEFAULT_LIMIT);
+    if !(1..=MAX_LIMIT).contains(&limit) {
+        return Err(ApiError::invalid(format!("limit: {limit} is not between 1 and {MAX_LIMIT}")));
     }
-    let asked = HistoryQuery { task: query.task.as_ref(), before: query.before.as_ref(), limit };
-    let page = app.store.task_history(&id, asked).await?.ok_or_else(|| {
+    let history_query =
+        HistoryQuery { task: query.task.as_ref(), before: query.before.as_ref(), limit };
+    let page = store.assignments().history(&id, history_query).await?.ok_or_else(|| {
         let before = query.before.as_ref().map(DeploymentId::as_str).unwrap_or_default();
         ApiError::not_found(format!("before: there is no deployment {before}"))
     })?;

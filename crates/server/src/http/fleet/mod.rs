@@ -7,6 +7,7 @@ pub(super) mod bulk;
 pub(super) mod enroll;
 pub(super) mod feed;
 pub(super) mod history;
+pub(super) mod live_robots;
 pub(super) mod logs;
 pub(super) mod mqtt;
 pub(super) mod outputs;

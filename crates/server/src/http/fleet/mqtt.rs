@@ -9,19 +9,20 @@ use axum::extract::{ConnectInfo, Request, State};
 use axum::response::{IntoResponse as _, Response};
 use http::{HeaderValue, StatusCode, header};
 use hyper_util::rt::TokioIo;
+use task_macros::operation;
 use task_transport::websocket::{WebSocket, WebSocketError, grant};
 
-use crate::http::App;
+use crate::broker::Broker;
 use crate::http::error::ApiError;
 use crate::net::tls::ClientProof;
 
 /// Upgrades to MQTT over WebSocket. The broker authenticates the client, as at its own port.
-#[utoipa::path(get, path = "/mqtt", tag = "agent",
-    responses((status = 101, description = "MQTT from here on."),
-        (status = 426, description = "It is no WebSocket handshake for MQTT."),
-        (status = 503, description = "MQTT is served elsewhere, or to as many as there may be.")))]
+#[operation(tag = "agent",
+    responses((status = 101, description = "The connection continues with MQTT."),
+        (status = 426, description = "The request is not a WebSocket handshake for MQTT."),
+        (status = 503, description = "MQTT is served by an external broker, or the connection limit is reached.")))]
 pub(in crate::http) async fn upgrade(
-    State(app): State<App>,
+    State(broker): State<Broker>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     mut request: Request,
 ) -> Result<Response, ApiError> {
@@ -35,9 +36,9 @@ pub(in crate::http) async fn upgrade(
         let stream = upgrade.await.map_err(io::Error::other)?;
         Ok((WebSocket::server(TokioIo::new(stream)), proof))
     };
-    if !app.broker.take_in(peer, handshake) {
+    if !broker.serve_connection(peer, handshake) {
         return Err(ApiError::unavailable(
-            "MQTT is served elsewhere, or to as many as there may be",
+            "MQTT is served by an external broker, or the connection limit is reached",
         ));
     }
     let mut response = Response::new(Body::empty());

@@ -4,15 +4,16 @@
 use axum::Json;
 use axum::extract::State;
 use serde::Deserialize;
+use task_macros::operation;
 use task_proto::api::OutputList;
 use task_proto::{RobotName, TaskName};
 use utoipa::IntoParams;
 
 use super::robots::find;
 use crate::domain::person::{Person, Scope};
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::QueryParams;
+use crate::store::Store;
 
 /// The query of `GET /outputs`.
 #[derive(Deserialize, IntoParams)]
@@ -27,19 +28,19 @@ pub(in crate::http) struct ListQuery {
 }
 
 /// Lists the outputs of one robot or of all robots.
-#[utoipa::path(get, path = "/api/v1/outputs", tag = "outputs",
+#[operation(tag = "outputs",
     responses((status = 404, description = "There is no such robot.")))]
 pub(in crate::http) async fn list(
-    State(app): State<App>,
+    State(store): State<Store>,
     by: Person,
     QueryParams(query): QueryParams<ListQuery>,
 ) -> Result<Json<OutputList>, ApiError> {
     let robot = match &query.robot {
-        Some(robot) => Some(find(&app, &by, robot).await?),
+        Some(robot) => Some(find(&store, &by, robot).await?),
         None => None,
     };
     let scope = if robot.is_some() { &Scope::everything() } else { &by.scope };
     Ok(Json(OutputList {
-        outputs: app.store.outputs(robot.as_ref(), query.task.as_ref(), scope).await?,
+        outputs: store.outputs().list(robot.as_ref(), query.task.as_ref(), scope).await?,
     }))
 }

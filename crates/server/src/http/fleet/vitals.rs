@@ -5,46 +5,48 @@ use std::net::SocketAddr;
 use axum::Json;
 use axum::extract::{ConnectInfo, State};
 use axum::response::NoContent;
+use task_macros::operation;
 use task_proto::api::VitalsView;
-use task_proto::vitals::Telemetry;
+use task_proto::telemetry::vitals::Telemetry;
 use task_proto::{RobotId, RobotName};
 
+use super::live_robots::LiveRobots;
 use super::robots::find;
 use crate::domain::person::Person;
-use crate::http::App;
+use crate::fleet::robot_vitals::RobotVitals;
 use crate::http::error::ApiError;
 use crate::http::extract::{PathParam, TolerantJson};
-use crate::link::uplink;
-use crate::orders::changes::Change;
+use crate::store::Store;
+use crate::system::clock::Clock;
 
 /// Receives the vitals of the robot's machine while the robot has no MQTT session.
-#[utoipa::path(post, path = "/api/v1/robots/{robot}/telemetry", tag = "agent")]
+#[operation(tag = "agent")]
 pub(in crate::http) async fn telemetry(
-    State(app): State<App>,
+    State(live): State<LiveRobots>,
     ConnectInfo(peer): ConnectInfo<SocketAddr>,
     PathParam(robot): PathParam<RobotId>,
-    TolerantJson(said): TolerantJson<Telemetry>,
+    TolerantJson(received): TolerantJson<Telemetry>,
 ) -> Result<NoContent, ApiError> {
-    if said.robot_id != robot {
+    if received.robot_id != robot {
         return Err(ApiError::invalid(format!(
             "robot_id: the vitals are of {}, not of {robot}",
-            said.robot_id
+            received.robot_id
         )));
     }
-    let now_ms = app.clock.now_ms();
-    uplink::heard(&app.presence, &app.changes, &robot, peer, now_ms);
-    app.vitals.take(&robot, said.vitals, now_ms);
-    app.changes.announce(Change::Robot(robot));
+    live.record_request(&robot, peer);
+    live.record_vitals(robot, received.vitals);
     Ok(NoContent)
 }
 
 /// Shows the vitals of a robot's machine over the last hour.
-#[utoipa::path(get, path = "/api/v1/robots/{robot}/vitals", tag = "robots")]
+#[operation(tag = "robots")]
 pub(in crate::http) async fn show(
-    State(app): State<App>,
+    State(store): State<Store>,
+    State(clock): State<Clock>,
+    State(vitals): State<RobotVitals>,
     by: Person,
     PathParam(robot): PathParam<RobotName>,
 ) -> Result<Json<VitalsView>, ApiError> {
-    let id = find(&app, &by, &robot).await?;
-    Ok(Json(VitalsView { samples: app.vitals.last_hour(&id, app.clock.now_ms()) }))
+    let id = find(&store, &by, &robot).await?;
+    Ok(Json(VitalsView { samples: vitals.last_hour(&id, clock.now_ms()) }))
 }

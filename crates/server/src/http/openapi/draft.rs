@@ -7,16 +7,16 @@ use std::collections::BTreeMap;
 use http::{Method, StatusCode};
 use serde_json::json;
 use task_proto::api::ErrorBody;
-use task_proto::person::Permission;
+use task_proto::people::roles::Permission;
 use utoipa::openapi::extensions::Extensions;
 use utoipa::openapi::path::{HttpMethod, Operation, Parameter, ParameterBuilder, ParameterIn};
 use utoipa::openapi::request_body::RequestBodyBuilder;
 use utoipa::openapi::schema::{AdditionalProperties, SchemaType, Type};
 use utoipa::openapi::{
-    ContentBuilder, HeaderBuilder, Object, Ref, RefOr, Required, Response, ResponseBuilder, Schema,
-    SecurityRequirement,
+    ContentBuilder, HeaderBuilder, Object, OpenApi, Ref, RefOr, Required, Response,
+    ResponseBuilder, Schema, SecurityRequirement,
 };
-use utoipa::{IntoParams, PartialSchema as _, ToSchema};
+use utoipa::{IntoParams, IntoResponses, PartialSchema as _, ToSchema};
 
 use super::super::Route;
 use super::super::auth::Access;
@@ -40,6 +40,18 @@ pub(in crate::http) struct OrderKey {
         example = "order-4711"
     )]
     idempotency_key: Option<String>,
+}
+
+/// The refusals of an order for the robots that a selector matches.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "the handlers answer with `ApiError`, which describes no status")]
+pub(in crate::http) enum OrderRefusals {
+    /// `unknown_robots`: the selector names unknown robots.
+    #[response(status = 404)]
+    UnknownRobots,
+    /// `no_robots_match`, or `idempotency_key_reused`: the key was used for another order.
+    #[response(status = 409)]
+    Conflict,
 }
 
 /// The description of an operation, as collected so far.
@@ -77,10 +89,7 @@ impl Draft {
         (route.describe)(&mut draft);
         draft.guarded_by(route.access);
         if route.deadline.is_some() && route.access != Access::Anyone {
-            draft.refusal(
-                StatusCode::REQUEST_TIMEOUT,
-                "It took too long to arrive or to be answered.",
-            );
+            draft.refusal(StatusCode::REQUEST_TIMEOUT, "The request took too long.");
         }
         draft.complete_refusals(route.access);
         for parameter in draft.operation.parameters.iter_mut().flatten() {
@@ -91,27 +100,13 @@ impl Draft {
         draft
     }
 
-    /// Begins with the contents of the handler's attribute.
-    pub(in crate::http) fn begin<P>(&mut self, id: &str)
-    where
-        P: utoipa::Path + utoipa::__dev::SchemaReferences + for<'t> utoipa::__dev::Tags<'t>,
-    {
-        debug_assert_eq!(
-            P::path().trim_end_matches('/'),
-            self.path.trim_end_matches('/'),
-            "the table has another path"
-        );
-        debug_assert!(
-            P::methods() == [self.method.clone()],
-            "the table has another method at {}",
-            self.path
-        );
-        self.operation = P::operation();
-        self.operation.tags = Some(P::tags().into_iter().map(str::to_owned).collect());
+    /// Begins with the contents of the handler's attribute: a document with this one operation,
+    /// whose method and path are placeholders.
+    pub(in crate::http) fn begin(&mut self, id: &str, attribute: OpenApi) {
+        self.operation =
+            attribute.paths.paths.into_values().find_map(|item| item.get).unwrap_or_default();
         self.operation.operation_id = Some(id.to_owned());
-        let mut schemas = Vec::new();
-        P::schemas(&mut schemas);
-        self.schemas.extend(schemas);
+        self.schemas.extend(attribute.components.unwrap_or_default().schemas);
     }
 
     /// A reference to a type's schema, which becomes a component.
@@ -149,7 +144,7 @@ impl Draft {
         let Some(name) = self.path_parameters.next() else { return };
         self.refusal(
             StatusCode::NOT_FOUND,
-            "There is no such thing, or no thing can have such a name.",
+            "The resource does not exist, or the name is not valid.",
         );
         let mut described = self.operation.parameters.iter().flatten();
         if described.any(|known| matches!(known, RefOr::T(known) if known.name == name)) {
@@ -215,7 +210,7 @@ impl Draft {
             Access::Anyone => ("anyone", None, &[]),
             Access::Person(permission) => ("person", Some(permission), &["token", "session"]),
             Access::OwnRobot => ("robot", None, &["token"]),
-            Access::Enrolment => ("enrolment", None, &["token"]),
+            Access::Enrollment => ("enrolment", None, &["token"]),
             Access::PersonOrRobot => ("person or robot", None, &["token", "password", "session"]),
         };
         self.operation.security = Some(schemes.iter().map(|name| scheme(name)).collect());
@@ -226,11 +221,11 @@ impl Draft {
         self.operation.extensions = Some(extensions);
         let caller = match access {
             Access::Anyone => "Anyone may call this.".to_owned(),
-            Access::Person(permission) => format!("Takes the permission `{permission}`."),
-            Access::OwnRobot => "For the robot itself, by its token.".to_owned(),
-            Access::Enrolment => "Takes an enrolment token.".to_owned(),
+            Access::Person(permission) => format!("Requires the permission `{permission}`."),
+            Access::OwnRobot => "Requires the robot's own token.".to_owned(),
+            Access::Enrollment => "Requires an enrollment token.".to_owned(),
             Access::PersonOrRobot => {
-                "For people and robots, each of whom sees their own.".to_owned()
+                "For people and robots, each within their own rights.".to_owned()
             }
         };
         let description = self.operation.description.take().filter(|text| !text.is_empty());
@@ -241,14 +236,17 @@ impl Draft {
         }
         self.refusal(
             StatusCode::UNAUTHORIZED,
-            "No token, or one that is unknown, expired or revoked.",
+            "The token is missing, unknown, expired or revoked.",
         );
-        self.refusal(StatusCode::FORBIDDEN, "The caller may not do that, or not to this robot.");
+        self.refusal(
+            StatusCode::FORBIDDEN,
+            "The caller lacks the permission, or the robot is outside of the caller's scope.",
+        );
         self.refusal(
             StatusCode::TOO_MANY_REQUESTS,
-            "Too many wrong tokens from this address, or a robot asks too often.",
+            "Too many invalid tokens from this address, or too many requests of this caller.",
         );
-        self.refusal(StatusCode::INTERNAL_SERVER_ERROR, "The server failed; its log says why.");
+        self.refusal(StatusCode::INTERNAL_SERVER_ERROR, "Internal error; see the server's log.");
     }
 
     /// Adds the API's common error body and its headers to every refusal without a schema of its
@@ -271,7 +269,7 @@ impl Draft {
             if matches!(status.as_str(), "429" | "503") {
                 let header = HeaderBuilder::new()
                     .schema(Some(u64::schema()))
-                    .description(Some("When to try again, in seconds."));
+                    .description(Some("Seconds until a retry is useful."));
                 response.headers.insert("Retry-After".to_owned(), RefOr::T(header.build()));
             }
         }

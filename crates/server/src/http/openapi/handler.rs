@@ -148,4 +148,7 @@ macro_rules! describe_handlers {
     )* };
 }
 
-describe_handlers! { () (T1) (T1, T2) (T1, T2, T3) (T1, T2, T3, T4) (T1, T2, T3, T4, T5) (T1, T2, T3, T4, T5, T6) }
+describe_handlers! {
+    () (T1) (T1, T2) (T1, T2, T3) (T1, T2, T3, T4) (T1, T2, T3, T4, T5) (T1, T2, T3, T4, T5, T6)
+    (T1, T2, T3, T4, T5, T6, T7)
+}

@@ -10,35 +10,36 @@ use std::sync::LazyLock;
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
 use http::{HeaderMap, StatusCode, header};
+use task_macros::operation;
 use task_proto::Digest;
 use utoipa::openapi::security::{ApiKey, ApiKeyValue, Http, HttpAuthScheme, SecurityScheme};
 use utoipa::openapi::tag::TagBuilder;
 use utoipa::openapi::{ComponentsBuilder, InfoBuilder, License, OpenApi, OpenApiBuilder, Paths};
 
-pub(super) use self::draft::{Draft, OrderKey};
+pub(super) use self::draft::{Draft, OrderKey, OrderRefusals};
 pub(super) use self::handler::{Answer, Created, Describe};
 use super::auth::COOKIE;
 use super::{Route, routes};
-use crate::http::server::web::is_known;
+use crate::http::server::web::has_current_tag;
 
 /// The groups of operations.
 const TAGS: [(&str, &str); 12] = [
-    ("robots", "The robots there are: what they are, run, say and show."),
-    ("deployments", "Orders of a package on robots."),
-    ("tasks", "Orders on tasks that robots have already."),
-    ("packages", "What can be ordered."),
-    ("outputs", "What tasks brought back."),
-    ("events", "What changes, as it does."),
-    ("people", "Users, their tokens, and what they did."),
-    ("session", "Signing in and out."),
-    ("enrolment", "How robots come in."),
-    ("agent", "What robots ask and report themselves."),
-    ("registry", "The OCI distribution API, whose own specification says what it answers."),
-    ("server", "The server itself, and the pages it serves."),
+    ("robots", "Robots: their state, tasks, logs and vitals."),
+    ("deployments", "Deployments of packages to robots."),
+    ("tasks", "Orders for tasks that robots already have."),
+    ("packages", "Packages and their versions."),
+    ("outputs", "Files that tasks brought back."),
+    ("events", "The stream of changes."),
+    ("people", "Users, their tokens and the audit log."),
+    ("session", "Sign-in and sign-out."),
+    ("enrollment", "Enrollment of new robots."),
+    ("agent", "Requests and reports of robots' agents."),
+    ("registry", "The OCI distribution API, as defined by its own specification."),
+    ("server", "The server and its pages."),
 ];
 
 const ABOUT: &str = "Distributes task packages to fleets of robots. Times are milliseconds since the Unix epoch by the \
-     server's clock, sizes are bytes. A field that is not known is refused in a request and to be passed over in an answer.";
+     server's clock, sizes are bytes. Unknown fields are refused in requests; clients should ignore unknown fields in responses.";
 
 /// The document's text and its tag, fixed while the server runs.
 static DOCUMENT: LazyLock<(Bytes, String)> = LazyLock::new(|| {
@@ -52,13 +53,13 @@ static DOCUMENT: LazyLock<(Bytes, String)> = LazyLock::new(|| {
 });
 
 /// Returns this OpenAPI description.
-#[utoipa::path(get, path = "/api/openapi.json", tag = "server",
+#[operation(tag = "server",
     responses((status = 200, description = "An OpenAPI 3.1 document.", body = serde_json::Value),
         (status = 304, description = "The document is still the one that `If-None-Match` names.")))]
 pub(super) async fn show(headers: HeaderMap) -> Response {
     let (text, tag) = &*DOCUMENT;
     let caching = [(header::ETAG, tag.clone()), (header::CACHE_CONTROL, "no-cache".to_owned())];
-    if is_known(&headers, tag) {
+    if has_current_tag(&headers, tag) {
         return (StatusCode::NOT_MODIFIED, caching).into_response();
     }
     (caching, [(header::CONTENT_TYPE, "application/json")], text.clone()).into_response()
@@ -69,17 +70,17 @@ pub(super) fn document(routes: &[Route]) -> OpenApi {
     let mut components = ComponentsBuilder::new()
         .security_scheme(
             "token",
-            SecurityScheme::Http(scheme(HttpAuthScheme::Bearer, "A person's, a robot's or an enrolment token.")),
+            SecurityScheme::Http(scheme(HttpAuthScheme::Bearer, "A person's, a robot's or an enrollment token.")),
         )
         .security_scheme(
             "password",
-            SecurityScheme::Http(scheme(HttpAuthScheme::Basic, "Any name, and the token as the password.")),
+            SecurityScheme::Http(scheme(HttpAuthScheme::Basic, "Any user name, and the token as the password.")),
         )
         .security_scheme(
             "session",
             SecurityScheme::ApiKey(ApiKey::Cookie(ApiKeyValue::with_description(
                 COOKIE,
-                "The cookie of a signed-in page. Whatever changes something has to come from the same origin.",
+                "The cookie of a signed-in page. Requests that change something must come from the same origin.",
             ))),
         )
         .build();
@@ -217,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_guard_refuses_is_in_every_description() {
+    fn guard_refusals_are_described_for_every_route() {
         let document = as_json();
         for (name, operation) in operations(&document) {
             let is_for_anyone = operation["x-caller"] == "anyone";
@@ -242,7 +243,7 @@ mod tests {
     }
 
     #[test]
-    fn whatever_is_referred_to_is_there() {
+    fn every_reference_in_the_document_resolves() {
         let document = as_json();
         let mut found = BTreeSet::new();
         references(&document, &mut found);

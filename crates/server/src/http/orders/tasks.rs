@@ -4,116 +4,110 @@
 use axum::Json;
 use axum::extract::State;
 use http::HeaderMap;
+use task_macros::operation;
 use task_proto::TaskName;
 use task_proto::api::{IDEMPOTENCY_KEY, MatchedRobots, OrderTask, RolledBack};
 
-use super::deployments;
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::{JsonBody, PathParam, idempotency_key};
-use crate::http::openapi::OrderKey;
-use crate::http::views::complete_matched;
-use crate::orders::actions::{Rollback, TaskOrder};
+use crate::http::openapi::{OrderKey, OrderRefusals};
+use crate::http::views::Views;
+use crate::orders::actions::{DeploymentActions, Rollback, TaskOrder};
 
 /// Starts a task on robots that have it. A job runs once more.
-#[utoipa::path(post, path = "/api/v1/tasks/{task}/start", tag = "tasks", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "tasks", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn start(
-    State(app): State<App>,
+    State(deployments): State<DeploymentActions>,
+    State(views): State<Views>,
     by: Person,
     PathParam(task): PathParam<TaskName>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<OrderTask>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    order(&app, &by, TaskOrder::Start, &task, &headers, &request).await
+    order(&deployments, &views, &by, TaskOrder::Start, &task, &headers, &request).await
 }
 
 /// Restarts a task on robots that have it. A running instance is stopped first.
-#[utoipa::path(post, path = "/api/v1/tasks/{task}/restart", tag = "tasks", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "tasks", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn restart(
-    State(app): State<App>,
+    State(deployments): State<DeploymentActions>,
+    State(views): State<Views>,
     by: Person,
     PathParam(task): PathParam<TaskName>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<OrderTask>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    order(&app, &by, TaskOrder::Restart, &task, &headers, &request).await
+    order(&deployments, &views, &by, TaskOrder::Restart, &task, &headers, &request).await
 }
 
 /// Rolls robots back to the package of a task that ran there before the current one.
-#[utoipa::path(post, path = "/api/v1/tasks/{task}/rollback", tag = "tasks", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, `nothing_to_roll_back`: none of them had another package \
-        before, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "tasks", params(OrderKey),
+    responses((status = 404, description = "`unknown_robots`: the selector names unknown robots."),
+        (status = 409, description = "`no_robots_match`, `nothing_to_roll_back`: none of the robots had another package \
+        before, or `idempotency_key_reused`: the key was used for another order.")))]
 pub(in crate::http) async fn rollback(
-    State(app): State<App>,
+    State(deployments): State<DeploymentActions>,
+    State(views): State<Views>,
     by: Person,
     PathParam(task): PathParam<TaskName>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<OrderTask>,
 ) -> Result<Json<RolledBack>, ApiError> {
-    let Rollback { deployments: ids, mut robots, mut without } = if request.dry_run {
-        app.actions.rollback(&by, &task, &request.selector).await?
+    let Rollback { deployments: ids, robots, without } = if request.dry_run {
+        deployments.preview_rollback(&by, &task, &request.selector).await?
     } else {
         let key = idempotency_key(headers.get(IDEMPOTENCY_KEY))?;
-        app.actions.roll_back(&by, &key, &task, &request.selector).await?
+        deployments.rollback(&by, &key, &task, &request.selector).await?
     };
     let mut deployments = Vec::with_capacity(ids.len());
     for id in &ids {
-        deployments.push(deployments::view(&app, &by, id).await?);
+        deployments.push(views.deployment(&by, id, false).await?);
     }
-    let now_ms = app.clock.now_ms();
-    complete_matched(&mut robots, &app.presence, now_ms);
-    complete_matched(&mut without, &app.presence, now_ms);
+    let (robots, without) = (views.matched(robots).robots, views.matched(without).robots);
     Ok(Json(RolledBack { deployments, robots, without }))
 }
 
 /// Stops a task on robots that have it. The task stays installed.
-#[utoipa::path(post, path = "/api/v1/tasks/{task}/stop", tag = "tasks", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "tasks", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn stop(
-    State(app): State<App>,
+    State(deployments): State<DeploymentActions>,
+    State(views): State<Views>,
     by: Person,
     PathParam(task): PathParam<TaskName>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<OrderTask>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    order(&app, &by, TaskOrder::Stop, &task, &headers, &request).await
+    order(&deployments, &views, &by, TaskOrder::Stop, &task, &headers, &request).await
 }
 
 /// Removes a task from robots.
-#[utoipa::path(post, path = "/api/v1/tasks/{task}/remove", tag = "tasks", params(OrderKey),
-    responses((status = 404, description = "`unknown_robots`: the selector names robots that there are not."),
-        (status = 409, description = "`no_robots_match`, or `idempotency_key_reused` for another order.")))]
+#[operation(tag = "tasks", params(OrderKey), responses(OrderRefusals))]
 pub(in crate::http) async fn remove(
-    State(app): State<App>,
+    State(deployments): State<DeploymentActions>,
+    State(views): State<Views>,
     by: Person,
     PathParam(task): PathParam<TaskName>,
     headers: HeaderMap,
     JsonBody(request): JsonBody<OrderTask>,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    order(&app, &by, TaskOrder::Remove, &task, &headers, &request).await
+    order(&deployments, &views, &by, TaskOrder::Remove, &task, &headers, &request).await
 }
 
 async fn order(
-    app: &App,
+    deployments: &DeploymentActions,
+    views: &Views,
     by: &Person,
     order: TaskOrder,
     task: &TaskName,
     headers: &HeaderMap,
     request: &OrderTask,
 ) -> Result<Json<MatchedRobots>, ApiError> {
-    let mut robots = if request.dry_run {
-        app.actions.robots_with_task(by, task, &request.selector).await?
+    let robots = if request.dry_run {
+        deployments.preview_task_order(by, task, &request.selector).await?
     } else {
         let key = idempotency_key(headers.get(IDEMPOTENCY_KEY))?;
-        app.actions.order_task(by, &key, order, task, &request.selector).await?
+        deployments.order_task(by, &key, order, task, &request.selector).await?
     };
-    complete_matched(&mut robots, &app.presence, app.clock.now_ms());
-    Ok(Json(MatchedRobots { robots }))
+    Ok(Json(views.matched(robots)))
 }

@@ -12,17 +12,17 @@ use tokio::sync::Semaphore;
 use crate::blobs::Blob;
 
 /// Time limit for reading one or two whole archives.
-pub(in crate::http) const READING: Duration = Duration::from_secs(10 * 60);
+pub(in crate::http) const READ_TIMEOUT: Duration = Duration::from_secs(10 * 60);
 /// The most archives read at the same time: each keeps a processor busy.
-const AT_ONCE: usize = 2;
+const MAX_CONCURRENT: usize = 2;
 
-/// The limited places for readers.
+/// The limited slots for readers.
 #[derive(Clone)]
 pub struct ArchiveReaders(Arc<Semaphore>);
 
 impl Default for ArchiveReaders {
     fn default() -> Self {
-        Self(Arc::new(Semaphore::new(AT_ONCE)))
+        Self(Arc::new(Semaphore::new(MAX_CONCURRENT)))
     }
 }
 
@@ -33,13 +33,14 @@ impl ArchiveReaders {
         blob: &Blob,
         read: impl FnOnce(&mut dyn Read) -> Result<T, UnpackError> + Send + 'static,
     ) -> Result<T, UnpackError> {
-        let turn = self.0.clone().acquire_owned().await;
-        let given_up = Arc::new(AtomicBool::new(false));
-        let mut reader = GivenUp { inner: blob.reader(), given_up: given_up.clone() };
-        let _guard = GiveUp(given_up);
+        let permit = self.0.clone().acquire_owned().await;
+        let is_cancelled = Arc::new(AtomicBool::new(false));
+        let mut reader =
+            CancellableReader { inner: blob.reader(), is_cancelled: is_cancelled.clone() };
+        let _guard = CancelOnDrop(is_cancelled);
         let reading = tokio::task::spawn_blocking(move || {
             let result = read(&mut reader);
-            drop(turn);
+            drop(permit);
             result
         });
         match reading.await {
@@ -50,24 +51,24 @@ impl ArchiveReaders {
 }
 
 /// Tells the reader on drop that no request waits for it.
-struct GiveUp(Arc<AtomicBool>);
+struct CancelOnDrop(Arc<AtomicBool>);
 
-impl Drop for GiveUp {
+impl Drop for CancelOnDrop {
     fn drop(&mut self) {
         self.0.store(true, Ordering::Relaxed);
     }
 }
 
 /// A reader that fails once no request waits for it: a request has a deadline, a thread has none.
-struct GivenUp<R> {
+struct CancellableReader<R> {
     inner: R,
-    given_up: Arc<AtomicBool>,
+    is_cancelled: Arc<AtomicBool>,
 }
 
-impl<R: Read> Read for GivenUp<R> {
+impl<R: Read> Read for CancellableReader<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        if self.given_up.load(Ordering::Relaxed) {
-            return Err(io::Error::new(io::ErrorKind::TimedOut, "nobody waits for it"));
+        if self.is_cancelled.load(Ordering::Relaxed) {
+            return Err(io::Error::new(io::ErrorKind::TimedOut, "the request has ended"));
         }
         self.inner.read(buffer)
     }

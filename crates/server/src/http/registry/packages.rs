@@ -11,22 +11,23 @@ use axum::response::NoContent;
 use http::StatusCode;
 use serde::Deserialize;
 use task_archive::UnpackError;
+use task_macros::operation;
+use task_package::contents;
 use task_proto::api::{
     PackageDiff, PackageFile, PackageFiles, PackageList, PackageVersions, PackageView,
 };
 use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 use utoipa::{IntoParams, ToSchema};
 
+use super::Registry;
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::{PathParam, PathParams, QueryParams};
 use crate::orders::changes::Change;
-use crate::package::contents;
-use crate::store::{Act, Deed, Deletion, PackageUsers, Reference};
+use crate::store::{AuditAction, AuditEvent, Deletion, PackageUsers, Reference, Store};
 
 /// The most robots, and the most deployments, that the message about a package in use names.
-const MOST_NAMED: usize = 5;
+const MAX_NAMED: usize = 5;
 
 /// A version, or a manifest's digest.
 #[derive(Debug, Clone, ToSchema)]
@@ -59,24 +60,26 @@ impl fmt::Display for PackageReference {
 }
 
 /// Lists all package versions.
-#[utoipa::path(get, path = "/api/v1/packages", tag = "packages")]
-pub(in crate::http) async fn list(State(app): State<App>) -> Result<Json<PackageList>, ApiError> {
-    Ok(Json(PackageList { packages: app.store.packages().await? }))
+#[operation(tag = "packages")]
+pub(in crate::http) async fn list(
+    State(store): State<Store>,
+) -> Result<Json<PackageList>, ApiError> {
+    Ok(Json(PackageList { packages: store.packages().list().await? }))
 }
 
 /// Lists the versions of a package and how many robots should have each.
-#[utoipa::path(get, path = "/api/v1/packages/{package}", tag = "packages")]
+#[operation(tag = "packages")]
 pub(in crate::http) async fn show(
-    State(app): State<App>,
+    State(store): State<Store>,
     by: Person,
     PathParam(name): PathParam<TaskName>,
 ) -> Result<Json<PackageVersions>, ApiError> {
-    let versions = app.store.package_versions(&name).await?;
+    let versions = store.packages().versions(&name).await?;
     let robots = match by.scope.is_everything() {
         true => None,
-        false => Some(app.store.robots_in(&by.scope).await?.into_iter().collect::<HashSet<_>>()),
+        false => Some(store.robots().ids_in(&by.scope).await?.into_iter().collect::<HashSet<_>>()),
     };
-    let running = app.store.package_uses(&name, robots.as_ref()).await?;
+    let running = store.packages().uses(&name, robots.as_ref()).await?;
     if versions.is_empty() && running.is_empty() {
         return Err(ApiError::not_found(format!("there is no package {name}")));
     }
@@ -84,14 +87,14 @@ pub(in crate::http) async fn show(
 }
 
 /// Lists the contents of a package.
-#[utoipa::path(get, path = "/api/v1/packages/{package}/{version}/files", tag = "packages",
-    responses((status = 422, description = "`archive_refused`: its content is nothing that a robot would unpack.")))]
+#[operation(tag = "packages",
+    responses((status = 422, description = "`archive_refused`: robots would refuse to unpack the content.")))]
 pub(in crate::http) async fn files(
-    State(app): State<App>,
+    State(registry): State<Registry>,
     PathParams(name, version): PathParams<TaskName, PackageReference>,
 ) -> Result<Json<PackageFiles>, ApiError> {
-    let package = find(&app, &name, &version).await?;
-    Ok(Json(PackageFiles { files: listed(&app, &package).await? }))
+    let package = find(&registry.store, &name, &version).await?;
+    Ok(Json(PackageFiles { files: listed(&registry, &package).await? }))
 }
 
 /// The query of `GET /packages/{package}/diff`.
@@ -105,10 +108,10 @@ pub(in crate::http) struct DiffQuery {
 }
 
 /// Compares two versions of a package.
-#[utoipa::path(get, path = "/api/v1/packages/{package}/diff", tag = "packages",
-    responses((status = 422, description = "`archive_refused`: the content of one is nothing that a robot would unpack.")))]
+#[operation(tag = "packages",
+    responses((status = 422, description = "`archive_refused`: robots would refuse to unpack one of the contents.")))]
 pub(in crate::http) async fn diff(
-    State(app): State<App>,
+    State(registry): State<Registry>,
     PathParam(name): PathParam<TaskName>,
     QueryParams(query): QueryParams<DiffQuery>,
 ) -> Result<Json<PackageDiff>, ApiError> {
@@ -117,45 +120,47 @@ pub(in crate::http) async fn diff(
             .map_err(|error| ApiError::invalid(format!("{key}: {error}")))
     };
     let (from, to) = (named("from", &query.from)?, named("to", &query.to)?);
-    let (from, to) = (find(&app, &name, &from).await?, find(&app, &name, &to).await?);
-    let manifest_changed = !contents::says_the_same(&from.manifest, &to.manifest);
+    let (from, to) =
+        (find(&registry.store, &name, &from).await?, find(&registry.store, &name, &to).await?);
+    let manifest_changed = !contents::is_same_except_version(&from.manifest, &to.manifest);
     if from.package.content == to.package.content {
         return Ok(Json(PackageDiff { manifest_changed, ..PackageDiff::default() }));
     }
-    let diff = contents::diff(listed(&app, &from).await?, listed(&app, &to).await?);
+    let diff = contents::diff(listed(&registry, &from).await?, listed(&registry, &to).await?);
     Ok(Json(PackageDiff { manifest_changed, ..diff }))
 }
 
 /// Deletes a version of a package that no robot should have.
-#[utoipa::path(delete, path = "/api/v1/packages/{package}/{version}", tag = "packages",
-    responses((status = 409, description = "`package_in_use`: robots should have it, or are to get it.")))]
+#[operation(tag = "packages",
+    responses((status = 409, description = "`package_in_use`: robots have the package, or will get it.")))]
 pub(in crate::http) async fn remove(
-    State(app): State<App>,
+    State(registry): State<Registry>,
     by: Person,
     PathParams(name, version): PathParams<TaskName, PackageReference>,
 ) -> Result<NoContent, ApiError> {
-    let _hold = app.blobs.hold_collection().await;
-    let package = find(&app, &name, &version).await?.package;
-    let (digest, now_ms) = (package.manifest.digest, app.clock.now_ms());
-    let deed = Deed::by(&by, Act::ManifestDelete, &name)
+    let _hold = registry.blobs.hold_collection().await;
+    let package = find(&registry.store, &name, &version).await?.package;
+    let (digest, now_ms) = (package.manifest.digest, registry.clock.now_ms());
+    let event = AuditEvent::by(&by, AuditAction::ManifestDelete, &name)
         .with("manifest", digest)
         .with("version", &package.version);
-    match app
+    match registry
         .store
-        .delete_manifest(&RepositoryName::of_package(&name), &digest, &deed, now_ms)
+        .manifests()
+        .delete(&RepositoryName::of_package(&name), &digest, &event, now_ms)
         .await?
     {
         Deletion::Unknown => return Err(unknown(&name, &version)),
         Deletion::InUse(users) => {
-            let message = in_use(&by, &format!("{name} {}", package.version), &users);
+            let message = in_use_message(&by, &format!("{name} {}", package.version), &users);
             return Err(ApiError::conflict("package_in_use", message));
         }
         Deletion::Deleted(parts) => {
-            app.changes.announce(Change::Package(name));
+            registry.changes.announce(Change::Package(name));
             // An order that looked the package up a moment ago still finds its bytes, because the
             // bytes are kept for a while.
             for blob in parts.into_iter().chain([digest]) {
-                app.blobs.touch(blob, now_ms).await?;
+                registry.blobs.touch(blob, now_ms).await?;
             }
         }
     }
@@ -163,11 +168,11 @@ pub(in crate::http) async fn remove(
 }
 
 async fn find(
-    app: &App,
+    store: &Store,
     name: &TaskName,
     version: &PackageReference,
 ) -> Result<PackageView, ApiError> {
-    app.store.find_package(name, &version.0).await?.ok_or_else(|| unknown(name, version))
+    store.packages().find(name, &version.0).await?.ok_or_else(|| unknown(name, version))
 }
 
 fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
@@ -180,7 +185,7 @@ fn unknown(name: &TaskName, version: &PackageReference) -> ApiError {
 
 /// Names the users of a package that is in use. Robots outside the person's scope, and deployments
 /// without robots in that scope, are only counted.
-pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) -> String {
+pub(in crate::http) fn in_use_message(by: &Person, package: &str, users: &PackageUsers) -> String {
     let own =
         users.robots.iter().filter(|robot| by.scope.covers(&robot.id, &robot.name, &robot.labels));
     let (ids, names): (HashSet<&RobotId>, Vec<&str>) =
@@ -189,15 +194,15 @@ pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) 
         by.scope.is_everything() || robots.iter().any(|robot| ids.contains(robot))
     };
     let deployments = users.deployments.iter().filter(|(_, robots)| is_own(robots));
-    let deployments: Vec<&str> = deployments.map(|(id, _)| id.as_str()).take(MOST_NAMED).collect();
-    let robots: Vec<&str> = names.into_iter().take(MOST_NAMED).collect();
+    let deployments: Vec<&str> = deployments.map(|(id, _)| id.as_str()).take(MAX_NAMED).collect();
+    let robots: Vec<&str> = names.into_iter().take(MAX_NAMED).collect();
     let named = |names: Vec<&str>, of: usize| match of > names.len() {
         true if names.is_empty() => String::new(),
         true => format!(": {}, …", names.join(", ")),
         false => format!(": {}", names.join(", ")),
     };
     format!(
-        "{package} is what {} robots should have{}, by {} deployments{}; bring them another version or remove the task first",
+        "{package} is in use by {} robots{}, through {} deployments{}; deploy another version or remove the task first",
         users.robots.len(),
         named(robots, users.robots.len()),
         users.deployments.len(),
@@ -206,13 +211,12 @@ pub(in crate::http) fn in_use(by: &Person, package: &str, users: &PackageUsers) 
 }
 
 /// The entries of a package, read from its archive.
-async fn listed(app: &App, view: &PackageView) -> Result<Vec<PackageFile>, ApiError> {
+async fn listed(registry: &Registry, view: &PackageView) -> Result<Vec<PackageFile>, ApiError> {
     let content = view.package.content;
-    let gone = || ApiError::not_found(format!("the content of {} is gone", view.package.name));
-    let blob = app.blobs.get(content.digest).await?.ok_or_else(gone)?;
+    let gone = || ApiError::not_found(format!("the content of {} is missing", view.package.name));
+    let blob = registry.blobs.get(content.digest).await?.ok_or_else(gone)?;
     let facts = view.manifest.content;
-    let listed = app
-        .uploads
+    let listed = registry
         .readers
         .read(&blob, move |bytes| contents::list(bytes, content.size, &facts))
         .await;

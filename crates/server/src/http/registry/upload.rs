@@ -9,12 +9,14 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
-use axum::extract::{FromRef as _, Request, State};
+use axum::extract::{Request, State};
 use bytes::Bytes;
 use futures_util::StreamExt as _;
 use http::{HeaderMap, StatusCode, header};
 use serde::Deserialize;
 use task_archive::{Compression, Limits, Refusal, UnpackError, unpack_unannounced};
+use task_macros::operation;
+use task_package::{PackageError, Packed, pack_into};
 use task_proto::UserName;
 use task_proto::api::PackageView;
 use tempfile::TempDir;
@@ -22,91 +24,82 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::time::timeout;
 use utoipa::IntoParams;
 
-use super::archives::ArchiveReaders;
-use super::oci::{self, OciError, Registry};
-use crate::blobs::BlobError;
+use super::Registry;
+use super::oci::{self, OciError};
+use crate::blobs::{BlobError, Blobs};
 use crate::domain::person::Person;
-use crate::http::App;
 use crate::http::error::ApiError;
 use crate::http::extract::QueryParams;
 use crate::http::openapi::Created;
-use crate::package::{PackageError, Packed, pack_into};
 
 /// The most archives that are unpacked and packed at the same time.
-const AT_ONCE: usize = 2;
-/// The time limits of a sender that holds a place.
-const PATIENCE: Patience =
-    Patience { silence: Duration::from_secs(60), whole: Duration::from_secs(60 * 60) };
+const MAX_CONCURRENT: usize = 2;
+/// The time limits of a sender that holds a slot.
+const SENDER_TIMEOUTS: SenderTimeouts =
+    SenderTimeouts { idle: Duration::from_secs(60), total: Duration::from_secs(60 * 60) };
 /// Capacity of the channel between the body and the unpacker, in chunks.
-const WAITING: usize = 16;
+const CHANNEL_CHUNKS: usize = 16;
 /// Allowance for archive overhead beyond the contents, in bytes.
 const OVERHEAD_BYTES: u64 = 1 << 20;
 
 /// Time limits of a sender.
 #[derive(Debug, Clone, Copy)]
-struct Patience {
+struct SenderTimeouts {
     /// For the next chunk.
-    silence: Duration,
+    idle: Duration,
     /// For the whole body.
-    whole: Duration,
+    total: Duration,
 }
 
-/// The workspace for unpacking, and the limits on its users.
+/// The workspace for unpacking, and the limits on its users. Clones share the limits.
+#[derive(Clone)]
 pub struct UploadSpace {
     directory: PathBuf,
     limits: Limits,
-    places: Arc<Semaphore>,
+    slots: Arc<Semaphore>,
     /// People with an archive being unpacked.
     uploading: Arc<Mutex<HashSet<UserName>>>,
-    /// Readers of whole archives.
-    pub(in crate::http) readers: ArchiveReaders,
 }
 
 impl UploadSpace {
-    /// Uses this empty directory. At most `most_bytes` of an archive are unpacked.
-    pub fn new(directory: PathBuf, most_bytes: u64) -> Self {
+    /// Uses this empty directory. At most `max_bytes` of an archive are unpacked.
+    pub fn new(directory: PathBuf, max_bytes: u64) -> Self {
         let limits = Limits::default();
-        let limits = Limits { bytes: limits.bytes.min(most_bytes), ..limits };
-        let places = Arc::new(Semaphore::new(AT_ONCE));
-        Self {
-            directory,
-            limits,
-            places,
-            uploading: Arc::default(),
-            readers: ArchiveReaders::default(),
-        }
+        let limits = Limits { bytes: limits.bytes.min(max_bytes), ..limits };
+        let slots = Arc::new(Semaphore::new(MAX_CONCURRENT));
+        Self { directory, limits, slots, uploading: Arc::default() }
     }
 
-    /// Reserves a place for one archive of this person. One person may have one at a time.
-    fn place(&self, person: &UserName) -> Result<UploadPlace, ApiError> {
+    /// Reserves a slot for one archive of this person. One person may have one at a time.
+    fn reserve_slot(&self, person: &UserName) -> Result<UploadSlot, ApiError> {
         if !locked(&self.uploading).insert(person.clone()) {
             return Err(ApiError::too_many(format!(
-                "{person} uploads a package already; wait until it is there"
+                "{person} is already uploading a package; wait until it is done"
             )));
         }
-        let own = OwnUpload { uploading: self.uploading.clone(), person: person.clone() };
-        let place = self.places.clone().try_acquire_owned().map_err(|_| {
+        let mark = PersonMark { uploading: self.uploading.clone(), person: person.clone() };
+        let slot = self.slots.clone().try_acquire_owned().map_err(|_| {
             ApiError::too_many(format!(
-                "{AT_ONCE} packages are being uploaded already; try again in a moment"
+                "{MAX_CONCURRENT} packages are being uploaded already; try again in a moment"
             ))
         })?;
-        Ok(UploadPlace { _own: own, _place: place })
+        Ok(UploadSlot { _mark: mark, _slot: slot })
     }
 }
 
-/// The place of an archive being unpacked and packed; released on drop.
-struct UploadPlace {
-    _own: OwnUpload,
-    _place: OwnedSemaphorePermit,
+/// The slot of an archive being unpacked and packed; released on drop.
+struct UploadSlot {
+    _mark: PersonMark,
+    _slot: OwnedSemaphorePermit,
 }
 
 /// Marks a person with an upload under way; dropping the guard removes the mark.
-struct OwnUpload {
+struct PersonMark {
     uploading: Arc<Mutex<HashSet<UserName>>>,
     person: UserName,
 }
 
-impl Drop for OwnUpload {
+impl Drop for PersonMark {
     fn drop(&mut self) {
         locked(&self.uploading).remove(&self.person);
     }
@@ -141,31 +134,33 @@ pub(in crate::http) struct UploadQuery {
 
 /// Uploads a package's directory as a tar archive, optionally compressed with zstd, and packs it as
 /// `taskd push` would.
-#[utoipa::path(post, path = "/api/v1/packages", tag = "packages",
-    request_body(description = "The directory: its files, directories and links, or that one directory with all that is in it.",
+#[operation(tag = "packages",
+    request_body(description = "The directory: either its entries, or the directory itself with its entries.",
         content((String = "application/x-tar"), (String = "application/zstd"))),
-    responses((status = 400, description = "The body broke off."),
-        (status = 409, description = "`version_taken`: the version is there with other content; the message says which."),
-        (status = 413, description = "`too_large`: it is more than the server unpacks."),
+    responses((status = 400, description = "The request body ended early."),
+        (status = 409, description = "`version_taken`: the version exists with other content; the message names it."),
+        (status = 413, description = "`too_large`: the package exceeds the server's limit."),
         (status = 415, description = "The body is neither `application/x-tar` nor `application/zstd`."),
-        (status = 422, description = "`archive_refused`: there is something in it that a package can't have. \
-            `package_invalid`: it can't be run; the message says all that is wrong."),
-        (status = 408, description = "It took too long to arrive."),
-        (status = 429, description = "The person uploads a package already, or others do."),
-        (status = 507, description = "`disk_full`: the server's disk is.")))]
+        (status = 422, description = "`archive_refused`: the archive has an entry that a package can't have. \
+            `package_invalid`: the package can't run; the message lists all problems."),
+        (status = 408, description = "The upload took too long."),
+        (status = 429, description = "This person, or too many others, are uploading a package already."),
+        (status = 507, description = "`disk_full`: the server's disk is full.")))]
 pub(in crate::http) async fn package(
-    State(app): State<App>,
+    State(uploads): State<UploadSpace>,
+    State(registry): State<Registry>,
     by: Person,
     QueryParams(query): QueryParams<UploadQuery>,
     request: Request,
 ) -> Result<Created<PackageView>, ApiError> {
     let compression = compression(request.headers())?;
-    let place = app.uploads.place(&by.name)?;
-    let (packed, _place) = receive(&app, place, compression, request.into_body()).await?;
-    Ok(Created(oci::publish(&Registry::from_ref(&app), &by, &packed, query.force).await?))
+    let slot = uploads.reserve_slot(&by.name)?;
+    let (packed, _slot) =
+        receive(&uploads, &registry.blobs, slot, compression, request.into_body()).await?;
+    Ok(Created(oci::publish(&registry, &by, &packed, query.force).await?))
 }
 
-fn too_slow(message: &str) -> ApiError {
+fn timed_out(message: &str) -> ApiError {
     ApiError::new(StatusCode::REQUEST_TIMEOUT, "timeout", message)
 }
 
@@ -187,36 +182,37 @@ fn compression(headers: &HeaderMap) -> Result<Compression, ApiError> {
 }
 
 /// Unpacks the body as it arrives, and packs the contents. The work goes on if the caller
-/// disconnects, so its place has to stay taken as well.
+/// disconnects, so its slot has to stay taken as well.
 async fn receive(
-    app: &App,
-    place: UploadPlace,
+    uploads: &UploadSpace,
+    blobs: &Blobs,
+    slot: UploadSlot,
     compression: Compression,
     body: Body,
-) -> Result<(Packed, UploadPlace), ApiError> {
-    let (sender, receiver) = mpsc::channel(WAITING);
-    let (directory, limits) = (app.uploads.directory.clone(), app.uploads.limits);
+) -> Result<(Packed, UploadSlot), ApiError> {
+    let (sender, receiver) = mpsc::channel(CHANNEL_CHUNKS);
+    let (directory, limits) = (uploads.directory.clone(), uploads.limits);
     // Half of the room: the unpacked contents and their package are on disk at the same time.
-    let room = app.blobs.room_for_people() / 2;
+    let room = blobs.space_for_people() / 2;
     let (limits, is_short) =
         (Limits { bytes: limits.bytes.min(room), ..limits }, room < limits.bytes);
-    let most = limits.bytes.saturating_add(OVERHEAD_BYTES);
+    let max_bytes = limits.bytes.saturating_add(OVERHEAD_BYTES);
     let work = tokio::task::spawn_blocking(move || {
-        packed(Arriving { receiver, current: Bytes::new() }, compression, &limits, &directory)
-            .map(|it| (it, place))
+        pack(BodyReader { receiver, current: Bytes::new() }, compression, &limits, &directory)
+            .map(|it| (it, slot))
     });
-    let (fed, worked) = tokio::join!(feed(body, sender, most, PATIENCE), work);
-    let of_disk = |error: ApiError| match error.status {
+    let (fed, worked) = tokio::join!(feed(body, sender, max_bytes, SENDER_TIMEOUTS), work);
+    let as_disk_error = |error: ApiError| match error.status {
         StatusCode::PAYLOAD_TOO_LARGE if is_short => {
-            OciError::from(BlobError::DiskReserved { reserve: app.blobs.settings().reserve_bytes })
+            OciError::from(BlobError::DiskReserved { reserve: blobs.settings().reserve_bytes })
                 .into()
         }
         _ => error,
     };
     // Checked first: if the body is incomplete, so is its archive.
-    fed.map_err(of_disk)?;
+    fed.map_err(as_disk_error)?;
     match worked {
-        Ok(worked) => worked.map_err(|error| of_disk(refused(error))),
+        Ok(worked) => worked.map_err(|error| as_disk_error(refused(error))),
         Err(panic) => std::panic::resume_unwind(panic.into_panic()),
     }
 }
@@ -225,23 +221,22 @@ async fn receive(
 async fn feed(
     body: Body,
     sender: mpsc::Sender<Bytes>,
-    most: u64,
-    patience: Patience,
+    max_bytes: u64,
+    timeouts: SenderTimeouts,
 ) -> Result<(), ApiError> {
-    let (mut chunks, mut taken) = (body.into_data_stream(), 0);
-    let handing_on = async {
+    let (mut chunks, mut received) = (body.into_data_stream(), 0);
+    let forwarding = async {
         loop {
-            let chunk = match timeout(patience.silence, chunks.next()).await {
+            let chunk = match timeout(timeouts.idle, chunks.next()).await {
                 Ok(Some(Ok(chunk))) => chunk,
-                Ok(Some(Err(_))) => return Err(ApiError::invalid("the body broke off")),
+                Ok(Some(Err(_))) => return Err(ApiError::invalid("the request body ended early")),
                 Ok(None) => return Ok(()),
-                Err(_) => return Err(too_slow("the upload stopped for a minute")),
+                Err(_) => return Err(timed_out("the upload stopped for a minute")),
             };
-            taken += chunk.len() as u64;
-            if taken > most {
-                let message = format!(
-                    "the archive has more than {most} bytes, the most that this server takes"
-                );
+            received += chunk.len() as u64;
+            if received > max_bytes {
+                let message =
+                    format!("the archive has more than {max_bytes} bytes, this server's limit");
                 return Err(too_large(message));
             }
             if sender.send(chunk).await.is_err() {
@@ -249,18 +244,18 @@ async fn feed(
             }
         }
     };
-    timeout(patience.whole, handing_on)
+    timeout(timeouts.total, forwarding)
         .await
-        .unwrap_or_else(|_| Err(too_slow("the upload took longer than an hour")))
+        .unwrap_or_else(|_| Err(timed_out("the upload took longer than an hour")))
 }
 
 /// A body that a thread reads. The body ends when its sender is gone.
-struct Arriving {
+struct BodyReader {
     receiver: mpsc::Receiver<Bytes>,
     current: Bytes,
 }
 
-impl Read for Arriving {
+impl Read for BodyReader {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         while self.current.is_empty() {
             match self.receiver.blocking_recv() {
@@ -274,8 +269,8 @@ impl Read for Arriving {
     }
 }
 
-fn packed(
-    body: Arriving,
+fn pack(
+    body: BodyReader,
     compression: Compression,
     limits: &Limits,
     directory: &Path,
@@ -335,10 +330,10 @@ mod tests {
     const SHORT: Duration = Duration::from_millis(20);
 
     /// The answer that [`feed`] gives to the sender of this body.
-    async fn told(body: Body, patience: Patience) -> String {
-        let (sender, mut receiver) = mpsc::channel(WAITING);
+    async fn refusal_message(body: Body, timeouts: SenderTimeouts) -> String {
+        let (sender, mut receiver) = mpsc::channel(CHANNEL_CHUNKS);
         let fed = async {
-            tokio::join!(feed(body, sender, 1 << 20, patience), async {
+            tokio::join!(feed(body, sender, 1 << 20, timeouts), async {
                 while receiver.recv().await.is_some() {}
             })
             .0
@@ -349,16 +344,20 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn who_is_silent_or_never_ends_is_let_go() {
+    async fn silent_and_endless_uploads_time_out() {
         let silent = Body::from_stream(stream::pending::<Result<Bytes, Infallible>>());
-        let said = told(silent, Patience { silence: SHORT, whole: 2 * LONG }).await;
-        assert!(said.contains("stopped for a minute"), "{said}");
+        let message =
+            refusal_message(silent, SenderTimeouts { idle: SHORT, total: 2 * LONG }).await;
+        assert!(message.contains("stopped for a minute"), "{message}");
         let endless = stream::unfold((), |()| async {
             tokio::task::yield_now().await;
             Some((Ok::<_, Infallible>(Bytes::new()), ()))
         });
-        let said =
-            told(Body::from_stream(endless), Patience { silence: 2 * LONG, whole: SHORT }).await;
-        assert!(said.contains("longer than an hour"), "{said}");
+        let message = refusal_message(
+            Body::from_stream(endless),
+            SenderTimeouts { idle: 2 * LONG, total: SHORT },
+        )
+        .await;
+        assert!(message.contains("longer than an hour"), "{message}");
     }
 }

@@ -5,26 +5,32 @@ use axum::extract::State;
 use axum::response::{IntoResponse as _, Response};
 use http::StatusCode;
 use serde_json::{Value, json};
+use task_macros::operation;
 use task_proto::api::ServerInfo;
+use tokio_util::sync::CancellationToken;
 
-use crate::http::App;
+use super::gauges::Gauges;
+use crate::http::server::readiness::Readiness;
 
 /// Reports that the process responds.
-#[utoipa::path(get, path = "/healthz", tag = "server",
-    responses((status = 200, description = "It does.", body = Value, example = json!({ "status": "ok" }))))]
+#[operation(tag = "server",
+    responses((status = 200, description = "The process responds.", body = Value, example = json!({ "status": "ok" }))))]
 pub(in crate::http) async fn healthz() -> Json<Value> {
     Json(json!({ "status": "ok" }))
 }
 
 /// Reports whether database, broker and disk passed their last check, a few seconds ago, and names
 /// the problems.
-#[utoipa::path(get, path = "/readyz", tag = "server",
-    responses((status = 200, description = "All of them were.", body = Value,
+#[operation(tag = "server",
+    responses((status = 200, description = "All components are healthy.", body = Value,
             example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
-        (status = 503, description = "Some were not, or the server stops.", body = Value)))]
-pub(in crate::http) async fn readyz(State(app): State<App>) -> Response {
-    let verdicts = app.readiness.verdicts();
-    let is_ready = verdicts.values().all(Option::is_none) && !app.stop.is_cancelled();
+        (status = 503, description = "A component is unhealthy, or the server is stopping.", body = Value)))]
+pub(in crate::http) async fn readyz(
+    State(readiness): State<Readiness>,
+    State(stop): State<CancellationToken>,
+) -> Response {
+    let verdicts = readiness.verdicts();
+    let is_ready = verdicts.values().all(Option::is_none) && !stop.is_cancelled();
     let mut body = json!({ "status": if is_ready { "ready" } else { "not_ready" } });
     for (component, problem) in verdicts {
         body[component.as_str()] = problem.unwrap_or_else(|| "ok".to_owned()).into();
@@ -34,16 +40,16 @@ pub(in crate::http) async fn readyz(State(app): State<App>) -> Response {
 }
 
 /// Shows information about the server, its MQTT listeners and their traffic.
-#[utoipa::path(get, path = "/api/v1/server", tag = "server")]
-pub(in crate::http) async fn server(State(app): State<App>) -> Json<ServerInfo> {
+#[operation(tag = "server")]
+pub(in crate::http) async fn server(State(gauges): State<Gauges>) -> Json<ServerInfo> {
     Json(ServerInfo {
         version: env!("CARGO_PKG_VERSION").to_owned(),
-        key: app.key.clone(),
-        ca_pin: app.ca_pin,
-        mqtt: app.broker.address(),
-        now_ms: app.clock.now_ms(),
-        traffic: app.broker.traffic(),
-        http: app.http_traffic.read(),
-        conduct: app.conduct.totals(),
+        key: gauges.facts.key.clone(),
+        ca_pin: gauges.facts.ca_pin,
+        mqtt: gauges.broker.address(),
+        now_ms: gauges.clock.now_ms(),
+        traffic: gauges.broker.traffic(),
+        http: gauges.http_traffic.read(),
+        conduct: gauges.robot_limiter.totals(),
     })
 }

@@ -14,16 +14,16 @@ use tokio_util::sync::CancellationToken;
 
 use crate::broker::{Broker, Health};
 use crate::store::Store;
-use crate::system::data_directory::room;
+use crate::system::data_directory::disk_space;
 
 /// Interval between two checks of the database and the disk.
 const CHECK_INTERVAL: Duration = Duration::from_secs(5);
 /// Time limit for the answer of one component.
-const PATIENCE: Duration = Duration::from_secs(5);
+const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 /// A file system with less free space than this, in bytes, counts as full.
-const LEAST_FREE_BYTES: u64 = 16 << 20;
+const MIN_FREE_BYTES: u64 = 16 << 20;
 /// On a small file system, the threshold is the total size divided by this number.
-const LEAST_FREE_SHARE: u64 = 64;
+const MIN_FREE_SHARE: u64 = 64;
 
 /// A component that the server needs to work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -82,16 +82,14 @@ impl ReadinessCheck {
     /// Checks all components once.
     pub async fn check(&mut self) {
         let (database, disk) =
-            tokio::join!(timeout(PATIENCE, self.store.ping()), self.disk.problem());
+            tokio::join!(timeout(CHECK_TIMEOUT, self.store.ping()), self.disk.problem());
         self.readiness.set(
             Component::Database,
             match database {
                 Ok(Ok(())) => self.store.state().problem(),
-                Ok(Err(_)) => self
-                    .store
-                    .state()
-                    .problem()
-                    .or_else(|| Some("it refuses a statement".to_owned())),
+                Ok(Err(_)) => {
+                    self.store.state().problem().or_else(|| Some("a statement failed".to_owned()))
+                }
                 Err(_) => Some("it does not answer".to_owned()),
             },
         );
@@ -122,7 +120,7 @@ impl ReadinessCheck {
 fn broker_problem(health: &Health) -> Option<String> {
     match health {
         Health::Serving => None,
-        Health::Recovering(seen) | Health::Failed(seen) => Some(seen.clone()),
+        Health::Recovering(problem) | Health::Failed(problem) => Some(problem.clone()),
     }
 }
 
@@ -130,14 +128,14 @@ fn broker_problem(health: &Health) -> Option<String> {
 /// blocks one thread, not one per check.
 pub struct DiskProbe {
     data: PathBuf,
-    patience: Duration,
+    check_timeout: Duration,
     running: Option<JoinHandle<io::Result<()>>>,
 }
 
 impl DiskProbe {
     /// A probe of this directory.
     pub fn new(data: PathBuf) -> Self {
-        Self { data, patience: PATIENCE, running: None }
+        Self { data, check_timeout: CHECK_TIMEOUT, running: None }
     }
 
     /// The reason why the data directory is not writable, or `None`.
@@ -146,14 +144,14 @@ impl DiskProbe {
         let probe = self
             .running
             .get_or_insert_with(|| tokio::task::spawn_blocking(move || probe_disk(&data)));
-        let finished = timeout(self.patience, probe).await.ok();
+        let finished = timeout(self.check_timeout, probe).await.ok();
         if finished.is_some() {
             self.running = None;
         }
         match finished {
             Some(Ok(Ok(()))) => None,
             Some(Ok(Err(error))) if error.kind() == io::ErrorKind::StorageFull => {
-                let free = room(&self.data).map_or(0, |(free, _)| free);
+                let free = disk_space(&self.data).map_or(0, |(free, _)| free);
                 Some(format!("the data directory's disk is full: {free} bytes are free"))
             }
             Some(Ok(Err(error))) => {
@@ -169,8 +167,8 @@ fn probe_disk(data: &Path) -> io::Result<()> {
     std::fs::write(data.join(".ready"), b"ready\n")?;
     // The file is short and exists already, so this write may succeed where others fail. Therefore
     // we also check the free space.
-    match room(data) {
-        Some((free, total)) if free < LEAST_FREE_BYTES.min(total / LEAST_FREE_SHARE) => {
+    match disk_space(data) {
+        Some((free, total)) if free < MIN_FREE_BYTES.min(total / MIN_FREE_SHARE) => {
             Err(io::ErrorKind::StorageFull.into())
         }
         _ => Ok(()),
@@ -202,7 +200,7 @@ mod tests {
         });
         let mut probe = DiskProbe {
             data: data.path().to_owned(),
-            patience: Duration::from_millis(1),
+            check_timeout: Duration::from_millis(1),
             running: Some(hanging),
         };
         for _ in 0..3 {
@@ -213,7 +211,7 @@ mod tests {
         }
         assert!(!data.path().join(".ready").exists(), "a second write was begun");
         release.send(()).expect("it waits");
-        probe.patience = PATIENCE;
+        probe.check_timeout = CHECK_TIMEOUT;
         assert_eq!(probe.problem().await, None);
     }
 }

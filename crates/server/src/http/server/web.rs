@@ -4,6 +4,7 @@
 use axum::response::{IntoResponse, Response};
 use http::{HeaderMap, StatusCode, header};
 use rust_embed::{Embed, EmbeddedFile};
+use task_macros::operation;
 use task_proto::Digest;
 
 use crate::http::error::ApiError;
@@ -25,26 +26,26 @@ const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; i
      frame-ancestors 'none'";
 
 /// Returns the page. The page holds no data; data needs a session.
-#[utoipa::path(get, path = "/", tag = "server",
+#[operation(tag = "server",
     responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
-        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
+        (status = 304, description = "Not modified: `If-None-Match` names the current version.")))]
 pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("index.html", &headers)
 }
 
 /// Returns the interactive API documentation.
-#[utoipa::path(get, path = "/api/docs", tag = "server",
+#[operation(tag = "server",
     responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
-        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
+        (status = 304, description = "Not modified: `If-None-Match` names the current version.")))]
 pub async fn docs(headers: HeaderMap) -> Result<Response, ApiError> {
     serve("docs.html", &headers)
 }
 
 /// Returns a file of the page.
-#[utoipa::path(get, path = "/ui/{file}", tag = "server",
-    params(("file" = String, Path, description = "Its path, which may have slashes.")),
+#[operation(tag = "server",
+    params(("file" = String, Path, description = "The file's path, which may contain slashes.")),
     responses((status = 200, description = "The file.", body = String, content_type = "text/plain"),
-        (status = 304, description = "It is still the one that `If-None-Match` names.")))]
+        (status = 304, description = "Not modified: `If-None-Match` names the current version.")))]
 pub async fn file(
     PathParam(path): PathParam<String>,
     headers: HeaderMap,
@@ -58,7 +59,7 @@ fn serve(path: &str, headers: &HeaderMap) -> Result<Response, ApiError> {
     let caching = if path.starts_with("vendor/") { IMMUTABLE } else { REVALIDATED };
     let caching = [(header::ETAG, tag.clone()), (header::CACHE_CONTROL, caching.to_owned())];
     let policy = [(header::CONTENT_SECURITY_POLICY, POLICY)];
-    if is_known(headers, &tag) {
+    if has_current_tag(headers, &tag) {
         return Ok((StatusCode::NOT_MODIFIED, caching, policy).into_response());
     }
     Ok((caching, policy, [(header::CONTENT_TYPE, content_type(path))], file.data.into_owned())
@@ -71,7 +72,7 @@ fn tag(file: &EmbeddedFile) -> String {
 
 /// True if the caller has the file already: one of its tags matches, compared weakly as RFC 9110
 /// requires.
-pub fn is_known(headers: &HeaderMap, tag: &str) -> bool {
+pub fn has_current_tag(headers: &HeaderMap, tag: &str) -> bool {
     let given =
         headers.get_all(header::IF_NONE_MATCH).iter().filter_map(|value| value.to_str().ok());
     given
@@ -127,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn no_path_leads_out() {
+    fn paths_outside_the_page_are_not_found() {
         for path in [
             "",
             "/",
@@ -145,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn the_page_asks_no_other_host_and_has_no_inline_code() {
+    fn page_uses_no_other_host_and_no_inline_code() {
         for path in Files::iter().filter(|path| !path.starts_with("vendor/")) {
             let file = Files::get(&path).expect("there");
             let text = std::str::from_utf8(&file.data)

@@ -3,8 +3,8 @@
 //! again. A robot that can't keep up is told to pull instead. This module never chooses a robot's
 //! initial delivery.
 
-mod course;
 mod package;
+mod state;
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -21,18 +21,18 @@ use tokio_util::sync::CancellationToken;
 use crate::blobs::Blobs;
 use crate::broker::Broker;
 use crate::config::DeliverySettings;
-use crate::orders::actions::Actions;
+use crate::orders::actions::DeploymentActions;
 use crate::orders::changes::{Change, Changes};
 use crate::store::{Store, StoreError};
 
 /// Maximum packages in fan-out at the same time; the broker permits no more.
 const MAX_AT_ONCE: usize = 4;
 /// Interval between polls if nothing has changed.
-const LOOK_INTERVAL: Duration = Duration::from_secs(5);
+const POLL_INTERVAL: Duration = Duration::from_secs(5);
 /// Minimum interval between polls, whatever changes: changes in between are handled together.
 /// Robots that learn of an order request its parts at once, and are refused until a poll has seen
 /// the order.
-const LOOK_PAUSE: Duration = Duration::from_millis(25);
+const MIN_POLL_INTERVAL: Duration = Duration::from_millis(25);
 
 /// The dependencies of a fan-out. Clones share them.
 #[derive(Clone)]
@@ -40,7 +40,7 @@ pub struct FanOutWorker {
     /// The source of pending work.
     pub store: Store,
     /// Tells robots to pull instead.
-    pub actions: Actions,
+    pub deployments: DeploymentActions,
     /// The bytes of packages.
     pub blobs: Blobs,
     pub broker: Broker,
@@ -52,14 +52,14 @@ pub struct FanOutWorker {
 
 /// Packages in fan-out, and the channels that tell their tasks of changed orders.
 #[derive(Default)]
-struct UnderWay {
+struct ActiveFanOuts {
     tasks: JoinSet<Digest>,
     packages: HashMap<Digest, Arc<Notify>>,
 }
 
 /// One content to fan out, and the orders for it.
 #[derive(Debug)]
-struct Wanted {
+struct PendingContent {
     content: BlobRef,
     deployments: Vec<DeploymentId>,
 }
@@ -70,26 +70,24 @@ impl FanOutWorker {
         // If this is cut off half-way, robots lack parts and begin anew with the next fan-out.
         tokio::select! {
             () = stop.cancelled() => {}
-            () = self.work() => {}
+            () = self.poll() => {}
         }
     }
 
-    async fn work(self) {
+    async fn poll(self) {
         let mut notices = self.changes.subscribe();
-        let mut under_way = UnderWay::default();
+        let mut active = ActiveFanOuts::default();
         loop {
-            let looked_at = Instant::now();
-            match self.wanted().await {
-                Ok(wanted) => self.begin(wanted, &mut under_way),
-                Err(error) => {
-                    error.log("what is to be fanned out could not be read; it is tried again")
-                }
+            let polled_at = Instant::now();
+            match self.pending_contents().await {
+                Ok(pending) => self.begin(pending, &mut active),
+                Err(error) => error.log("pending fan-outs could not be read; trying again"),
             }
             loop {
                 tokio::select! {
-                    () = tokio::time::sleep_until(looked_at + LOOK_INTERVAL) => break,
-                    Some(ended) = under_way.tasks.join_next() => {
-                        under_way.ended(ended);
+                    () = tokio::time::sleep_until(polled_at + POLL_INTERVAL) => break,
+                    Some(ended) = active.tasks.join_next() => {
+                        active.ended(ended);
                         break;
                     }
                     notice = notices.recv() => match notice {
@@ -99,35 +97,37 @@ impl FanOutWorker {
                     },
                 }
             }
-            tokio::time::sleep_until(looked_at + LOOK_PAUSE).await;
+            tokio::time::sleep_until(polled_at + MIN_POLL_INTERVAL).await;
             notices = notices.resubscribe();
         }
     }
 
-    /// All contents that some robot should receive by fan-out and has not, the most urgent first.
-    async fn wanted(&self) -> Result<Vec<Wanted>, StoreError> {
-        let mut wanted: Vec<Wanted> = Vec::new();
-        for (deployment, package) in self.store.direct_pushes().await? {
-            match wanted.iter_mut().find(|other| other.content == package.content) {
+    /// All contents that robots should receive by fan-out and have not yet received, the most
+    /// urgent first.
+    async fn pending_contents(&self) -> Result<Vec<PendingContent>, StoreError> {
+        let mut pending: Vec<PendingContent> = Vec::new();
+        for (deployment, package) in self.store.fan_outs().list().await? {
+            match pending.iter_mut().find(|other| other.content == package.content) {
                 Some(other) => other.deployments.push(deployment),
-                None => {
-                    wanted.push(Wanted { content: package.content, deployments: vec![deployment] })
-                }
+                None => pending.push(PendingContent {
+                    content: package.content,
+                    deployments: vec![deployment],
+                }),
             }
         }
-        Ok(wanted)
+        Ok(pending)
     }
 
-    fn begin(&self, wanted: Vec<Wanted>, under_way: &mut UnderWay) {
-        for Wanted { content, deployments } in wanted {
-            if let Some(changed) = under_way.packages.get(&content.digest) {
+    fn begin(&self, pending: Vec<PendingContent>, active: &mut ActiveFanOuts) {
+        for PendingContent { content, deployments } in pending {
+            if let Some(changed) = active.packages.get(&content.digest) {
                 changed.notify_one();
-            } else if under_way.packages.len() < MAX_AT_ONCE {
+            } else if active.packages.len() < MAX_AT_ONCE {
                 let changed = Arc::new(Notify::new());
-                under_way.packages.insert(content.digest, changed.clone());
+                active.packages.insert(content.digest, changed.clone());
                 tracing::info!(digest = %content.digest, deployments = deployments.len(), "a package is fanned out");
                 let worker = self.clone();
-                under_way.tasks.spawn(async move {
+                active.tasks.spawn(async move {
                     worker.fan_out(content, changed).await;
                     content.digest
                 });
@@ -136,14 +136,14 @@ impl FanOutWorker {
     }
 }
 
-impl UnderWay {
+impl ActiveFanOuts {
     fn ended(&mut self, ended: Result<Digest, tokio::task::JoinError>) {
         match ended {
             Ok(digest) => drop(self.packages.remove(&digest)),
             // One of the tasks that are aborted below.
             Err(error) if error.is_cancelled() => {}
             Err(error) => {
-                tracing::error!(%error, "a fan-out has failed; all begin anew");
+                tracing::error!(%error, "a fan-out task has failed; all fan-outs restart");
                 self.tasks.abort_all();
                 self.packages.clear();
             }

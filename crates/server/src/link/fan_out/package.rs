@@ -8,20 +8,21 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::desired::BlobRef;
-use task_proto::part::{Cut, MAX_PARTS};
+use task_proto::messages::part::{MAX_PARTS, PartLayout};
+use task_proto::time::millis;
 use task_proto::{DeploymentId, RobotId};
 use tokio::sync::Notify;
 use tokio::time::{Instant, timeout};
 
 use super::FanOutWorker;
-use super::course::{Course, GivenUp, Step};
+use super::state::{FanOutState, GiveUpReason, Step};
 use crate::blobs::Blob;
 use crate::broker::{FanOut, FanOutError, FanOutSettings, Part, PartQos};
-use crate::fleet::part_requests::Listening;
+use crate::fleet::part_requests::PartSubscription;
 use crate::store::StoreError;
 
 /// Interval of checks for subscribers and for the next step.
-const TURN: Duration = Duration::from_millis(250);
+const CHECK_INTERVAL: Duration = Duration::from_millis(250);
 /// How long to wait for further subscribers after the first: they tend to come together.
 const JOIN_PAUSE: Duration = Duration::from_millis(20);
 /// Minimum interval between database queries for robots that still need the package,
@@ -30,19 +31,19 @@ const SYNC_PAUSE: Duration = Duration::from_millis(200);
 const SYNC_INTERVAL: Duration = Duration::from_secs(2);
 /// Time limit for the acknowledgement of the last parts; afterwards we wait for the robots'
 /// reports.
-const SETTLE: Duration = Duration::from_secs(10);
+const SETTLE_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Pause before an interrupted fan-out is retried.
-const PAUSE: Duration = Duration::from_secs(2);
+const RETRY_PAUSE: Duration = Duration::from_secs(2);
 
 struct Package<'a> {
     worker: &'a FanOutWorker,
     content: BlobRef,
-    cut: Cut,
+    cut: PartLayout,
     blob: Blob,
     fan_out: FanOut,
-    requests: Listening,
-    course: Course,
+    requests: PartSubscription,
+    state: FanOutState,
     started: Instant,
     /// The deployments of each robot that include the package.
     owners: BTreeMap<RobotId, Vec<DeploymentId>>,
@@ -58,7 +59,7 @@ enum Interrupted {
     #[error("the database failed")]
     Store(#[from] StoreError),
     #[error("the orders could not be changed")]
-    Action(#[from] crate::orders::actions::ActionError),
+    Deployment(#[from] crate::orders::actions::DeploymentError),
     #[error("the blob can't be read")]
     Blob(#[from] crate::blobs::BlobError),
     #[error("the broker refused")]
@@ -79,9 +80,9 @@ impl FanOutWorker {
                 tracing::warn!(
                     digest = %content.digest,
                     error = &error as &dyn std::error::Error,
-                    "a fan-out was interrupted; it is tried again"
+                    "a fan-out was interrupted; trying again"
                 );
-                tokio::time::sleep(PAUSE).await;
+                tokio::time::sleep(RETRY_PAUSE).await;
             }
         }
     }
@@ -99,7 +100,7 @@ impl FanOutWorker {
         };
         // A robot can track only a limited number of parts, so parts grow with the package.
         let least = u32::try_from(content.size.div_ceil(u64::from(MAX_PARTS))).unwrap_or(u32::MAX);
-        let Ok(cut) = Cut::new(content.size, self.settings.part_bytes.max(least)) else {
+        let Ok(cut) = PartLayout::new(content.size, self.settings.part_bytes.max(least)) else {
             return Ok(None);
         };
         let qos = match self.settings.qos {
@@ -117,8 +118,8 @@ impl FanOutWorker {
             cut,
             blob,
             fan_out,
-            requests: self.changes.part_requests().listen(content.digest),
-            course: Course::begin(cut.count(), 0),
+            requests: self.changes.part_requests().subscribe(content.digest),
+            state: FanOutState::begin(cut.count(), 0),
             started: Instant::now(),
             owners: BTreeMap::new(),
             changed,
@@ -128,8 +129,8 @@ impl FanOutWorker {
     }
 
     async fn give_up_on_all(&self, content: BlobRef) -> Result<(), Interrupted> {
-        let open = self.store.awaiting_parts(&content.digest).await?;
-        Ok(self.actions.pull_instead(&open, "the server has no such content").await?)
+        let open = self.store.fan_outs().awaiting_parts(&content.digest).await?;
+        Ok(self.deployments.switch_to_pull(&open, "the server has no such content").await?)
     }
 }
 
@@ -137,11 +138,11 @@ impl Package<'_> {
     async fn run(mut self) -> Result<(), Interrupted> {
         loop {
             self.sync().await?;
-            match self.course.next(self.now_ms()) {
+            match self.state.next(self.now_ms()) {
                 Step::Publish(parts) => self.publish(parts).await?,
                 Step::Wait => self.wait().await,
                 Step::Over => {
-                    self.tell_to_pull().await?;
+                    self.switch_given_up_to_pull().await?;
                     // Robots that were released meanwhile are found by the next check.
                     return Ok(());
                 }
@@ -153,9 +154,9 @@ impl Package<'_> {
     async fn wait(&self) {
         tokio::select! {
             () = self.changed.notified() => {}
-            () = self.requests.news() => {}
+            () = self.requests.added() => {}
             () = self.fan_out.joined() => tokio::time::sleep(JOIN_PAUSE).await,
-            () = tokio::time::sleep(TURN) => {}
+            () = tokio::time::sleep(CHECK_INTERVAL) => {}
         }
     }
 
@@ -167,7 +168,7 @@ impl Package<'_> {
             let part = Part { header: Bytes::copy_from_slice(&self.cut.header(index)), bytes };
             // A cancelled call has sent nothing.
             loop {
-                match timeout(TURN, self.fan_out.publish(part.clone())).await {
+                match timeout(CHECK_INTERVAL, self.fan_out.publish(part.clone())).await {
                     Ok(sent) => break sent?,
                     Err(_) => self.sync().await?,
                 }
@@ -175,12 +176,12 @@ impl Package<'_> {
             if self.synced_at.is_none_or(|at| at.elapsed() >= SYNC_INTERVAL) {
                 self.sync().await?;
             }
-            if self.course.is_over() {
+            if self.state.is_over() {
                 break;
             }
         }
-        self.fan_out.settle(SETTLE).await;
-        self.course.sent(self.now_ms());
+        self.fan_out.settle(SETTLE_TIMEOUT).await;
+        self.state.sent(self.now_ms());
         Ok(())
     }
 
@@ -197,27 +198,29 @@ impl Package<'_> {
         if is_due {
             self.read_orders(now_ms).await?;
         }
-        for robot in self.fan_out.take_put_out() {
-            self.course.put_out(robot);
+        for robot in self.fan_out.take_evicted() {
+            self.state.evicted(robot);
         }
-        let said = self.requests.take();
-        said.keys().for_each(|robot| self.fan_out.told(robot, true));
+        let reports = self.requests.take();
+        reports.keys().for_each(|robot| self.fan_out.note_subscription(robot, true));
         let fan_out = &self.fan_out;
-        self.course.set_listening(|robot| fan_out.is_listening(robot), now_ms);
-        for (robot, missing) in said {
-            self.course.lacks(&robot, missing, now_ms);
+        self.state.set_subscribed(|robot| fan_out.is_subscribed(robot), now_ms);
+        for (robot, missing) in reports {
+            self.state.report_missing(&robot, missing, now_ms);
         }
-        self.tell_to_pull().await
+        self.switch_given_up_to_pull().await
     }
 
     async fn read_orders(&mut self, now_ms: u64) -> Result<(), Interrupted> {
         (self.synced_at, self.is_stale) = (Some(Instant::now()), false);
         self.owners.clear();
-        for (deployment, robot) in self.worker.store.awaiting_parts(&self.content.digest).await? {
+        for (deployment, robot) in
+            self.worker.store.fan_outs().awaiting_parts(&self.content.digest).await?
+        {
             self.owners.entry(robot).or_default().push(deployment);
         }
         let robots: BTreeSet<RobotId> = self.owners.keys().cloned().collect();
-        let (new, gone) = self.course.set_robots(&robots, now_ms);
+        let (new, gone) = self.state.set_robots(&robots, now_ms);
         self.fan_out.admit(new);
         for robot in gone {
             self.fan_out.withdraw(&robot);
@@ -225,22 +228,22 @@ impl Package<'_> {
         Ok(())
     }
 
-    async fn tell_to_pull(&mut self) -> Result<(), Interrupted> {
-        let mut by_reason: BTreeMap<GivenUp, Vec<(DeploymentId, RobotId)>> = BTreeMap::new();
-        for (robot, why) in self.course.take_given_up() {
+    async fn switch_given_up_to_pull(&mut self) -> Result<(), Interrupted> {
+        let mut by_reason: BTreeMap<GiveUpReason, Vec<(DeploymentId, RobotId)>> = BTreeMap::new();
+        for (robot, why) in self.state.take_given_up() {
             self.fan_out.withdraw(&robot);
             let deployments = self.owners.remove(&robot).unwrap_or_default();
             let parts = deployments.into_iter().map(|deployment| (deployment, robot.clone()));
             by_reason.entry(why).or_default().extend(parts);
         }
         for (why, parts) in by_reason {
-            tracing::info!(digest = %self.content.digest, robots = parts.len(), why = why.as_str(), "robots are told to pull");
-            self.worker.actions.pull_instead(&parts, why.as_str()).await?;
+            tracing::info!(digest = %self.content.digest, robots = parts.len(), why = why.as_str(), "robots are switched to pull");
+            self.worker.deployments.switch_to_pull(&parts, why.as_str()).await?;
         }
         Ok(())
     }
 
     fn now_ms(&self) -> u64 {
-        u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX)
+        millis(self.started.elapsed())
     }
 }

@@ -4,7 +4,7 @@ use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use hmac::{Hmac, KeyInit as _, Mac as _};
 use sha2::Sha512;
-use task_proto::topic::TopicPrefix;
+use task_proto::messages::topic::TopicPrefix;
 
 use super::{Account, External};
 use crate::broker::CANARY_LEVEL;
@@ -103,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_hash_is_the_known_one() {
+    fn hash_matches_the_reference_vector() {
         // PBKDF2-HMAC-SHA-512 of "password" and "salt" with one and two iterations begins with
         // these bytes in every implementation.
         let hex = |iterations| {

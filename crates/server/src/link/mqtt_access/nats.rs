@@ -6,7 +6,7 @@
 
 use std::fmt::Write as _;
 
-use task_proto::topic::{RobotTopic, TopicPrefix};
+use task_proto::messages::topic::{RobotTopic, TopicPrefix};
 
 use super::{Account, External, Role};
 use crate::broker::CANARY_LEVEL;
@@ -90,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn topic_becomes_the_subject_that_nats_maps_it_to() {
+    fn topic_becomes_the_nats_subject() {
         assert_eq!(subject("taskd/v1"), "taskd.v1");
         assert_eq!(subject("fleet/v1.2/x"), "fleet.v1//2.x");
     }

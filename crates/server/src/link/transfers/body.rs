@@ -14,7 +14,7 @@ use super::Transfer;
 pub struct TransferBody<B> {
     body: B,
     transfer: Transfer,
-    /// Bytes received from the inner body and not yet passed on.
+    /// Bytes received from the inner body and not yet overtaken on.
     held: Bytes,
     /// The number of those bytes that are next, and when.
     next: Option<(usize, Pin<Box<Sleep>>)>,

@@ -12,23 +12,24 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use task_proto::id::{LabelKey, LabelValue, Labels};
+use task_proto::ids::{LabelKey, LabelValue, Labels};
 use task_proto::{Digest, RobotId};
 use tokio::sync::oneshot;
 use tokio::time::{Instant, timeout};
 
 pub use body::TransferBody;
 use pace::Pace;
-pub use queue::Claim;
-use queue::{Asking, Place, Progress, Queue, Turn, jittered};
+pub use queue::TransferRequest;
+use queue::{Permit, Place, Progress, Queue, RequestId, jittered};
+use task_proto::time::millis;
 
 use crate::config::TransferLimits;
 use crate::net::http_connections::Connection;
 
 /// How long a request waits for its turn.
-const PATIENCE: Duration = Duration::from_secs(2);
+const WAIT_TIMEOUT: Duration = Duration::from_secs(2);
 /// Number of samples for the displayed speed.
-const LOOKS: usize = 6;
+const SAMPLES: usize = 6;
 /// When a robot should retry if the queue had no place.
 const NO_PLACE_MS: u64 = 30_000;
 
@@ -41,25 +42,25 @@ pub struct Transfers {
 struct Shared {
     started: Instant,
     site_label: LabelKey,
-    turns: Mutex<Turns>,
+    state: Mutex<State>,
     paces: Mutex<Paces>,
     /// Bytes sent to robots.
     sent: AtomicU64,
     /// Samples of the sent bytes, with their times.
-    looks: Mutex<VecDeque<(Instant, u64)>>,
+    samples: Mutex<VecDeque<(Instant, u64)>>,
 }
 
-struct Turns {
+struct State {
     queue: Queue,
     /// Channels to the pending requests.
-    asking: HashMap<Asking, oneshot::Sender<Transfer>>,
+    senders: HashMap<RequestId, oneshot::Sender<Transfer>>,
     /// Transfers whose bytes are being sent.
-    carried: HashMap<u64, Carried>,
+    active: HashMap<u64, ActiveTransfer>,
     last_number: u64,
 }
 
 /// A transfer and its connection.
-struct Carried {
+struct ActiveTransfer {
     robot: RobotId,
     connection: Connection,
     progress: Progress,
@@ -72,18 +73,18 @@ struct Paces {
 
 /// The robot's turn has not come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("other robots come first; come back in {retry_after_s} s")]
-pub struct NotYet {
+#[error("other robots come first; try again in {retry_after_s} s")]
+pub struct RetryLater {
     /// Seconds after which to retry.
     pub retry_after_s: u64,
 }
 
-/// A robot's turn, which ends when this is dropped.
+/// A running transfer, which ends when this is dropped.
 pub struct Transfer {
     shared: Arc<Shared>,
-    turn: Turn,
+    permit: Permit,
     begun_ms: u64,
-    /// The number among the carried transfers.
+    /// The number among the active transfers.
     number: Option<u64>,
 }
 
@@ -99,15 +100,15 @@ impl Transfers {
             .iter()
             .filter_map(|(site, limits)| Some((site.clone(), pace(limits.bytes_per_s)?)));
         let paces = Paces { all: pace(limits.all.bytes_per_s), sites: sites.collect() };
-        let turns = Turns {
+        let state = State {
             queue: Queue::new(limits),
-            asking: HashMap::new(),
-            carried: HashMap::new(),
+            senders: HashMap::new(),
+            active: HashMap::new(),
             last_number: 0,
         };
-        let (turns, paces) = (Mutex::new(turns), Mutex::new(paces));
-        let (sent, looks) = (AtomicU64::new(0), Mutex::default());
-        Self { shared: Arc::new(Shared { started: now, site_label, turns, paces, sent, looks }) }
+        let (state, paces) = (Mutex::new(state), Mutex::new(paces));
+        let (sent, samples) = (AtomicU64::new(0), Mutex::default());
+        Self { shared: Arc::new(Shared { started: now, site_label, state, paces, sent, samples }) }
     }
 
     /// The site of a robot with these labels.
@@ -117,18 +118,19 @@ impl Transfers {
 
     /// The number of running transfers.
     pub fn running(&self) -> u64 {
-        self.shared.turns().queue.running()
+        self.shared.state().queue.running()
     }
 
     /// The number of waiting robots.
     pub fn waiting(&self) -> u64 {
-        self.shared.turns().queue.waiting()
+        self.shared.state().queue.waiting()
     }
 
-    /// Recent bytes per second of all transfers together; see [`Transfers::look`].
+    /// Recent bytes per second of all transfers together; see [`Transfers::sample`].
     pub fn bytes_per_s(&self) -> u64 {
-        let looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
-        let (Some((from, sent_before)), Some((to, sent))) = (looks.front(), looks.back()) else {
+        let samples = self.shared.samples.lock().unwrap_or_else(PoisonError::into_inner);
+        let (Some((from, sent_before)), Some((to, sent))) = (samples.front(), samples.back())
+        else {
             return 0;
         };
         let seconds = to.duration_since(*from).as_secs_f64();
@@ -137,13 +139,13 @@ impl Transfers {
 
     /// Samples the sent bytes, and ends transfers that make almost no progress while others wait.
     /// Call this about every second: the displayed speed covers the last samples.
-    pub fn look(&self) {
+    pub fn sample(&self) {
         self.shared.end_too_slow(self.shared.now_ms());
-        let mut looks = self.shared.looks.lock().unwrap_or_else(PoisonError::into_inner);
-        if looks.len() >= LOOKS {
-            looks.pop_front();
+        let mut samples = self.shared.samples.lock().unwrap_or_else(PoisonError::into_inner);
+        if samples.len() >= SAMPLES {
+            samples.pop_front();
         }
-        looks.push_back((Instant::now(), self.shared.sent.load(Ordering::Relaxed)));
+        samples.push_back((Instant::now(), self.shared.sent.load(Ordering::Relaxed)));
     }
 
     /// Waits for `robot`'s turn to pull `blob`, for a moment.
@@ -151,95 +153,96 @@ impl Transfers {
         &self,
         robot: &RobotId,
         blob: Digest,
-        claim: &Claim,
-    ) -> Result<Transfer, NotYet> {
+        request: &TransferRequest,
+    ) -> Result<Transfer, RetryLater> {
         let place = Place { robot: robot.clone(), blob };
-        let (tell, mut told) = oneshot::channel();
-        let asking = {
-            let mut turns = self.shared.turns();
-            let Some(asking) = turns.queue.ask(place, claim, self.shared.now_ms()) else {
-                return Err(come_back(jittered(NO_PLACE_MS, rand::random())));
+        let (sender, mut receiver) = oneshot::channel();
+        let id = {
+            let mut state = self.shared.state();
+            let Some(id) = state.queue.enqueue(place, request, self.shared.now_ms()) else {
+                return Err(retry_later(jittered(NO_PLACE_MS, rand::random())));
             };
-            turns.asking.insert(asking, tell);
-            asking
+            state.senders.insert(id, sender);
+            id
         };
-        let mut request = Request { shared: &self.shared, asking: Some(asking) };
-        self.shared.begin_what_may();
-        if let Ok(Ok(transfer)) = timeout(PATIENCE, &mut told).await {
-            request.asking = None;
+        let mut waiting = WaitingRequest { shared: &self.shared, id: Some(id) };
+        self.shared.start_permitted();
+        if let Ok(Ok(transfer)) = timeout(WAIT_TIMEOUT, &mut receiver).await {
+            waiting.id = None;
             return Ok(transfer);
         }
-        match request.leave() {
-            Some(away_ms) => Err(come_back(away_ms)),
+        match waiting.withdraw() {
+            Some(away_ms) => Err(retry_later(away_ms)),
             // The turn has come just now, or the robot sent a second request meanwhile.
-            None => told.await.map_err(|_| come_back(jittered(0, rand::random()))),
+            None => receiver.await.map_err(|_| retry_later(jittered(0, rand::random()))),
         }
     }
 }
 
-fn come_back(away_ms: u64) -> NotYet {
-    NotYet { retry_after_s: away_ms.div_ceil(1000) }
+fn retry_later(away_ms: u64) -> RetryLater {
+    RetryLater { retry_after_s: away_ms.div_ceil(1000) }
 }
 
 /// A waiting request. When its client disconnects, the value is dropped and the request stops
 /// waiting.
-struct Request<'a> {
+struct WaitingRequest<'a> {
     shared: &'a Arc<Shared>,
-    asking: Option<Asking>,
+    id: Option<RequestId>,
 }
 
-impl Request<'_> {
+impl WaitingRequest<'_> {
     /// How long the robot should stay away; `None` if the request no longer waits.
-    fn leave(&mut self) -> Option<u64> {
-        let asking = self.asking.take()?;
-        let mut turns = self.shared.turns();
-        turns.asking.remove(&asking);
-        turns.queue.send_away(asking, self.shared.now_ms(), rand::random())
+    fn withdraw(&mut self) -> Option<u64> {
+        let id = self.id.take()?;
+        let mut state = self.shared.state();
+        state.senders.remove(&id);
+        state.queue.defer(id, self.shared.now_ms(), rand::random())
     }
 }
 
-impl Drop for Request<'_> {
+impl Drop for WaitingRequest<'_> {
     fn drop(&mut self) {
-        self.leave();
+        self.withdraw();
     }
 }
 
 impl Shared {
     fn end_too_slow(&self, now_ms: u64) {
-        let Turns { queue, carried, .. } = &mut *self.turns();
-        for Carried { robot, connection, progress } in carried.values_mut() {
+        let State { queue, active, .. } = &mut *self.state();
+        for ActiveTransfer { robot, connection, progress } in active.values_mut() {
             if progress.is_too_slow(connection.bytes_out(), queue.others_wait(robot), now_ms) {
-                tracing::debug!(%robot, "it takes next to nothing, and others wait: its connection is cut");
+                tracing::debug!(%robot, "the transfer makes almost no progress while others wait; its connection is closed");
                 connection.end();
             }
         }
     }
 
-    /// Begins the permitted transfers. A request that has ended meanwhile returns its turn by
+    /// Begins the permitted transfers. A request that has ended meanwhile returns its permit by
     /// dropping the transfer.
-    fn begin_what_may(self: &Arc<Self>) {
+    fn start_permitted(self: &Arc<Self>) {
         let now_ms = self.now_ms();
-        let told: Vec<_> = {
-            let mut turns = self.turns();
-            let Turns { queue, asking, .. } = &mut *turns;
-            let begun = queue.begin(now_ms).into_iter();
-            begun.map(|(request, turn)| (asking.remove(&request), turn)).collect()
+        let started: Vec<_> = {
+            let mut state = self.state();
+            let State { queue, senders, .. } = &mut *state;
+            let started = queue.start_next(now_ms).into_iter();
+            started.map(|(id, permit)| (senders.remove(&id), permit)).collect()
         };
-        for (tell, turn) in told {
-            let transfer = Transfer { shared: self.clone(), turn, begun_ms: now_ms, number: None };
-            // Without a receiver the transfer is dropped, and its turn passes to another robot.
-            drop(tell.map(|tell| tell.send(transfer)));
+        for (sender, permit) in started {
+            let transfer =
+                Transfer { shared: self.clone(), permit, begun_ms: now_ms, number: None };
+            // Without a receiver the transfer is dropped, and its permit passes to another robot.
+            drop(sender.map(|sender| sender.send(transfer)));
         }
     }
 
     fn now_ms(&self) -> u64 {
-        u64::try_from(self.started.elapsed().as_millis()).unwrap_or(u64::MAX)
+        millis(self.started.elapsed())
     }
 
-    fn turns(&self) -> MutexGuard<'_, Turns> {
+    fn state(&self) -> MutexGuard<'_, State> {
         // Every change under these locks is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
-        self.turns.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn paces(&self) -> MutexGuard<'_, Paces> {
@@ -252,13 +255,14 @@ impl Transfer {
     pub fn by(mut self, connection: Option<&Connection>) -> Self {
         let Some(connection) = connection.cloned() else { return self };
         let progress = Progress::from(self.shared.now_ms(), connection.bytes_out());
-        let mut turns = self.shared.turns();
-        turns.last_number += 1;
-        let number = turns.last_number;
-        turns
-            .carried
-            .insert(number, Carried { robot: self.turn.robot.clone(), connection, progress });
-        drop(turns);
+        let mut state = self.shared.state();
+        state.last_number += 1;
+        let number = state.last_number;
+        state.active.insert(
+            number,
+            ActiveTransfer { robot: self.permit.robot.clone(), connection, progress },
+        );
+        drop(state);
         self.number = Some(number);
         self
     }
@@ -271,9 +275,9 @@ impl Transfer {
     fn reserve(&self, bytes: u64) -> Option<(u64, Instant)> {
         let mut paces = self.shared.paces();
         let Paces { all, sites } = &mut *paces;
-        let site = self.turn.site.as_ref().and_then(|site| sites.get_mut(site));
+        let site = self.permit.site.as_ref().and_then(|site| sites.get_mut(site));
         let mut limits: Vec<&mut Pace> = all.as_mut().into_iter().chain(site).collect();
-        let running = self.shared.turns().queue.running();
+        let running = self.shared.state().queue.running();
         let piece = limits.iter().map(|pace| pace.piece(running)).min()?.min(bytes);
         let now = Instant::now();
         let at = limits.iter_mut().map(|pace| pace.reserve(piece, now)).max()?;
@@ -284,11 +288,11 @@ impl Transfer {
 impl Drop for Transfer {
     fn drop(&mut self) {
         let lasted_ms = self.shared.now_ms().saturating_sub(self.begun_ms);
-        let mut turns = self.shared.turns();
-        turns.queue.end(&self.turn, lasted_ms);
-        self.number.and_then(|number| turns.carried.remove(&number));
-        drop(turns);
-        self.shared.begin_what_may();
+        let mut state = self.shared.state();
+        state.queue.finish(&self.permit, lasted_ms);
+        self.number.and_then(|number| state.active.remove(&number));
+        drop(state);
+        self.shared.start_permitted();
     }
 }
 
@@ -300,19 +304,20 @@ mod tests {
     use crate::config::SiteLimits;
 
     #[tokio::test]
-    async fn the_connection_of_a_stalled_transfer_is_cut_for_another_robot() {
+    async fn stalled_transfer_is_cut_while_another_robot_waits() {
         let all = SiteLimits { max: Some(1), bytes_per_s: None };
         let limits = TransferLimits { all, ..TransferLimits::default() };
         let transfers = Transfers::new(&limits, "site".parse().expect("valid"));
-        let (robot, other, claim) = (RobotId::random(), RobotId::random(), Claim::default());
+        let (robot, other, request) =
+            (RobotId::random(), RobotId::random(), TransferRequest::default());
         let (blob, connection) = (Digest::of(b"x"), Connection::default());
         let stalled =
-            transfers.admit(&robot, blob, &claim).await.expect("its turn").by(Some(&connection));
-        let mut again = Box::pin(transfers.admit(&robot, Digest::of(b"y"), &claim));
+            transfers.admit(&robot, blob, &request).await.expect("its turn").by(Some(&connection));
+        let mut again = Box::pin(transfers.admit(&robot, Digest::of(b"y"), &request));
         assert!(poll!(again.as_mut()).is_pending());
         transfers.shared.end_too_slow(60_000);
         assert_eq!(connection.cut().now_or_never(), None, "no other robot waits");
-        let mut waits = Box::pin(transfers.admit(&other, blob, &claim));
+        let mut waits = Box::pin(transfers.admit(&other, blob, &request));
         assert!(poll!(waits.as_mut()).is_pending());
         transfers.shared.end_too_slow(89_999);
         connection.wrote(16 * 1024);
@@ -322,6 +327,6 @@ mod tests {
         assert_eq!(connection.cut().now_or_never(), Some(()));
         drop((again, stalled));
         waits.await.expect("its turn");
-        assert!(transfers.shared.turns().carried.is_empty());
+        assert!(transfers.shared.state().active.is_empty());
     }
 }

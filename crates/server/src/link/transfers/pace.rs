@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_go_no_faster_than_the_pace_and_pauses_are_not_saved_up() {
+    fn pace_limits_bytes_and_idle_time_is_not_saved() {
         let now = Instant::now();
         let mut pace = Pace::new(1_000_000, now);
         assert_eq!(
@@ -57,7 +57,7 @@ mod tests {
     }
 
     #[test]
-    fn pieces_are_small_enough_for_all_to_get_some_every_second() {
+    fn pieces_shrink_with_the_number_of_transfers() {
         let pace = Pace::new(4_000_000, Instant::now());
         assert_eq!(
             (pace.piece(1), pace.piece(10), pace.piece(100_000)),

@@ -51,13 +51,13 @@ impl Authority {
     /// Reads the authority, or creates it.
     pub(super) fn open(data: &DataDirectory) -> Result<Self, TlsError> {
         let key = data.authority_key(KeyPair::generate()?.serialize_pem())?;
-        let key = KeyPair::from_pem(&key).map_err(|_| data.authority_is_wrong(true))?;
+        let key = KeyPair::from_pem(&key).map_err(|_| data.authority_error(true))?;
         let pin = CaPin::of(&key.subject_public_key_info());
         let params = authority_params(&pin)?;
         let certificate = data.authority_certificate(params.self_signed(&key)?.pem())?;
         let certificate = CertificateDer::from_pem_slice(certificate.as_bytes()).ok();
         let certificate = certificate.filter(|certificate| pin_of(certificate) == Some(pin));
-        let certificate = certificate.ok_or_else(|| data.authority_is_wrong(false))?;
+        let certificate = certificate.ok_or_else(|| data.authority_error(false))?;
         Ok(Self { issuer: Issuer::new(params, key), certificate, pin })
     }
 

@@ -11,7 +11,7 @@ use rustls::crypto::{
 use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
 use rustls::{CertificateError, DigitallySignedStruct, DistinguishedName, Error, SignatureScheme};
-use task_proto::envelope::PublicKey;
+use task_proto::trust::envelope::PublicKey;
 use task_transport::key_in;
 
 /// A client's proof by a certificate of its own.
@@ -19,9 +19,9 @@ use task_transport::key_in;
 pub enum ClientProof {
     /// The server did not request a certificate.
     #[default]
-    NotAsked,
+    NotRequested,
     /// The client presented none.
-    Nothing,
+    NoCertificate,
     /// The client holds this key.
     Holds(PublicKey),
 }
@@ -30,15 +30,15 @@ impl ClientProof {
     /// Whether the proof is sufficient for a client that has registered this key, if any.
     pub fn suffices(&self, registered: Option<&PublicKey>) -> bool {
         match (self, registered) {
-            (Self::NotAsked, _) | (_, None) => true,
-            (Self::Nothing, Some(_)) => false,
+            (Self::NotRequested, _) | (_, None) => true,
+            (Self::NoCertificate, Some(_)) => false,
             (Self::Holds(key), Some(registered)) => key == registered,
         }
     }
 
     /// The proof from the certificates that a client presented on request.
-    pub(super) fn of(shown: Option<&[CertificateDer<'_>]>) -> Self {
-        shown.and_then(<[_]>::first).and_then(key_in).map_or(Self::Nothing, Self::Holds)
+    pub(super) fn of(presented: Option<&[CertificateDer<'_>]>) -> Self {
+        presented.and_then(<[_]>::first).and_then(key_in).map_or(Self::NoCertificate, Self::Holds)
     }
 }
 

@@ -31,7 +31,7 @@ impl Files {
 
     /// The content of the files; `None` if unchanged since the last call. An error is reported
     /// once.
-    pub(super) fn read_news(&mut self) -> Result<Option<CertifiedKey>, TlsError> {
+    pub(super) fn read_if_changed(&mut self) -> Result<Option<CertifiedKey>, TlsError> {
         let (certificate, key) = (read(&self.certificate)?, read(&self.key)?);
         let content = [&certificate, &key].map(|bytes| Digest::of(bytes));
         if self.seen.replace(content) == Some(content) {

@@ -6,6 +6,9 @@ use std::io;
 use sqlx::Error;
 use sqlx::migrate::MigrateError;
 
+/// The beginning of PgBouncer's message about a parameter that it does not know.
+const UNSUPPORTED_PARAMETER: &str = "unsupported startup parameter";
+
 /// A fault that an operator repairs, or that passes by itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
@@ -14,7 +17,7 @@ pub enum Fault {
     /// The disk is full.
     Full,
     /// The database server can't be reached, or takes no statements now.
-    Away,
+    Unreachable,
     /// Other users hold the resources of a statement for too long.
     Busy,
 }
@@ -24,10 +27,24 @@ impl Fault {
     pub(in crate::store) fn of(error: &Error) -> Option<Self> {
         match error {
             Error::Io(error) if error.kind() == io::ErrorKind::StorageFull => Some(Self::Full),
-            Error::Io(_) => Some(Self::Away),
+            Error::Io(_) => Some(Self::Unreachable),
             Error::PoolTimedOut | Error::PoolClosed => Some(Self::Busy),
+            // A pooler that refuses the driver's parameters refuses them again. It has the same code
+            // for its own faults.
+            Error::Database(error) if error.message().starts_with(UNSUPPORTED_PARAMETER) => None,
             Error::Database(error) => error.code().as_deref().and_then(Self::of_code),
             _ => None,
+        }
+    }
+
+    /// The error in the words of the database or of the operating system, without the driver's
+    /// classification before it.
+    pub(in crate::store) fn description(error: &Error) -> String {
+        match error {
+            Error::Io(error) => error.to_string(),
+            Error::Database(error) => error.message().to_owned(),
+            Error::Tls(error) | Error::Configuration(error) => error.to_string(),
+            error => error.to_string(),
         }
     }
 
@@ -52,12 +69,12 @@ impl Fault {
     /// Classifies SQLite's extended result code, whose low byte is the primary one.
     fn of_sqlite(code: u16) -> Option<Self> {
         /// A checksum mismatch: one of the file system, and one of the database.
-        const DAMAGED_READS: [u16; 2] = [8458, 8202];
+        const CHECKSUM_MISMATCHES: [u16; 2] = [8458, 8202];
         /// The index of the write-ahead log could not be extended.
         const SHARED_MEMORY_SIZE: u16 = 4874;
         match (code & 0xff, code) {
             (11 | 26, _) => Some(Self::Corrupt),
-            (10, code) if DAMAGED_READS.contains(&code) => Some(Self::Corrupt),
+            (10, code) if CHECKSUM_MISMATCHES.contains(&code) => Some(Self::Corrupt),
             (13, _) | (10, SHARED_MEMORY_SIZE) => Some(Self::Full),
             (5 | 6, _) => Some(Self::Busy),
             _ => None,
@@ -69,13 +86,13 @@ impl Fault {
             "XX001" | "XX002" => Some(Self::Corrupt),
             "53100" => Some(Self::Full),
             // Shut down, crashed, starting up, cut off for being idle, a standby.
-            "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Away),
+            "57P01" | "57P02" | "57P03" | "57P05" | "25P03" | "25006" => Some(Self::Unreachable),
             // Too many connections, too little memory, a lock or a statement that took too long, a
             // deadlock. The open connections remain usable.
             "53000" | "53200" | "53300" | "53400" | "55P03" | "57014" | "40001" | "40P01" => {
                 Some(Self::Busy)
             }
-            _ if code.starts_with("08") => Some(Self::Away),
+            _ if code.starts_with("08") => Some(Self::Unreachable),
             _ => None,
         }
     }
@@ -86,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn codes_of_both_databases_show_their_faults() {
+    fn error_codes_of_both_databases_map_to_faults() {
         for (code, fault) in [
             ("11", Some(Fault::Corrupt)),
             ("26", Some(Fault::Corrupt)),
@@ -99,9 +116,12 @@ mod tests {
             ("2067", None),
             ("XX001", Some(Fault::Corrupt)),
             ("53100", Some(Fault::Full)),
-            ("57P03", Some(Fault::Away)),
+            ("57P01", Some(Fault::Unreachable)),
+            ("57P02", Some(Fault::Unreachable)),
+            ("57P03", Some(Fault::Unreachable)),
+            ("25006", Some(Fault::Unreachable)),
             ("53300", Some(Fault::Busy)),
-            ("08006", Some(Fault::Away)),
+            ("08006", Some(Fault::Unreachable)),
             ("57014", Some(Fault::Busy)),
             ("23505", None),
             ("28P01", None),

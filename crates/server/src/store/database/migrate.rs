@@ -7,6 +7,9 @@ use std::borrow::Cow;
 use sqlx::migrate::{MigrateError, Migration, MigrationType, Migrator};
 use sqlx::{AnyConnection, SqlSafeStr};
 
+use crate::domain::database_url::without_password;
+use crate::store::StoreError;
+
 /// Version, name and text of every migration.
 const MIGRATIONS: &[(i64, &str, &str)] = &[
     (1, "fleet", include_str!("../migrations/0001_fleet.sql")),
@@ -30,10 +33,18 @@ const MIGRATIONS: &[(i64, &str, &str)] = &[
     (19, "needs", include_str!("../migrations/0019_needs.sql")),
     (20, "last_run", include_str!("../migrations/0020_last_run.sql")),
     (21, "replaced", include_str!("../migrations/0021_replaced.sql")),
+    (22, "guard", include_str!("../migrations/0022_guard.sql")),
+    (23, "pages", include_str!("../migrations/0023_pages.sql")),
 ];
 
-/// Applies the pending migrations.
-pub(in crate::store) async fn run(connection: &mut AnyConnection) -> Result<(), MigrateError> {
+/// The version of the tables after all migrations.
+pub(in crate::store) const NEWEST: i64 = MIGRATIONS[MIGRATIONS.len() - 1].0;
+
+/// Applies the pending migrations to the database at `url`.
+pub(in crate::store) async fn run(
+    url: &str,
+    connection: &mut AnyConnection,
+) -> Result<(), StoreError> {
     let migrations = MIGRATIONS.iter().map(|&(version, name, sql)| {
         Migration::new(
             version,
@@ -44,5 +55,10 @@ pub(in crate::store) async fn run(connection: &mut AnyConnection) -> Result<(), 
         )
     });
     // The future of `run` itself is not guaranteed to be `Send`.
-    Migrator::with_migrations(migrations.collect()).run_direct(None, connection, false).await
+    let migrator = Migrator::with_migrations(migrations.collect());
+    let url = || without_password(url);
+    migrator.run_direct(None, connection, false).await.map_err(|source| match source {
+        MigrateError::VersionMissing(version) => StoreError::Newer { url: url(), version },
+        source => StoreError::Migrate { url: url(), source },
+    })
 }

@@ -5,19 +5,20 @@
 use std::collections::{BTreeMap, HashSet};
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::manifest::TaskKind;
-use task_proto::report::{Phase, Report, TaskReport};
+use task_proto::messages::report::{Phase, Report, TaskReport};
+use task_proto::packages::manifest::TaskKind;
 use task_proto::{Generation, RobotId, TaskName};
 
+use crate::store::repositories::Robots;
 use crate::store::rows::{from_json, id, json, number, stored, word};
-use crate::store::timelines::{grown, grown_by, step};
-use crate::store::{StoreError, Write};
+use crate::store::timelines::{appended_phase, appended_step, step};
+use crate::store::{StoreError, Transaction};
 
 /// The highest run that is adopted. A made-up one beyond this would leave no room above it, and an
 /// order for this robot and others would fail for all of them.
 const MAX_RUN: u64 = 1 << 53;
 
-impl Write {
+impl Robots<&mut Transaction> {
     /// Adopts those of `robots` that are diverged.
     pub async fn adopt_diverged(
         &mut self,
@@ -28,7 +29,7 @@ impl Write {
             "SELECT id, observed_generation, report FROM robots
              WHERE observed_generation > generation AND removed_at_ms IS NULL AND report IS NOT NULL",
         )
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         if rows.is_empty() {
             return Ok(());
@@ -59,11 +60,11 @@ impl Write {
                  phase = CASE ended WHEN 1 THEN phase ELSE 'stopped' END,
                  timeline = CASE ended WHEN 1 THEN timeline ELSE {} END
              WHERE robot_id = $1 AND desired = 1",
-            grown_by(Phase::Stopped, "$2")
+            appended_phase(Phase::Stopped, "$2")
         )))
         .bind(robot.as_str())
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         // A robot could list a task twice. The database would refuse that, and the whole order with
         // it.
@@ -75,7 +76,7 @@ impl Write {
         sqlx::query("UPDATE robots SET generation = $2 WHERE id = $1")
             .bind(robot.as_str())
             .bind(stored(observed.0))
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
         Ok(())
     }
@@ -88,7 +89,7 @@ impl Write {
     ) -> Result<(), StoreError> {
         // The number is older than the orders of this write, so that the task can be rolled back to
         // this deployment.
-        let number = stored(self.turn().saturating_sub(1));
+        let number = stored(self.0.sequence().saturating_sub(1));
         // The order itself may be lost as well. Then the robot's report is its only record.
         sqlx::query(
             "INSERT INTO deployments (id, number, task, version, package, kind, selector, delivery, created_at_ms,
@@ -103,7 +104,7 @@ impl Write {
         .bind(word(&task.kind.unwrap_or(TaskKind::Service)))
         .bind(robot.as_str())
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         sqlx::query(AssertSqlSafe(format!(
             "INSERT INTO assignments (deployment_id, robot_id, task, place, released, desired, ended, wanted, run, phase,
@@ -116,7 +117,7 @@ impl Write {
                  wanted = excluded.wanted, run = excluded.run, phase = excluded.phase, failure = excluded.failure,
                  superseded_by = NULL, removed_generation = NULL, updated_at_ms = excluded.updated_at_ms,
                  ran = CASE excluded.ran WHEN 1 THEN 1 ELSE assignments.ran END, timeline = {}",
-            grown("excluded.timeline")
+            appended_step("excluded.timeline")
         )))
         .bind(task.deployment.as_str())
         .bind(robot.as_str())
@@ -128,7 +129,7 @@ impl Write {
         .bind(task.failure.as_ref().map(json))
         .bind(stored(now_ms))
         .bind(step(task.phase, now_ms, task.attempts))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }

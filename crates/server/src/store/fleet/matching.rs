@@ -1,11 +1,12 @@
 //! The robots that match a selector, and the names in the selector that match none.
 
 use task_proto::RobotName;
-use task_proto::selector::Selector;
+use task_proto::ids::selector::Selector;
 
 use super::robots::{KNOWN, known_robot};
 use crate::domain::person::Scope;
-use crate::store::{KnownRobot, Store, StoreError, Write};
+use crate::store::repositories::Robots;
+use crate::store::{KnownRobot, Store, StoreError, Transaction};
 
 /// Selects the robots that can take orders.
 const ORDERABLE: &str =
@@ -13,44 +14,44 @@ const ORDERABLE: &str =
 
 /// The result of a selector.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Matching {
+pub struct MatchingRobots {
     /// The matching robots of all scopes, sorted by name.
     pub robots: Vec<KnownRobot>,
     /// Names and ids in the selector that belong to no robot of the scope, sorted.
     pub unknown: Vec<RobotName>,
 }
 
-impl Store {
+impl Robots<&Store> {
     /// The robots that match `selector` now, sorted by name, without those that wait for approval.
-    pub async fn matching_robots(
-        &self,
+    pub async fn matching(
+        self,
         selector: &Selector,
         scope: &Scope,
-    ) -> Result<Matching, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(&self.reads).await?, selector, scope)
+    ) -> Result<MatchingRobots, StoreError> {
+        matching(sqlx::query(ORDERABLE).fetch_all(&self.0.reads).await?, selector, scope)
     }
 
     /// The names and ids in a selector that belong to no robot of a scope, sorted.
-    pub async fn unknown_robots(
-        &self,
+    pub async fn unknown(
+        self,
         selector: &Selector,
         scope: &Scope,
     ) -> Result<Vec<RobotName>, StoreError> {
         if selector.names().is_empty() {
             return Ok(Vec::new());
         }
-        Ok(matching(sqlx::query(KNOWN).fetch_all(&self.reads).await?, selector, scope)?.unknown)
+        Ok(matching(sqlx::query(KNOWN).fetch_all(&self.0.reads).await?, selector, scope)?.unknown)
     }
 }
 
-impl Write {
+impl Robots<&mut Transaction> {
     /// The robots that match `selector` now, sorted by name, without those that wait for approval.
-    pub async fn matching_robots(
+    pub async fn matching(
         &mut self,
         selector: &Selector,
         scope: &Scope,
-    ) -> Result<Matching, StoreError> {
-        matching(sqlx::query(ORDERABLE).fetch_all(self.connection()).await?, selector, scope)
+    ) -> Result<MatchingRobots, StoreError> {
+        matching(sqlx::query(ORDERABLE).fetch_all(self.0.connection()).await?, selector, scope)
     }
 }
 
@@ -58,7 +59,7 @@ fn matching(
     rows: Vec<sqlx::any::AnyRow>,
     selector: &Selector,
     scope: &Scope,
-) -> Result<Matching, StoreError> {
+) -> Result<MatchingRobots, StoreError> {
     let mut robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
     let mut names = selector.names();
     if !names.is_empty() {
@@ -72,5 +73,5 @@ fn matching(
     let unknown = names.into_iter().collect();
     robots.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
     robots.sort_by(|one, other| one.name.cmp(&other.name));
-    Ok(Matching { robots, unknown })
+    Ok(MatchingRobots { robots, unknown })
 }

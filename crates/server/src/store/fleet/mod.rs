@@ -2,8 +2,9 @@
 //! run.
 
 pub(super) mod adoption;
-pub(super) mod enrolments;
+pub(super) mod enrollments;
 pub(super) mod matching;
+pub(super) mod needed_packages;
 pub(super) mod reports;
 pub(super) mod robot_pages;
 pub(super) mod robots;

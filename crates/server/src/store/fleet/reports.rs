@@ -1,22 +1,30 @@
 //! Reports: reads the known state of a batch of robots at once, and writes their reports at once.
+//!
+//! On Postgres, several servers write reports at the same time, while no order is written. A
+//! statement of a [`ReportTransaction`] therefore may change only the rows of the robots that the
+//! transaction holds, and may rely on these rows and on all that only orders change.
+
+use std::collections::BTreeSet;
 
 use futures_util::TryStreamExt as _;
 use serde::Deserialize;
+use sqlx::any::AnyRow;
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::id::Labels;
-use task_proto::manifest::TaskKind;
-use task_proto::report::{Phase, Report};
+use task_proto::ids::Labels;
+use task_proto::messages::report::{Phase, Report};
+use task_proto::packages::manifest::TaskKind;
 use task_proto::{DeploymentId, Digest, Generation, InstanceId, RobotId, RobotName};
 
-use crate::domain::deployment::Standing;
+use crate::domain::deployment::AssignmentState;
+use crate::store::repositories::Reports;
 use crate::store::rows::{
     from_json, from_optional_json, from_word, groups, id, json, number, stored, values,
 };
-use crate::store::timelines::{grown, step};
-use crate::store::{Store, StoreError, Write};
+use crate::store::timelines::{appended_step, step};
+use crate::store::{Store, StoreError, Transaction};
 
 /// Columns of an assignment's state in a statement.
-const STANDING: &[&str] =
+const STATE_COLUMNS: &[&str] =
     &["TEXT", "TEXT", "TEXT", "BIGINT", "TEXT", "TEXT", "BIGINT", "BIGINT", "TEXT"];
 /// The highest generation that we accept from a robot. A made-up one beyond this would leave no
 /// room above it.
@@ -48,12 +56,12 @@ pub struct OpenAssignment {
     /// The generation in which the assignment left the desired state.
     pub removed: Option<Generation>,
     /// The progress of the assignment.
-    pub standing: Standing,
+    pub state: AssignmentState,
 }
 
 /// The agent that wrote a stored report.
 #[derive(Debug, Deserialize)]
-pub struct ReportedBy {
+pub struct ReportingAgent {
     /// The agent's instance id, which identifies its start.
     pub instance: InstanceId,
     /// A digest of the place where the agent ran, if reported.
@@ -61,12 +69,34 @@ pub struct ReportedBy {
     pub place: Option<Digest>,
 }
 
-impl Store {
+impl Reports<&Store> {
+    /// The generations of `robots`.
+    pub async fn generations(
+        self,
+        robots: &[&RobotId],
+    ) -> Result<Vec<(RobotId, Generation)>, StoreError> {
+        let mut found = Vec::with_capacity(robots.len());
+        for group in groups(robots) {
+            let sql = format!(
+                "SELECT id, generation FROM robots WHERE id IN ({})",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query_as::<_, (String, i64)>(AssertSqlSafe(sql));
+            for robot in group {
+                query = query.bind(robot.as_str());
+            }
+            for (robot, generation) in query.fetch_all(&self.0.reads).await? {
+                found.push((id("robots.id", &robot)?, Generation(number(generation))));
+            }
+        }
+        Ok(found)
+    }
+
     /// The agent of each robot's last report. Unreadable reports are left out.
-    pub async fn last_agents(&self) -> Result<Vec<(RobotId, ReportedBy)>, StoreError> {
+    pub async fn last_agents(self) -> Result<Vec<(RobotId, ReportingAgent)>, StoreError> {
         let sql =
             "SELECT id, report FROM robots WHERE report IS NOT NULL AND removed_at_ms IS NULL";
-        let mut rows = sqlx::query(sql).fetch(&self.reads);
+        let mut rows = sqlx::query(sql).fetch(&self.0.reads);
         let mut found = Vec::new();
         // A report may be large, and each robot has one.
         while let Some(row) = rows.try_next().await? {
@@ -78,74 +108,123 @@ impl Store {
     }
 }
 
-impl Write {
-    /// Those of `robots` that are registered.
-    pub async fn reported_robots(
-        &mut self,
-        robots: &[RobotId],
-    ) -> Result<Vec<ReportedRobot>, StoreError> {
-        let mut found = Vec::with_capacity(robots.len());
-        for group in groups(robots) {
+/// A write of robots' reports in progress. It holds these robots' rows: no other write of reports
+/// is about any of them before this one has ended.
+pub struct ReportTransaction {
+    write: Transaction,
+    robots: Vec<ReportedRobot>,
+}
+
+impl ReportTransaction {
+    /// Takes the rows of `robots`, with a query that ends with `lock`.
+    pub(in crate::store) async fn lock(
+        mut write: Transaction,
+        robots: &BTreeSet<&RobotId>,
+        lock: &str,
+    ) -> Result<Self, StoreError> {
+        let ordered: Vec<&RobotId> = robots.iter().copied().collect();
+        let mut robots = Vec::with_capacity(ordered.len());
+        for group in groups(&ordered) {
             let sql = format!(
                 "WITH v (id) AS ({})
                  SELECT r.id, r.name, r.labels, r.generation, r.report_start, r.report_seq,
                      r.token_number
-                 FROM v JOIN robots r ON r.id = v.id WHERE r.removed_at_ms IS NULL",
+                 FROM v JOIN robots r ON r.id = v.id WHERE r.removed_at_ms IS NULL {lock}",
                 values(1, group.len(), &["TEXT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql));
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            for row in query.fetch_all(self.connection()).await? {
-                found.push(ReportedRobot {
-                    id: id("robots.id", row.try_get("id")?)?,
-                    name: id("robots.name", row.try_get("name")?)?,
-                    labels: from_json("robots.labels", row.try_get("labels")?)?,
-                    generation: Generation(number(row.try_get("generation")?)),
-                    last_report: (
-                        number(row.try_get("report_start")?),
-                        number(row.try_get("report_seq")?),
-                    ),
-                    token_number: number(row.try_get("token_number")?),
-                });
+            for row in query.fetch_all(write.connection()).await? {
+                robots.push(reported_robot(&row)?);
             }
         }
-        Ok(found)
+        Ok(Self { write, robots })
     }
 
+    /// The number of the last order; while it stays the same, reports alone have changed anything.
+    pub fn last_order(&self) -> u64 {
+        self.write.sequence()
+    }
+
+    /// The registered ones of the robots of this write, as they stood when it began.
+    pub fn robots(&self) -> &[ReportedRobot] {
+        &self.robots
+    }
+
+    /// The statements of this write.
+    pub fn reports(&mut self) -> Reports<&mut Transaction> {
+        self.write.reports()
+    }
+
+    /// Commits the write. The commit runs to its end even if the caller does not wait for it.
+    pub async fn commit(self) -> Result<(), StoreError> {
+        self.write.commit().await
+    }
+}
+
+impl Reports<&mut Transaction> {
     /// The released assignments of `robots` that have not ended.
     pub async fn open_assignments(
         &mut self,
         robots: &[RobotId],
     ) -> Result<Vec<OpenAssignment>, StoreError> {
-        let mut found = Vec::with_capacity(robots.len());
+        let sql = "SELECT a.deployment_id, a.robot_id, d.kind, a.run, a.phase, a.progress,
+                 a.failure, a.attempts, a.removed_generation
+             FROM v JOIN assignments a ON a.robot_id = v.id
+                 JOIN deployments d ON d.id = a.deployment_id
+             WHERE a.ended = 0 AND a.released = 1";
+        self.rows_of(robots, sql).await?.iter().map(open_assignment).collect()
+    }
+
+    /// The rows that `sql` selects for `robots`, whose ids it finds in a table `v`.
+    async fn rows_of(
+        &mut self,
+        robots: &[RobotId],
+        sql: &'static str,
+    ) -> Result<Vec<AnyRow>, StoreError> {
+        let mut rows = Vec::with_capacity(robots.len());
         for group in groups(robots) {
-            let sql = format!(
-                "WITH v (id) AS ({})
-                 SELECT a.deployment_id, a.robot_id, d.kind, a.run, a.phase, a.progress, a.failure, a.attempts,
-                     a.removed_generation
-                 FROM v JOIN assignments a ON a.robot_id = v.id JOIN deployments d ON d.id = a.deployment_id
-                 WHERE a.ended = 0 AND a.released = 1",
-                values(1, group.len(), &["TEXT"])
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
+            let ids = values(1, group.len(), &["TEXT"]);
+            let mut query = sqlx::query(AssertSqlSafe(format!("WITH v (id) AS ({ids}) {sql}")));
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            for row in query.fetch_all(self.connection()).await? {
-                found.push(open_assignment(&row)?);
+            rows.extend(query.fetch_all(self.0.connection()).await?);
+        }
+        Ok(rows)
+    }
+
+    /// Those of `deployments` that may begin another batch: robots wait for theirs, and the rollout
+    /// is neither paused nor cancelled. No report changes which ones these are.
+    pub async fn waiting(
+        &mut self,
+        deployments: &[DeploymentId],
+    ) -> Result<BTreeSet<DeploymentId>, StoreError> {
+        let mut found = BTreeSet::new();
+        for group in groups(deployments) {
+            let sql = format!(
+                "WITH v (id) AS ({})
+                 SELECT d.id FROM v JOIN deployments d ON d.id = v.id
+                 WHERE d.paused = 0 AND d.cancelled_at_ms IS NULL AND EXISTS (
+                     SELECT 1 FROM assignments a WHERE a.deployment_id = d.id AND a.released = 0 AND a.ended = 0)",
+                values(1, group.len(), &["TEXT"])
+            );
+            let mut query = sqlx::query_scalar(AssertSqlSafe(sql));
+            for deployment in group {
+                query = query.bind(deployment.as_str());
+            }
+            let rows: Vec<String> = query.fetch_all(self.0.connection()).await?;
+            for row in rows {
+                found.insert(id("deployments.id", &row)?);
             }
         }
         Ok(found)
     }
 
     /// Stores reports, at most one of each robot.
-    pub async fn store_reports(
-        &mut self,
-        reports: &[&Report],
-        now_ms: u64,
-    ) -> Result<(), StoreError> {
+    pub async fn store(&mut self, reports: &[&Report], now_ms: u64) -> Result<(), StoreError> {
         for group in groups(reports) {
             let sql = format!(
                 "WITH v (id, start, seq, observed, report, link, battery) AS ({})
@@ -165,7 +244,7 @@ impl Write {
                     .bind(report.link.as_ref().map(json))
                     .bind(report.host.battery_percent.map(|percent| i64::from(percent.min(100))));
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
@@ -193,14 +272,14 @@ impl Write {
                     .bind(stored(report.seq))
                     .bind(stored(report.reached_generation().min(MAX_GENERATION).0));
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
 
     /// Stores the new phases of assignments, and records phase changes and retries in their
     /// timelines. An assignment that has run or ended no longer expires.
-    pub async fn store_standings(
+    pub async fn store_assignment_states(
         &mut self,
         assignments: &[OpenAssignment],
         now_ms: u64,
@@ -213,24 +292,24 @@ impl Write {
                      expires_at_ms = CASE v.reached WHEN 1 THEN NULL ELSE expires_at_ms END,
                      ran = CASE WHEN v.phase IN ('running', 'succeeded') THEN 1 ELSE ran END
                  FROM v WHERE assignments.deployment_id = v.deployment_id AND assignments.robot_id = v.robot_id",
-                values(2, group.len(), STANDING),
-                grown("v.step")
+                values(2, group.len(), STATE_COLUMNS),
+                appended_step("v.step")
             );
             let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
-            for OpenAssignment { deployment, robot, standing, .. } in group {
-                let ended = standing.phase.is_final();
+            for OpenAssignment { deployment, robot, state, .. } in group {
+                let ended = state.phase.is_final();
                 query = query
                     .bind(deployment.as_str())
                     .bind(robot.as_str())
-                    .bind(standing.phase.as_str())
+                    .bind(state.phase.as_str())
                     .bind(i64::from(ended))
-                    .bind(standing.progress.as_ref().map(json))
-                    .bind(standing.failure.as_ref().map(json))
-                    .bind(i64::from(standing.attempts))
-                    .bind(i64::from(ended || standing.phase == Phase::Running))
-                    .bind(step(standing.phase, now_ms, standing.attempts));
+                    .bind(state.progress.as_ref().map(json))
+                    .bind(state.failure.as_ref().map(json))
+                    .bind(i64::from(state.attempts))
+                    .bind(i64::from(ended || state.phase == Phase::Running))
+                    .bind(step(state.phase, now_ms, state.attempts));
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
@@ -251,21 +330,32 @@ impl Write {
                 values(2, group.len(), &["TEXT", "TEXT", "TEXT", "TEXT", "BIGINT"])
             );
             let mut query = sqlx::query(AssertSqlSafe(sql)).bind(stored(now_ms));
-            for OpenAssignment { deployment, robot, standing, .. } in group {
+            for OpenAssignment { deployment, robot, state, .. } in group {
                 query = query
                     .bind(deployment.as_str())
                     .bind(robot.as_str())
-                    .bind(standing.progress.as_ref().map(json))
-                    .bind(standing.failure.as_ref().map(json))
-                    .bind(i64::from(standing.attempts));
+                    .bind(state.progress.as_ref().map(json))
+                    .bind(state.failure.as_ref().map(json))
+                    .bind(i64::from(state.attempts));
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
 }
 
-fn open_assignment(row: &sqlx::any::AnyRow) -> Result<OpenAssignment, StoreError> {
+fn reported_robot(row: &AnyRow) -> Result<ReportedRobot, StoreError> {
+    Ok(ReportedRobot {
+        id: id("robots.id", row.try_get("id")?)?,
+        name: id("robots.name", row.try_get("name")?)?,
+        labels: from_json("robots.labels", row.try_get("labels")?)?,
+        generation: Generation(number(row.try_get("generation")?)),
+        last_report: (number(row.try_get("report_start")?), number(row.try_get("report_seq")?)),
+        token_number: number(row.try_get("token_number")?),
+    })
+}
+
+fn open_assignment(row: &AnyRow) -> Result<OpenAssignment, StoreError> {
     Ok(OpenAssignment {
         deployment: id("assignments.deployment_id", row.try_get("deployment_id")?)?,
         robot: id("assignments.robot_id", row.try_get("robot_id")?)?,
@@ -273,7 +363,7 @@ fn open_assignment(row: &sqlx::any::AnyRow) -> Result<OpenAssignment, StoreError
         removed: row
             .try_get::<Option<i64>, _>("removed_generation")?
             .map(|stored| Generation(number(stored))),
-        standing: Standing {
+        state: AssignmentState {
             run: number(row.try_get("run")?),
             phase: Phase::from_text(row.try_get("phase")?),
             progress: from_optional_json("assignments.progress", row.try_get("progress")?)?,

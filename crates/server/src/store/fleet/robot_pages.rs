@@ -1,34 +1,33 @@
 //! A list of robots in pages, cut by name: an insertion meanwhile repeats no robot.
 
-use task_proto::api::RobotView;
-use task_proto::selector::Selector;
+use task_proto::ids::selector::Selector;
 use task_proto::{RobotId, RobotName};
 
 use crate::domain::person::Scope;
-use crate::store::{Store, StoreError};
+use crate::store::repositories::Robots;
+use crate::store::{RobotRow, Store, StoreError};
 
 /// A page of robots, sorted by name.
 #[derive(Debug)]
 pub struct RobotPage {
-    /// The robots, as returned by [`Store::robots`].
-    pub robots: Vec<RobotView>,
+    pub robots: Vec<RobotRow>,
     /// The last robot's name, if there are more pages.
     pub next: Option<RobotName>,
     /// The number of robots in all pages.
     pub total: u64,
 }
 
-impl Store {
+impl Robots<&Store> {
     /// The first `limit` robots in a scope that match `selector` and have a name after `after`. The
     /// query checks all robots, but reads the full rows of these few only.
-    pub async fn robots_page(
-        &self,
+    pub async fn page(
+        self,
         scope: &Scope,
         selector: Option<&Selector>,
         after: Option<&RobotName>,
         limit: usize,
     ) -> Result<RobotPage, StoreError> {
-        let mut known = self.known_robots(scope).await?;
+        let mut known = self.known(scope).await?;
         if let Some(selector) = selector {
             known.retain(|robot| selector.matches(&robot.id, &robot.name, &robot.labels));
         }
@@ -39,6 +38,6 @@ impl Store {
         known.truncate(limit);
         let next = known.last().filter(|_| has_more).map(|last| last.name.clone());
         let page: Vec<RobotId> = known.into_iter().map(|robot| robot.id).collect();
-        Ok(RobotPage { robots: self.robots_among(&page).await?, next, total })
+        Ok(RobotPage { robots: self.among(&page).await?, next, total })
     }
 }

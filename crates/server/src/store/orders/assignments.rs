@@ -5,12 +5,13 @@
 use std::collections::BTreeSet;
 
 use sqlx::AssertSqlSafe;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use task_proto::{DeploymentId, RobotId, TaskName};
 
-use crate::store::rows::{groups, id, parts_of, stored, values};
-use crate::store::timelines::{grown_by, step};
-use crate::store::{StoreError, Write};
+use crate::store::repositories::Assignments;
+use crate::store::rows::{deployment_robot_pairs, groups, id, stored, values};
+use crate::store::timelines::{appended_phase, step};
+use crate::store::{StoreError, Transaction};
 
 /// An order on a task that a robot has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -27,18 +28,18 @@ pub enum TaskOrder {
 
 /// The outcome of beginning a batch.
 #[derive(Debug, Default)]
-pub struct Released {
+pub struct ReleasedBatch {
     /// The robots with a new desired state.
     pub robots: Vec<RobotId>,
     /// The deployments that were replaced on some of these robots.
     pub superseded: BTreeSet<DeploymentId>,
 }
 
-impl Write {
+impl Assignments<&mut Transaction> {
     /// Gives each of `robots`, in this order, its part of a new deployment. Nothing is released
     /// yet. Older parts of the same task that wait for their batch end, and their deployments are
     /// returned.
-    pub async fn assign(
+    pub async fn insert(
         &mut self,
         deployment: &DeploymentId,
         task: &TaskName,
@@ -63,7 +64,7 @@ impl Write {
                 query = query.bind(robot.as_str()).bind(place);
                 place += 1;
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
             "UPDATE assignments SET phase = 'superseded', ended = 1, superseded_by = $1, updated_at_ms = $3,
@@ -71,12 +72,12 @@ impl Write {
              WHERE task = $2 AND released = 0 AND ended = 0 AND deployment_id <> $1
                AND robot_id IN (SELECT robot_id FROM assignments WHERE deployment_id = $1)
              RETURNING deployment_id",
-            grown_by(Phase::Superseded, "$3")
+            appended_phase(Phase::Superseded, "$3")
         )))
         .bind(deployment.as_str())
         .bind(task.as_str())
         .bind(stored(now_ms))
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         deployments(superseded)
     }
@@ -100,11 +101,11 @@ impl Write {
                  WHERE ordered.id = $1 AND ordered.kind = 'service' AND present.package = ordered.package
                    AND has.wanted = 'running' AND has.phase = 'running'
                    AND r.observed_generation <= r.generation)",
-            grown_by(Phase::Running, "$2")
+            appended_phase(Phase::Running, "$2")
         )))
         .bind(deployment.as_str())
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
@@ -118,7 +119,7 @@ impl Write {
         let last: Option<i64> =
             sqlx::query_scalar("SELECT MAX(place) FROM assignments WHERE deployment_id = $1")
                 .bind(deployment.as_str())
-                .fetch_one(self.connection())
+                .fetch_one(self.0.connection())
                 .await?;
         for group in groups(robots) {
             let sql = format!(
@@ -132,7 +133,7 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
@@ -151,7 +152,7 @@ impl Write {
         )
         .bind(deployment.as_str())
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(begun.rows_affected() > 0)
     }
@@ -163,22 +164,22 @@ impl Write {
         deployment: &DeploymentId,
         count: u64,
         now_ms: u64,
-    ) -> Result<Released, StoreError> {
+    ) -> Result<ReleasedBatch, StoreError> {
         let batch: Vec<(String, i64)> = sqlx::query_as(
             "SELECT robot_id, place FROM assignments WHERE deployment_id = $1 AND released = 0 AND ended = 0
              ORDER BY place LIMIT $2",
         )
         .bind(deployment.as_str())
         .bind(stored(count))
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
-        let Some(&(_, last)) = batch.last() else { return Ok(Released::default()) };
-        self.changes_access();
+        let Some(&(_, last)) = batch.last() else { return Ok(ReleasedBatch::default()) };
+        self.0.mark_auth_change();
         let robots = batch
             .iter()
             .map(|(robot, _)| id("assignments.robot_id", robot))
             .collect::<Result<Vec<_>, _>>()?;
-        self.adopt_diverged(&robots, now_ms).await?;
+        self.0.robots().adopt_diverged(&robots, now_ms).await?;
         sqlx::query(
             "UPDATE assignments SET previous = (
                  SELECT old.deployment_id FROM assignments old
@@ -187,7 +188,7 @@ impl Write {
         )
         .bind(deployment.as_str())
         .bind(last)
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         let superseded = sqlx::query_scalar(AssertSqlSafe(format!(
             "UPDATE assignments SET desired = 0, superseded_by = $1, ended = 1, progress = NULL, updated_at_ms = $3,
@@ -197,12 +198,12 @@ impl Write {
                  SELECT robot_id FROM assignments
                  WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2)
              RETURNING deployment_id",
-            grown_by(Phase::Superseded, "$3")
+            appended_phase(Phase::Superseded, "$3")
         )))
         .bind(deployment.as_str())
         .bind(last)
         .bind(stored(now_ms))
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         // The first batch has just got this entry in its timeline.
         sqlx::query(AssertSqlSafe(format!(
@@ -210,20 +211,20 @@ impl Write {
                  expires_at_ms = CAST($3 AS BIGINT) + (SELECT expires_at_ms - created_at_ms FROM deployments WHERE id = $1),
                  timeline = CASE WHEN updated_at_ms = $3 THEN timeline ELSE {} END
              WHERE deployment_id = $1 AND released = 0 AND ended = 0 AND place <= $2",
-            grown_by(Phase::Assigned, "$3")
+            appended_phase(Phase::Assigned, "$3")
         )))
         .bind(deployment.as_str())
         .bind(last)
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
-        self.raise_generations(&robots).await?;
-        Ok(Released { robots, superseded: deployments(superseded)? })
+        self.0.robots().raise_generations(&robots).await?;
+        Ok(ReleasedBatch { robots, superseded: deployments(superseded)? })
     }
 
     /// Applies an order on `task` to those of `robots` where it changes anything. Returns the
     /// changed assignments.
-    pub async fn order_on_task(
+    pub async fn apply(
         &mut self,
         order: TaskOrder,
         task: &TaskName,
@@ -231,7 +232,7 @@ impl Write {
         expires_at_ms: u64,
         now_ms: u64,
     ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
-        let begun = grown_by(Phase::Assigned, "$3");
+        let begun = appended_phase(Phase::Assigned, "$3");
         let restart = format!(
             "SET wanted = 'running', run = CASE WHEN last_run > run THEN last_run ELSE run END + 1, phase = 'assigned', ended = 0, progress = NULL, failure = NULL,
                  attempts = 0, expires_at_ms = $2, updated_at_ms = $3, timeline = {begun} FROM v WHERE desired = 1"
@@ -266,10 +267,10 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            changed.extend(parts_of(query.fetch_all(self.connection()).await?)?);
+            changed.extend(deployment_robot_pairs(query.fetch_all(self.0.connection()).await?)?);
         }
         let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
-        self.raise_generations(&robots).await?;
+        self.0.robots().raise_generations(&robots).await?;
         Ok(changed)
     }
 
@@ -289,7 +290,7 @@ impl Write {
                  WHERE released = 0 AND ended = 0 AND robot_id = v.id AND (task = $1 OR $1 = '')
                  RETURNING deployment_id",
                 values(3, group.len(), &["TEXT"]),
-                grown_by(Phase::Cancelled, "$2")
+                appended_phase(Phase::Cancelled, "$2")
             );
             let mut query = sqlx::query_scalar(AssertSqlSafe(sql))
                 .bind(task.map_or("", TaskName::as_str).to_owned())
@@ -297,13 +298,13 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            dropped.append(&mut query.fetch_all(self.connection()).await?);
+            dropped.append(&mut query.fetch_all(self.0.connection()).await?);
         }
         deployments(dropped)
     }
 
     /// Ends all assignments of robots that are being removed. Returns their deployments.
-    pub async fn end_all_of_robots(
+    pub async fn end_all_of(
         &mut self,
         robots: &[RobotId],
         now_ms: u64,
@@ -317,33 +318,15 @@ impl Write {
                  WHERE robot_id = v.id AND (ended = 0 OR desired = 1)
                  RETURNING deployment_id",
                 values(2, group.len(), &["TEXT"]),
-                grown_by(Phase::Cancelled, "$1")
+                appended_phase(Phase::Cancelled, "$1")
             );
             let mut query = sqlx::query_scalar(AssertSqlSafe(sql)).bind(stored(now_ms));
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            ended.append(&mut query.fetch_all(self.connection()).await?);
+            ended.append(&mut query.fetch_all(self.0.connection()).await?);
         }
         deployments(ended)
-    }
-
-    pub(in crate::store) async fn raise_generations(
-        &mut self,
-        robots: &[RobotId],
-    ) -> Result<(), StoreError> {
-        for group in groups(robots) {
-            let sql = format!(
-                "WITH v (id) AS ({}) UPDATE robots SET generation = generation + 1 FROM v WHERE robots.id = v.id",
-                values(1, group.len(), &["TEXT"])
-            );
-            let mut query = sqlx::query(AssertSqlSafe(sql));
-            for robot in group {
-                query = query.bind(robot.as_str());
-            }
-            query.execute(self.connection()).await?;
-        }
-        Ok(())
     }
 }
 

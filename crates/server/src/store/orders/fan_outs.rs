@@ -5,8 +5,9 @@ use sqlx::AssertSqlSafe;
 use task_proto::desired::{Delivery, PackageRef};
 use task_proto::{DeploymentId, Digest, RobotId};
 
-use crate::store::rows::{from_json, groups, id, parts_of, stored, values};
-use crate::store::{Store, StoreError, Write};
+use crate::store::repositories::FanOuts;
+use crate::store::rows::{deployment_robot_pairs, from_json, groups, id, stored, values};
+use crate::store::{Store, StoreError, Transaction};
 
 /// Assignments of robots that receive the package in parts and still miss some. Diverged robots
 /// are left alone.
@@ -15,15 +16,15 @@ const AWAITING: &str = "assignments.mechanism = 'direct-push' AND assignments.de
     AND EXISTS (SELECT 1 FROM robots r WHERE r.id = assignments.robot_id AND r.removed_at_ms IS NULL
                     AND r.observed_generation <= r.generation)";
 
-impl Store {
+impl FanOuts<&Store> {
     /// The deployments with robots that wait for parts, the most urgent first.
-    pub async fn direct_pushes(&self) -> Result<Vec<(DeploymentId, PackageRef)>, StoreError> {
+    pub async fn list(self) -> Result<Vec<(DeploymentId, PackageRef)>, StoreError> {
         let rows: Vec<(String, String)> = sqlx::query_as(AssertSqlSafe(format!(
             "SELECT d.id, d.package FROM deployments d
              WHERE d.id IN (SELECT assignments.deployment_id FROM assignments WHERE {AWAITING})
              ORDER BY d.priority DESC, d.number"
         )))
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let read = |(deployment, package): &(String, String)| {
             Ok((id("deployments.id", deployment)?, from_json("deployments.package", package)?))
@@ -33,11 +34,11 @@ impl Store {
 
     /// The robots that wait for parts of `content`, with their deployments.
     pub async fn awaiting_parts(
-        &self,
+        self,
         content: &Digest,
     ) -> Result<Vec<(DeploymentId, RobotId)>, StoreError> {
         let mut awaiting = Vec::new();
-        for (deployment, package) in self.direct_pushes().await? {
+        for (deployment, package) in self.list().await? {
             if package.content.digest != *content {
                 continue;
             }
@@ -45,7 +46,7 @@ impl Store {
                 "SELECT robot_id FROM assignments WHERE deployment_id = $1 AND {AWAITING} ORDER BY place"
             )))
             .bind(deployment.as_str())
-            .fetch_all(&self.reads)
+            .fetch_all(&self.0.reads)
             .await?;
             for robot in robots {
                 awaiting.push((deployment.clone(), id("assignments.robot_id", &robot)?));
@@ -55,7 +56,7 @@ impl Store {
     }
 }
 
-impl Write {
+impl FanOuts<&mut Transaction> {
     /// Changes the delivery decision for those of `parts` that still wait for parts: they pull, by
     /// `rule`, `because`. Returns the robots with a new desired state.
     pub async fn pull_instead(
@@ -83,10 +84,10 @@ impl Write {
             for (deployment, robot) in group {
                 query = query.bind(deployment.as_str()).bind(robot.as_str());
             }
-            changed.extend(parts_of(query.fetch_all(self.connection()).await?)?);
+            changed.extend(deployment_robot_pairs(query.fetch_all(self.0.connection()).await?)?);
         }
         let robots: Vec<RobotId> = changed.iter().map(|(_, robot)| robot.clone()).collect();
-        self.raise_generations(&robots).await?;
+        self.0.robots().raise_generations(&robots).await?;
         Ok(changed)
     }
 }

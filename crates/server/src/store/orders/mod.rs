@@ -2,8 +2,8 @@
 
 pub(super) mod assignments;
 pub(super) mod deployments;
-pub(super) mod earlier;
 pub(super) mod fan_outs;
 pub(super) mod idempotency;
+pub(super) mod past_assignments;
+pub(super) mod revert;
 pub(super) mod still_running;
-pub(super) mod taking_back;

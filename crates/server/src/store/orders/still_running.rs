@@ -4,12 +4,13 @@
 
 use sqlx::Row as _;
 use task_proto::desired::Wanted;
-use task_proto::report::{Phase, Report};
+use task_proto::messages::report::{Phase, Report};
 use task_proto::{DeploymentId, RobotId, TaskName};
 
+use crate::store::repositories::Assignments;
 use crate::store::rows::{from_json, id};
-use crate::store::timelines::grown_by;
-use crate::store::{StoreError, Write};
+use crate::store::timelines::appended_phase;
+use crate::store::{StoreError, Transaction};
 
 /// A robot that still runs an ordered package.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,7 +22,7 @@ pub struct StillRunning {
     pub earlier: DeploymentId,
 }
 
-impl Write {
+impl Assignments<&mut Transaction> {
     /// Settles a new deployment of `task` on the robots that, as of their last reports, still run
     /// its package after a later one failed. Returns these robots: their desired state is new.
     pub async fn settle_still_running(
@@ -34,18 +35,18 @@ impl Write {
         if found.is_empty() {
             return Ok(found);
         }
-        self.changes_access();
+        self.0.mark_auth_change();
         // Only one of a robot's deployments is desired at a time, so this comes first.
-        let give_way = "SET desired = 0, superseded_by = $2, updated_at_ms = $1";
-        self.set_pairs(
-            give_way,
+        let displace = "SET desired = 0, superseded_by = $2, updated_at_ms = $1";
+        self.update_pairs(
+            displace,
             deployment.as_str(),
             now_ms,
             found.iter().map(|one| (&one.failed, &one.robot)),
         )
         .await?;
-        let timeline = grown_by(Phase::Running, "$1");
-        let come_back = format!(
+        let timeline = appended_phase(Phase::Running, "$1");
+        let restore = format!(
             "SET desired = 1, superseded_by = NULL, removed_generation = NULL, wanted = 'running', phase = $2, ended = 0,
                  progress = NULL, failure = NULL, expires_at_ms = NULL, updated_at_ms = $1, timeline = {timeline}"
         );
@@ -53,17 +54,22 @@ impl Write {
             "SET released = 1, ended = 1, ran = 1, phase = $2, updated_at_ms = $1, timeline = {timeline}"
         );
         let running = Phase::Running.as_str();
-        self.set_pairs(
-            &come_back,
+        self.update_pairs(
+            &restore,
             running,
             now_ms,
             found.iter().map(|one| (&one.earlier, &one.robot)),
         )
         .await?;
-        self.set_pairs(&settle, running, now_ms, found.iter().map(|one| (deployment, &one.robot)))
-            .await?;
+        self.update_pairs(
+            &settle,
+            running,
+            now_ms,
+            found.iter().map(|one| (deployment, &one.robot)),
+        )
+        .await?;
         let robots: Vec<RobotId> = found.iter().map(|one| one.robot.clone()).collect();
-        self.raise_generations(&robots).await?;
+        self.0.robots().raise_generations(&robots).await?;
         Ok(found)
     }
 
@@ -89,7 +95,7 @@ impl Write {
         )
         .bind(deployment.as_str())
         .bind(task.as_str())
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         let mut found = Vec::new();
         for row in &rows {
@@ -99,11 +105,11 @@ impl Write {
                 earlier: id("assignments.deployment_id", row.try_get("earlier")?)?,
             };
             let report: Report = from_json("robots.report", row.try_get("report")?)?;
-            let runs = report.tasks.iter().any(|said| {
-                let brought = said.active.as_ref().map(|active| &active.deployment);
-                let is_over = said.wanted == Wanted::Running && said.phase.is_final();
-                said.task == *task
-                    && said.deployment == one.failed
+            let runs = report.tasks.iter().any(|task_report| {
+                let brought = task_report.active.as_ref().map(|active| &active.deployment);
+                let is_over = task_report.wanted == Wanted::Running && task_report.phase.is_final();
+                task_report.task == *task
+                    && task_report.deployment == one.failed
                     && is_over
                     && brought == Some(&one.earlier)
             });

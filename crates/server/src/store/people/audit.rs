@@ -9,24 +9,25 @@ use std::time::{Duration, Instant};
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::TokenId;
 use task_proto::api::{AuditPage, AuditQuery};
-use task_proto::audit::{AuditEntry, AuditRecord, Link};
-use task_proto::person::Permission;
+use task_proto::people::audit::{AuditEntry, AuditRecord, ChainLink};
+use task_proto::people::roles::Permission;
 
+use crate::domain::limits::keyed_rate_limit::{KeyedRateLimit, seconds};
 use crate::domain::person::Person;
-use crate::limits::pace::{Pace, seconds};
+use crate::store::repositories::Audit;
 use crate::store::rows::{id, json, number, stored};
-use crate::store::{KnownRobot, Store, StoreError, Write};
+use crate::store::{KnownRobot, Store, StoreError, Transaction};
 
 /// The most entries in one answer.
-const MOST_RECORDS: u64 = 1_000;
+const MAX_RECORDS: u64 = 1_000;
 /// The most bytes of entries in one answer.
-const MOST_BYTES: usize = 4 * 1024 * 1024;
+const MAX_PAGE_BYTES: usize = 4 * 1024 * 1024;
 /// The longest stored text of a target or a detail: a selector may be as long as 64 KiB.
-const MOST_CHARACTERS: usize = 1_000;
+const MAX_TEXT_CHARACTERS: usize = 1_000;
 
-/// An act that the audit log records.
+/// An action that the audit log records.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Act {
+pub enum AuditAction {
     /// A robot enrolled, for the first time or again.
     RobotEnroll,
     /// A waiting robot was approved.
@@ -46,9 +47,9 @@ pub enum Act {
     /// A robot was asked for an immediate change, like one of a parameter.
     RobotAsk,
     /// An enrollment token was made.
-    EnrolmentCreate,
+    EnrollmentCreate,
     /// An enrollment token was revoked.
-    EnrolmentRevoke,
+    EnrollmentRevoke,
     /// A package was ordered.
     DeploymentCreate,
     /// An order was cancelled.
@@ -95,8 +96,8 @@ pub enum Act {
     TokenRevoke,
 }
 
-impl Act {
-    /// The name of the act in the audit log.
+impl AuditAction {
+    /// The name of the action in the audit log.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::RobotEnroll => "robot.enroll",
@@ -108,8 +109,8 @@ impl Act {
             Self::BulkRemove => "bulk.remove",
             Self::RobotRevoke => "robot.revoke",
             Self::RobotAsk => "robot.ask",
-            Self::EnrolmentCreate => "enrolment_token.create",
-            Self::EnrolmentRevoke => "enrolment_token.revoke",
+            Self::EnrollmentCreate => "enrolment_token.create",
+            Self::EnrollmentRevoke => "enrolment_token.revoke",
             Self::DeploymentCreate => "deployment.create",
             Self::DeploymentCancel => "deployment.cancel",
             Self::DeploymentResume => "deployment.resume",
@@ -136,55 +137,55 @@ impl Act {
     }
 }
 
-impl Act {
-    /// Whether every person may do the act repeatedly, whatever their role, and only to their own
-    /// account. Signing out and revoking a token are excluded: each ends once something that such
+impl AuditAction {
+    /// Whether every person may do the action repeatedly, whatever their role, and only to their
+    /// own account. Signing out and revoking a token are excluded: each ends once something that such
     /// an act began. All other acts take a role that we trust with more than the length of the
     /// audit log, and an order must not wait.
-    fn is_everybodys(self) -> bool {
+    fn is_self_service(self) -> bool {
         matches!(self, Self::SignIn | Self::TokenCreate | Self::UserPassword)
     }
 }
 
 /// The rate limit of one person for such acts: a burst after a rest, and then 2,000 a day.
-pub(in crate::store) fn everybodys_pace() -> Pace {
-    Pace::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
+pub(in crate::store) fn new_self_service_limit() -> KeyedRateLimit {
+    KeyedRateLimit::new(Duration::from_secs(24 * 60 * 60) / 2_000, 200)
 }
 
-/// An act in progress, described by its caller. A secret must never be part of it.
+/// An entry for the audit log, described by its caller. A secret must never be part of it.
 #[derive(Debug, Clone)]
-pub struct Deed {
-    who: String,
+pub struct AuditEvent {
+    actor: String,
     token: Option<TokenId>,
     address: Option<IpAddr>,
     /// The person whose rights are used; `None`: the act uses no rights, like signing in.
     by: Option<Person>,
-    act: Act,
+    action: AuditAction,
     target: String,
     detail: BTreeMap<String, String>,
 }
 
-impl Deed {
-    /// `person` does `act` to `target`.
-    pub fn by(person: &Person, act: Act, target: impl ToString) -> Self {
-        let (who, token) = (person.name.to_string(), Some(person.token.clone()));
-        Self { by: Some(person.clone()), ..Self::new(who, token, person.address, act, target) }
+impl AuditEvent {
+    /// `person` does `action` to `target`.
+    pub fn by(person: &Person, action: AuditAction, target: impl ToString) -> Self {
+        let (actor, token) = (person.name.to_string(), Some(person.token.clone()));
+        Self { by: Some(person.clone()), ..Self::new(actor, token, person.address, action, target) }
     }
 
     /// An act without a user, or before the user is known.
     pub fn new(
-        who: String,
+        actor: String,
         token: Option<TokenId>,
         address: Option<IpAddr>,
-        act: Act,
+        action: AuditAction,
         target: impl ToString,
     ) -> Self {
         Self {
-            who,
+            actor,
             token,
             address,
             by: None,
-            act,
+            action,
             target: shortened(&target.to_string()),
             detail: BTreeMap::new(),
         }
@@ -204,7 +205,7 @@ impl Deed {
     }
 }
 
-impl Deed {
+impl AuditEvent {
     /// Whether a robot is in the scope of the acting person.
     pub(in crate::store) fn covers(&self, robot: &KnownRobot) -> bool {
         self.by.as_ref().is_some_and(|by| by.scope.covers(&robot.id, &robot.name, &robot.labels))
@@ -215,84 +216,86 @@ impl Deed {
 /// terminal nor Postgres takes every one.
 fn shortened(text: &str) -> String {
     let mut characters = text.chars().map(|c| if c.is_control() { ' ' } else { c });
-    let mut kept: String = characters.by_ref().take(MOST_CHARACTERS).collect();
+    let mut kept: String = characters.by_ref().take(MAX_TEXT_CHARACTERS).collect();
     if characters.next().is_some() {
         kept.push('…');
     }
     kept
 }
 
-impl Write {
+impl Audit<&mut Transaction> {
     /// Records the act of this write. The entry exists if and only if the write is committed. The
     /// write fails if the person's rights have ended meanwhile: a request's body can come long
     /// after its head. A write that changes the rights of its own caller therefore has to call this
     /// first.
-    pub async fn audit(&mut self, deed: &Deed, now_ms: u64) -> Result<(), StoreError> {
-        if let Some(by) = &deed.by {
-            self.check_rights(by, now_ms).await?;
+    pub async fn record(&mut self, event: &AuditEvent, now_ms: u64) -> Result<(), StoreError> {
+        if let Some(by) = &event.by {
+            self.0.tokens().check_rights(by, now_ms).await?;
         }
-        if deed.act.is_everybodys()
-            && !deed.by.as_ref().is_some_and(|by| by.may(Permission::Administer))
+        if event.action.is_self_service()
+            && !event.by.as_ref().is_some_and(|by| by.may(Permission::Administer))
         {
-            let taken = self.everybodys.take(&deed.who, Instant::now());
+            let taken = self.0.self_service_limit.take(&event.actor, Instant::now());
             taken.map_err(|wait| StoreError::TooManyActs {
-                who: deed.who.clone(),
+                user: event.actor.clone(),
                 seconds: seconds(wait),
             })?;
         }
         let last = sqlx::query("SELECT number, digest FROM audit ORDER BY number DESC LIMIT 1")
-            .fetch_optional(self.connection())
+            .fetch_optional(self.0.connection())
             .await?;
         let last = match last {
             Some(row) => {
                 let digest = id("audit.digest", row.try_get("digest")?)?;
-                Link { number: number(row.try_get("number")?), digest }
+                ChainLink { number: number(row.try_get("number")?), digest }
             }
-            None => Link::START,
+            None => ChainLink::START,
         };
         let entry = json(&AuditEntry {
             number: last.number + 1,
             at_ms: now_ms,
-            who: deed.who.clone(),
-            token: deed.token.clone(),
-            address: deed.address,
-            act: deed.act.as_str().to_owned(),
-            target: deed.target.clone(),
-            detail: deed.detail.clone(),
+            who: event.actor.clone(),
+            token: event.token.clone(),
+            address: event.address,
+            act: event.action.as_str().to_owned(),
+            target: event.target.clone(),
+            detail: event.detail.clone(),
         });
         let link = last.next(&entry);
         sqlx::query("INSERT INTO audit (number, who, act, target, entry, digest) VALUES ($1, $2, $3, $4, $5, $6)")
             .bind(stored(link.number))
-            .bind(deed.who.as_str())
-            .bind(deed.act.as_str())
-            .bind(deed.target.as_str())
+            .bind(event.actor.as_str())
+            .bind(event.action.as_str())
+            .bind(event.target.as_str())
             .bind(entry)
             .bind(link.digest.to_string())
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
         Ok(())
     }
+}
 
+impl Transaction {
     /// Records the act, if there is one, and commits the write.
-    pub(in crate::store) async fn commit_with(
+    pub(in crate::store) async fn commit_with_audit(
         mut self,
-        deed: Option<&Deed>,
+        event: Option<&AuditEvent>,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        if let Some(deed) = deed {
-            self.audit(deed, now_ms).await?;
+        if let Some(event) = event {
+            self.audit().record(event, now_ms).await?;
         }
         self.commit().await
     }
 }
 
-impl Store {
+impl Audit<&Store> {
     /// Reads entries of the audit log: those after a number, oldest first, or else newest first.
-    pub async fn audit(&self, query: &AuditQuery) -> Result<AuditPage, StoreError> {
+    pub async fn page(self, query: &AuditQuery) -> Result<AuditPage, StoreError> {
         let last: Option<i64> =
-            sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.reads).await?;
+            sqlx::query_scalar("SELECT MAX(number) FROM audit").fetch_one(&self.0.reads).await?;
         let order = if query.after.is_some() { "ASC" } else { "DESC" };
-        let limit = query.limit.unwrap_or(MOST_RECORDS).min(MOST_RECORDS);
+        let limit = query.limit.unwrap_or(MAX_RECORDS).min(MAX_RECORDS);
         let rows = sqlx::query(AssertSqlSafe(format!(
             "SELECT entry, digest FROM audit
              WHERE number > $1 AND number < $2 AND (who = $3 OR $3 = '') AND ($4 = '' OR target = $4 OR target IN (SELECT id FROM robots WHERE name = $4))
@@ -306,13 +309,13 @@ impl Store {
         .bind(query.act.as_deref().unwrap_or_default())
         .bind(stored(query.act.as_deref().map_or(0, |act| act.chars().count() as u64)))
         .bind(stored(limit))
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let (mut records, mut bytes) = (Vec::with_capacity(rows.len()), 0);
         for row in rows {
             let entry: String = row.try_get("entry")?;
             bytes += entry.len();
-            if bytes > MOST_BYTES && !records.is_empty() {
+            if bytes > MAX_PAGE_BYTES && !records.is_empty() {
                 break;
             }
             let entry = serde_json::value::RawValue::from_string(entry)
@@ -329,7 +332,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn no_statement_changes_or_removes_an_entry() {
+    fn audit_entries_are_never_updated_or_deleted() {
         let mut directories =
             vec![std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src/store")];
         let mut looked_at = 0;
@@ -353,11 +356,11 @@ mod tests {
     }
 
     #[test]
-    fn a_text_is_kept_short_and_harmless() {
+    fn stored_text_is_truncated_and_has_no_control_characters() {
         assert_eq!(shortened("site=lab"), "site=lab");
         assert_eq!(shortened("a\u{1b}[2J\0b\n"), "a [2J b ");
         let long = shortened(&"é".repeat(5_000));
-        assert_eq!((long.chars().count(), long.ends_with('…')), (MOST_CHARACTERS + 1, true));
-        assert_eq!(shortened(&"é".repeat(MOST_CHARACTERS)), "é".repeat(MOST_CHARACTERS));
+        assert_eq!((long.chars().count(), long.ends_with('…')), (MAX_TEXT_CHARACTERS + 1, true));
+        assert_eq!(shortened(&"é".repeat(MAX_TEXT_CHARACTERS)), "é".repeat(MAX_TEXT_CHARACTERS));
     }
 }

@@ -6,26 +6,27 @@ use std::collections::BTreeSet;
 use sqlx::{AssertSqlSafe, Row as _};
 use subtle::ConstantTimeEq as _;
 use task_proto::api::TokenOrigin;
-use task_proto::envelope::PublicKey;
-use task_proto::id::Labels;
-use task_proto::person::Roles;
-use task_proto::selector::Selector;
-use task_proto::token::{Token, TokenKind};
+use task_proto::ids::Labels;
+use task_proto::ids::selector::Selector;
+use task_proto::people::roles::Roles;
+use task_proto::trust::envelope::PublicKey;
+use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{RobotId, TokenId, UserName};
 
 use crate::domain::person::{Person, Scope};
 use crate::net::tls::ClientProof;
+use crate::store::repositories::{Enrollments, Tokens};
 use crate::store::rows::{
     from_optional_json, from_word, groups, id, json, number, optional, stored, values,
 };
-use crate::store::{Store, StoreError, Write};
+use crate::store::{Store, StoreError, Transaction};
 
 /// The holder of a valid token.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum TokenHolder {
     Person(Person),
     /// The holder of an enrollment token.
-    Enrolment,
+    Enrollment,
     Robot {
         robot: RobotId,
         /// The number of the token: a later one has a higher number.
@@ -45,7 +46,7 @@ impl TokenHolder {
     fn is_proven_by(&self, proof: &ClientProof) -> bool {
         match self {
             Self::Robot { key, .. } | Self::Pending { key, .. } => proof.suffices(key.as_ref()),
-            Self::Person(_) | Self::Enrolment => true,
+            Self::Person(_) | Self::Enrollment => true,
         }
     }
 }
@@ -62,7 +63,7 @@ pub struct Admitted {
 
 /// The terms of an enrollment token.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct EnrolmentTerms {
+pub struct EnrollmentTerms {
     /// Only this robot may use it.
     pub robot: Option<RobotId>,
     /// Labels given to each robot that enrolls with the token.
@@ -111,34 +112,34 @@ const VALID_TOKEN: &str = "SELECT t.digest, t.robot_id, t.labels, t.uses_left, t
        AND (t.uses_left IS NULL OR t.uses_left > 0 OR EXISTS (SELECT 1 FROM tokens made
             WHERE made.made_by = t.id AND made.used_at_ms IS NULL AND made.revoked_at_ms IS NULL))";
 
-impl Store {
+impl Tokens<&Store> {
     /// The holder of `token` at `now_ms`; `None` if the token is unknown, wrong, used up, expired
     /// or revoked. Changes nothing.
-    pub async fn token_holder(
-        &self,
+    pub async fn holder(
+        self,
         token: &Token,
         now_ms: u64,
     ) -> Result<Option<TokenHolder>, StoreError> {
-        let row = self.valid_token(token, now_ms).await?;
+        let row = self.find_valid(token, now_ms).await?;
         Ok(row.and_then(|row| row.holder(token)))
     }
 
-    /// Finds the holder of `token` as [`Self::token_holder`] does, and admits the client. A robot's
+    /// Finds the holder of `token` as [`Self::holder`] does, and admits the client. A robot's
     /// first use of a token ends its other tokens. A robot that has registered a key must have
     /// proven its possession, if the server asked for the proof. Otherwise the token counts as
     /// unknown.
     pub async fn admit(
-        &self,
+        self,
         token: &Token,
         proof: &ClientProof,
         now_ms: u64,
     ) -> Result<Option<Admitted>, StoreError> {
-        if let Some(holder) = self.access.holder(token, now_ms) {
+        if let Some(holder) = self.0.auth_cache.holder(token, now_ms) {
             let is_proven = holder.is_proven_by(proof);
             return Ok(is_proven.then_some(Admitted { holder, is_first_use: false }));
         }
-        let asked = self.access.ask();
-        let Some(row) = self.valid_token(token, now_ms).await? else { return Ok(None) };
+        let epoch = self.0.auth_cache.epoch();
+        let Some(row) = self.find_valid(token, now_ms).await? else { return Ok(None) };
         let is_unused = token.kind() == TokenKind::Robot && !row.is_used;
         let expires_at_ms = row.expires_at_ms;
         let holder = row.holder(token).filter(|holder| holder.is_proven_by(proof));
@@ -146,60 +147,73 @@ impl Store {
         if is_unused && !self.use_first(token, now_ms).await? {
             // A concurrent request was first, either with this token or with a later one.
             let holder =
-                self.token_holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
+                self.holder(token, now_ms).await?.filter(|holder| holder.is_proven_by(proof));
             return Ok(holder.map(|holder| Admitted { holder, is_first_use: false }));
         }
         // The uses of an enrollment token are counted by the code that enrolls.
-        if !is_unused && holder != TokenHolder::Enrolment {
-            self.access.remember_holder(asked, token, &holder, expires_at_ms);
+        if !is_unused && holder != TokenHolder::Enrollment {
+            self.0.auth_cache.cache_holder(epoch, token, &holder, expires_at_ms);
         }
         Ok(Some(Admitted { holder, is_first_use: is_unused }))
     }
 
-    async fn valid_token(
-        &self,
-        token: &Token,
-        now_ms: u64,
-    ) -> Result<Option<TokenRow>, StoreError> {
+    async fn find_valid(self, token: &Token, now_ms: u64) -> Result<Option<TokenRow>, StoreError> {
         let row = sqlx::query(VALID_TOKEN)
             .bind(token.id())
             .bind(kind_text(token.kind()))
             .bind(stored(now_ms))
-            .fetch_optional(&self.reads)
+            .fetch_optional(&self.0.reads)
             .await?;
         Ok(row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token)))
     }
 
-    /// Stores the first token, which does not expire.
-    pub async fn create_operator_token(
-        &self,
-        token: &Token,
+    /// The person of the token with this id and this digest of its secret, and the token's expiry
+    /// time; `None` if the token is not valid.
+    pub(in crate::store) async fn person(
+        self,
+        token: &TokenId,
+        digest: &str,
         now_ms: u64,
-    ) -> Result<(), StoreError> {
-        let mut write = self.begin().await?;
-        write.insert_token(token, None, None, now_ms).await?;
+    ) -> Result<Option<(Person, Option<u64>)>, StoreError> {
+        let row = sqlx::query(VALID_TOKEN)
+            .bind(token.as_str())
+            .bind(kind_text(TokenKind::Operator))
+            .bind(stored(now_ms))
+            .fetch_optional(&self.0.reads)
+            .await?;
+        let row = row.map(token_row).transpose()?.filter(|row| row.digest == digest);
+        Ok(row.and_then(|row| {
+            let expires_at_ms = row.expires_at_ms;
+            Some((row.person(token)?, expires_at_ms))
+        }))
+    }
+
+    /// Stores the first token, which does not expire.
+    pub async fn create_first(self, token: &Token, now_ms: u64) -> Result<(), StoreError> {
+        let mut write = self.0.begin().await?;
+        write.tokens().insert(token, None, None, now_ms).await?;
         write.commit().await
     }
 }
 
-impl Write {
+impl Enrollments<&mut Transaction> {
     /// The present terms of the enrollment token `token`; `None` if the token is not valid.
-    pub async fn enrolment_terms(
+    pub async fn terms(
         &mut self,
         token: &Token,
         now_ms: u64,
-    ) -> Result<Option<EnrolmentTerms>, StoreError> {
-        if token.kind() != TokenKind::Enrolment {
+    ) -> Result<Option<EnrollmentTerms>, StoreError> {
+        if token.kind() != TokenKind::Enrollment {
             return Ok(None);
         }
         let row = sqlx::query(VALID_TOKEN)
             .bind(token.id())
             .bind(kind_text(token.kind()))
             .bind(stored(now_ms))
-            .fetch_optional(self.connection())
+            .fetch_optional(self.0.connection())
             .await?;
         let row = row.map(token_row).transpose()?.filter(|row| row.has_secret_of(token));
-        Ok(row.map(|row| EnrolmentTerms {
+        Ok(row.map(|row| EnrollmentTerms {
             robot: row.robot,
             labels: row.labels,
             uses_left: row.uses_left,
@@ -208,6 +222,38 @@ impl Write {
         }))
     }
 
+    /// Counts one enrollment by `token`.
+    pub async fn use_token(&mut self, token: &Token) -> Result<(), StoreError> {
+        sqlx::query(
+            "UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL",
+        )
+        .bind(token.id())
+        .execute(self.0.connection())
+        .await?;
+        Ok(())
+    }
+
+    /// Stores an enrollment token.
+    pub async fn create_token(
+        &mut self,
+        token: &Token,
+        terms: &EnrollmentTerms,
+        now_ms: u64,
+    ) -> Result<(), StoreError> {
+        self.0.tokens().insert(token, terms.robot.as_ref(), None, now_ms).await?;
+        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4, approval = $5 WHERE id = $1")
+            .bind(token.id())
+            .bind(json(&terms.labels))
+            .bind(terms.uses_left.map(stored))
+            .bind(stored(terms.expires_at_ms))
+            .bind(i64::from(terms.approval))
+            .execute(self.0.connection())
+            .await?;
+        Ok(())
+    }
+}
+
+impl Tokens<&mut Transaction> {
     /// Fails unless `by` still has the rights that they had at admission. Changes by this write
     /// itself do not count.
     pub(in crate::store) async fn check_rights(
@@ -215,57 +261,27 @@ impl Write {
         by: &Person,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        if self.vouched_for.as_ref() == Some(by) {
+        if self.0.verified_person.as_ref() == Some(by) {
             return Ok(());
         }
         let row = sqlx::query(VALID_TOKEN)
             .bind(by.token.as_str())
             .bind(kind_text(TokenKind::Operator))
             .bind(stored(now_ms))
-            .fetch_optional(self.connection())
+            .fetch_optional(self.0.connection())
             .await?;
         let person = row.map(token_row).transpose()?.and_then(|row| row.person(&by.token));
         if !person.is_some_and(|person| person.has_the_rights_of(by)) {
             return Err(StoreError::RightsEnded);
         }
-        self.vouched_for = Some(by.clone());
-        Ok(())
-    }
-
-    /// Counts one enrollment by `token`.
-    pub async fn use_enrolment_token(&mut self, token: &Token) -> Result<(), StoreError> {
-        sqlx::query(
-            "UPDATE tokens SET uses_left = uses_left - 1 WHERE id = $1 AND uses_left IS NOT NULL",
-        )
-        .bind(token.id())
-        .execute(self.connection())
-        .await?;
-        Ok(())
-    }
-
-    /// Stores an enrollment token.
-    pub async fn create_enrolment_token(
-        &mut self,
-        token: &Token,
-        terms: &EnrolmentTerms,
-        now_ms: u64,
-    ) -> Result<(), StoreError> {
-        self.insert_token(token, terms.robot.as_ref(), None, now_ms).await?;
-        sqlx::query("UPDATE tokens SET labels = $2, uses_left = $3, expires_at_ms = $4, approval = $5 WHERE id = $1")
-            .bind(token.id())
-            .bind(json(&terms.labels))
-            .bind(terms.uses_left.map(stored))
-            .bind(stored(terms.expires_at_ms))
-            .bind(i64::from(terms.approval))
-            .execute(self.connection())
-            .await?;
+        self.0.verified_person = Some(by.clone());
         Ok(())
     }
 
     /// Makes `token` the robot's next token, in place of an earlier offer that was never used.
     /// `made_by` is the enrollment token of the request; `None`: the robot itself asked for the
     /// token. With `key`, the robot has to prove that key when it uses the token.
-    pub async fn offer_robot_token(
+    pub async fn offer(
         &mut self,
         token: &Token,
         robot: &RobotId,
@@ -277,30 +293,26 @@ impl Write {
             "DELETE FROM tokens WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NULL",
         )
         .bind(robot.as_str())
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
-        self.insert_token(token, Some(robot), made_by, now_ms).await?;
+        self.insert(token, Some(robot), made_by, now_ms).await?;
         sqlx::query("UPDATE tokens SET client_key = $2 WHERE id = $1")
             .bind(token.id())
             .bind(key.map(json))
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
         Ok(())
     }
 
     /// Refuses a request of `robot` if its token has ended since.
-    pub async fn check_token(
-        &mut self,
-        robot: &RobotId,
-        token_number: u64,
-    ) -> Result<(), StoreError> {
+    pub async fn check(&mut self, robot: &RobotId, token_number: u64) -> Result<(), StoreError> {
         let found: Option<String> = sqlx::query_scalar(
             "SELECT id FROM tokens
              WHERE robot_id = $1 AND number = $2 AND kind = 'robot' AND used_at_ms IS NOT NULL AND revoked_at_ms IS NULL",
         )
         .bind(robot.as_str())
         .bind(stored(token_number))
-        .fetch_optional(self.connection())
+        .fetch_optional(self.0.connection())
         .await?;
         found.map(drop).ok_or(StoreError::RightsEnded)
     }
@@ -312,7 +324,7 @@ impl Write {
              WHERE robot_id = $1 AND kind = 'robot' AND used_at_ms IS NOT NULL AND revoked_at_ms IS NULL",
         )
         .bind(robot.as_str())
-        .fetch_optional(self.connection())
+        .fetch_optional(self.0.connection())
         .await?;
         row.map(|row| client_key(&row)).transpose().map(Option::flatten)
     }
@@ -330,13 +342,13 @@ impl Write {
         )
         .bind(robot.as_str())
         .bind(made_by.map(Token::id).unwrap_or_default())
-        .fetch_optional(self.connection())
+        .fetch_optional(self.0.connection())
         .await?;
         Ok(found.is_some())
     }
 
     /// Revokes all tokens of `robots`.
-    pub async fn revoke_tokens(
+    pub async fn revoke_all_of(
         &mut self,
         robots: &[RobotId],
         now_ms: u64,
@@ -350,7 +362,7 @@ impl Write {
             for robot in group {
                 query = query.bind(robot.as_str());
             }
-            query.execute(self.connection()).await?;
+            query.execute(self.0.connection()).await?;
         }
         Ok(())
     }
@@ -359,10 +371,7 @@ impl Write {
     /// users. The first token stays when it was revoked: its secret is in the data directory, and
     /// must not become valid again at the next start. The tokens of a revoked robot stay as well,
     /// so that the robot can be told.
-    pub async fn forget_ended_tokens(
-        &mut self,
-        now_ms: u64,
-    ) -> Result<BTreeSet<UserName>, StoreError> {
+    pub async fn forget_ended(&mut self, now_ms: u64) -> Result<BTreeSet<UserName>, StoreError> {
         let users: Vec<Option<String>> = sqlx::query_scalar(
             "DELETE FROM tokens
              WHERE (kind <> 'operator' OR user_name IS NOT NULL) AND (revoked_at_ms IS NOT NULL OR expires_at_ms <= $1
@@ -373,19 +382,19 @@ impl Write {
              RETURNING user_name",
         )
         .bind(stored(now_ms))
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         users.iter().flatten().map(|user| id("tokens.user_name", user)).collect()
     }
 
-    pub(in crate::store) async fn insert_token(
+    pub(in crate::store) async fn insert(
         &mut self,
         token: &Token,
         robot: Option<&RobotId>,
         made_by: Option<&Token>,
         now_ms: u64,
     ) -> Result<(), StoreError> {
-        let number = stored(self.turn());
+        let number = stored(self.0.sequence());
         sqlx::query(
             "INSERT INTO tokens (id, kind, digest, robot_id, made_by, number, created_at_ms)
              VALUES ($1, $2, $3, $4, $5, $6, $7)",
@@ -397,7 +406,7 @@ impl Write {
         .bind(made_by.map(Token::id))
         .bind(number)
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
@@ -407,7 +416,7 @@ impl TokenRow {
     fn holder(self, token: &Token) -> Option<TokenHolder> {
         match token.kind() {
             TokenKind::Operator => self.person(&token.id().parse().ok()?).map(TokenHolder::Person),
-            TokenKind::Enrolment => Some(TokenHolder::Enrolment),
+            TokenKind::Enrollment => Some(TokenHolder::Enrollment),
             TokenKind::Robot if self.is_pending => {
                 self.robot.map(|robot| TokenHolder::Pending { robot, key: self.key })
             }
@@ -479,7 +488,7 @@ fn user_part(row: &sqlx::any::AnyRow) -> Result<Option<UserPart>, StoreError> {
 fn kind_text(kind: TokenKind) -> &'static str {
     match kind {
         TokenKind::Operator => "operator",
-        TokenKind::Enrolment => "enrolment",
+        TokenKind::Enrollment => "enrolment",
         TokenKind::Robot => "robot",
     }
 }

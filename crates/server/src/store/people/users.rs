@@ -4,18 +4,19 @@
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
 use task_proto::api::{TokenOrigin, TokenView, UserView};
-use task_proto::person::{Permission, Roles};
-use task_proto::selector::Selector;
-use task_proto::token::Token;
+use task_proto::ids::selector::Selector;
+use task_proto::people::roles::{Permission, Roles};
+use task_proto::trust::token::Token;
 use task_proto::{TokenId, UserName};
 
 use crate::auth::passwords::PasswordHash;
 use crate::domain::person::first_name;
+use crate::store::repositories::{Tokens, Users};
 use crate::store::rows::{from_word, id, number, optional, stored, word};
-use crate::store::{Store, StoreError, Write};
+use crate::store::{Store, StoreError, Transaction};
 
 /// The most tokens in a list.
-const MOST_LISTED: i64 = 10_000;
+const MAX_LISTED: i64 = 10_000;
 
 /// A user, as stored.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -71,26 +72,28 @@ const TOKENS: &str =
     "SELECT id, user_name, origin, title, roles, scope, created_at_ms, expires_at_ms, revoked_at_ms
      FROM tokens WHERE kind = 'operator'";
 
-impl Store {
+impl Users<&Store> {
     /// All users, sorted by name.
-    pub async fn users(&self) -> Result<Vec<User>, StoreError> {
-        let rows = sqlx::query(USERS).fetch_all(&self.reads).await?;
+    pub async fn list(self) -> Result<Vec<User>, StoreError> {
+        let rows = sqlx::query(USERS).fetch_all(&self.0.reads).await?;
         let mut users = rows.iter().map(user).collect::<Result<Vec<_>, _>>()?;
         users.sort_by(|one, other| one.name.cmp(&other.name));
         Ok(users)
     }
 
     /// The user with this name.
-    pub async fn user(&self, name: &UserName) -> Result<Option<User>, StoreError> {
+    pub async fn get(self, name: &UserName) -> Result<Option<User>, StoreError> {
         let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
             .bind(name.as_str());
-        row.fetch_optional(&self.reads).await?.as_ref().map(user).transpose()
+        row.fetch_optional(&self.0.reads).await?.as_ref().map(user).transpose()
     }
+}
 
+impl Tokens<&Store> {
     /// The tokens of all users or of one, the newest first. Of the ended tokens only the first
     /// token is included.
-    pub async fn person_tokens(
-        &self,
+    pub async fn list(
+        self,
         of: Option<&UserName>,
         now_ms: u64,
     ) -> Result<Vec<TokenView>, StoreError> {
@@ -100,40 +103,34 @@ impl Store {
         let rows = sqlx::query(sqlx::AssertSqlSafe(format!("{TOKENS} {listed}")))
             .bind(of.map_or("", UserName::as_str))
             .bind(stored(now_ms))
-            .bind(MOST_LISTED)
-            .fetch_all(&self.reads)
+            .bind(MAX_LISTED)
+            .fetch_all(&self.0.reads)
             .await?;
         rows.iter().map(token_view).collect()
     }
 }
 
-impl Write {
+impl Users<&mut Transaction> {
     /// The user with this name.
-    pub async fn user(&mut self, name: &UserName) -> Result<Option<User>, StoreError> {
+    pub async fn get(&mut self, name: &UserName) -> Result<Option<User>, StoreError> {
         let row = sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE name = $1")))
             .bind(name.as_str());
-        row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
+        row.fetch_optional(self.0.connection()).await?.as_ref().map(user).transpose()
     }
 
     /// The user with `subject` at the provider.
-    pub async fn user_by_subject(&mut self, subject: &str) -> Result<Option<User>, StoreError> {
+    pub async fn find_by_subject(&mut self, subject: &str) -> Result<Option<User>, StoreError> {
         let row =
             sqlx::query(sqlx::AssertSqlSafe(format!("{USERS} WHERE subject = $1"))).bind(subject);
-        row.fetch_optional(self.connection()).await?.as_ref().map(user).transpose()
+        row.fetch_optional(self.0.connection()).await?.as_ref().map(user).transpose()
     }
 
-    pub async fn users(&mut self) -> Result<Vec<User>, StoreError> {
-        sqlx::query(USERS).fetch_all(self.connection()).await?.iter().map(user).collect()
-    }
-
-    /// Whether the first token is valid.
-    pub async fn has_first_token(&mut self) -> Result<bool, StoreError> {
-        let good = "SELECT id FROM tokens WHERE kind = 'operator' AND user_name IS NULL AND revoked_at_ms IS NULL";
-        Ok(sqlx::query(good).fetch_optional(self.connection()).await?.is_some())
+    pub async fn list(&mut self) -> Result<Vec<User>, StoreError> {
+        sqlx::query(USERS).fetch_all(self.0.connection()).await?.iter().map(user).collect()
     }
 
     /// Stores a user, and replaces a user of the same name.
-    pub async fn put_user(&mut self, user: &User) -> Result<(), StoreError> {
+    pub async fn put(&mut self, user: &User) -> Result<(), StoreError> {
         sqlx::query(
             "INSERT INTO users (name, roles, scope, password, subject, created_at_ms) VALUES ($1, $2, $3, $4, $5, $6)
              ON CONFLICT (name) DO UPDATE
@@ -145,27 +142,35 @@ impl Write {
         .bind(user.password.as_ref().map(|password| password.as_str().to_owned()))
         .bind(user.subject.as_deref())
         .bind(stored(user.created_at_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
 
-    /// Removes a user with all their tokens.
-    pub async fn remove_user(&mut self, name: &UserName) -> Result<(), StoreError> {
-        for sql in ["DELETE FROM tokens WHERE user_name = $1", "DELETE FROM users WHERE name = $1"]
-        {
-            sqlx::query(sql).bind(name.as_str()).execute(self.connection()).await?;
+    /// Removes a user with all their tokens, page sessions and wrong passwords.
+    pub async fn remove(&mut self, name: &UserName) -> Result<(), StoreError> {
+        for sql in [
+            "DELETE FROM tokens WHERE user_name = $1",
+            "DELETE FROM page_sessions WHERE user_name = $1",
+            "DELETE FROM sign_in_failures WHERE user_name = $1",
+            "DELETE FROM users WHERE name = $1",
+        ] {
+            sqlx::query(sql).bind(name.as_str()).execute(self.0.connection()).await?;
         }
         Ok(())
     }
+}
+
+impl Tokens<&mut Transaction> {
+    /// Whether the first token is valid.
+    pub async fn has_first(&mut self) -> Result<bool, StoreError> {
+        let good = "SELECT id FROM tokens WHERE kind = 'operator' AND user_name IS NULL AND revoked_at_ms IS NULL";
+        Ok(sqlx::query(good).fetch_optional(self.0.connection()).await?.is_some())
+    }
 
     /// Stores a user's token.
-    pub async fn create_token(
-        &mut self,
-        new: &NewToken<'_>,
-        now_ms: u64,
-    ) -> Result<(), StoreError> {
-        self.insert_token(new.token, None, None, now_ms).await?;
+    pub async fn create(&mut self, new: &NewToken<'_>, now_ms: u64) -> Result<(), StoreError> {
+        self.insert(new.token, None, None, now_ms).await?;
         sqlx::query(
             "UPDATE tokens SET user_name = $2, origin = $3, title = $4, roles = $5, scope = $6, expires_at_ms = $7
              WHERE id = $1",
@@ -177,41 +182,37 @@ impl Write {
         .bind(new.roles.map(Roles::to_string))
         .bind(new.scope.map(Selector::to_string))
         .bind(stored(new.expires_at_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
 
     /// One user's token, valid or not.
-    pub async fn person_token(&mut self, token: &TokenId) -> Result<Option<TokenView>, StoreError> {
+    pub async fn get(&mut self, token: &TokenId) -> Result<Option<TokenView>, StoreError> {
         let row =
             sqlx::query(sqlx::AssertSqlSafe(format!("{TOKENS} AND id = $1"))).bind(token.as_str());
-        row.fetch_optional(self.connection()).await?.as_ref().map(token_view).transpose()
+        row.fetch_optional(self.0.connection()).await?.as_ref().map(token_view).transpose()
     }
 
     /// The tokens of one user, the newest first.
-    pub async fn tokens_of_user(&mut self, name: &UserName) -> Result<Vec<TokenView>, StoreError> {
+    pub async fn of_user(&mut self, name: &UserName) -> Result<Vec<TokenView>, StoreError> {
         let sql =
             format!("{TOKENS} AND user_name = $1 AND revoked_at_ms IS NULL ORDER BY number DESC");
         let rows = sqlx::query(sqlx::AssertSqlSafe(sql))
             .bind(name.as_str())
-            .fetch_all(self.connection())
+            .fetch_all(self.0.connection())
             .await?;
         rows.iter().map(token_view).collect()
     }
 
     /// Revokes a user's token.
-    pub async fn revoke_person_token(
-        &mut self,
-        token: &TokenId,
-        now_ms: u64,
-    ) -> Result<(), StoreError> {
+    pub async fn revoke(&mut self, token: &TokenId, now_ms: u64) -> Result<(), StoreError> {
         sqlx::query(
             "UPDATE tokens SET revoked_at_ms = $2 WHERE id = $1 AND kind = 'operator' AND revoked_at_ms IS NULL",
         )
         .bind(token.as_str())
         .bind(stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }

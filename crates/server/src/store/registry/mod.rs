@@ -1,6 +1,6 @@
 //! Owns what is known of packages, signatures and outputs; it never touches their bytes.
 
-pub(super) mod needs;
+pub(super) mod blob_references;
 pub(super) mod outputs;
 pub(super) mod package_use;
 pub(super) mod packages;

@@ -4,17 +4,18 @@
 use futures_util::TryStreamExt as _;
 use sqlx::Row as _;
 use task_proto::api::OutputView;
-use task_proto::output::OutputSet;
+use task_proto::packages::output::OutputSet;
 use task_proto::{Digest, RepositoryName, RobotId, TaskName};
 
-use super::robot_blobs::bytes_taken;
+use super::robot_blobs::disk_usage;
 use crate::domain::person::Scope;
-use crate::store::{Store, StoreError, Write, rows};
+use crate::store::repositories::Outputs;
+use crate::store::{Store, StoreError, Transaction, rows};
 
 /// The newest runs kept of one task on one robot.
-const KEPT: usize = 10;
+const MAX_RUNS_OF_TASK: usize = 10;
 /// The newest runs kept of one robot: the robot itself chooses the names of its tasks.
-const KEPT_OF_ROBOT: usize = 200;
+const MAX_RUNS_OF_ROBOT: usize = 200;
 /// The most outputs listed.
 const MAX_LISTED: usize = 1000;
 /// The most bytes of JSON in a list: an output of many files with long names takes a lot of room.
@@ -29,16 +30,16 @@ pub struct NewOutput {
     pub max_bytes: u64,
 }
 
-impl Store {
+impl Outputs<&Store> {
     /// The newest outputs first, of one robot or of all in a scope, of one task or of all. Returns
     /// at most 1,000, and fewer if they are large.
-    pub async fn outputs(
-        &self,
+    pub async fn list(
+        self,
         robot: Option<&RobotId>,
         task: Option<&TaskName>,
         scope: &Scope,
     ) -> Result<Vec<OutputView>, StoreError> {
-        let mut lent = self.reads.lend().await?;
+        let mut connection = self.0.reads.acquire().await?;
         let mut found = sqlx::query(
             "SELECT o.manifest, o.output, o.pushed_at_ms, r.name, o.robot_id, r.labels FROM outputs o JOIN robots r ON r.id = o.robot_id
              WHERE ($1 = '' OR o.robot_id = $1) AND ($2 = '' OR o.task = $2)
@@ -48,7 +49,7 @@ impl Store {
         .bind(task.map_or("", TaskName::as_str))
         // The share of the scope among the newest outputs is not known before they are read.
         .bind(if scope.is_everything() { MAX_LISTED as i64 } else { i64::MAX })
-        .fetch(lent.connection());
+        .fetch(connection.connection());
         let (mut views, mut bytes) = (Vec::new(), 0);
         while let Some(row) = found.try_next().await? {
             let robot_name = rows::id("robots.name", row.try_get("name")?)?;
@@ -78,10 +79,10 @@ impl Store {
     }
 }
 
-impl Write {
+impl Outputs<&mut Transaction> {
     /// Stores an output, which replaces an earlier one of the same run. Returns the manifests of
     /// the robot's repositories that now exceed the limits on number or bytes.
-    pub(in crate::store) async fn insert_output(
+    pub(in crate::store) async fn insert(
         &mut self,
         repository: &RepositoryName,
         manifest: &Digest,
@@ -102,8 +103,8 @@ impl Write {
         .bind(&tag)
         .bind(rows::json(output))
         .bind(rows::stored(now_ms))
-        .bind(rows::stored(bytes_taken(output)))
-        .execute(self.connection())
+        .bind(rows::stored(disk_usage(output)))
+        .execute(self.0.connection())
         .await?;
         let others = sqlx::query(
             "SELECT repository, manifest, tag, bytes FROM outputs
@@ -113,20 +114,20 @@ impl Write {
         .bind(output.robot_id.as_str())
         .bind(repository.as_str())
         .bind(manifest.to_string())
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         let (mut surplus, mut kept, mut kept_here, mut kept_bytes) =
-            (Vec::new(), 1, 1, bytes_taken(output));
+            (Vec::new(), 1, 1, disk_usage(output));
         for row in &others {
             let is_here = row.try_get::<&str, _>("repository")? == repository.as_str();
             let is_replaced = is_here && row.try_get::<&str, _>("tag")? == tag;
-            let is_outlived = is_replaced || (is_here && kept_here >= KEPT);
-            if !is_outlived {
+            let is_surplus = is_replaced || (is_here && kept_here >= MAX_RUNS_OF_TASK);
+            if !is_surplus {
                 kept += 1;
                 kept_bytes = kept_bytes.saturating_add(rows::number(row.try_get("bytes")?));
             }
             // If one output has no room, no older one has.
-            if is_outlived || kept > KEPT_OF_ROBOT || kept_bytes > *max_bytes {
+            if is_surplus || kept > MAX_RUNS_OF_ROBOT || kept_bytes > *max_bytes {
                 let repository = rows::id("outputs.repository", row.try_get("repository")?)?;
                 surplus.push((repository, rows::id("outputs.manifest", row.try_get("manifest")?)?));
             } else {

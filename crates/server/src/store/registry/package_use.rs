@@ -8,10 +8,11 @@ use task_proto::api::{PackageUse, PackageView};
 use task_proto::desired::PackageRef;
 use task_proto::{DeploymentId, Digest, RepositoryName, RobotId, Tag, TaskName};
 
-use super::packages::{PACKAGE_ROWS, Reference, ranked};
+use super::packages::{PACKAGE_ROWS, Reference, sorted_views};
 use crate::store::fleet::robots::{KNOWN, known_robot};
+use crate::store::repositories::{Blobs, Manifests, Packages, Tags};
 use crate::store::rows::{from_json, id};
-use crate::store::{Deed, KnownRobot, Store, StoreError, Write};
+use crate::store::{AuditEvent, KnownRobot, Store, StoreError, Transaction};
 
 /// The outcome of deleting a manifest, a tag or a blob.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -39,37 +40,39 @@ impl PackageUsers {
     }
 
     /// Whether some of the robots are outside the acting person's scope.
-    fn are_others_than_of(&self, deed: &Deed) -> bool {
-        self.robots.iter().any(|robot| !deed.covers(robot))
+    fn exceed_scope_of(&self, event: &AuditEvent) -> bool {
+        self.robots.iter().any(|robot| !event.covers(robot))
     }
 }
 
-impl Store {
+impl Packages<&Store> {
     /// Every package of a name: tagged ones first, each group newest first.
-    pub async fn package_versions(&self, name: &TaskName) -> Result<Vec<PackageView>, StoreError> {
+    pub async fn versions(self, name: &TaskName) -> Result<Vec<PackageView>, StoreError> {
         let rows = sqlx::query(AssertSqlSafe(format!("{PACKAGE_ROWS} WHERE p.name = $1")))
             .bind(name.as_str())
-            .fetch_all(&self.reads)
+            .fetch_all(&self.0.reads)
             .await?;
-        ranked(&rows)
+        sorted_views(&rows)
     }
 
     /// The package of a version or a digest. A version means the target of its tag, or else the
     /// newest package with that version.
-    pub async fn find_package(
-        &self,
+    pub async fn find(
+        self,
         name: &TaskName,
         reference: &Reference,
     ) -> Result<Option<PackageView>, StoreError> {
         let tag = match reference {
-            Reference::Digest(digest) => return self.package(name, digest).await,
+            Reference::Digest(digest) => return self.get(name, digest).await,
             Reference::Tag(tag) => tag,
         };
         let tagged = self
-            .manifest(&RepositoryName::of_package(name), reference)
+            .0
+            .manifests()
+            .get(&RepositoryName::of_package(name), reference)
             .await?
             .map(|found| found.digest);
-        let mut versions = self.package_versions(name).await?;
+        let mut versions = self.versions(name).await?;
         let at =
             versions.iter().position(|view| Some(view.package.manifest.digest) == tagged).or_else(
                 || versions.iter().position(|view| view.package.version.as_str() == tag.as_str()),
@@ -79,8 +82,8 @@ impl Store {
 
     /// The number of robots that should have each package of a name, among all robots or among
     /// `robots`.
-    pub async fn package_uses(
-        &self,
+    pub async fn uses(
+        self,
         name: &TaskName,
         robots: Option<&HashSet<RobotId>>,
     ) -> Result<Vec<PackageUse>, StoreError> {
@@ -88,7 +91,7 @@ impl Store {
             "SELECT deployment_id, robot_id FROM assignments WHERE task = $1 AND desired = 1",
         )
         .bind(name.as_str())
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let mut by_deployment: HashMap<String, u64> = HashMap::new();
         for (deployment, robot) in rows {
@@ -101,7 +104,7 @@ impl Store {
              WHERE id IN (SELECT deployment_id FROM assignments WHERE task = $1 AND desired = 1)",
         )
         .bind(name.as_str())
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let mut uses: BTreeMap<Digest, u64> = BTreeMap::new();
         for (deployment, package) in rows {
@@ -112,89 +115,101 @@ impl Store {
         let uses = uses.into_iter().filter(|(_, robots)| *robots > 0);
         Ok(uses.map(|(manifest, robots)| PackageUse { manifest, robots }).collect())
     }
+}
 
+impl Manifests<&Store> {
     /// Removes a manifest with all its tags. Refuses if robots should have a package that the
     /// manifest is, is a part of, or signs. A person whose scope has all of those robots may remove
     /// a signature.
-    pub async fn delete_manifest(
-        &self,
+    pub async fn delete(
+        self,
         repository: &RepositoryName,
         digest: &Digest,
-        deed: &Deed,
+        event: &AuditEvent,
         now_ms: u64,
     ) -> Result<Deletion, StoreError> {
-        let mut write = self.begin().await?;
-        if let Some(users) = write.refusal_to_delete(repository, digest, deed).await? {
+        let mut write = self.0.begin().await?;
+        if let Some(users) =
+            write.packages().users_blocking_deletion(repository, digest, event).await?
+        {
             return Ok(Deletion::InUse(users));
         }
-        let Some(parts) = write.delete_manifest(repository, digest).await? else {
+        let Some(parts) = write.manifests().delete(repository, digest).await? else {
             return Ok(Deletion::Unknown);
         };
-        write.commit_with(Some(deed), now_ms).await?;
+        write.commit_with_audit(Some(event), now_ms).await?;
         Ok(Deletion::Deleted(parts))
     }
+}
 
-    /// Removes a tag, unless [`Write::refusal_to_move`] refuses.
-    pub async fn delete_tag(
-        &self,
+impl Tags<&Store> {
+    /// Removes a tag, unless [`Packages::users_blocking_tag_move`] refuses.
+    pub async fn delete(
+        self,
         repository: &RepositoryName,
         tag: &Tag,
-        deed: &Deed,
+        event: &AuditEvent,
         now_ms: u64,
     ) -> Result<Deletion, StoreError> {
-        let mut write = self.begin().await?;
-        if let Some(users) = write.refusal_to_move(repository, tag, None, Some(deed)).await? {
+        let mut write = self.0.begin().await?;
+        if let Some(users) =
+            write.packages().users_blocking_tag_move(repository, tag, None, Some(event)).await?
+        {
             return Ok(Deletion::InUse(users));
         }
-        if !write.delete_tag(repository, tag).await? {
+        if !write.tags().delete(repository, tag).await? {
             return Ok(Deletion::Unknown);
         }
-        write.commit_with(Some(deed), now_ms).await?;
-        Ok(Deletion::Deleted(Vec::new()))
-    }
-
-    /// Removes a blob from a repository, on the terms of [`Self::delete_manifest`].
-    pub async fn unlink_blob(
-        &self,
-        repository: &RepositoryName,
-        digest: &Digest,
-        deed: &Deed,
-        now_ms: u64,
-    ) -> Result<Deletion, StoreError> {
-        let mut write = self.begin().await?;
-        if let Some(users) = write.refusal_to_delete(repository, digest, deed).await? {
-            return Ok(Deletion::InUse(users));
-        }
-        if !write.unlink_blob(repository, digest).await? {
-            return Ok(Deletion::Unknown);
-        }
-        write.commit_with(Some(deed), now_ms).await?;
+        write.commit_with_audit(Some(event), now_ms).await?;
         Ok(Deletion::Deleted(Vec::new()))
     }
 }
 
-impl Write {
+impl Blobs<&Store> {
+    /// Removes a blob from a repository, on the terms of [`Manifests::delete`].
+    pub async fn unlink(
+        self,
+        repository: &RepositoryName,
+        digest: &Digest,
+        event: &AuditEvent,
+        now_ms: u64,
+    ) -> Result<Deletion, StoreError> {
+        let mut write = self.0.begin().await?;
+        if let Some(users) =
+            write.packages().users_blocking_deletion(repository, digest, event).await?
+        {
+            return Ok(Deletion::InUse(users));
+        }
+        if !write.blobs().unlink(repository, digest).await? {
+            return Ok(Deletion::Unknown);
+        }
+        write.commit_with_audit(Some(event), now_ms).await?;
+        Ok(Deletion::Deleted(Vec::new()))
+    }
+}
+
+impl Packages<&mut Transaction> {
     /// The users that prevent the deletion of this manifest or blob from `repository`.
-    async fn refusal_to_delete(
+    async fn users_blocking_deletion(
         &mut self,
         repository: &RepositoryName,
         digest: &Digest,
-        deed: &Deed,
+        event: &AuditEvent,
     ) -> Result<Option<PackageUsers>, StoreError> {
         let Ok(name) = repository.as_str().parse::<TaskName>() else { return Ok(None) };
         let packages =
             "SELECT manifest FROM packages WHERE name = $1 AND (manifest = $2 OR manifest IN
                  (SELECT manifest FROM manifest_parts WHERE repository = $1 AND digest = $2))";
         for package in self.digests(packages, repository, digest).await? {
-            let users = self.package_users(&name, &package).await?;
+            let users = self.users(&name, &package).await?;
             if !users.is_empty() {
                 return Ok(Some(users));
             }
         }
         let signed = "SELECT package FROM signatures WHERE repository = $1 AND (manifest = $2 OR envelope = $2)";
         for package in self.digests(signed, repository, digest).await? {
-            let users = self.package_users(&name, &package).await?;
-            if users.are_others_than_of(deed) {
+            let users = self.users(&name, &package).await?;
+            if users.exceed_scope_of(event) {
                 return Ok(Some(users));
             }
         }
@@ -203,21 +218,21 @@ impl Write {
 
     /// The users that prevent deleting a tag, or pointing it to another manifest than `to`: robots
     /// that should have the tagged package, and are outside the person's scope.
-    pub(in crate::store) async fn refusal_to_move(
+    pub(in crate::store) async fn users_blocking_tag_move(
         &mut self,
         repository: &RepositoryName,
         tag: &Tag,
         to: Option<&Digest>,
-        deed: Option<&Deed>,
+        event: Option<&AuditEvent>,
     ) -> Result<Option<PackageUsers>, StoreError> {
-        let (Some(deed), Ok(name)) = (deed, repository.as_str().parse::<TaskName>()) else {
+        let (Some(event), Ok(name)) = (event, repository.as_str().parse::<TaskName>()) else {
             return Ok(None);
         };
         let tagged: Option<String> =
             sqlx::query_scalar("SELECT manifest FROM tags WHERE repository = $1 AND tag = $2")
                 .bind(repository.as_str())
                 .bind(tag.as_str())
-                .fetch_optional(self.connection())
+                .fetch_optional(self.0.connection())
                 .await?;
         let Some(tagged) =
             tagged.map(|digest| id::<Digest>("tags.manifest", &digest)).transpose()?
@@ -227,8 +242,8 @@ impl Write {
         if to == Some(&tagged) {
             return Ok(None);
         }
-        let users = self.package_users(&name, &tagged).await?;
-        Ok(users.are_others_than_of(deed).then_some(users))
+        let users = self.users(&name, &tagged).await?;
+        Ok(users.exceed_scope_of(event).then_some(users))
     }
 
     async fn digests(
@@ -238,11 +253,11 @@ impl Write {
         digest: &Digest,
     ) -> Result<Vec<Digest>, StoreError> {
         let query = sqlx::query_scalar(sql).bind(repository.as_str()).bind(digest.to_string());
-        let found: Vec<String> = query.fetch_all(self.connection()).await?;
+        let found: Vec<String> = query.fetch_all(self.0.connection()).await?;
         found.iter().map(|found| id("packages.manifest", found)).collect()
     }
 
-    async fn package_users(
+    async fn users(
         &mut self,
         name: &TaskName,
         manifest: &Digest,
@@ -253,7 +268,7 @@ impl Write {
              ORDER BY number",
         )
         .bind(name.as_str())
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
         let mut users = PackageUsers::default();
         for (deployment, package) in rows {
@@ -265,7 +280,7 @@ impl Write {
             let sql = format!("{KNOWN} AND id IN ({assigned})");
             let rows = sqlx::query(AssertSqlSafe(sql))
                 .bind(&deployment)
-                .fetch_all(self.connection())
+                .fetch_all(self.0.connection())
                 .await?;
             let robots = rows.iter().map(known_robot).collect::<Result<Vec<_>, _>>()?;
             let ids = robots.iter().map(|robot| robot.id.clone()).collect();

@@ -8,10 +8,13 @@ use sqlx::Row as _;
 use sqlx::any::AnyRow;
 use task_proto::api::PackageView;
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::TaskManifest;
+use task_proto::packages::manifest::TaskManifest;
 use task_proto::{Digest, RepositoryName, Tag, TaskName};
 
-use crate::store::{Deed, NewOutput, PackageUsers, SignedDocument, Store, StoreError, Write, rows};
+use crate::store::repositories::{Blobs, Manifests, Packages, Tags};
+use crate::store::{
+    AuditEvent, NewOutput, PackageUsers, SignedDocument, Store, StoreError, Transaction, rows,
+};
 
 /// A manifest's reference inside its repository.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -72,20 +75,20 @@ pub enum PutManifest {
     TagInUse(Tag, PackageUsers),
 }
 
-impl Store {
+impl Manifests<&Store> {
     /// Stores a manifest and points its tags to it, if all its parts are in the repository. A
-    /// `deed` is recorded in the audit log in the same write.
-    pub async fn put_manifest(
-        &self,
+    /// `event` is recorded in the audit log in the same write.
+    pub async fn put(
+        self,
         repository: &RepositoryName,
         new: &NewManifest,
-        deed: Option<&Deed>,
+        event: Option<&AuditEvent>,
         now_ms: u64,
     ) -> Result<PutManifest, StoreError> {
-        let mut write = self.begin().await?;
+        let mut write = self.0.begin().await?;
         let mut missing = Vec::new();
         for part in &new.parts {
-            if !write.repository_holds(repository, part).await? {
+            if !write.manifests().repository_holds(repository, part).await? {
                 missing.push(*part);
             }
         }
@@ -93,47 +96,52 @@ impl Store {
             return Ok(PutManifest::PartsMissing(missing));
         }
         if let Some(document) = &new.document
-            && !write.insert_document(repository, &new.manifest.digest, document, now_ms).await?
+            && !write
+                .publishers()
+                .insert_document(repository, &new.manifest.digest, document, now_ms)
+                .await?
         {
             return Ok(PutManifest::Outdated);
         }
         // A package stored for a single order is addressed by its digest, and takes no version.
         if let Some((package, _)) = new.package.as_ref().filter(|_| !new.tags.is_empty())
-            && let Some(other) = write.other_of_version(package).await?
+            && let Some(other) = write.packages().with_version(package).await?
         {
             if !new.takes_version {
                 return Ok(PutManifest::VersionTaken(other));
             }
             if new.tags.iter().any(|tag| tag.as_str() == package.version.as_str()) {
-                write.replace_package(package, &other).await?;
+                write.packages().replace(package, &other).await?;
             }
         }
-        write.insert_manifest(repository, new, now_ms).await?;
+        write.manifests().insert(repository, new, now_ms).await?;
         for tag in &new.tags {
-            if let Some(users) =
-                write.refusal_to_move(repository, tag, Some(&new.manifest.digest), deed).await?
+            if let Some(users) = write
+                .packages()
+                .users_blocking_tag_move(repository, tag, Some(&new.manifest.digest), event)
+                .await?
             {
                 return Ok(PutManifest::TagInUse(tag.clone(), users));
             }
-            write.point_tag(repository, tag, &new.manifest.digest).await?;
+            write.tags().point(repository, tag, &new.manifest.digest).await?;
         }
         if let Some((package, task_manifest)) = &new.package {
-            write.insert_package(package, task_manifest, now_ms).await?;
+            write.packages().insert(package, task_manifest, now_ms).await?;
         }
         if let Some(output) = &new.output {
             for (repository, surplus) in
-                write.insert_output(repository, &new.manifest.digest, output, now_ms).await?
+                write.outputs().insert(repository, &new.manifest.digest, output, now_ms).await?
             {
-                write.delete_manifest(&repository, &surplus).await?;
+                write.manifests().delete(&repository, &surplus).await?;
             }
         }
-        write.commit_with(deed, now_ms).await?;
+        write.commit_with_audit(event, now_ms).await?;
         Ok(PutManifest::Stored)
     }
 
     /// Reads a manifest by tag or digest.
-    pub async fn manifest(
-        &self,
+    pub async fn get(
+        self,
         repository: &RepositoryName,
         reference: &Reference,
     ) -> Result<Option<StoredManifest>, StoreError> {
@@ -151,7 +159,7 @@ impl Store {
             .bind(repository.as_str())
             .bind(tag.as_str()),
         };
-        let row = query.fetch_optional(&self.reads).await?;
+        let row = query.fetch_optional(&self.0.reads).await?;
         row.map(|row| {
             Ok(StoredManifest {
                 digest: rows::id("manifests.digest", row.try_get("digest")?)?,
@@ -161,22 +169,24 @@ impl Store {
         })
         .transpose()
     }
+}
 
+impl Tags<&Store> {
     /// A repository's tags in byte order; `None` if there is no such repository.
-    pub async fn tags(&self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
+    pub async fn list(self, repository: &RepositoryName) -> Result<Option<Vec<Tag>>, StoreError> {
         let known: Option<i64> = sqlx::query_scalar(
             "SELECT CAST(1 AS BIGINT) WHERE EXISTS (SELECT 1 FROM manifests WHERE repository = $1)
              OR EXISTS (SELECT 1 FROM repository_blobs WHERE repository = $1)",
         )
         .bind(repository.as_str())
-        .fetch_optional(&self.reads)
+        .fetch_optional(&self.0.reads)
         .await?;
         if known.is_none() {
             return Ok(None);
         }
         let names: Vec<String> = sqlx::query_scalar("SELECT tag FROM tags WHERE repository = $1")
             .bind(repository.as_str())
-            .fetch_all(&self.reads)
+            .fetch_all(&self.0.reads)
             .await?;
         let mut tags =
             names.iter().map(|name| rows::id("tags.tag", name)).collect::<Result<Vec<Tag>, _>>()?;
@@ -184,15 +194,13 @@ impl Store {
         tags.sort();
         Ok(Some(tags))
     }
+}
 
+impl Blobs<&Store> {
     /// Adds a blob to a repository.
-    pub async fn link_blob(
-        &self,
-        repository: &RepositoryName,
-        blob: &BlobRef,
-    ) -> Result<(), StoreError> {
-        let mut write = self.begin().await?;
-        let is_known = write.count_blob(repository, blob).await?;
+    pub async fn link(self, repository: &RepositoryName, blob: &BlobRef) -> Result<(), StoreError> {
+        let mut write = self.0.begin().await?;
+        let is_known = write.robot_blobs().count(repository, blob).await?;
         let linked =
             sqlx::query("INSERT INTO repository_blobs (repository, digest) VALUES ($1, $2) ON CONFLICT DO NOTHING")
                 .bind(repository.as_str())
@@ -200,14 +208,14 @@ impl Store {
                 .execute(write.connection())
                 .await?;
         if is_known && linked.rows_affected() > 0 {
-            write.count_link(repository, blob).await?;
+            write.robot_blobs().count_link(repository, blob).await?;
         }
         write.commit().await
     }
 
     /// Whether `repository` has the blob; with `None`, whether any repository has it.
-    pub async fn has_blob(
-        &self,
+    pub async fn has(
+        self,
         repository: Option<&RepositoryName>,
         digest: &Digest,
     ) -> Result<bool, StoreError> {
@@ -220,21 +228,23 @@ impl Store {
             None => sqlx::query("SELECT digest FROM repository_blobs WHERE digest = $1 LIMIT 1")
                 .bind(digest.to_string()),
         };
-        Ok(query.fetch_optional(&self.reads).await?.is_some())
+        Ok(query.fetch_optional(&self.0.reads).await?.is_some())
     }
+}
 
+impl Packages<&Store> {
     /// All packages, sorted by name. Within a name, tagged packages come first, and each group is
     /// sorted newest first.
-    pub async fn packages(&self) -> Result<Vec<PackageView>, StoreError> {
-        let rows = sqlx::query(PACKAGE_ROWS).fetch_all(&self.reads).await?;
-        let mut packages = ranked(&rows)?;
+    pub async fn list(self) -> Result<Vec<PackageView>, StoreError> {
+        let rows = sqlx::query(PACKAGE_ROWS).fetch_all(&self.0.reads).await?;
+        let mut packages = sorted_views(&rows)?;
         // The sort is stable and keeps the rank within a name.
         packages.sort_by(|one, other| one.package.name.cmp(&other.package.name));
         Ok(packages)
     }
 
-    pub async fn package(
-        &self,
+    pub async fn get(
+        self,
         name: &TaskName,
         manifest: &Digest,
     ) -> Result<Option<PackageView>, StoreError> {
@@ -242,26 +252,46 @@ impl Store {
             sqlx::query("SELECT package, task_manifest, pushed_at_ms FROM packages WHERE name = $1 AND manifest = $2")
                 .bind(name.as_str())
                 .bind(manifest.to_string())
-                .fetch_optional(&self.reads)
+                .fetch_optional(&self.0.reads)
                 .await?;
         row.as_ref().map(package_view).transpose()
     }
 }
 
-impl Write {
+impl Tags<&mut Transaction> {
     /// Removes a tag; false if there is none.
-    pub(in crate::store) async fn delete_tag(
+    pub(in crate::store) async fn delete(
         &mut self,
         repository: &RepositoryName,
         tag: &Tag,
     ) -> Result<bool, StoreError> {
         let query = sqlx::query("DELETE FROM tags WHERE repository = $1 AND tag = $2");
         let query = query.bind(repository.as_str()).bind(tag.as_str());
-        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+        Ok(query.execute(self.0.connection()).await?.rows_affected() > 0)
     }
 
+    async fn point(
+        &mut self,
+        repository: &RepositoryName,
+        tag: &Tag,
+        manifest: &Digest,
+    ) -> Result<(), StoreError> {
+        sqlx::query(
+            "INSERT INTO tags (repository, tag, manifest) VALUES ($1, $2, $3)
+             ON CONFLICT (repository, tag) DO UPDATE SET manifest = excluded.manifest",
+        )
+        .bind(repository.as_str())
+        .bind(tag.as_str())
+        .bind(manifest.to_string())
+        .execute(self.0.connection())
+        .await?;
+        Ok(())
+    }
+}
+
+impl Blobs<&mut Transaction> {
     /// Removes a blob from a repository; false if the repository does not have the blob.
-    pub(in crate::store) async fn unlink_blob(
+    pub(in crate::store) async fn unlink(
         &mut self,
         repository: &RepositoryName,
         digest: &Digest,
@@ -269,25 +299,27 @@ impl Write {
         let query =
             sqlx::query("DELETE FROM repository_blobs WHERE repository = $1 AND digest = $2");
         let query = query.bind(repository.as_str()).bind(digest.to_string());
-        Ok(query.execute(self.connection()).await?.rows_affected() > 0)
+        Ok(query.execute(self.0.connection()).await?.rows_affected() > 0)
     }
+}
 
+impl Manifests<&mut Transaction> {
     /// Removes a manifest with all its tags, and returns its parts; `None` if there is no such
     /// manifest.
-    pub(in crate::store) async fn delete_manifest(
+    pub(in crate::store) async fn delete(
         &mut self,
         repository: &RepositoryName,
         digest: &Digest,
     ) -> Result<Option<Vec<Digest>>, StoreError> {
-        self.drop_of_robot(repository, digest).await?;
+        self.0.robot_blobs().mark_dropped(repository, digest).await?;
         let parts: Vec<String> = sqlx::query_scalar(
             "DELETE FROM manifest_parts WHERE repository = $1 AND manifest = $2 RETURNING digest",
         )
         .bind(repository.as_str())
         .bind(digest.to_string())
-        .fetch_all(self.connection())
+        .fetch_all(self.0.connection())
         .await?;
-        self.delete_document(repository, digest).await?;
+        self.0.publishers().delete_document(repository, digest).await?;
         let mut deleted = 0;
         for sql in [
             "DELETE FROM packages WHERE name = $1 AND manifest = $2",
@@ -296,7 +328,7 @@ impl Write {
             "DELETE FROM manifests WHERE repository = $1 AND digest = $2",
         ] {
             let query = sqlx::query(sql).bind(repository.as_str()).bind(digest.to_string());
-            deleted = query.execute(self.connection()).await?.rows_affected();
+            deleted = query.execute(self.0.connection()).await?.rows_affected();
         }
         if deleted == 0 {
             return Ok(None);
@@ -319,11 +351,11 @@ impl Write {
         )
         .bind(repository.as_str())
         .bind(part.to_string())
-        .fetch_optional(self.connection());
+        .fetch_optional(self.0.connection());
         Ok(found.await?.is_some())
     }
 
-    async fn insert_manifest(
+    async fn insert(
         &mut self,
         repository: &RepositoryName,
         new: &NewManifest,
@@ -344,7 +376,7 @@ impl Write {
         .bind(rows::json(&new.annotations))
         .bind(new.subject.as_ref())
         .bind(rows::stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         for part in &new.parts {
             sqlx::query(
@@ -353,35 +385,16 @@ impl Write {
             .bind(repository.as_str())
             .bind(new.manifest.digest.to_string())
             .bind(part.to_string())
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
         }
         Ok(())
     }
+}
 
-    async fn point_tag(
-        &mut self,
-        repository: &RepositoryName,
-        tag: &Tag,
-        manifest: &Digest,
-    ) -> Result<(), StoreError> {
-        sqlx::query(
-            "INSERT INTO tags (repository, tag, manifest) VALUES ($1, $2, $3)
-             ON CONFLICT (repository, tag) DO UPDATE SET manifest = excluded.manifest",
-        )
-        .bind(repository.as_str())
-        .bind(tag.as_str())
-        .bind(manifest.to_string())
-        .execute(self.connection())
-        .await?;
-        Ok(())
-    }
-
+impl Packages<&mut Transaction> {
     /// The digest of another package that has the version of this one.
-    async fn other_of_version(
-        &mut self,
-        package: &PackageRef,
-    ) -> Result<Option<Digest>, StoreError> {
+    async fn with_version(&mut self, package: &PackageRef) -> Result<Option<Digest>, StoreError> {
         let other: Option<String> = sqlx::query_scalar(
             "SELECT t.manifest FROM tags t JOIN packages p ON p.name = t.repository AND p.manifest = t.manifest
              WHERE t.repository = $1 AND t.tag = $2 AND t.manifest <> $3",
@@ -389,17 +402,13 @@ impl Write {
         .bind(package.name.as_str())
         .bind(package.version.as_str())
         .bind(package.manifest.digest.to_string())
-        .fetch_optional(self.connection())
+        .fetch_optional(self.0.connection())
         .await?;
         other.map(|digest| rows::id("tags.manifest", &digest)).transpose()
     }
 
     /// Marks the package `outdated` as replaced by `package`, and `package` as not replaced.
-    async fn replace_package(
-        &mut self,
-        package: &PackageRef,
-        outdated: &Digest,
-    ) -> Result<(), StoreError> {
+    async fn replace(&mut self, package: &PackageRef, outdated: &Digest) -> Result<(), StoreError> {
         for (manifest, replaced_by) in
             [(outdated, Some(&package.manifest.digest)), (&package.manifest.digest, None)]
         {
@@ -407,14 +416,14 @@ impl Write {
                 .bind(package.name.as_str())
                 .bind(manifest.to_string())
                 .bind(replaced_by.map(Digest::to_string))
-                .execute(self.connection())
+                .execute(self.0.connection())
                 .await?;
         }
         Ok(())
     }
 
     /// A package that is pushed again keeps the time of its first push.
-    async fn insert_package(
+    async fn insert(
         &mut self,
         package: &PackageRef,
         task_manifest: &TaskManifest,
@@ -429,7 +438,7 @@ impl Write {
         .bind(rows::json(package))
         .bind(rows::json(task_manifest))
         .bind(rows::stored(now_ms))
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
@@ -442,7 +451,7 @@ pub(in crate::store) const PACKAGE_ROWS: &str = "SELECT p.package, p.task_manife
 
 /// Tagged packages before the others, each group newest first. A name or a version thus means the
 /// package that was pushed under it.
-pub(in crate::store) fn ranked(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
+pub(in crate::store) fn sorted_views(rows: &[AnyRow]) -> Result<Vec<PackageView>, StoreError> {
     let views =
         rows.iter().map(|row| Ok((row.try_get::<i64, _>("tags")? == 0, package_view(row)?)));
     let mut views = views.collect::<Result<Vec<_>, StoreError>>()?;

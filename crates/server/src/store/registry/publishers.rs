@@ -6,10 +6,11 @@ use std::collections::{BTreeSet, HashMap};
 use sqlx::any::AnyRow;
 use sqlx::{AssertSqlSafe, Row as _};
 use task_proto::desired::{BlobRef, Evidence, SignatureRef};
-use task_proto::publisher::{MAX_LISTS, MAX_SIGNATURES};
-use task_proto::{Digest, RepositoryName, RobotId, TaskName};
+use task_proto::packages::publisher::{MAX_LISTS, MAX_SIGNATURES};
+use task_proto::{Digest, RepositoryName, RobotId};
 
-use crate::store::{DesiredTasks, Store, StoreError, Write, rows};
+use crate::store::repositories::Publishers;
+use crate::store::{DesiredTasks, Store, StoreError, Transaction, rows};
 
 /// The signed document of a manifest, in addition to the manifest itself.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -26,33 +27,26 @@ pub enum SignedDocument {
     },
 }
 
-impl Store {
+impl Publishers<&Store> {
     /// The list of publishers with this version, or the newest.
-    pub async fn publisher_list(
-        &self,
-        version: Option<u64>,
-    ) -> Result<Option<BlobRef>, StoreError> {
+    pub async fn list(self, version: Option<u64>) -> Result<Option<BlobRef>, StoreError> {
         let sql = "SELECT envelope, size FROM publisher_lists WHERE version = $1 OR $1 < 0 ORDER BY version DESC LIMIT 1";
         let row = sqlx::query(sql)
             .bind(version.map_or(-1, rows::stored))
-            .fetch_optional(&self.reads)
+            .fetch_optional(&self.0.reads)
             .await?;
         row.as_ref().map(|row| envelope("publisher_lists.envelope", row)).transpose()
     }
 
     /// Whether `robot` may have to verify the blob: a list of publishers, or a signature of a
-    /// package that the robot should have.
-    pub async fn is_evidence_for(
-        &self,
-        robot: &RobotId,
-        blob: &Digest,
-    ) -> Result<bool, StoreError> {
+    /// package in the evidence of the robot's desired state.
+    pub async fn is_evidence_for(self, robot: &RobotId, blob: &Digest) -> Result<bool, StoreError> {
         let packages: Vec<String> = sqlx::query_scalar(
             "SELECT package FROM signatures WHERE envelope = $1
              UNION ALL SELECT CAST('' AS TEXT) FROM publisher_lists WHERE envelope = $1",
         )
         .bind(blob.to_string())
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         if packages.iter().any(String::is_empty) {
             return Ok(true);
@@ -60,54 +54,41 @@ impl Store {
         if packages.is_empty() {
             return Ok(false);
         }
-        let wanted = self.desired_tasks(std::slice::from_ref(robot)).await?;
-        let mut manifests =
-            wanted.iter().flat_map(|wanted| &wanted.tasks).map(|task| task.package.manifest.digest);
-        Ok(manifests.any(|manifest| packages.contains(&manifest.to_string())))
+        let wanted = self.0.robots().desired_tasks(std::slice::from_ref(robot)).await?;
+        let mut signed = wanted.iter().flat_map(|wanted| &wanted.evidence.signatures);
+        Ok(signed.any(|signature| packages.contains(&signature.manifest.to_string())))
     }
 
-    /// The robots that should have this version of the package.
-    pub async fn robots_with_package(
-        &self,
-        name: &TaskName,
-        manifest: &Digest,
-    ) -> Result<Vec<RobotId>, StoreError> {
-        let rows: Vec<String> = sqlx::query_scalar(
-            "SELECT DISTINCT a.robot_id FROM assignments a JOIN deployments d ON d.id = a.deployment_id
-             WHERE a.desired = 1 AND d.task = $1 AND d.package LIKE $2",
-        )
-        .bind(name.as_str())
-        .bind(format!("%\"{manifest}\"%"))
-        .fetch_all(&self.reads)
-        .await?;
-        rows.iter().map(|row| rows::id("assignments.robot_id", row)).collect()
-    }
-
-    /// Adds the signatures to the desired state of robots. The documents are sent along if any
-    /// blobs are.
+    /// Adds the signatures to the desired state of robots. `proven` are the manifests of packages
+    /// that the robots may go back to. The documents about the ordered packages are sent along if
+    /// any blobs are.
     pub(in crate::store) async fn add_evidence(
-        &self,
+        self,
         found: &mut [DesiredTasks],
+        proven: &HashMap<RobotId, Vec<Digest>>,
     ) -> Result<(), StoreError> {
-        let lists = self.lists_to_follow().await?;
-        let manifests: BTreeSet<Digest> = found
-            .iter()
-            .flat_map(|found| &found.tasks)
-            .map(|task| task.package.manifest.digest)
-            .collect();
+        let lists = self.lists().await?;
+        let ordered =
+            found.iter().flat_map(|found| &found.tasks).map(|task| task.package.manifest.digest);
+        let manifests = ordered.chain(proven.values().flatten().copied()).collect();
         let signatures = self.signatures(&manifests).await?;
+        let signatures_of = |manifest: Digest| {
+            let envelopes = signatures.get(&manifest).into_iter().flatten();
+            envelopes.map(move |envelope| SignatureRef { manifest, envelope: *envelope })
+        };
         for wanted in found {
             let mut evidence = Evidence { lists: lists.clone(), signatures: Vec::new() };
             for task in &wanted.tasks {
-                let manifest = task.package.manifest.digest;
-                let envelopes = signatures.get(&manifest).into_iter().flatten();
-                evidence.signatures.extend(
-                    envelopes.map(|envelope| SignatureRef { manifest, envelope: *envelope }),
-                );
+                evidence.signatures.extend(signatures_of(task.package.manifest.digest));
             }
-            if !wanted.along.is_empty() {
+            if !wanted.bundled_blobs.is_empty() {
                 // The evidence goes first: without it the other blobs are of no use.
-                wanted.along.splice(0..0, evidence.blobs());
+                wanted.bundled_blobs.splice(0..0, evidence.blobs());
+            }
+            for manifest in proven.get(&wanted.robot).into_iter().flatten() {
+                let is_new =
+                    evidence.signatures.iter().all(|signature| signature.manifest != *manifest);
+                evidence.signatures.extend(signatures_of(*manifest).filter(|_| is_new));
             }
             wanted.evidence = evidence;
         }
@@ -115,35 +96,35 @@ impl Store {
     }
 
     /// The lists that a robot may need to reach the newest, from any older one.
-    async fn lists_to_follow(&self) -> Result<Vec<BlobRef>, StoreError> {
-        if let Some(lists) = self.access.lists() {
+    async fn lists(self) -> Result<Vec<BlobRef>, StoreError> {
+        if let Some(lists) = self.0.auth_cache.lists() {
             return Ok(lists);
         }
-        let asked = self.access.ask();
+        let epoch = self.0.auth_cache.epoch();
         let rows = sqlx::query(
             "SELECT envelope, size FROM publisher_lists
              WHERE changes_keepers = 1 OR version = (SELECT MAX(version) FROM publisher_lists)
              ORDER BY version DESC LIMIT $1",
         )
         .bind(rows::stored(MAX_LISTS as u64))
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let lists = rows.iter().rev().map(|row| envelope("publisher_lists.envelope", row));
         let lists = lists.collect::<Result<Vec<_>, _>>()?;
-        self.access.remember_lists(asked, &lists);
+        self.0.auth_cache.cache_lists(epoch, &lists);
         Ok(lists)
     }
 
     /// The first envelopes about each of these packages.
     async fn signatures(
-        &self,
+        self,
         manifests: &BTreeSet<Digest>,
     ) -> Result<HashMap<Digest, Vec<BlobRef>>, StoreError> {
-        let asked = self.access.ask();
+        let epoch = self.0.auth_cache.epoch();
         let mut signatures: HashMap<Digest, Vec<BlobRef>> = HashMap::new();
         let mut unknown = Vec::new();
         for manifest in manifests {
-            match self.access.signatures(manifest) {
+            match self.0.auth_cache.signatures(manifest) {
                 Some(known) => drop(signatures.insert(*manifest, known)),
                 None => unknown.push(*manifest),
             }
@@ -156,7 +137,7 @@ impl Store {
             for manifest in group {
                 query = query.bind(manifest.to_string());
             }
-            for row in query.fetch_all(&self.reads).await? {
+            for row in query.fetch_all(&self.0.reads).await? {
                 let package: Digest = rows::id("signatures.package", row.try_get("package")?)?;
                 let of_package = signatures.entry(package).or_default();
                 let found = envelope("signatures.envelope", &row)?;
@@ -166,8 +147,8 @@ impl Store {
             }
         }
         for manifest in unknown {
-            self.access.remember_signatures(
-                asked,
+            self.0.auth_cache.cache_signatures(
+                epoch,
                 manifest,
                 signatures.get(&manifest).cloned().unwrap_or_default(),
             );
@@ -176,7 +157,7 @@ impl Store {
     }
 }
 
-impl Write {
+impl Publishers<&mut Transaction> {
     /// Records a signed document. Returns false for a list that is not newer than all stored ones.
     pub(in crate::store) async fn insert_document(
         &mut self,
@@ -197,7 +178,7 @@ impl Write {
                 .bind(envelope.digest.to_string())
                 .bind(rows::stored(envelope.size))
                 .bind(rows::stored(now_ms))
-                .execute(self.connection())
+                .execute(self.0.connection())
                 .await?;
                 Ok(true)
             }
@@ -206,7 +187,7 @@ impl Write {
                     "SELECT envelope FROM publisher_lists WHERE version >= $1 ORDER BY version LIMIT 1",
                 )
                 .bind(rows::stored(*version))
-                .fetch_optional(self.connection())
+                .fetch_optional(self.0.connection())
                 .await?;
                 if let Some(known) = known {
                     return Ok(known == envelope.digest.to_string());
@@ -220,7 +201,7 @@ impl Write {
                 .bind(envelope.digest.to_string())
                 .bind(rows::stored(envelope.size))
                 .bind(i64::from(*changes_keepers))
-                .execute(self.connection())
+                .execute(self.0.connection())
                 .await?;
                 Ok(true)
             }
@@ -236,12 +217,12 @@ impl Write {
         sqlx::query("DELETE FROM signatures WHERE repository = $1 AND manifest = $2")
             .bind(repository.as_str())
             .bind(manifest.to_string())
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
-        if repository.as_str() == task_proto::publisher::LIST_REPOSITORY {
+        if repository.as_str() == task_proto::packages::publisher::LIST_REPOSITORY {
             let delete = sqlx::query("DELETE FROM publisher_lists WHERE manifest = $1")
                 .bind(manifest.to_string());
-            delete.execute(self.connection()).await?;
+            delete.execute(self.0.connection()).await?;
         }
         Ok(())
     }

@@ -4,9 +4,10 @@
 use sqlx::Row as _;
 use sqlx::any::AnyRow;
 use task_proto::desired::BlobRef;
-use task_proto::oci::Descriptor;
+use task_proto::packages::oci::Descriptor;
 use task_proto::{Digest, RepositoryName};
 
+use crate::store::repositories::Manifests;
 use crate::store::{Store, StoreError, rows};
 
 /// Approximate limit of a page in bytes of JSON. A larger first entry is returned alone.
@@ -23,11 +24,11 @@ pub struct ReferrersPage {
     pub next: Option<Digest>,
 }
 
-impl Store {
+impl Manifests<&Store> {
     /// The manifests whose subject is `subject`, of one type or of all. The page begins after a
     /// digest, or with the first manifest.
     pub async fn referrers(
-        &self,
+        self,
         repository: &RepositoryName,
         subject: &str,
         artifact_type: Option<&str>,
@@ -47,7 +48,7 @@ impl Store {
         .bind(artifact_type)
         .bind(&after)
         .bind(rows::stored(MAX_PAGE_BYTES / ENTRY_BYTES + 1))
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let Some((last, has_more)) = page_end(&sizes) else { return Ok(ReferrersPage::default()) };
         let found = sqlx::query(
@@ -60,7 +61,7 @@ impl Store {
         .bind(artifact_type)
         .bind(&after)
         .bind(last)
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         let next = if has_more { Some(rows::id("manifests.digest", last)?) } else { None };
         Ok(ReferrersPage {

@@ -4,65 +4,68 @@
 use std::collections::BTreeMap;
 
 use task_proto::desired::BlobRef;
-use task_proto::output::{OutputSet, owner};
+use task_proto::packages::output::{OutputSet, owner};
 use task_proto::{Digest, RepositoryName, RobotId};
 
-use crate::store::{Store, StoreError, Write, rows};
+use crate::store::repositories::RobotBlobs;
+use crate::store::{Store, StoreError, Transaction, rows};
 
 /// The size that the smallest file counts: storing a file costs more than its bytes.
-const LEAST_BYTES: u64 = 64 * 1024;
+const MIN_FILE_BYTES: u64 = 64 * 1024;
 
 /// The disk usage of one output with its manifest and config, in bytes. Small files count as
-/// [`LEAST_BYTES`] each.
-pub fn bytes_taken(output: &OutputSet) -> u64 {
+/// [`MIN_FILE_BYTES`] each.
+pub fn disk_usage(output: &OutputSet) -> u64 {
     let blobs: BTreeMap<Digest, u64> =
         output.files.iter().map(|file| (file.blob.digest, file.blob.size)).collect();
-    blobs.values().fold(2 * LEAST_BYTES, |sum, size| sum.saturating_add((*size).max(LEAST_BYTES)))
+    blobs
+        .values()
+        .fold(2 * MIN_FILE_BYTES, |sum, size| sum.saturating_add((*size).max(MIN_FILE_BYTES)))
 }
 
-impl Store {
+impl RobotBlobs<&Store> {
     /// Adds a manifest or a blob to its robot's disk usage, if the repository is a robot's.
-    pub async fn count_blob(
-        &self,
+    pub async fn count(
+        self,
         repository: &RepositoryName,
         blob: &BlobRef,
     ) -> Result<(), StoreError> {
         if owner(repository).is_none() {
             return Ok(());
         }
-        let mut write = self.begin().await?;
-        write.count_blob(repository, blob).await?;
+        let mut write = self.0.begin().await?;
+        write.robot_blobs().count(repository, blob).await?;
         write.commit().await
     }
 
-    /// The disk usage of a robot's uploads, in bytes. Small files count as [`LEAST_BYTES`] each.
-    pub async fn bytes_of_robot(&self, robot: &RobotId) -> Result<u64, StoreError> {
+    /// The disk usage of a robot's uploads, in bytes. Small files count as [`MIN_FILE_BYTES`] each.
+    pub async fn disk_usage(self, robot: &RobotId) -> Result<u64, StoreError> {
         let bytes: Option<i64> =
             sqlx::query_scalar("SELECT bytes FROM robot_bytes WHERE robot_id = $1")
                 .bind(robot.as_str())
-                .fetch_optional(&self.reads)
+                .fetch_optional(&self.0.reads)
                 .await?;
         Ok(rows::number(bytes.unwrap_or(0)))
     }
 
     /// Blobs of deleted manifests of robots, except those that a known push may be about to list.
     /// Manifests of others may still need them.
-    pub async fn blobs_dropped_by_robots(&self) -> Result<Vec<Digest>, StoreError> {
+    pub async fn dropped(self) -> Result<Vec<Digest>, StoreError> {
         let texts: Vec<String> = sqlx::query_scalar(
             "SELECT DISTINCT d.digest FROM robot_blobs d WHERE d.dropped = 1
              AND NOT EXISTS (SELECT 1 FROM robot_blobs b WHERE b.digest = d.digest AND b.dropped = 0)
              AND NOT EXISTS (SELECT 1 FROM repository_blobs r
                              WHERE r.digest = d.digest AND r.repository NOT LIKE 'outputs/%')",
         )
-        .fetch_all(&self.reads)
+        .fetch_all(&self.0.reads)
         .await?;
         texts.iter().map(|text| rows::id("robot_blobs.digest", text)).collect()
     }
 }
 
-impl Write {
+impl RobotBlobs<&mut Transaction> {
     /// Records that a manifest is about to be deleted, if the repository is a robot's.
-    pub(in crate::store) async fn drop_of_robot(
+    pub(in crate::store) async fn mark_dropped(
         &mut self,
         repository: &RepositoryName,
         manifest: &Digest,
@@ -75,14 +78,14 @@ impl Write {
         .bind(robot.as_str())
         .bind(manifest.to_string())
         .bind(repository.as_str())
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }
 
-    /// Does the same as [`Store::count_blob`]. A blob stays counted until it is collected. Returns
-    /// whether the blob was counted already.
-    pub(in crate::store) async fn count_blob(
+    /// Adds a manifest or a blob to its robot's disk usage, if the repository is a robot's. A blob
+    /// stays counted until it is collected. Returns whether the blob was counted already.
+    pub(in crate::store) async fn count(
         &mut self,
         repository: &RepositoryName,
         blob: &BlobRef,
@@ -92,17 +95,17 @@ impl Write {
             sqlx::query("UPDATE robot_blobs SET dropped = 0 WHERE robot_id = $1 AND digest = $2")
                 .bind(robot.as_str())
                 .bind(blob.digest.to_string())
-                .execute(self.connection())
+                .execute(self.0.connection())
                 .await?;
         if known.rows_affected() > 0 {
             return Ok(true);
         }
-        let bytes = rows::stored(blob.size.max(LEAST_BYTES));
+        let bytes = rows::stored(blob.size.max(MIN_FILE_BYTES));
         sqlx::query("INSERT INTO robot_blobs (robot_id, digest, bytes) VALUES ($1, $2, $3)")
             .bind(robot.as_str())
             .bind(blob.digest.to_string())
             .bind(bytes)
-            .execute(self.connection())
+            .execute(self.0.connection())
             .await?;
         self.add_to_robot(robot.as_str(), bytes).await?;
         Ok(false)
@@ -115,27 +118,24 @@ impl Write {
         blob: &BlobRef,
     ) -> Result<(), StoreError> {
         let Some((robot, _)) = owner(repository) else { return Ok(()) };
-        let bytes = rows::stored(LEAST_BYTES);
+        let bytes = rows::stored(MIN_FILE_BYTES);
         sqlx::query(
             "UPDATE robot_blobs SET bytes = bytes + $1 WHERE robot_id = $2 AND digest = $3",
         )
         .bind(bytes)
         .bind(robot.as_str())
         .bind(blob.digest.to_string())
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         self.add_to_robot(robot.as_str(), bytes).await
     }
 
     /// Removes a collected blob from the disk usage.
-    pub(in crate::store) async fn uncount_blob(
-        &mut self,
-        digest: &Digest,
-    ) -> Result<(), StoreError> {
+    pub(in crate::store) async fn uncount(&mut self, digest: &Digest) -> Result<(), StoreError> {
         let counted: Vec<(String, i64)> =
             sqlx::query_as("DELETE FROM robot_blobs WHERE digest = $1 RETURNING robot_id, bytes")
                 .bind(digest.to_string())
-                .fetch_all(self.connection())
+                .fetch_all(self.0.connection())
                 .await?;
         for (robot, bytes) in counted {
             self.add_to_robot(&robot, -bytes).await?;
@@ -150,7 +150,7 @@ impl Write {
         )
         .bind(robot)
         .bind(bytes)
-        .execute(self.connection())
+        .execute(self.0.connection())
         .await?;
         Ok(())
     }

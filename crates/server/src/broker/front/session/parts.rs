@@ -6,25 +6,25 @@ use std::sync::Arc;
 
 use rumqttd::protocol::QoS;
 use task_proto::Digest;
-use task_proto::topic::Topic;
+use task_proto::messages::topic::Topic;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::Notify;
 
 use super::subscriptions::lower;
 use super::{Count, End, Session};
 use crate::broker::Part;
-use crate::broker::front::access::Hearing;
+use crate::broker::front::access::MessageSource;
 use crate::broker::front::codec::encode_publish_head;
-use crate::broker::front::parts::{Due, Member};
+use crate::broker::front::parts::{Due, PartSubscription};
 
 /// Maximum unwritten bytes of a part after the robot's permission is withdrawn; more would keep the
 /// connection busy in vain.
-const MAX_VAIN_BYTES: usize = 256 * 1024;
+const MAX_WASTED_BYTES: usize = 256 * 1024;
 
 /// The package subscriptions of a session.
 #[derive(Default)]
 pub(super) struct Parts {
-    members: HashMap<Digest, Member>,
+    subscriptions: HashMap<Digest, PartSubscription>,
     /// Wakes the session when a package has news.
     news: Arc<Notify>,
     /// By packet id: parts that are sent and not acknowledged.
@@ -40,13 +40,13 @@ impl Parts {
         self.news.clone()
     }
 
-    pub(super) fn join(&mut self, digest: Digest, member: Member) {
-        self.members.insert(digest, member);
+    pub(super) fn join(&mut self, digest: Digest, subscription: PartSubscription) {
+        self.subscriptions.insert(digest, subscription);
     }
 
     /// Ends the subscription to the package; later acknowledgements are ignored.
     pub(super) fn leave(&mut self, digest: &Digest) {
-        self.members.remove(digest);
+        self.subscriptions.remove(digest);
         self.in_flight.retain(|_, (of, _)| of != digest);
         self.writing.take_if(|(of, _)| of == digest);
     }
@@ -66,17 +66,21 @@ impl Parts {
     }
 
     fn done(&self, digest: &Digest, number: u64) {
-        if let Some(member) = self.members.get(digest) {
-            member.acknowledged(number);
+        if let Some(subscription) = self.subscriptions.get(digest) {
+            subscription.acknowledged(number);
         }
     }
 
     /// The first due action, with packages taking turns.
     fn first_due(&self, may_send: bool) -> Option<(Digest, Due)> {
         let by_turns = |is_last: bool| {
-            self.members.iter().filter(move |(digest, _)| (Some(**digest) == self.last) == is_last)
+            self.subscriptions
+                .iter()
+                .filter(move |(digest, _)| (Some(**digest) == self.last) == is_last)
         };
-        by_turns(false).chain(by_turns(true)).find_map(|(digest, member)| match member.due() {
+        by_turns(false).chain(by_turns(true)).find_map(|(digest, subscription)| match subscription
+            .due()
+        {
             Due::Nothing => None,
             Due::Part(..) if !may_send => None,
             due => Some((*digest, due)),
@@ -96,17 +100,18 @@ pub(super) async fn due(parts: &Parts, may_send: bool) -> (Digest, Due) {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
-    pub(super) fn act_on_part(&mut self, digest: Digest, due: Due) -> Result<(), End> {
+    pub(super) fn handle_part(&mut self, digest: Digest, due: Due) -> Result<(), End> {
         match due {
             Due::Part(number, part) => self.send_part(digest, number, part),
             Due::Nothing => {}
             // The grant was withdrawn, and with it the subscription.
             Due::End => {
-                let was_heard = self.parts.last == Some(digest);
+                let was_writing = self.parts.last == Some(digest);
                 self.parts.leave(&digest);
-                self.hearing.retain(|_, (hearing, _)| *hearing != Hearing::Package(digest));
-                self.note_subscriptions();
-                if was_heard && self.output.shared_bytes() > MAX_VAIN_BYTES {
+                self.subscriptions
+                    .retain(|_, (source, _)| *source != MessageSource::Package(digest));
+                self.publish_subscriptions();
+                if was_writing && self.output.shared_bytes() > MAX_WASTED_BYTES {
                     return Err(End::Withdrawn);
                 }
             }
@@ -115,10 +120,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Session<'_, S> {
     }
 
     fn send_part(&mut self, digest: Digest, number: u64, part: Part) {
-        let Some(member) = self.parts.members.get(&digest) else { return };
-        let granted = self.qos_of(Hearing::Package(digest)).unwrap_or(QoS::AtMostOnce);
-        let qos = lower(granted, member.qos());
-        member.take(number);
+        let Some(subscription) = self.parts.subscriptions.get(&digest) else { return };
+        let granted = self.qos_of(MessageSource::Package(digest)).unwrap_or(QoS::AtMostOnce);
+        let qos = lower(granted, subscription.qos());
+        subscription.take(number);
         let packet_id = self.outgoing.begin(qos);
         match qos {
             QoS::AtMostOnce => self.parts.writing = Some((digest, number)),

@@ -16,12 +16,12 @@ use task_proto::desired::BlobRef;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 use super::{Answer, OciError, Registry, empty};
-use crate::blobs::{Blob, BytesFor};
+use crate::blobs::{Blob, BytesConsumer};
 use crate::domain::person::Person;
 use crate::http::connection::listener::Unencrypted;
-use crate::http::registry::packages::in_use;
-use crate::link::transfers::Claim;
-use crate::store::{Act, Deed, Deletion};
+use crate::http::registry::packages::in_use_message;
+use crate::link::transfers::TransferRequest;
+use crate::store::{AuditAction, AuditEvent, Deletion};
 
 /// Cached copies must be revalidated with the server before each use.
 pub(super) const REVALIDATED: &str = "private, no-cache";
@@ -33,7 +33,7 @@ pub(super) async fn get(
     digest: Digest,
     request: &Parts,
 ) -> Answer {
-    if !registry.store.has_blob(Some(repository), &digest).await? {
+    if !registry.store.blobs().has(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
     }
     read(registry, digest, request).await
@@ -48,7 +48,7 @@ pub(super) async fn head_before_push(
     request: &Parts,
 ) -> Answer {
     let _hold = registry.blobs.hold_collection().await;
-    if !registry.store.has_blob(Some(repository), &digest).await? {
+    if !registry.store.blobs().has(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
     }
     registry.blobs.touch(digest, registry.clock.now_ms()).await?;
@@ -64,9 +64,9 @@ pub(super) async fn get_for_robot(
     digest: Digest,
     request: &Parts,
 ) -> Answer {
-    let Some(order) = registry.store.fetched_by(robot, &digest).await? else {
+    let Some(order) = registry.store.robots().fetch_grant(robot, &digest).await? else {
         // Evidence blobs are small, and everything else waits for them.
-        if registry.store.is_evidence_for(robot, &digest).await? {
+        if registry.store.publishers().is_evidence_for(robot, &digest).await? {
             return read(registry, digest, request).await;
         }
         return Err(OciError::denied("the blob is not part of a package this robot should have"));
@@ -75,8 +75,9 @@ pub(super) async fn get_for_robot(
         return read(registry, digest, request).await;
     }
     let site = registry.transfers.site_of(&order.labels);
-    let claim = Claim { priority: order.priority, deployment: order.number, site };
-    let transfer = registry.transfers.admit(robot, digest, &claim).await?;
+    let transfer_request =
+        TransferRequest { priority: order.priority, deployment: order.number, site };
+    let transfer = registry.transfers.admit(robot, digest, &transfer_request).await?;
     let transfer = transfer.by(request.extensions.get());
     Ok(read(registry, digest, request).await?.map(|body| Body::new(transfer.carry(body))))
 }
@@ -89,10 +90,10 @@ pub(super) async fn delete(
     repository: &RepositoryName,
     digest: Digest,
 ) -> Answer {
-    let deed = Deed::by(by, Act::BlobDelete, repository).with("digest", digest);
+    let event = AuditEvent::by(by, AuditAction::BlobDelete, repository).with("digest", digest);
     let deletion =
-        registry.store.unlink_blob(repository, &digest, &deed, registry.clock.now_ms()).await?;
-    deleted(by, deletion, &format!("{repository}@{digest}"), OciError::blob_unknown)
+        registry.store.blobs().unlink(repository, &digest, &event, registry.clock.now_ms()).await?;
+    deletion_answer(by, deletion, &format!("{repository}@{digest}"), OciError::blob_unknown)
 }
 
 async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
@@ -129,28 +130,31 @@ pub(super) fn serve(
         (ACCEPT_RANGES, HeaderValue::from_static("bytes")),
     ];
     let headers = &request.headers;
-    let mut response = if has_it(headers, &etag) {
-        let mut response = with_room(Body::empty());
+    let mut response = if is_not_modified(headers, &etag) {
+        let mut response = response_with_capacity(Body::empty());
         *response.status_mut() = StatusCode::NOT_MODIFIED;
         response
     } else {
-        let (status, range) = match wanted(headers, &etag, blob.size()) {
-            Wanted::All => (StatusCode::OK, 0..blob.size()),
-            Wanted::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
-            Wanted::Nothing => return unsatisfiable(blob),
+        let (status, range) = match requested_range(headers, &etag, blob.size()) {
+            RequestedRange::Whole => (StatusCode::OK, 0..blob.size()),
+            RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
+            RequestedRange::Unsatisfiable => return unsatisfiable(blob),
         };
         let length = range.end - range.start;
         let is_head = request.method == Method::HEAD;
         let reader = if request.extensions.get::<Unencrypted>().is_some() {
-            BytesFor::Socket
+            BytesConsumer::Socket
         } else {
-            BytesFor::Process
+            BytesConsumer::Process
         };
         let content_range = (status == StatusCode::PARTIAL_CONTENT).then(|| {
             format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size())
         });
-        let mut response =
-            with_room(if is_head { Body::empty() } else { Body::new(blob.body(range, reader)) });
+        let mut response = response_with_capacity(if is_head {
+            Body::empty()
+        } else {
+            Body::new(blob.body(range, reader))
+        });
         *response.status_mut() = status;
         if let Some(content_range) = content_range {
             response.headers_mut().insert(CONTENT_RANGE, header_value(content_range)?);
@@ -164,7 +168,7 @@ pub(super) fn serve(
 }
 
 /// An answer with capacity for all its headers, including those for browsers.
-fn with_room(body: Body) -> Response {
+fn response_with_capacity(body: Body) -> Response {
     const HEADERS: usize = 24;
     let mut response = Response::new(body);
     response.headers_mut().reserve(HEADERS);
@@ -184,7 +188,7 @@ fn unsatisfiable(blob: &Blob) -> Answer {
 }
 
 /// True if `If-None-Match` names the content.
-fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
+fn is_not_modified(headers: &HeaderMap, etag: &HeaderValue) -> bool {
     let tags = headers
         .get_all(IF_NONE_MATCH)
         .iter()
@@ -195,32 +199,32 @@ fn has_it(headers: &HeaderMap, etag: &HeaderValue) -> bool {
 
 /// The result of evaluating a request's `Range`.
 #[derive(Debug, PartialEq, Eq)]
-enum Wanted {
-    All,
+enum RequestedRange {
+    Whole,
     Part(Range<u64>),
-    Nothing,
+    Unsatisfiable,
 }
 
 /// Evaluates `Range` by RFC 9110, section 14. Multiple ranges, other units and malformed values are
 /// answered with the whole content, as the RFC allows. A range that ends before it begins is
 /// unsatisfiable, as is usual for registries.
-fn wanted(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> Wanted {
+fn requested_range(headers: &HeaderMap, etag: &HeaderValue, size: u64) -> RequestedRange {
     if headers.get(IF_RANGE).is_some_and(|tag| tag != etag) {
-        return Wanted::All;
+        return RequestedRange::Whole;
     }
     let text = headers.get(RANGE).and_then(|value| value.to_str().ok());
     let Some((first, last)) =
         text.and_then(|text| text.strip_prefix("bytes=")).and_then(|set| set.split_once('-'))
     else {
-        return Wanted::All;
+        return RequestedRange::Whole;
     };
     let range = match (decimal(first), decimal(last)) {
         (Some(first), Some(last)) => first..size.min(last.saturating_add(1)),
         (Some(first), None) if last.is_empty() => first..size,
         (None, Some(length)) if first.is_empty() => size.saturating_sub(length)..size,
-        _ => return Wanted::All,
+        _ => return RequestedRange::Whole,
     };
-    if range.is_empty() { Wanted::Nothing } else { Wanted::Part(range) }
+    if range.is_empty() { RequestedRange::Unsatisfiable } else { RequestedRange::Part(range) }
 }
 
 /// Parses a number of digits only: `parse` alone would accept a plus sign.
@@ -229,7 +233,7 @@ pub(super) fn decimal(text: &str) -> Option<u64> {
 }
 
 /// The answer to a deletion of the resource `named`.
-pub(super) fn deleted(
+pub(super) fn deletion_answer(
     by: &Person,
     deletion: Deletion,
     named: &str,
@@ -237,7 +241,7 @@ pub(super) fn deleted(
 ) -> Answer {
     match deletion {
         Deletion::Deleted(_) => empty(StatusCode::ACCEPTED, []),
-        Deletion::InUse(users) => Err(OciError::conflict(in_use(by, named, &users))),
+        Deletion::InUse(users) => Err(OciError::conflict(in_use_message(by, named, &users))),
         Deletion::Unknown => Err(unknown()),
     }
 }
@@ -248,7 +252,7 @@ pub(super) async fn check_blob(
     repository: &RepositoryName,
     part: BlobRef,
 ) -> Result<Blob, OciError> {
-    let is_here = registry.store.has_blob(Some(repository), &part.digest).await?;
+    let is_here = registry.store.blobs().has(Some(repository), &part.digest).await?;
     let blob = if is_here { registry.blobs.get(part.digest).await? } else { None };
     let blob = blob.ok_or_else(|| OciError::parts_unknown(&[part.digest]))?;
     if blob.size() != part.size {
@@ -275,37 +279,46 @@ mod tests {
     fn ranges_follow_the_http_rules() {
         let etag = HeaderValue::from_static("\"x\"");
         let cases = [
-            ("bytes=0-0", Wanted::Part(0..1)),
-            ("bytes=2-", Wanted::Part(2..10)),
-            ("bytes=-3", Wanted::Part(7..10)),
-            ("bytes=-30", Wanted::Part(0..10)),
-            ("bytes=5-99", Wanted::Part(5..10)),
-            ("bytes=10-", Wanted::Nothing),
-            ("bytes=-0", Wanted::Nothing),
-            ("bytes=18446744073709551615-", Wanted::Nothing),
-            ("bytes=5-4", Wanted::Nothing),
-            ("bytes=500-0", Wanted::Nothing),
-            ("bytes=-", Wanted::All),
-            ("bytes=0-1,3-4", Wanted::All),
-            ("bytes=+1-2", Wanted::All),
-            ("lines=0-1", Wanted::All),
+            ("bytes=0-0", RequestedRange::Part(0..1)),
+            ("bytes=2-", RequestedRange::Part(2..10)),
+            ("bytes=-3", RequestedRange::Part(7..10)),
+            ("bytes=-30", RequestedRange::Part(0..10)),
+            ("bytes=5-99", RequestedRange::Part(5..10)),
+            ("bytes=10-", RequestedRange::Unsatisfiable),
+            ("bytes=-0", RequestedRange::Unsatisfiable),
+            ("bytes=18446744073709551615-", RequestedRange::Unsatisfiable),
+            ("bytes=5-4", RequestedRange::Unsatisfiable),
+            ("bytes=500-0", RequestedRange::Unsatisfiable),
+            ("bytes=-", RequestedRange::Whole),
+            ("bytes=0-1,3-4", RequestedRange::Whole),
+            ("bytes=+1-2", RequestedRange::Whole),
+            ("lines=0-1", RequestedRange::Whole),
         ];
         for (range, expected) in cases {
-            assert_eq!(wanted(&headers(&[(RANGE, range)]), &etag, 10), expected, "{range}");
+            assert_eq!(
+                requested_range(&headers(&[(RANGE, range)]), &etag, 10),
+                expected,
+                "{range}"
+            );
         }
-        let part =
-            |if_range| wanted(&headers(&[(RANGE, "bytes=1-"), (IF_RANGE, if_range)]), &etag, 10);
-        assert_eq!(part("\"x\""), Wanted::Part(1..10));
-        assert_eq!(part("\"y\""), Wanted::All);
+        let part = |if_range| {
+            requested_range(&headers(&[(RANGE, "bytes=1-"), (IF_RANGE, if_range)]), &etag, 10)
+        };
+        assert_eq!(part("\"x\""), RequestedRange::Part(1..10));
+        assert_eq!(part("\"y\""), RequestedRange::Whole);
     }
 
     #[test]
-    fn an_etag_in_a_list_is_found() {
+    fn etag_in_a_list_matches() {
         let etag = HeaderValue::from_static("\"x\"");
         for (value, expected) in
             [("\"y\", \"x\"", true), ("W/\"x\"", true), ("*", true), ("\"y\"", false)]
         {
-            assert_eq!(has_it(&headers(&[(IF_NONE_MATCH, value)]), &etag), expected, "{value}");
+            assert_eq!(
+                is_not_modified(&headers(&[(IF_NONE_MATCH, value)]), &etag),
+                expected,
+                "{value}"
+            );
         }
     }
 }

@@ -11,7 +11,7 @@ use task_proto::Digest;
 
 use crate::blobs::BlobError;
 use crate::http::error::{ApiError, DATABASE_CORRUPT};
-use crate::link::transfers::NotYet;
+use crate::link::transfers::RetryLater;
 use crate::store::{Fault, StoreError};
 
 /// Seconds until a retry is useful when something has to be collected first.
@@ -72,13 +72,13 @@ impl OciError {
         let error = Self::new(
             StatusCode::METHOD_NOT_ALLOWED,
             "UNSUPPORTED",
-            "the endpoint does not have this method",
+            "the endpoint does not support this method",
         );
         Self { allow: Some(allow), ..error }
     }
 
     /// 400: not a valid repository name.
-    pub fn name_invalid(error: &task_proto::id::InvalidId) -> Self {
+    pub fn name_invalid(error: &task_proto::ids::InvalidId) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "NAME_INVALID", error.to_string())
     }
 
@@ -93,7 +93,7 @@ impl OciError {
     }
 
     /// 400: not a valid tag.
-    pub fn tag_invalid(error: &task_proto::id::InvalidId) -> Self {
+    pub fn tag_invalid(error: &task_proto::ids::InvalidId) -> Self {
         Self::new(StatusCode::BAD_REQUEST, "TAG_INVALID", error.to_string())
     }
 
@@ -170,7 +170,7 @@ impl OciError {
         Self::new(
             StatusCode::INTERNAL_SERVER_ERROR,
             "UNKNOWN",
-            "the server failed; its log says why",
+            "internal error; see the server's log",
         )
     }
 }
@@ -191,18 +191,17 @@ impl From<Fault> for OciError {
         let ApiError { status, message, retry_after_s, .. } = fault.into();
         let (code, retry_after_s) = match fault {
             Fault::Corrupt => (CORRUPT, Some(retry_after_s)),
-            Fault::Away | Fault::Busy => ("UNAVAILABLE", Some(retry_after_s)),
+            Fault::Unreachable | Fault::Busy => ("UNAVAILABLE", Some(retry_after_s)),
             Fault::Full => ("DENIED", None),
         };
         Self { retry_after_s, ..Self::new(status, code, message) }
     }
 }
 
-impl From<NotYet> for OciError {
-    fn from(not_yet: NotYet) -> Self {
-        let error =
-            Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", not_yet.to_string());
-        Self { retry_after_s: Some(not_yet.retry_after_s), ..error }
+impl From<RetryLater> for OciError {
+    fn from(retry: RetryLater) -> Self {
+        let error = Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", retry.to_string());
+        Self { retry_after_s: Some(retry.retry_after_s), ..error }
     }
 }
 
@@ -221,7 +220,7 @@ impl From<BlobError> for OciError {
                 Self::new(StatusCode::RANGE_NOT_SATISFIABLE, "BLOB_UPLOAD_INVALID", message)
             }
             BlobError::TooLarge { .. } => Self::too_large(message),
-            BlobError::TooMuchOfRobot { .. } => {
+            BlobError::RobotQuotaExceeded { .. } => {
                 let error = Self::new(StatusCode::TOO_MANY_REQUESTS, "TOOMANYREQUESTS", message);
                 Self { retry_after_s: Some(COLLECTION_S), ..error }
             }

@@ -8,7 +8,7 @@ use http::request::Parts;
 use serde::Deserialize;
 use serde_json::json;
 use task_proto::RepositoryName;
-use task_proto::oci::INDEX_TYPE;
+use task_proto::packages::oci::INDEX_TYPE;
 
 use super::{Answer, OciError, Registry, parse_digest, query};
 
@@ -34,7 +34,8 @@ pub(super) async fn tags(
     request: &Parts,
 ) -> Answer {
     let query: TagsQuery = query(&request.uri)?;
-    let mut tags = registry.store.tags(repository).await?.ok_or_else(OciError::name_unknown)?;
+    let mut tags =
+        registry.store.tags().list(repository).await?.ok_or_else(OciError::name_unknown)?;
     if let Some(last) = &query.last {
         tags.retain(|tag| tag.as_str() > last.as_str());
     }
@@ -63,10 +64,11 @@ pub(super) async fn referrers(
     let query: ReferrersQuery = query(&request.uri)?;
     let kind = query.artifact_type.as_deref().filter(|kind| !kind.is_empty());
     if kind.is_some_and(|kind| kind.contains(char::is_control)) {
-        return Err(OciError::query_invalid("artifactType: it has a control character"));
+        return Err(OciError::query_invalid("artifactType: contains a control character"));
     }
     let after = query.last.as_deref().map(parse_digest).transpose()?;
-    let page = registry.store.referrers(repository, subject, kind, after.as_ref()).await?;
+    let page =
+        registry.store.manifests().referrers(repository, subject, kind, after.as_ref()).await?;
     let index = json!({ "schemaVersion": 2, "mediaType": INDEX_TYPE, "manifests": page.manifests });
     let mut response = index.to_string().into_response();
     let headers = response.headers_mut();
@@ -76,13 +78,16 @@ pub(super) async fn referrers(
     }
     if let Some(last) = page.next {
         // The link to the next page: the same query, continued after the last entry.
-        let asked = request.uri.query().unwrap_or_default();
-        let kept = asked.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("last="));
-        let kept: String = kept.map(|pair| format!("{pair}&")).collect();
-        let link =
-            format!("</v2/{repository}/referrers/{subject}?{kept}last={last}>; rel=\"next\"");
-        let link = HeaderValue::try_from(link)
-            .map_err(|_| OciError::query_invalid("a query no header can hold"))?;
+        let original_query = request.uri.query().unwrap_or_default();
+        let other_pairs =
+            original_query.split('&').filter(|pair| !pair.is_empty() && !pair.starts_with("last="));
+        let other_pairs: String = other_pairs.map(|pair| format!("{pair}&")).collect();
+        let link = format!(
+            "</v2/{repository}/referrers/{subject}?{other_pairs}last={last}>; rel=\"next\""
+        );
+        let link = HeaderValue::try_from(link).map_err(|_| {
+            OciError::query_invalid("the query has characters that are invalid in a header")
+        })?;
         headers.insert(LINK, link);
     }
     Ok(response)

@@ -10,23 +10,23 @@ use http::request::Parts;
 use http::{HeaderMap, HeaderValue, StatusCode};
 use task_archive::{Limits, UnpackError};
 use task_proto::desired::{BlobRef, PackageRef};
-use task_proto::manifest::{ContentFacts, TaskManifest};
-use task_proto::oci::{ImageManifest, PACKAGE_TYPE};
-use task_proto::output::{MAX_FILES, OutputSet};
+use task_proto::packages::manifest::{ContentFacts, TaskManifest};
+use task_proto::packages::oci::{ImageManifest, PACKAGE_TYPE};
+use task_proto::packages::output::{MAX_FILES, OutputSet};
 use task_proto::{Digest, RepositoryName, Tag};
 
-use super::super::archives::READING;
-use super::blobs::{REVALIDATED, caching, check_blob, deleted, serve};
-use super::parsed::{Parsed, is_json};
-use super::uploads::kept_bytes;
+use super::super::archives::READ_TIMEOUT;
+use super::blobs::{REVALIDATED, caching, check_blob, deletion_answer, serve};
+use super::parsed::{ParsedManifest, is_json};
+use super::uploads::stored_bytes;
 use super::{Answer, OciError, Registry, empty, is_reserved, signed};
 use crate::blobs::Blob;
 use crate::domain::person::Person;
-use crate::http::registry::packages::in_use;
+use crate::http::registry::packages::in_use_message;
 use crate::orders::changes::Change;
 use crate::store::{
-    Act, Deed, Deletion, NewManifest, NewOutput, PutManifest, Reference, StoredManifest,
-    bytes_taken,
+    AuditAction, AuditEvent, Deletion, NewManifest, NewOutput, PutManifest, Reference,
+    StoredManifest, disk_usage,
 };
 
 /// The largest manifest, in bytes; the specification asks for at least this.
@@ -34,7 +34,7 @@ const MAX_MANIFEST_BYTES: usize = 4 * 1024 * 1024;
 /// The largest task manifest, in bytes.
 const MAX_CONFIG_BYTES: u64 = 1024 * 1024;
 /// Time limit for a manifest's body.
-const PATIENCE: Duration = Duration::from_secs(60);
+const BODY_TIMEOUT: Duration = Duration::from_secs(60);
 /// The most tags that one request sets.
 const MAX_TAGS: usize = 64;
 
@@ -48,7 +48,8 @@ pub(super) async fn get(
     let Ok(reference) = reference else { return Err(OciError::manifest_unknown()) };
     let stored = registry
         .store
-        .manifest(repository, &reference)
+        .manifests()
+        .get(repository, &reference)
         .await?
         .ok_or_else(OciError::manifest_unknown)?;
     let blob = registry.blobs.get(stored.digest).await?.ok_or_else(OciError::manifest_unknown)?;
@@ -73,7 +74,7 @@ pub(super) struct Push<'a> {
     /// `None` for a robot.
     pub(super) by: Option<&'a Person>,
     /// The only artifact type that is accepted.
-    pub(super) only: Option<&'static str>,
+    pub(super) required_type: Option<&'static str>,
     /// True if a package may take its version from another package.
     pub(super) takes_version: bool,
 }
@@ -85,25 +86,25 @@ impl<'a> Push<'a> {
         repository: &'a RepositoryName,
         reference: Reference,
         by: Option<&'a Person>,
-        only: Option<&'static str>,
+        required_type: Option<&'static str>,
     ) -> Result<Self, OciError> {
         let pairs: Vec<(String, String)> = super::query(&parts.uri)?;
         let takes_version = pairs.iter().any(|(key, value)| key == "force" && value == "true");
-        Ok(Self { repository, reference, by, only, takes_version })
+        Ok(Self { repository, reference, by, required_type, takes_version })
     }
 }
 
 /// `PUT`: stores the exact bytes, if all referenced parts are in the repository.
 pub(super) async fn put(
     registry: &Registry,
-    as_said: Push<'_>,
+    request: Push<'_>,
     parts: &Parts,
     body: Body,
 ) -> Answer {
     let bytes = read_body(body).await?;
-    let tags = tags_to_set(parts, &as_said.reference)?;
-    let repository = as_said.repository;
-    let stored = push(registry, as_said, tags, &parts.headers, bytes).await?;
+    let tags = tags_to_set(parts, &request.reference)?;
+    let repository = request.repository;
+    let stored = push(registry, request, tags, &parts.headers, bytes).await?;
     created(repository, &stored.manifest.digest, stored.subject, parts, &stored.tags)
 }
 
@@ -115,12 +116,14 @@ pub(super) async fn push(
     headers: &HeaderMap,
     bytes: Bytes,
 ) -> Result<NewManifest, OciError> {
-    let Push { repository, reference, by, only, takes_version } = push;
+    let Push { repository, reference, by, required_type, takes_version } = push;
     let digest = digest_of(&bytes, &reference)?;
     let content_type = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
-    let parsed = Parsed::new(content_type, &bytes)?;
-    parsed.check_for_robots(digest)?;
-    if only.is_some_and(|only| parsed.artifact_type.as_deref() != Some(only)) {
+    let parsed = ParsedManifest::new(content_type, &bytes)?;
+    parsed.check_robot_algorithms(digest)?;
+    if required_type
+        .is_some_and(|required_type| parsed.artifact_type.as_deref() != Some(required_type))
+    {
         return Err(OciError::denied("a robot may only push outputs"));
     }
 
@@ -144,10 +147,10 @@ pub(super) async fn push(
         None => None,
     };
     let document = signed::check(registry, repository, &parsed, &tags).await?;
-    if only.is_some() && output.is_none() {
+    if required_type.is_some() && output.is_none() {
         return Err(OciError::denied("a robot may only push outputs"));
     }
-    if only.is_some()
+    if required_type.is_some()
         && output
             .as_ref()
             .is_some_and(|output| tags.iter().any(|tag| output.set.tag().as_ref() != Some(tag)))
@@ -157,10 +160,10 @@ pub(super) async fn push(
     let now_ms = registry.clock.now_ms();
     // A robot's manifest is counted together with the parts that it lists.
     let more = if by.is_some() { manifest.size } else { 0 };
-    registry.blobs.check_room(repository, more, kept_bytes(registry, repository).await?)?;
+    registry.blobs.check_space(repository, more, stored_bytes(registry, repository).await?)?;
     // Counted before the bytes are stored, so that a client that disconnects in between is counted
     // as well.
-    registry.store.count_blob(repository, &manifest).await?;
+    registry.store.robot_blobs().count(repository, &manifest).await?;
     registry.blobs.put(digest.algorithm(), bytes).await?;
     registry.blobs.touch(digest, now_ms).await?;
     let new = NewManifest {
@@ -175,20 +178,21 @@ pub(super) async fn push(
         output,
         document,
     };
-    let deed = by.map(|by| pushed(by, repository, &new));
-    match registry.store.put_manifest(repository, &new, deed.as_ref(), now_ms).await? {
+    let event = by.map(|by| push_deed(by, repository, &new));
+    match registry.store.manifests().put(repository, &new, event.as_ref(), now_ms).await? {
         PutManifest::VersionTaken(other) => Err(version_taken(&new, &other)),
         PutManifest::PartsMissing(missing) => Err(OciError::parts_unknown(&missing)),
-        PutManifest::Outdated => {
-            Err(OciError::manifest_invalid("there is a list of publishers as new as this one"))
-        }
+        PutManifest::Outdated => Err(OciError::manifest_invalid(
+            "a list of publishers with this version or a newer one exists",
+        )),
         PutManifest::TagInUse(tag, users) => {
-            let message =
-                by.map(|by| in_use(by, &format!("{repository}:{tag}"), &users)).unwrap_or_default();
+            let message = by
+                .map(|by| in_use_message(by, &format!("{repository}:{tag}"), &users))
+                .unwrap_or_default();
             Err(OciError::conflict(message))
         }
         PutManifest::Stored => {
-            signed::tell(registry, repository, new.document.as_ref()).await;
+            signed::notify(registry, repository, new.document.as_ref()).await;
             if let Some((package, _)) = &new.package {
                 registry.changes.announce(Change::Package(package.name.clone()));
             }
@@ -204,8 +208,7 @@ fn version_taken(new: &NewManifest, other: &Digest) -> OciError {
         None => ("", ""),
     };
     OciError::conflict(format!(
-        "{name} {version} is there with other content, manifest {other}: robots that have it would show this version for \
-         two contents. Raise the version, or push with --force (?force=true)"
+        "{name} {version} exists with other content, manifest {other}: raise the version, or push with --force (?force=true)"
     ))
 }
 
@@ -222,10 +225,11 @@ fn digest_of(bytes: &[u8], reference: &Reference) -> Result<Digest, OciError> {
 }
 
 /// The audit entry for the push of a manifest.
-fn pushed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> Deed {
+fn push_deed(by: &Person, repository: &RepositoryName, new: &NewManifest) -> AuditEvent {
     let tags: Vec<&str> = new.tags.iter().map(Tag::as_str).collect();
-    let deed = Deed::by(by, Act::ManifestPush, repository).with("manifest", new.manifest.digest);
-    deed.with("tags", tags.join(",")).with_some("type", new.artifact_type.as_ref())
+    let event = AuditEvent::by(by, AuditAction::ManifestPush, repository)
+        .with("manifest", new.manifest.digest);
+    event.with("tags", tags.join(",")).with_some("type", new.artifact_type.as_ref())
 }
 
 /// `DELETE`: a tag alone, or a manifest with all its tags.
@@ -238,15 +242,16 @@ pub(super) async fn delete(
     let now_ms = registry.clock.now_ms();
     let (deletion, named) = match reference {
         Reference::Tag(tag) => {
-            let deed = Deed::by(by, Act::TagDelete, repository).with("tag", &tag);
-            let deletion = registry.store.delete_tag(repository, &tag, &deed, now_ms).await?;
+            let event = AuditEvent::by(by, AuditAction::TagDelete, repository).with("tag", &tag);
+            let deletion = registry.store.tags().delete(repository, &tag, &event, now_ms).await?;
             (deletion, format!("{repository}:{tag}"))
         }
         Reference::Digest(digest) => {
             let _hold = registry.blobs.hold_collection().await;
-            let deed = Deed::by(by, Act::ManifestDelete, repository).with("manifest", digest);
+            let event = AuditEvent::by(by, AuditAction::ManifestDelete, repository)
+                .with("manifest", digest);
             let deletion =
-                registry.store.delete_manifest(repository, &digest, &deed, now_ms).await?;
+                registry.store.manifests().delete(repository, &digest, &event, now_ms).await?;
             if let Deletion::Deleted(parts) = &deletion {
                 if let Ok(name) = repository.as_str().parse() {
                     registry.changes.announce(Change::Package(name));
@@ -260,13 +265,13 @@ pub(super) async fn delete(
             (deletion, format!("{repository}@{digest}"))
         }
     };
-    deleted(by, deletion, &named, OciError::manifest_unknown)
+    deletion_answer(by, deletion, &named, OciError::manifest_unknown)
 }
 
 async fn read_body(body: Body) -> Result<Bytes, OciError> {
     let too_large =
-        || OciError::too_large(format!("a manifest may have {MAX_MANIFEST_BYTES} bytes"));
-    match tokio::time::timeout(PATIENCE, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
+        || OciError::too_large(format!("a manifest may have at most {MAX_MANIFEST_BYTES} bytes"));
+    match tokio::time::timeout(BODY_TIMEOUT, axum::body::to_bytes(body, MAX_MANIFEST_BYTES)).await {
         Ok(Ok(bytes)) => Ok(bytes),
         Ok(Err(error)) => {
             let is_limit = std::error::Error::source(&error)
@@ -274,7 +279,7 @@ async fn read_body(body: Body) -> Result<Bytes, OciError> {
             Err(if is_limit {
                 too_large()
             } else {
-                OciError::manifest_invalid("the manifest broke off")
+                OciError::manifest_invalid("the manifest ended early")
             })
         }
         Err(_) => Err(OciError::manifest_invalid("the manifest took too long to arrive")),
@@ -307,21 +312,21 @@ async fn check_output(
     })?;
     if output.repository().as_ref() != Some(repository) {
         let message = format!(
-            "the output of {} on {} belongs into its own repository",
+            "the output of {} on {} belongs in its own repository",
             output.task, output.robot_id
         );
         return Err(OciError::manifest_invalid(message));
     }
     if output.files.len() > MAX_FILES || output.manifest(config) != *image {
         let message = format!(
-            "the manifest is not that of the output in its config, or it has more than {MAX_FILES} files"
+            "the manifest does not match the output in its config, or has more than {MAX_FILES} files"
         );
         return Err(OciError::manifest_invalid(message));
     }
-    let bytes = bytes_taken(&output);
+    let bytes = disk_usage(&output);
     if bytes > max_bytes {
         let message = format!(
-            "the output takes {bytes} bytes, and {max_bytes} are kept of one robot (robots.output_bytes)"
+            "the output takes {bytes} bytes, the limit per robot is {max_bytes} (robots.output_bytes)"
         );
         return Err(OciError::too_large(message));
     }
@@ -372,14 +377,12 @@ async fn check_package(
         return Err(OciError::manifest_invalid(problems.join("; ")));
     }
     if is_reserved(repository) {
-        let message = format!(
-            "the package {} can't be stored in {repository}, which is for other things",
-            task.name
-        );
+        let message =
+            format!("the package {} can't be stored in {repository}, which is reserved", task.name);
         return Err(OciError::manifest_invalid(message));
     }
     // A stored package was checked at its first push.
-    if registry.store.package(&task.name, &manifest.digest).await?.is_none() {
+    if registry.store.packages().get(&task.name, &manifest.digest).await?.is_none() {
         check_archive(registry, &archive, content.size, task.content).await?;
     }
     let package = PackageRef {
@@ -402,7 +405,7 @@ async fn check_archive(
     let check = registry
         .readers
         .read(blob, move |bytes| task_archive::check(bytes, size, &facts, &Limits::default()));
-    let checked = tokio::time::timeout(READING, check).await;
+    let checked = tokio::time::timeout(READ_TIMEOUT, check).await;
     match checked
         .map_err(|_| OciError::manifest_invalid("the package's archive took too long to read"))?
     {

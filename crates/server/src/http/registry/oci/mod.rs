@@ -11,46 +11,30 @@ mod publish;
 mod signed;
 mod uploads;
 
+use axum::body::Body;
 use axum::extract::rejection::PathRejection;
 use axum::extract::{Path, Request, State};
 use axum::response::{IntoResponse, Response};
+use http::request::Parts;
 use http::{HeaderMap, HeaderValue, Method, StatusCode, Uri};
 use serde::de::DeserializeOwned;
-use task_proto::digest::Algorithm;
-use task_proto::output::{self, OUTPUT_TYPE};
-use task_proto::person::Permission;
-use task_proto::publisher::LIST_REPOSITORY;
+use task_macros::operation;
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::output::{self, OUTPUT_TYPE};
+use task_proto::packages::publisher::LIST_REPOSITORY;
+use task_proto::people::roles::Permission;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 pub use error::OciError;
 pub use publish::publish;
 
-use super::archives::ArchiveReaders;
-use crate::blobs::Blobs;
+use super::Registry;
 use crate::domain::person::Person;
 use crate::http::auth::Caller;
-use crate::link::transfers::Transfers;
-use crate::orders::changes::Changes;
-use crate::store::{Reference, Store};
-use crate::system::clock::Clock;
+use crate::store::Reference;
 
 /// Error message for digests by an unsupported algorithm.
 const ALGORITHMS: &str = "only sha256 and sha512 are supported";
-
-/// State of the registry's handlers.
-#[derive(Clone)]
-pub struct Registry {
-    pub store: Store,
-    pub blobs: Blobs,
-    /// The clock for push times.
-    pub clock: Clock,
-    /// Scheduler of pulls by robots.
-    pub transfers: Transfers,
-    /// Announces newly signed documents.
-    pub changes: Changes,
-    /// Readers of whole archives.
-    pub readers: ArchiveReaders,
-}
 
 /// The result of every registry handler.
 pub type Answer = Result<Response, OciError>;
@@ -85,8 +69,8 @@ fn endpoint(path: &str) -> Option<(&str, Endpoint<'_>)> {
 }
 
 /// Confirms that this is an OCI registry and that the caller's token is valid.
-#[utoipa::path(get, path = "/v2/", tag = "registry",
-    responses((status = 200, description = "It is.", body = serde_json::Value, example = json!({}))))]
+#[operation(tag = "registry",
+    responses((status = 200, description = "The token is valid.", body = serde_json::Value, example = json!({}))))]
 pub async fn version(request: Request) -> Answer {
     match request.extensions().get::<Caller>() {
         Some(Caller::Person(_) | Caller::Robot(_)) => {}
@@ -102,14 +86,14 @@ pub async fn version(request: Request) -> Answer {
 
 /// The OCI distribution API, pull and push.
 ///
-/// Manifests, blobs, uploads, tags and referrers of packages, of lists of publishers and of what
-/// tasks brought back, as the specification of that API says. People pull and push as their roles
-/// allow; a robot reads the blobs of the packages it should have and pushes its own outputs.
+/// Manifests, blobs, uploads, tags and referrers of packages, lists of publishers and outputs, as
+/// defined by the specification of that API. People pull and push as their roles allow; a robot
+/// reads the blobs of its packages and pushes its own outputs.
 // The caller is taken from the request's extensions, where the guard put it. Without a caller, the
 // request is refused.
-#[utoipa::path(get, path = "/v2/{path}", tag = "registry",
-    params(("path" = String, Path, description = "A repository and what of it, which has slashes.")),
-    responses((status = 200, description = "As the OCI distribution specification says.", body = String,
+#[operation(tag = "registry",
+    params(("path" = String, Path, description = "The repository's name and the resource in it, with slashes.")),
+    responses((status = 200, description = "As defined by the OCI distribution specification.", body = String,
         content_type = "application/octet-stream")))]
 pub async fn dispatch(
     State(registry): State<Registry>,
@@ -147,14 +131,14 @@ pub async fn dispatch(
         Endpoint::Blob(digest) => {
             let digest = digest_of_blob(digest)?;
             match method {
-                Method::HEAD if may_begin(person, &repository) => {
+                Method::HEAD if may_start_upload(person, &repository) => {
                     blobs::head_before_push(&registry, &repository, digest, &parts).await
                 }
                 Method::GET | Method::HEAD => {
                     blobs::get(&registry, &repository, digest, &parts).await
                 }
                 Method::DELETE => {
-                    blobs::delete(&registry, deleter(person)?, &repository, digest).await
+                    blobs::delete(&registry, require_person(person)?, &repository, digest).await
                 }
                 _ => Err(OciError::method("GET, HEAD, DELETE")),
             }
@@ -178,24 +162,7 @@ pub async fn dispatch(
             }
         }
         Endpoint::Manifest(text) => {
-            let reference = parse_reference(text);
-            match method {
-                Method::GET | Method::HEAD => {
-                    manifests::get(&registry, &repository, reference, &parts).await
-                }
-                Method::PUT => {
-                    let only = robot.map(|_| OUTPUT_TYPE);
-                    let push = manifests::Push::of(&parts, &repository, reference?, person, only)?;
-                    manifests::put(&registry, push, &parts, body).await
-                }
-                Method::DELETE if is_of_another_algorithm(text) => {
-                    Err(OciError::manifest_unknown())
-                }
-                Method::DELETE => {
-                    manifests::delete(&registry, deleter(person)?, &repository, reference?).await
-                }
-                _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
-            }
+            manifest(&registry, &repository, text, caller.as_ref(), &parts, body).await
         }
         Endpoint::Tags | Endpoint::Referrers(_) if method != Method::GET => {
             Err(OciError::method("GET"))
@@ -204,6 +171,32 @@ pub async fn dispatch(
         Endpoint::Referrers(subject) => {
             lists::referrers(&registry, &repository, subject, &parts).await
         }
+    }
+}
+
+/// Answers a request about the manifest that `text`, a tag or a digest, refers to.
+async fn manifest(
+    registry: &Registry,
+    repository: &RepositoryName,
+    text: &str,
+    caller: Option<&Caller>,
+    parts: &Parts,
+    body: Body,
+) -> Answer {
+    let person = caller.and_then(Caller::person);
+    let reference = parse_reference(text);
+    match parts.method {
+        Method::GET | Method::HEAD => manifests::get(registry, repository, reference, parts).await,
+        Method::PUT => {
+            let required_type = caller.and_then(Caller::robot).map(|_| OUTPUT_TYPE);
+            let push = manifests::Push::of(parts, repository, reference?, person, required_type)?;
+            manifests::put(registry, push, parts, body).await
+        }
+        Method::DELETE if has_unsupported_algorithm(text) => Err(OciError::manifest_unknown()),
+        Method::DELETE => {
+            manifests::delete(registry, require_person(person)?, repository, reference?).await
+        }
+        _ => Err(OciError::method("GET, HEAD, PUT, DELETE")),
     }
 }
 
@@ -216,7 +209,7 @@ async fn check_person(
     method: &Method,
     endpoint: &Endpoint<'_>,
 ) -> Result<(), OciError> {
-    let permission = needed(repository, method, endpoint);
+    let permission = required_permission(repository, method, endpoint);
     if !person.may(permission) {
         let (name, roles) = (&person.name, &person.roles);
         return Err(OciError::denied(format!(
@@ -227,7 +220,7 @@ async fn check_person(
         return Ok(());
     }
     let Some((robot, _)) = output::owner(repository) else { return Ok(()) };
-    let robot = registry.store.find_robot(robot.as_str()).await?;
+    let robot = registry.store.robots().find(robot.as_str()).await?;
     if robot.is_some_and(|robot| person.scope.covers(&robot.id, &robot.name, &robot.labels)) {
         return Ok(());
     }
@@ -238,8 +231,12 @@ async fn check_person(
 /// The permission that a person needs for this request. Outputs belong to robots: deleting an
 /// output takes the same permission as stopping the task it came from, and pushing in a robot's
 /// name takes full rights. The list of publishers concerns all robots.
-fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>) -> Permission {
-    let is_output = is_of_outputs(repository);
+fn required_permission(
+    repository: &RepositoryName,
+    method: &Method,
+    endpoint: &Endpoint<'_>,
+) -> Permission {
+    let is_output = is_output_repository(repository);
     match (method, endpoint) {
         (&Method::GET | &Method::HEAD, endpoint)
             if !matches!(endpoint, Endpoint::Uploads | Endpoint::Upload(_)) =>
@@ -253,23 +250,25 @@ fn needed(repository: &RepositoryName, method: &Method, endpoint: &Endpoint<'_>)
 }
 
 /// The person that deletes; robots delete nothing.
-fn deleter(person: Option<&Person>) -> Result<&Person, OciError> {
-    person.ok_or_else(|| OciError::denied("a robot deletes nothing"))
+fn require_person(person: Option<&Person>) -> Result<&Person, OciError> {
+    person.ok_or_else(|| OciError::denied("robots can't delete anything"))
 }
 
 /// True for repositories reserved for outputs or for lists of publishers.
 fn is_reserved(repository: &RepositoryName) -> bool {
-    is_of_outputs(repository) || repository.as_str() == LIST_REPOSITORY
+    is_output_repository(repository) || repository.as_str() == LIST_REPOSITORY
 }
 
-fn is_of_outputs(repository: &RepositoryName) -> bool {
+fn is_output_repository(repository: &RepositoryName) -> bool {
     repository.as_str().starts_with("outputs/")
 }
 
 /// True if an admitted caller may push to this repository. A robot gets this far only for its own
 /// outputs.
-fn may_begin(person: Option<&Person>, repository: &RepositoryName) -> bool {
-    person.is_none_or(|person| person.may(needed(repository, &Method::POST, &Endpoint::Uploads)))
+fn may_start_upload(person: Option<&Person>, repository: &RepositoryName) -> bool {
+    person.is_none_or(|person| {
+        person.may(required_permission(repository, &Method::POST, &Endpoint::Uploads))
+    })
 }
 
 /// True if the request is part of pushing one of the robot's own outputs. Such a request deletes
@@ -291,8 +290,8 @@ fn may_push(
 }
 
 fn parse_digest(text: &str) -> Result<Digest, OciError> {
-    text.parse().map_err(|error: task_proto::digest::InvalidDigest| {
-        match is_of_another_algorithm(text) {
+    text.parse().map_err(|error: task_proto::ids::digest::InvalidDigest| {
+        match has_unsupported_algorithm(text) {
             true => OciError::digest_invalid(ALGORITHMS),
             false => OciError::digest_invalid(error.to_string()),
         }
@@ -301,14 +300,15 @@ fn parse_digest(text: &str) -> Result<Digest, OciError> {
 
 /// The digest of a blob to look up. No blob exists under an unsupported algorithm.
 fn digest_of_blob(text: &str) -> Result<Digest, OciError> {
-    if is_of_another_algorithm(text) { Err(OciError::blob_unknown()) } else { parse_digest(text) }
+    if has_unsupported_algorithm(text) { Err(OciError::blob_unknown()) } else { parse_digest(text) }
 }
 
 /// True for a well-formed digest by an unsupported algorithm.
-fn is_of_another_algorithm(text: &str) -> bool {
-    let is_known = |algorithm: &str| Algorithm::ALL.iter().any(|known| known.as_str() == algorithm);
+fn has_unsupported_algorithm(text: &str) -> bool {
+    let is_supported =
+        |algorithm: &str| Algorithm::ALL.iter().any(|known| known.as_str() == algorithm);
     lists::is_digest(text)
-        && text.split_once(':').is_some_and(|(algorithm, _)| !is_known(algorithm))
+        && text.split_once(':').is_some_and(|(algorithm, _)| !is_supported(algorithm))
 }
 
 fn parse_reference(text: &str) -> Result<Reference, OciError> {
@@ -322,7 +322,7 @@ fn parse_reference(text: &str) -> Result<Reference, OciError> {
 fn query<T: DeserializeOwned>(uri: &Uri) -> Result<T, OciError> {
     axum::extract::Query::try_from_uri(uri)
         .map(|axum::extract::Query(query)| query)
-        .map_err(|_| OciError::query_invalid("the query can't be understood"))
+        .map_err(|_| OciError::query_invalid("the query is not valid"))
 }
 
 /// An answer without a body.
@@ -330,8 +330,9 @@ fn empty<const N: usize>(status: StatusCode, headers: [(&'static str, String); N
     let mut response = status.into_response();
     for (name, value) in headers {
         // All values consist of digests, ids, numbers and names, which are valid in headers.
-        let value = HeaderValue::try_from(value)
-            .map_err(|_| OciError::query_invalid("a name no header can hold"))?;
+        let value = HeaderValue::try_from(value).map_err(|_| {
+            OciError::query_invalid("a name has characters that are invalid in a header")
+        })?;
         response.headers_mut().insert(name, value);
     }
     Ok(response)
@@ -342,7 +343,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_repository_is_what_comes_before_the_endpoint() {
+    fn repository_name_precedes_the_endpoint() {
         let cases = [
             ("a/blobs/sha256:0", Some(("a", Endpoint::Blob("sha256:0")))),
             ("a/b/c/manifests/latest", Some(("a/b/c", Endpoint::Manifest("latest")))),

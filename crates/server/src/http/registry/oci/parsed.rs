@@ -6,10 +6,10 @@ use std::collections::BTreeMap;
 
 use serde::Deserialize;
 use task_proto::Digest;
-use task_proto::digest::Algorithm;
-use task_proto::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
-use task_proto::output::OUTPUT_TYPE;
-use task_proto::publisher::{LIST_ARTIFACT, SIGNATURE_ARTIFACT};
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::oci::{INDEX_TYPE, ImageManifest, MANIFEST_TYPE, PACKAGE_TYPE};
+use task_proto::packages::output::OUTPUT_TYPE;
+use task_proto::packages::publisher::{LIST_ARTIFACT, SIGNATURE_ARTIFACT};
 
 use super::OciError;
 
@@ -23,7 +23,7 @@ const MAX_ANNOTATION_BYTES: usize = 64 * 1024;
 
 /// The parsed fields of a manifest of any kind.
 #[derive(Debug)]
-pub struct Parsed {
+pub struct ParsedManifest {
     /// The content type under which the manifest is served; always a type of JSON.
     pub media_type: String,
     /// The artifact type in lists of referrers.
@@ -66,13 +66,13 @@ struct Part {
 
 impl Part {
     /// True for layers that, by their type, are not distributed with the image.
-    fn is_elsewhere(&self) -> bool {
+    fn is_not_distributed(&self) -> bool {
         self.media_type.starts_with("application/vnd.oci.image.layer.nondistributable.")
             || self.media_type == "application/vnd.docker.image.rootfs.foreign.diff.tar.gzip"
     }
 }
 
-impl Parsed {
+impl ParsedManifest {
     /// Parses a manifest that came with `content_type`.
     pub fn new(content_type: Option<&str>, bytes: &[u8]) -> Result<Self, OciError> {
         let invalid = |error: serde_json::Error| {
@@ -81,12 +81,13 @@ impl Parsed {
         let document: Document = serde_json::from_slice(bytes).map_err(invalid)?;
         let media_type = media_type(content_type, document.media_type.as_deref())?;
         document.check_kind(&media_type)?;
-        let whole_if = |kind: &str| {
-            let is_meant = document.artifact_type.as_deref() == Some(kind);
-            is_meant.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()
+        let parse_if_type = |kind: &str| {
+            let is_type = document.artifact_type.as_deref() == Some(kind);
+            is_type.then(|| serde_json::from_slice(bytes).map_err(invalid)).transpose()
         };
-        let (package, output) = (whole_if(PACKAGE_TYPE)?, whole_if(OUTPUT_TYPE)?);
-        let (signature, publishers) = (whole_if(SIGNATURE_ARTIFACT)?, whole_if(LIST_ARTIFACT)?);
+        let (package, output) = (parse_if_type(PACKAGE_TYPE)?, parse_if_type(OUTPUT_TYPE)?);
+        let (signature, publishers) =
+            (parse_if_type(SIGNATURE_ARTIFACT)?, parse_if_type(LIST_ARTIFACT)?);
         let config_type = document.config.as_ref().map(|config| config.media_type.clone());
         let parsed = Self {
             media_type,
@@ -106,7 +107,7 @@ impl Parsed {
 
     /// Documents for or from robots must use sha256, the algorithm that robots of every version
     /// know.
-    pub(super) fn check_for_robots(&self, manifest: Digest) -> Result<(), OciError> {
+    pub(super) fn check_robot_algorithms(&self, manifest: Digest) -> Result<(), OciError> {
         let documents = [&self.package, &self.output, &self.signature, &self.publishers];
         if documents.into_iter().all(Option::is_none) {
             return Ok(());
@@ -114,7 +115,7 @@ impl Parsed {
         let mut digests = self.parts.iter().chain([&manifest]);
         match digests.find(|digest| digest.algorithm() != Algorithm::Sha256) {
             Some(other) => {
-                let message = format!("{other}: robots know the digests by sha256 alone");
+                let message = format!("{other}: robots only support digests by sha256");
                 Err(OciError::manifest_invalid(message))
             }
             None => Ok(()),
@@ -130,7 +131,7 @@ impl Parsed {
             .find(|(_, text)| text.is_some_and(|text| text.contains(char::is_control)))
         {
             Some((key, _)) => {
-                Err(OciError::manifest_invalid(format!("{key}: it has a control character")))
+                Err(OciError::manifest_invalid(format!("{key}: contains a control character")))
             }
             None => Ok(()),
         }
@@ -143,7 +144,7 @@ impl Parsed {
             return Ok(());
         }
         let message = format!(
-            "annotations: they have {bytes} bytes, {MAX_ANNOTATION_BYTES} are possible where there is a subject"
+            "annotations: {bytes} bytes; at most {MAX_ANNOTATION_BYTES} are allowed in a manifest with a subject"
         );
         Err(OciError::manifest_invalid(message))
     }
@@ -165,7 +166,7 @@ impl Document {
 
     fn parts(&self) -> Result<Vec<Digest>, OciError> {
         let lists = [&self.layers, &self.manifests].into_iter().flatten().flatten();
-        let needed = self.config.iter().chain(lists).filter(|part| !part.is_elsewhere());
+        let needed = self.config.iter().chain(lists).filter(|part| !part.is_not_distributed());
         let mut parts = Vec::new();
         for part in needed {
             let digest = part.digest.parse().map_err(|_| {
@@ -204,7 +205,7 @@ fn media_type(header: Option<&str>, document: Option<&str>) -> Result<String, Oc
     };
     if !is_json(media_type) {
         let message = format!(
-            "{media_type:?} is no manifest's type; those are application/json and application/…+json"
+            "{media_type:?} is not a manifest type: expected application/json or application/…+json"
         );
         return Err(OciError::manifest_invalid(message));
     }
@@ -225,7 +226,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_manifests_type_is_one_of_json() {
+    fn manifest_type_is_a_json_type() {
         for text in
             ["application/json", MANIFEST_TYPE, DOCKER_LIST_TYPE, "application/x-foreign+json"]
         {

@@ -4,17 +4,17 @@ use std::io;
 
 use http::header::CONTENT_TYPE;
 use http::{HeaderMap, HeaderValue};
+use task_package::Packed;
 use task_proto::api::PackageView;
 use task_proto::desired::BlobRef;
-use task_proto::oci::MANIFEST_TYPE;
+use task_proto::packages::oci::MANIFEST_TYPE;
 use task_proto::{RepositoryName, Tag};
 use tokio_util::io::ReaderStream;
 
 use super::manifests::{Push, push};
-use super::uploads::begun;
+use super::uploads::start_upload;
 use super::{OciError, Registry};
 use crate::domain::person::Person;
-use crate::package::Packed;
 use crate::store::Reference;
 
 /// Bytes of content read at once.
@@ -46,10 +46,15 @@ pub async fn publish(
     headers.insert(CONTENT_TYPE, HeaderValue::from_static(MANIFEST_TYPE));
     let manifest = packed.manifest_bytes.clone().into();
     let reference = Reference::Tag(tag.clone());
-    let as_tag =
-        Push { repository: &repository, reference, by: Some(by), only: None, takes_version };
-    push(registry, as_tag, vec![tag], &headers, manifest).await?;
-    let view = registry.store.package(&package.name, &package.manifest.digest).await?;
+    let request = Push {
+        repository: &repository,
+        reference,
+        by: Some(by),
+        required_type: None,
+        takes_version,
+    };
+    push(registry, request, vec![tag], &headers, manifest).await?;
+    let view = registry.store.packages().get(&package.name, &package.manifest.digest).await?;
     view.ok_or_else(OciError::manifest_unknown)
 }
 
@@ -63,12 +68,12 @@ async fn store<S>(
 where
     S: futures_util::Stream<Item = io::Result<bytes::Bytes>> + Send,
 {
-    let is_there = registry.store.has_blob(Some(repository), &blob.digest).await?
+    let is_there = registry.store.blobs().has(Some(repository), &blob.digest).await?
         && registry.blobs.touch(blob.digest, registry.clock.now_ms()).await?;
     if is_there {
         return Ok(());
     }
-    let upload = begun(registry, repository).await?;
+    let upload = start_upload(registry, repository).await?;
     if let Err(error) = registry.blobs.append(repository, &upload.id, Some(0), bytes, 0).await {
         // Best effort: the collector would remove the upload anyway, and the caller needs the
         // original error.

@@ -3,15 +3,15 @@
 //! or that contradict their manifest.
 
 use task_proto::desired::BlobRef;
-use task_proto::envelope::Envelope;
-use task_proto::oci::ImageManifest;
-use task_proto::publisher::{
+use task_proto::packages::oci::ImageManifest;
+use task_proto::packages::publisher::{
     LIST_REPOSITORY, MAX_LIST_BYTES, MAX_SIGNATURE_BYTES, PackageStatement, PublisherList,
 };
+use task_proto::trust::envelope::Envelope;
 use task_proto::{RepositoryName, Tag};
 
 use super::blobs::check_blob;
-use super::parsed::Parsed;
+use super::parsed::ParsedManifest;
 use super::{OciError, Registry};
 use crate::store::{Reference, SignedDocument};
 
@@ -19,7 +19,7 @@ use crate::store::{Reference, SignedDocument};
 pub(super) async fn check(
     registry: &Registry,
     repository: &RepositoryName,
-    parsed: &Parsed,
+    parsed: &ParsedManifest,
     tags: &[Tag],
 ) -> Result<Option<SignedDocument>, OciError> {
     if let Some(image) = &parsed.signature {
@@ -33,20 +33,20 @@ pub(super) async fn check(
 
 /// Notifies the robots that a document concerns. If this fails, the robots learn of the document at
 /// their next request.
-pub(super) async fn tell(
+pub(super) async fn notify(
     registry: &Registry,
     repository: &RepositoryName,
     document: Option<&SignedDocument>,
 ) {
     match document {
-        Some(SignedDocument::List { .. }) => registry.changes.ring_everyone(),
+        Some(SignedDocument::List { .. }) => registry.changes.notify_all_robots(),
         Some(SignedDocument::Signature { package, .. }) => {
             let Ok(name) = repository.as_str().parse() else { return };
-            match registry.store.robots_with_package(&name, package).await {
-                Ok(robots) => registry.changes.ring(robots),
+            match registry.store.robots().with_package(&name, package).await {
+                Ok(robots) => registry.changes.notify_robots(robots),
                 Err(error) => tracing::warn!(
                     error = &error as &dyn std::error::Error,
-                    "robots are not told of a signature; they hear of it when they ask"
+                    "robots were not notified of a signature; they learn of it at their next request"
                 ),
             }
         }
@@ -64,8 +64,9 @@ async fn check_signature(
     let subject = image
         .subject
         .as_ref()
-        .ok_or_else(|| OciError::manifest_invalid("subject: a signature is about one"))?;
-    let stored = registry.store.manifest(repository, &Reference::Digest(subject.digest)).await?;
+        .ok_or_else(|| OciError::manifest_invalid("subject: required for a signature"))?;
+    let stored =
+        registry.store.manifests().get(repository, &Reference::Digest(subject.digest)).await?;
     stored.ok_or_else(|| {
         OciError::manifest_invalid("subject: there is no such package; push it first")
     })?;
@@ -75,7 +76,7 @@ async fn check_signature(
         .map_err(|error| OciError::manifest_invalid(format!("the signature: {error}")))?
         .package;
     let own = match repository.as_str().parse() {
-        Ok(name) => registry.store.package(&name, &subject.digest).await?,
+        Ok(name) => registry.store.packages().get(&name, &subject.digest).await?,
         Err(_) => None,
     };
     let is_signed = match &own {
@@ -96,24 +97,26 @@ async fn check_list(
     tags: &[Tag],
 ) -> Result<SignedDocument, OciError> {
     if repository.as_str() != LIST_REPOSITORY {
-        let message = format!("a list of publishers belongs into the repository {LIST_REPOSITORY}");
+        let message = format!("a list of publishers belongs in the repository {LIST_REPOSITORY}");
         return Err(OciError::manifest_invalid(message));
     }
     let refused = |error| OciError::manifest_invalid(format!("the list of publishers: {error}"));
     let (blob, envelope) = envelope(registry, repository, image, MAX_LIST_BYTES).await?;
     let offered = PublisherList::unverified(&envelope).map_err(refused)?;
     if tags.iter().any(|tag| tag.as_str() != offered.version.to_string()) {
-        return Err(OciError::manifest_invalid("the tag of a list of publishers is its version"));
+        return Err(OciError::manifest_invalid(
+            "the tag of a list of publishers must be its version",
+        ));
     }
-    let again = registry.store.publisher_list(Some(offered.version)).await?;
-    let newest = registry.store.publisher_list(None).await?.filter(|_| again != Some(blob));
+    let again = registry.store.publishers().list(Some(offered.version)).await?;
+    let newest = registry.store.publishers().list(None).await?.filter(|_| again != Some(blob));
     let before = match newest {
         Some(newest) => Some(newest_list(registry, newest).await?),
         None => None,
     };
     let list = match &before {
-        Some(before) => PublisherList::follow(&envelope, &before.keepers, before.version),
-        None => PublisherList::alone(&envelope),
+        Some(before) => PublisherList::verify_successor(&envelope, &before.keepers, before.version),
+        None => PublisherList::verify_self_signed(&envelope),
     };
     let list = list.map_err(refused)?;
     let changes_keepers = before.is_none_or(|before| before.keepers != list.keepers);
@@ -132,14 +135,16 @@ async fn envelope(
     registry: &Registry,
     repository: &RepositoryName,
     image: &ImageManifest,
-    most: u64,
+    max_bytes: u64,
 ) -> Result<(BlobRef, Envelope), OciError> {
     let envelope = image.lone_envelope();
-    let envelope = envelope
-        .ok_or_else(|| OciError::manifest_invalid("layers: one DSSE envelope is expected"))?;
-    if envelope.size > most {
-        let message =
-            format!("layers: the envelope has {} bytes, {most} are possible", envelope.size);
+    let envelope =
+        envelope.ok_or_else(|| OciError::manifest_invalid("layers: expected one DSSE envelope"))?;
+    if envelope.size > max_bytes {
+        let message = format!(
+            "layers: the envelope has {} bytes; at most {max_bytes} are allowed",
+            envelope.size
+        );
         return Err(OciError::manifest_invalid(message));
     }
     let blob = check_blob(registry, repository, envelope).await?;

@@ -8,8 +8,8 @@ use http::request::Parts;
 use http::{HeaderMap, StatusCode};
 use serde::Deserialize;
 use task_proto::desired::BlobRef;
-use task_proto::digest::Algorithm;
-use task_proto::output::owner;
+use task_proto::ids::digest::Algorithm;
+use task_proto::packages::output::owner;
 use task_proto::{Digest, RepositoryName};
 
 use super::blobs::decimal;
@@ -41,9 +41,9 @@ pub(super) async fn begin(
     may_mount: bool,
 ) -> Answer {
     let query: BeginQuery = query(&parts.uri)?;
-    let is_known =
-        |asked: &String| Algorithm::ALL.iter().any(|algorithm| algorithm.as_str() == asked);
-    if query.digest_algorithm.as_ref().is_some_and(|asked| !is_known(asked)) {
+    let is_supported =
+        |requested: &String| Algorithm::ALL.iter().any(|algorithm| algorithm.as_str() == requested);
+    if query.digest_algorithm.as_ref().is_some_and(|requested| !is_supported(requested)) {
         return Err(OciError::digest_invalid(ALGORITHMS));
     }
     if let Some(digest) = &query.mount {
@@ -53,12 +53,12 @@ pub(super) async fn begin(
         }
     } else if let Some(digest) = &query.digest {
         let digest = parse_digest(digest)?;
-        let kept = kept_bytes(registry, repository).await?;
-        check_length(registry, repository, &parts.headers, kept)?;
-        let upload = begun(registry, repository).await?;
+        let stored = stored_bytes(registry, repository).await?;
+        check_length(registry, repository, &parts.headers, stored)?;
+        let upload = start_upload(registry, repository).await?;
         let appended = registry
             .blobs
-            .append(repository, &upload.id, Some(0), body.into_data_stream(), kept)
+            .append(repository, &upload.id, Some(0), body.into_data_stream(), stored)
             .await;
         if let Err(error) = appended {
             // Best effort: the collector would remove the upload anyway, and the caller needs the
@@ -68,10 +68,10 @@ pub(super) async fn begin(
         }
         return upload.complete(digest).await;
     }
-    begun(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
+    start_upload(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
 }
 
-pub(super) async fn begun<'a>(
+pub(super) async fn start_upload<'a>(
     registry: &'a Registry,
     repository: &'a RepositoryName,
 ) -> Result<Upload<'a>, OciError> {
@@ -118,12 +118,12 @@ impl Upload<'_> {
 
     async fn take_chunk(&self, parts: &Parts, body: Body) -> Result<u64, OciError> {
         let range = content_range(parts)?;
-        let kept = kept_bytes(self.registry, self.repository).await?;
-        check_length(self.registry, self.repository, &parts.headers, kept)?;
+        let stored = stored_bytes(self.registry, self.repository).await?;
+        check_length(self.registry, self.repository, &parts.headers, stored)?;
         let start = range.as_ref().map(|range| range.start);
         let body = body.into_data_stream();
         let offset =
-            self.registry.blobs.append(self.repository, &self.id, start, body, kept).await?;
+            self.registry.blobs.append(self.repository, &self.id, start, body, stored).await?;
         match range {
             Some(range) if range.end != offset => Err(OciError::size_invalid(format!(
                 "the Content-Range ends before byte {}, the body before byte {offset}",
@@ -141,15 +141,17 @@ impl Upload<'_> {
         let completed = tokio::spawn(async move {
             let _hold = registry.blobs.hold_collection().await;
             // Other uploads of the robot may have finished in the meantime.
-            if let Err(full) =
-                registry.blobs.check_room(&repository, 0, kept_bytes(&registry, &repository).await?)
-            {
+            if let Err(full) = registry.blobs.check_space(
+                &repository,
+                0,
+                stored_bytes(&registry, &repository).await?,
+            ) {
                 registry.blobs.cancel_upload(&repository, &id).await?;
                 return Err(full.into());
             }
             let size = registry.blobs.finish_upload(&repository, &id, digest).await?;
             registry.blobs.touch(digest, registry.clock.now_ms()).await?;
-            registry.store.link_blob(&repository, &BlobRef { digest, size }).await?;
+            registry.store.blobs().link(&repository, &BlobRef { digest, size }).await?;
             Ok::<_, OciError>(())
         });
         completed.await.map_err(|error| OciError::internal(&error))??;
@@ -182,23 +184,23 @@ async fn mount(
         .transpose()
         .map_err(|error| OciError::name_invalid(&error))?;
     let _hold = registry.blobs.hold_collection().await;
-    if !registry.store.has_blob(from.as_ref(), &digest).await?
+    if !registry.store.blobs().has(from.as_ref(), &digest).await?
         || !registry.blobs.touch(digest, registry.clock.now_ms()).await?
     {
         return Ok(false);
     }
     let Some(blob) = registry.blobs.get(digest).await? else { return Ok(false) };
-    registry.store.link_blob(repository, &BlobRef { digest, size: blob.size() }).await?;
+    registry.store.blobs().link(repository, &BlobRef { digest, size: blob.size() }).await?;
     Ok(true)
 }
 
 /// Bytes stored for the robot that owns this repository; 0 if no robot owns the repository.
-pub(super) async fn kept_bytes(
+pub(super) async fn stored_bytes(
     registry: &Registry,
     repository: &RepositoryName,
 ) -> Result<u64, OciError> {
     let Some((robot, _)) = owner(repository) else { return Ok(0) };
-    Ok(registry.store.bytes_of_robot(&robot).await?)
+    Ok(registry.store.robot_blobs().disk_usage(&robot).await?)
 }
 
 /// Refuses a body with a too large announced length, before reading it.
@@ -206,9 +208,9 @@ fn check_length(
     registry: &Registry,
     repository: &RepositoryName,
     headers: &HeaderMap,
-    kept: u64,
+    stored: u64,
 ) -> Result<(), OciError> {
-    Ok(registry.blobs.check_room(repository, announced_length(headers).unwrap_or(0), kept)?)
+    Ok(registry.blobs.check_space(repository, announced_length(headers).unwrap_or(0), stored)?)
 }
 
 fn announced_length(headers: &HeaderMap) -> Option<u64> {
@@ -227,7 +229,7 @@ fn content_range(parts: &Parts) -> Result<Option<std::ops::Range<u64>>, OciError
         .ok_or_else(|| OciError::upload_invalid("the Content-Range is not of the form 0-1023"))?;
     match announced_length(&parts.headers) {
         Some(length) if length != range.end - range.start => {
-            Err(OciError::size_invalid("the Content-Length does not fit the Content-Range"))
+            Err(OciError::size_invalid("the Content-Length does not match the Content-Range"))
         }
         _ => Ok(Some(range)),
     }

@@ -1,0 +1,40 @@
+//! The server's own order, about once a minute: ends what has lasted too long.
+
+use std::collections::BTreeSet;
+
+use task_proto::UserName;
+use task_proto::messages::report::Phase;
+
+use super::deployments::revert;
+use super::robots::expire_pending;
+use super::{Actions, DAY_MS, DeploymentActions};
+use crate::auth::sign_ins::WINDOW_MS;
+use crate::orders::changes::Change;
+use crate::store::StoreError;
+
+/// Lifetime of an idempotency key.
+const KEY_LIFETIME_MS: u64 = 30 * DAY_MS;
+
+impl Actions {
+    /// Ends assignments past their time limit, and removes old idempotency keys, tokens and page
+    /// sessions that have ended, old wrong passwords and robots that were never approved. To be
+    /// called about once a minute. Returns the users of those tokens.
+    pub async fn expire(&self) -> Result<BTreeSet<UserName>, StoreError> {
+        let DeploymentActions { store, clock, changes, planner, .. } = &self.deployments;
+        let now_ms = clock.now_ms();
+        let mut write = store.begin().await?;
+        write.idempotency().delete_before(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
+        let users = write.tokens().forget_ended(now_ms).await?;
+        write.page_sessions().delete_ended(now_ms).await?;
+        write.sign_in_failures().delete_before(now_ms.saturating_sub(WINDOW_MS)).await?;
+        let given_up = expire_pending(&mut write, now_ms).await?;
+        let overdue = write.assignments().overdue(now_ms).await?;
+        let notifications = revert(&mut write, planner, &overdue, Phase::Expired, now_ms).await?;
+        write.commit().await?;
+        changes.publish(notifications);
+        given_up
+            .into_iter()
+            .for_each(|robot| changes.announce(Change::RobotRemoved(Box::new(robot))));
+        Ok(users)
+    }
+}

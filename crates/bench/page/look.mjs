@@ -31,7 +31,7 @@ const page = await context.newPage();
 const devtools = await context.newCDPSession(page);
 
 await page.goto(`${url}/#token=${process.env.TASKD_TOKEN}`);
-await page.getByRole('button', { name: 'Sign in with it' }).click();
+await page.getByRole('button', { name: 'Sign in with token' }).click();
 await allRows();
 
 const seen = {

@@ -6,18 +6,18 @@ use std::process::ExitCode;
 
 use anyhow::Context as _;
 use clap::{Parser, Subcommand};
-use taskbench::compare::{CompareFlags, compare};
-use taskbench::load::{Load, LoadFlags};
-use taskbench::progress::say;
-use taskbench::report;
-use taskbench::run::Run;
+use taskbench::results::compare::{CompareFlags, compare};
+use taskbench::results::report;
+use taskbench::results::run::Run;
 use taskbench::scenario::blob::{self, BlobFlags};
 use taskbench::scenario::broker::{self, BrokerFlags};
 use taskbench::scenario::fleet::{self, FleetFlags};
+use taskbench::scenario::load::{Load, LoadFlags};
 use taskbench::scenario::page::{self, PageFlags};
 use taskbench::scenario::paper::{self, PaperFlags};
 use taskbench::scenario::pull::{self, PullFlags};
 use taskbench::scenario::status::{self, StatusFlags};
+use taskbench::system::progress::print_line;
 use tokio::signal::unix::{SignalKind, signal};
 
 /// Measures taskd
@@ -128,22 +128,22 @@ enum Command {
 fn main() -> ExitCode {
     let CommandLine { command } = CommandLine::parse();
     let outcome = tokio::runtime::Runtime::new()
-        .map_err(|error| anyhow::Error::new(error).context("no threads to run on"))
+        .map_err(|error| anyhow::Error::new(error).context("cannot start the runtime's threads"))
         .and_then(|runtime| runtime.block_on(run(command)));
-    outcome.unwrap_or_else(|error| complain(&error))
+    outcome.unwrap_or_else(|error| report_error(&error))
 }
 
 async fn run(command: Command) -> anyhow::Result<ExitCode> {
     match command {
         Command::Load(flags) => load(flags).await,
-        Command::Paper(flags) => concluded(until_interrupted(paper::run(flags)).await?),
-        Command::Fleet(flags) => concluded(until_interrupted(fleet::run(flags)).await?),
-        Command::Robots => taskbench::robots::run().await.map(|()| ExitCode::SUCCESS),
-        Command::Blob(flags) => concluded(until_interrupted(blob::run(flags)).await?),
-        Command::Pull(flags) => concluded(until_interrupted(pull::run(flags)).await?),
-        Command::Broker(flags) => concluded(until_interrupted(broker::run(flags)).await?),
-        Command::Status(flags) => concluded(until_interrupted(status::run(flags)).await?),
-        Command::Page(flags) => concluded(until_interrupted(page::run(flags)).await?),
+        Command::Paper(flags) => exit_code(until_interrupted(paper::run(flags)).await?),
+        Command::Fleet(flags) => exit_code(until_interrupted(fleet::run(flags)).await?),
+        Command::Robots => taskbench::simulated::robots::run().await.map(|()| ExitCode::SUCCESS),
+        Command::Blob(flags) => exit_code(until_interrupted(blob::run(flags)).await?),
+        Command::Pull(flags) => exit_code(until_interrupted(pull::run(flags)).await?),
+        Command::Broker(flags) => exit_code(until_interrupted(broker::run(flags)).await?),
+        Command::Status(flags) => exit_code(until_interrupted(status::run(flags)).await?),
+        Command::Page(flags) => exit_code(until_interrupted(page::run(flags)).await?),
         Command::Compare(flags) => {
             print(&compare(&flags)?)?;
             Ok(ExitCode::SUCCESS)
@@ -172,8 +172,13 @@ async fn until_interrupted<T>(
 }
 
 /// Success if nothing failed.
-fn concluded(run: Run) -> anyhow::Result<ExitCode> {
-    say(&format!("{} points, {} failures, {:.0} s", run.points.len(), run.failed(), run.wall_s));
+fn exit_code(run: Run) -> anyhow::Result<ExitCode> {
+    print_line(&format!(
+        "{} points, {} failures, {:.0} s",
+        run.points.len(),
+        run.failed(),
+        run.wall_s
+    ));
     Ok(if run.failed() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
@@ -192,7 +197,7 @@ async fn load(flags: LoadFlags) -> anyhow::Result<ExitCode> {
         .with_context(|| format!("robots labelled {} may be left on the server", load.label()));
     let mut code = if load.finish() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE };
     for error in [outcome.err(), cleaned.err()].into_iter().flatten() {
-        code = complain(&error);
+        code = report_error(&error);
     }
     Ok(code)
 }
@@ -203,7 +208,7 @@ fn print(text: &str) -> anyhow::Result<()> {
 }
 
 /// Prints the error with all causes on stderr.
-fn complain(error: &anyhow::Error) -> ExitCode {
-    say(&format!("taskbench: {error:#}"));
+fn report_error(error: &anyhow::Error) -> ExitCode {
+    print_line(&format!("taskbench: {error:#}"));
     ExitCode::FAILURE
 }

@@ -2,6 +2,8 @@
 //! same files in the same run. Every connection belongs to a different robot, with its own token
 //! and the right to just these blobs.
 
+mod cold;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -12,29 +14,27 @@ use task_proto::CaPin;
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
 use task_proto::desired::BlobRef;
 
-use super::cold;
-use crate::downloads::{Got, Target, Until, download};
-use crate::encryption::{ALL_IS_ENCRYPTED, Certificate, client_config};
-use crate::enrolment::enrol;
-use crate::machine::allow_files;
-use crate::package::Package;
-use crate::peer::Peer;
-use crate::process::Usage;
-use crate::progress::{RunProgress, say};
-use crate::run::{Plot, Point, Run, RunFlags, Unit};
-use crate::server::Server;
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use crate::measure::downloads::{Got, Target, Until, download};
+use crate::programs::encryption::{Certificate, ENCRYPTION_NOTE, client_config};
+use crate::programs::enrollment::enroll_robots;
+use crate::programs::package::Package;
+use crate::programs::peer::Peer;
+use crate::programs::server::Server;
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::run::{Plot, Point, Run, RunFlags, Unit};
+use crate::system::machine::allow_files;
+use crate::system::process::Usage;
+use crate::system::progress::{RunProgress, print_line};
 
 /// The ratios of one program's figures to the other's.
-pub(crate) const RATIO: &str = "taskd / nginx";
+const RATIO: &str = "taskd / nginx";
 /// Duration of each measurement of the small blob.
 const SMALL_TIME: Duration = Duration::from_secs(4);
 /// Bytes of the small blob.
 const SMALL_BYTES: u64 = 10_000;
 /// Bytes in all that each measurement of the large blob moves at least.
-const LEAST_BYTES: u64 = 3_200_000_000;
+const MIN_BYTES: u64 = 3_200_000_000;
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct BlobFlags {
     /// How often everything is measured, in turns with nginx
@@ -70,26 +70,27 @@ struct Case<'a> {
 }
 
 pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
-    let (began, seed) = (Instant::now(), flags.run.seed());
+    let began = Instant::now();
+    let seed = flags.run.seed();
     let mut run = Run::begin("blob", seed).await;
     let most =
         flags.clients.iter().copied().chain([flags.small_clients, flags.cold]).max().unwrap_or(0);
     allow_files(u64::from(most) + 200)?;
-    let order = if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
+    let order = if flags.tls { TaskdArgs::default().encrypted() } else { TaskdArgs::default() };
     let taskd = Taskd::start(&flags.taskd, &order).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
-    run.notes.extend(flags.tls.then(|| ALL_IS_ENCRYPTED.to_owned()));
+    run.notes.extend(flags.tls.then(|| ENCRYPTION_NOTE.to_owned()));
     let certificate = flags.tls.then(Certificate::new).transpose()?;
     let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), certificate.as_ref()).await?;
     match &nginx {
         Some(nginx) => drop(run.versions.insert("nginx".to_owned(), nginx.version.clone())),
         None => {
-            say("nginx is not installed: taskd is measured alone");
+            print_line("nginx is not installed: taskd is measured alone");
             run.notes.push("nginx was not installed, so there are no ratios.".to_owned());
         }
     }
-    say("enrolling robots and pushing packages");
-    let robots = enrol(&taskd.server, usize::from(most.max(1))).await?;
+    print_line("enrolling robots and pushing packages");
+    let robots = enroll_robots(&taskd.server, usize::from(most.max(1))).await?;
     let large = order_blob(&taskd.server, "large", "*", flags.megabytes * 1_000_000, seed).await?;
     let small = order_blob(&taskd.server, "small", "*", SMALL_BYTES, seed + 1).await?;
     let mut cases: Vec<Case<'_>> =
@@ -105,7 +106,8 @@ pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     }
     measure_cases(&mut run, &flags, &taskd, nginx.as_ref(), &cases).await?;
     if flags.cold > 0 {
-        let (runs, pulls) = (flags.runs, flags.cold.into());
+        let runs = flags.runs;
+        let pulls = flags.cold.into();
         let plan = cold::Plan { runs, pulls, size: flags.megabytes * 1_000_000, seed };
         cold::measure(&mut run, &plan, taskd, nginx.as_ref(), &robots).await?;
     } else {
@@ -116,19 +118,19 @@ pub async fn run(flags: BlobFlags) -> anyhow::Result<Run> {
     }
     run.plots = plots(flags.megabytes);
     for path in run.write(&flags.run.out, began)? {
-        say(&format!("wrote {}", path.display()));
+        print_line(&format!("wrote {}", path.display()));
     }
     Ok(run)
 }
 
 fn large_case(blob: BlobRef, clients: usize, robots: &[EnrollResponse]) -> Case<'_> {
-    let fetches = LEAST_BYTES.div_ceil(blob.size * clients as u64);
+    let fetches = MIN_BYTES.div_ceil(blob.size * clients as u64);
     Case { blob, clients, until: Until::Fetches(fetches), robots }
 }
 
 /// Pushes a package of `size` random bytes and orders the package for the robots that match
 /// `selector`; returns its blob.
-pub(crate) async fn order_blob(
+async fn order_blob(
     server: &Server,
     name: &str,
     selector: &str,
@@ -136,7 +138,8 @@ pub(crate) async fn order_blob(
     seed: u64,
 ) -> anyhow::Result<BlobRef> {
     let package = Package::random(name.parse()?, "1".parse()?, size, seed);
-    let (name, content) = (package.name.clone(), package.content_blob());
+    let name = package.name.clone();
+    let content = package.content_blob();
     let manifest = server.push(package).await?;
     let order = CreateDeployment {
         delivery: DeliveryChoice::Poll,
@@ -147,7 +150,7 @@ pub(crate) async fn order_blob(
 }
 
 /// Targets for each robot's download of the blob from taskd.
-pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) -> Vec<Target> {
+fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) -> Vec<Target> {
     let tls = tls(taskd.pin);
     let target = |robot: &EnrollResponse| Target {
         address: taskd.http,
@@ -160,7 +163,7 @@ pub(crate) fn at_taskd(taskd: &Taskd, blob: BlobRef, robots: &[EnrollResponse]) 
 }
 
 /// Targets for the same number of downloads from nginx.
-pub(crate) fn at_nginx(nginx: &Peer, blob: BlobRef, count: usize) -> Vec<Target> {
+fn at_nginx(nginx: &Peer, blob: BlobRef, count: usize) -> Vec<Target> {
     let path = format!("/{}", blob.digest.hex());
     vec![
         Target { address: nginx.address, tls: tls(nginx.pin), path, token: None, size: blob.size };
@@ -191,7 +194,7 @@ async fn measure_cases(
         progress.step();
         let mut figures = [Figures::default(), Figures::default()];
         for turn in 0..flags.runs {
-            progress.says(&format!("{} bytes to {} clients", case.blob.size, case.clients));
+            progress.set_message(&format!("{} bytes to {} clients", case.blob.size, case.clients));
             // The order alternates, so that neither server always finds the machine as the other
             // left it.
             for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {

@@ -12,30 +12,29 @@ use anyhow::{Context as _, ensure};
 use clap::Args;
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use task_proto::RobotId;
-use task_proto::topic::{RobotTopic, Topic, TopicPrefix};
+use task_proto::messages::topic::{RobotTopic, Topic, TopicPrefix};
 use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::process::ChildStdin;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-use crate::machine::allow_files;
-use crate::mqtt::{Heard, Link, Login, acknowledgement, message};
-use crate::peer::Peer;
-use crate::process::{Process, Program, Usage};
-use crate::progress::{RunProgress, say};
-use crate::run::{Plot, Point, Run, RunFlags, Unit};
+use crate::measure::mqtt::{Link, Login, Packet, acknowledgement, message};
+use crate::programs::peer::Peer;
+use crate::results::run::{Plot, Point, Run, RunFlags, Unit};
+use crate::system::machine::allow_files;
+use crate::system::process::{Process, Program, Usage};
+use crate::system::progress::{RunProgress, print_line};
 
 const RATIO: &str = "taskd / mosquitto";
 /// Bytes of a message. The front's own program sends as many.
 const PAYLOAD_BYTES: usize = 300;
 /// Connections opened at a time.
-const CONNECTS_AT_ONCE: usize = 64;
+const CONCURRENT_CONNECTS: usize = 64;
 /// Messages to each client after its first one.
 const WARM_ROUNDS: usize = 5;
 /// Time limit of one round.
 const ROUND_LIMIT: Duration = Duration::from_secs(60);
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct BrokerFlags {
     /// How many clients; may be given more than once
@@ -78,7 +77,7 @@ pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
     for &clients in &flags.clients {
         let mut figures = [Figures::default(), Figures::default()];
         for turn in 0..flags.runs {
-            progress.says(&format!("{clients} clients"));
+            progress.set_message(&format!("{clients} clients"));
             for side in if turn % 2 == 0 { [0, 1] } else { [1, 0] } {
                 let (sender, address) = if side == 0 {
                     start_front(&flags, dir.path()).await?
@@ -98,7 +97,7 @@ pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
         let settings = || [("clients", f64::from(clients))];
         let [own, others] = figures;
         if others.warm_ms.is_empty() {
-            say("mosquitto is not installed: the front is measured alone");
+            print_line("mosquitto is not installed: the front is measured alone");
             run.notes.push("mosquitto was not installed, so there are no ratios.".to_owned());
         } else {
             run.points.push(own.ratio(&others, Point::new(RATIO, settings())));
@@ -118,7 +117,7 @@ pub async fn run(flags: BrokerFlags) -> anyhow::Result<Run> {
         ..Plot::default()
     }];
     for path in run.write(&flags.run.out, began)? {
-        say(&format!("wrote {}", path.display()));
+        print_line(&format!("wrote {}", path.display()));
     }
     Ok(run)
 }
@@ -136,7 +135,7 @@ async fn start_front(
     let reading = output.read_line(&mut line);
     tokio::time::timeout(ROUND_LIMIT, reading)
         .await
-        .context("the front does not say where it listens")??;
+        .context("the front does not print its address")??;
     let address = line
         .trim()
         .parse()
@@ -210,8 +209,10 @@ impl Clients {
                 link.subscribe(topic).await?;
                 anyhow::Ok(link)
             });
-        let links: Vec<Link> =
-            futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await?;
+        let links: Vec<Link> = futures_util::stream::iter(connecting)
+            .buffered(CONCURRENT_CONNECTS)
+            .try_collect()
+            .await?;
         let shared = Arc::new(Shared {
             clients: links.len(),
             received: AtomicUsize::new(0),
@@ -257,7 +258,7 @@ async fn listen(link: Link, shared: Arc<Shared>) {
     let Link { mut reader, mut writer } = link;
     loop {
         let packet_id = match reader.next().await {
-            Ok(Heard::Message { packet_id, payload }) if payload.len() == PAYLOAD_BYTES => {
+            Ok(Packet::Message { packet_id, payload }) if payload.len() == PAYLOAD_BYTES => {
                 packet_id
             }
             Ok(_) => continue,

@@ -7,27 +7,26 @@ use anyhow::Context as _;
 use clap::{Args, ValueEnum};
 use task_proto::api::DeliveryChoice;
 
-use super::run_once::{OneOrder, run_once};
-use crate::encryption::ALL_IS_ENCRYPTED;
-use crate::fleet::{FILES_PER_ROBOT, Fleet, ROBOTS_PER_PROCESS};
-use crate::machine::allow_files;
-use crate::progress::{RunProgress, say};
-use crate::run::{Figure, Plot, Point, Run, RunFlags, Unit};
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use super::run_once::{DeliveryArgs, run_once};
+use crate::programs::encryption::ENCRYPTION_NOTE;
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::run::{Figure, Plot, Point, Run, RunFlags, Unit};
+use crate::simulated::fleet::{FILES_PER_ROBOT, Fleet, ROBOTS_PER_PROCESS};
+use crate::system::machine::allow_files;
+use crate::system::progress::{RunProgress, print_line};
 
 /// As the agent's own default.
 const POLL: Duration = Duration::from_secs(300);
 /// Open files of a process apart from those of its robots.
 const OTHER_FILES: usize = 500;
 /// The most robots: limited by the addresses and ports of one machine.
-const MOST_ROBOTS: u32 = 20_000;
+const MAX_ROBOTS: u32 = 20_000;
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct FleetFlags {
     /// How many robots; several numbers, with a fresh server for each
     #[arg(long, value_name = "N", value_delimiter = ',', default_values_t = [10, 100, 1000],
-          value_parser = clap::value_parser!(u32).range(1..=i64::from(MOST_ROBOTS)))]
+          value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_ROBOTS)))]
     robots: Vec<u32>,
     /// The package's size in bytes
     #[arg(long, value_name = "BYTES", default_value_t = 20_000)]
@@ -85,10 +84,10 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
          moment; connected means that the robot keeps to the server's state and the server has stored its report of it."
             .to_owned(),
     ];
-    run.notes.extend(flags.tls.then(|| ALL_IS_ENCRYPTED.to_owned()));
+    run.notes.extend(flags.tls.then(|| ENCRYPTION_NOTE.to_owned()));
     let mut progress = RunProgress::new(flags.robots.len());
     for (number, robots) in flags.robots.iter().enumerate() {
-        progress.says(&format!("{robots} robots"));
+        progress.set_message(&format!("{robots} robots"));
         let (point, version) =
             measure(&flags, *robots as usize, seed.wrapping_mul(1 << 11) + number as u64)
                 .await
@@ -98,16 +97,15 @@ pub async fn run(flags: FleetFlags) -> anyhow::Result<Run> {
         progress.step();
     }
     for file in run.write(&flags.run.out, begun).context("the results can't be written")? {
-        say(&format!("{}", file.display()));
+        print_line(&format!("{}", file.display()));
     }
     Ok(run)
 }
 
 async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result<(Point, String)> {
-    let mut order =
-        if flags.tls { TaskdOrder::default().encrypted() } else { TaskdOrder::default() };
+    let mut order = if flags.tls { TaskdArgs::default().encrypted() } else { TaskdArgs::default() };
     // All robots' sessions come from one address, unlike in production.
-    order.settings.push(("TASKD_MAX_SILENT_PER_ADDRESS".to_owned(), MOST_ROBOTS.to_string()));
+    order.settings.push(("TASKD_MAX_SILENT_PER_ADDRESS".to_owned(), MAX_ROBOTS.to_string()));
     let taskd = Taskd::start(&flags.taskd, &order).await?;
     let mut fleet = Fleet::assemble(&taskd, robots, POLL, None).await?;
     let limit = Duration::from_secs(flags.limit_s);
@@ -116,12 +114,14 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
     point.measure(
         "enrolled",
         Unit::Milliseconds,
-        fleet.enrolments.iter().map(|took| took.as_secs_f64() * 1000.0),
+        fleet.enrollments.iter().map(|took| took.as_secs_f64() * 1000.0),
     );
 
-    let (memory, before) = (taskd.watch_memory(), (taskd.usage(), fleet.usage()));
+    let memory = taskd.watch_memory();
+    let before = (taskd.usage(), fleet.usage());
     let connected = fleet.start(limit).await?;
-    let (middle, memory) = ((taskd.usage(), fleet.usage()), memory.most().await);
+    let middle = (taskd.usage(), fleet.usage());
+    let memory = memory.peak().await;
     point.measure("connected", Unit::Milliseconds, connected.delays_ms());
     point.measure("connect_server_cpu", Unit::Seconds, [middle.0.cpu_s - before.0.cpu_s]);
     point.measure("connect_robots_cpu", Unit::Seconds, [middle.1.cpu_s - before.1.cpu_s]);
@@ -129,7 +129,7 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
     connected.failures.into_iter().for_each(|why| point.fail(why));
 
     let memory = taskd.watch_memory();
-    let one = OneOrder {
+    let one = DeliveryArgs {
         choice: flags.delivery.ordered(),
         payload_bytes: flags.payload,
         robots,
@@ -137,7 +137,7 @@ async fn measure(flags: &FleetFlags, robots: usize, seed: u64) -> anyhow::Result
         limit,
     };
     let outcome = run_once(&taskd, &mut fleet, one).await?;
-    let memory = memory.most().await;
+    let memory = memory.peak().await;
     point.measure("delay", Unit::Milliseconds, outcome.arrivals.delays_ms());
     point.measure(
         "arrival",

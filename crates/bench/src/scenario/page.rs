@@ -14,17 +14,16 @@ use serde::Deserialize;
 use tokio::io::AsyncReadExt as _;
 
 use super::reporters::{Reporter, connect, report_at};
-use crate::machine::allow_files;
-use crate::process::Program;
-use crate::progress::say;
-use crate::run::{Point, Run, RunFlags, Unit};
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::run::{Point, Run, RunFlags, Unit};
+use crate::system::machine::allow_files;
+use crate::system::process::Program;
+use crate::system::progress::print_line;
 
 /// Time for the browser outside the watched period: its start, loading the page, and reading its
 /// last output.
 const MARGIN_S: u64 = 90;
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct PageFlags {
     /// How many robots there are
@@ -71,11 +70,14 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("page", flags.run.seed()).await;
     allow_files(u64::from(flags.robots) + 200)?;
-    let taskd = Taskd::start(&flags.taskd, &TaskdOrder::default()).await?;
+    let taskd = Taskd::start(&flags.taskd, &TaskdArgs::default()).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
-    say(&format!("connecting {} robots", flags.robots));
+    print_line(&format!("connecting {} robots", flags.robots));
     let mut robots = connect(&taskd, flags.robots.into()).await?;
-    say(&format!("{} reports each second, and a browser for {} s", flags.rate, flags.seconds));
+    print_line(&format!(
+        "{} reports each second, and a browser for {} s",
+        flags.rate, flags.seconds
+    ));
     let settings = [("robots", f64::from(flags.robots)), ("reports_per_s", f64::from(flags.rate))];
     let mut point = Point::new("Chromium", settings);
     let seen = watch(&taskd, &mut robots, &flags, &mut point).await?;
@@ -99,7 +101,7 @@ pub async fn run(flags: PageFlags) -> anyhow::Result<Run> {
     drop(robots);
     taskd.end().await?;
     for path in run.write(&flags.run.out, began)? {
-        say(&format!("wrote {}", path.display()));
+        print_line(&format!("wrote {}", path.display()));
     }
     Ok(run)
 }
@@ -117,9 +119,9 @@ async fn watch(
         .args([taskd.url(), flags.robots.to_string(), flags.seconds.to_string()])
         .variable("TASKD_TOKEN", &taskd.token.reveal());
     let (process, input, mut output) = look.converse(&taskd.dir().join("browser.log"))?;
-    let mut said = String::new();
+    let mut printed = String::new();
     {
-        let reading = output.read_to_string(&mut said);
+        let reading = output.read_to_string(&mut printed);
         let reporting = report_at(robots, flags.rate, flags.seconds + MARGIN_S);
         tokio::pin!(reading, reporting);
         let read = tokio::select! {
@@ -138,6 +140,6 @@ async fn watch(
     drop(input);
     process.end().await;
     let log = || std::fs::read_to_string(taskd.dir().join("browser.log")).unwrap_or_default();
-    serde_json::from_str(&said)
-        .with_context(|| format!("the browser did not say what it saw: {}", log()))
+    serde_json::from_str(&printed)
+        .with_context(|| format!("the browser printed no result: {}", log()))
 }

@@ -1,19 +1,21 @@
 //! `taskbench paper`: repeats the measurements of the paper, with every mechanism side by side.
 
+mod grid;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use clap::Args;
 
-use super::grid::{Cell, Extent, MOST_ROBOTS, Mechanism, plots, runs};
-use super::run_once::{OneOrder, Outcome, run_once};
-use crate::axis::written;
-use crate::fleet::Fleet;
-use crate::link::{Link, LinkQuality};
-use crate::progress::{RunProgress, say};
-use crate::run::{Point, Run, RunFlags, Unit};
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use self::grid::{Cell, Extent, MAX_ROBOTS, Mechanism, plots, runs};
+use super::run_once::{DeliveryArgs, Outcome, run_once};
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::axis::written;
+use crate::results::run::{Point, Run, RunFlags, Unit};
+use crate::simulated::fleet::Fleet;
+use crate::system::link::{Link, LinkQuality};
+use crate::system::progress::{RunProgress, print_line};
 
 /// Poll interval when MQTT announces changes: the agent's own default.
 const SLOW_POLL: Duration = Duration::from_secs(300);
@@ -24,13 +26,12 @@ const ORDER_LIMIT: Duration = Duration::from_secs(20);
 /// The rate that an unlimited machine reaches at least, bytes per second of all robots together.
 const SLOW_MACHINE_BYTES_PER_S: u64 = 20_000_000;
 /// Factor below which two durations count as about equal,
-const NEARLY: f64 = 1.1;
+const TOLERANCE_RATIO: f64 = 1.1;
 /// or difference in milliseconds.
-const NEARLY_MS: f64 = 20.0;
+const TOLERANCE_MS: f64 = 20.0;
 /// How long unreferenced blobs stay on the server.
 const BLOB_GRACE: &str = "40s";
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct PaperFlags {
     /// A small grid: does everything work?
@@ -85,7 +86,7 @@ impl Setting {
 }
 
 /// A server with robots.
-struct Stand {
+struct Testbed {
     taskd: Taskd,
     fleet: Fleet,
 }
@@ -100,12 +101,12 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
         Some(quality) => Some(Link::make(quality).await?),
         None => None,
     };
-    let mut stands = BTreeMap::new();
+    let mut testbeds = BTreeMap::new();
     for setting in cells.iter().map(|cell| Setting::of(cell.mechanism)).collect::<BTreeSet<_>>() {
-        stands.insert(setting, Stand::start(&flags, setting, link.as_ref()).await?);
+        testbeds.insert(setting, Testbed::start(&flags, setting, link.as_ref()).await?);
     }
     let version =
-        stands.values().next().map(|stand| stand.taskd.version.clone()).unwrap_or_default();
+        testbeds.values().next().map(|testbed| testbed.taskd.version.clone()).unwrap_or_default();
     run.versions.insert("taskd".to_owned(), version);
     run.plots = plots();
     run.notes = notes(&flags);
@@ -113,11 +114,14 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     let mut results: BTreeMap<Cell, Vec<Outcome>> = BTreeMap::new();
     let mut progress = RunProgress::new(cells.len());
     for (number, cell) in cells.iter().enumerate() {
-        progress
-            .says(&format!("{}, {} B, {} robots", cell.mechanism, cell.payload_bytes, cell.robots));
-        let stand =
-            stands.get_mut(&Setting::of(cell.mechanism)).context("a stand for each mechanism")?;
-        let order = OneOrder {
+        progress.set_message(&format!(
+            "{}, {} B, {} robots",
+            cell.mechanism, cell.payload_bytes, cell.robots
+        ));
+        let testbed = testbeds
+            .get_mut(&Setting::of(cell.mechanism))
+            .context("a testbed for each mechanism")?;
+        let order = DeliveryArgs {
             choice: cell.mechanism.choice(),
             payload_bytes: cell.payload_bytes,
             robots: cell.robots,
@@ -125,13 +129,14 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
             seed: seed.wrapping_mul(1 << 11).wrapping_add(number as u64),
             limit: limit(&flags, cell),
         };
-        let outcome = match run_once(&stand.taskd, &mut stand.fleet, order).await {
+        let outcome = match run_once(&testbed.taskd, &mut testbed.fleet, order).await {
             Ok(outcome) => outcome,
             // The failure belongs to this mechanism; the others are measured with a fresh server
             // and fresh robots.
             Err(error) => {
-                let why = stand.taskd.ended().unwrap_or_else(|| format!("{error:#}"));
-                *stand = Stand::start(&flags, Setting::of(cell.mechanism), link.as_ref()).await?;
+                let why = testbed.taskd.ended().unwrap_or_else(|| format!("{error:#}"));
+                *testbed =
+                    Testbed::start(&flags, Setting::of(cell.mechanism), link.as_ref()).await?;
                 Outcome::failed(why, cell.robots)
             }
         };
@@ -140,24 +145,24 @@ pub async fn run(flags: PaperFlags) -> anyhow::Result<Run> {
     }
     run.notes.extend(decisions(&results));
     run.points = results.iter().map(|(cell, outcomes)| point(cell, outcomes)).collect();
-    run.notes.extend(how_good_adaptive_is(&run.points));
-    for (_, stand) in stands {
-        stand.fleet.end().await?;
-        stand.taskd.end().await?;
+    run.notes.extend(adaptive_note(&run.points));
+    for (_, testbed) in testbeds {
+        testbed.fleet.end().await?;
+        testbed.taskd.end().await?;
     }
     for file in run.write(&flags.run.out, begun).context("the results can't be written")? {
-        say(&format!("{}", file.display()));
+        print_line(&format!("{}", file.display()));
     }
     Ok(run)
 }
 
-impl Stand {
+impl Testbed {
     async fn start(
         flags: &PaperFlags,
         setting: Setting,
         link: Option<&Link>,
     ) -> anyhow::Result<Self> {
-        let mut order = TaskdOrder::default();
+        let mut order = TaskdArgs::default();
         let mut set =
             |name: &str, value: &str| order.settings.push((name.to_owned(), value.to_owned()));
         set("TASKD_BLOB_GRACE", BLOB_GRACE);
@@ -176,7 +181,7 @@ impl Stand {
         } else {
             SLOW_POLL
         };
-        let mut fleet = Fleet::assemble(&taskd, MOST_ROBOTS, poll, link).await?;
+        let mut fleet = Fleet::assemble(&taskd, MAX_ROBOTS, poll, link).await?;
         let started = fleet.start(START_LIMIT).await?;
         anyhow::ensure!(
             started.failures.is_empty(),
@@ -257,28 +262,30 @@ fn decisions(results: &BTreeMap<Cell, Vec<Outcome>>) -> Option<String> {
         let all = outcomes.iter().flat_map(|outcome| outcome.decisions.iter().map(String::as_str));
         chosen.entry(cell.payload_bytes).or_default().extend(all);
     }
-    let say = |(bytes, decisions): (u64, BTreeSet<&str>)| {
+    let describe = |(bytes, decisions): (u64, BTreeSet<&str>)| {
         let size = written(bytes as f64, Unit::Bytes);
         format!("{size} by {}", decisions.into_iter().collect::<Vec<_>>().join(" or "))
     };
-    let said: Vec<String> = chosen.into_iter().map(say).collect();
-    (!said.is_empty())
-        .then(|| format!("Adaptive, with the rule that decided: {}.", said.join("; ")))
+    let described: Vec<String> = chosen.into_iter().map(describe).collect();
+    (!described.is_empty())
+        .then(|| format!("Adaptive, with the rule that decided: {}.", described.join("; ")))
 }
 
 /// The number of cells in which adaptive is about as fast as the fastest of the others.
-fn how_good_adaptive_is(points: &[Point]) -> Option<String> {
+fn adaptive_note(points: &[Point]) -> Option<String> {
     let adaptive = Mechanism::Adaptive.to_string();
     let delay = |point: &Point| point.quantities.get("delay").map(|delay| delay.median);
-    let (mut places, mut good) = (0, 0);
+    let mut places = 0;
+    let mut good = 0;
     for own in points.iter().filter(|point| point.series == adaptive) {
         let others = points
             .iter()
             .filter(|other| other.series != adaptive && other.settings == own.settings);
         let Some(best) = others.filter_map(delay).min_by(f64::total_cmp) else { continue };
         places += 1;
-        good +=
-            usize::from(delay(own).is_some_and(|own| own <= (best * NEARLY).max(best + NEARLY_MS)));
+        good += usize::from(
+            delay(own).is_some_and(|own| own <= (best * TOLERANCE_RATIO).max(best + TOLERANCE_MS)),
+        );
     }
     (places > 0).then(|| {
         format!(
@@ -331,7 +338,9 @@ mod tests {
             point.measure("delay", Unit::Milliseconds, [delay]);
             point
         };
-        let (adaptive, pull, poll) = (Mechanism::Adaptive, Mechanism::PushPull, Mechanism::Poll);
+        let adaptive = Mechanism::Adaptive;
+        let pull = Mechanism::PushPull;
+        let poll = Mechanism::Poll;
         let mut points = vec![
             point(adaptive, 1.0, 119.0),
             point(pull, 1.0, 100.0),
@@ -343,9 +352,9 @@ mod tests {
             // No other point to compare with.
             point(adaptive, 4.0, 1.0),
         ];
-        let said = how_good_adaptive_is(&points).expect("said");
-        assert!(said.contains("at 2 of 3 points"), "{said}");
+        let described = adaptive_note(&points).expect("described");
+        assert!(described.contains("at 2 of 3 points"), "{described}");
         points.retain(|point| point.series != adaptive.to_string());
-        assert_eq!(how_good_adaptive_is(&points), None);
+        assert_eq!(adaptive_note(&points), None);
     }
 }

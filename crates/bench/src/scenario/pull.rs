@@ -13,14 +13,14 @@ use task_proto::api::DeliveryChoice;
 use task_proto::desired::BlobRef;
 use tempfile::TempDir;
 
-use super::run_once::{OneOrder, run_once};
-use crate::fleet::{Fleet, memory_directory};
-use crate::package::{PAYLOAD_FILE, Package};
-use crate::peer::Peer;
-use crate::process::{Program, ended_children_cpu_s};
-use crate::progress::{RunProgress, say};
-use crate::run::{Point, Run, RunFlags, Unit};
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use super::run_once::{DeliveryArgs, run_once};
+use crate::programs::package::{PAYLOAD_FILE, Package};
+use crate::programs::peer::Peer;
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::run::{Point, Run, RunFlags, Unit};
+use crate::simulated::fleet::{Fleet, memory_directory};
+use crate::system::process::{Program, ended_children_cpu_s};
+use crate::system::progress::{RunProgress, print_line};
 
 /// Our own series in the results.
 const OWN: &str = "taskd";
@@ -38,7 +38,6 @@ const ORDER_LIMIT: Duration = Duration::from_secs(300);
 const SCRIPT: &str = "set -e; curl -sS --fail -o \"$2/blob\" \"$1\"; \
                       openssl dgst -sha256 -r \"$2/blob\" | cut -d ' ' -f 1; tar --zstd -x -f \"$2/blob\" -C \"$2\"";
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct PullFlags {
     /// How often each is measured, in turns
@@ -57,10 +56,12 @@ pub struct PullFlags {
 }
 
 pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
-    let (begun, seed) = (Instant::now(), flags.run.seed());
+    let begun = Instant::now();
+    let seed = flags.run.seed();
     let mut run = Run::begin("pull", seed).await;
-    let (bytes, robots) = (flags.megabytes * 1_000_000, usize::from(flags.robots));
-    let taskd = Taskd::start(&flags.taskd, &TaskdOrder::default()).await?;
+    let bytes = flags.megabytes * 1_000_000;
+    let robots = usize::from(flags.robots);
+    let taskd = Taskd::start(&flags.taskd, &TaskdArgs::default()).await?;
     run.versions.insert("taskd".to_owned(), taskd.version.clone());
     let nginx = Peer::nginx(taskd.dir(), &taskd.blobs(), None)
         .await?
@@ -82,8 +83,8 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
         Figures { point: Point::new(PROGRAMS, settings(&flags)), ..Figures::default() };
     let mut progress = RunProgress::new(flags.runs as usize);
     for turn in 0..flags.runs {
-        progress.says(&format!("{} MB to {robots}", flags.megabytes));
-        let order = OneOrder {
+        progress.set_message(&format!("{} MB to {robots}", flags.megabytes));
+        let order = DeliveryArgs {
             choice: DeliveryChoice::PushPull,
             payload_bytes: bytes,
             robots,
@@ -112,7 +113,7 @@ pub async fn run(flags: PullFlags) -> anyhow::Result<Run> {
         programs.finish(),
     ];
     for path in run.write(&flags.run.out, begun)? {
-        say(&format!("wrote {}", path.display()));
+        print_line(&format!("wrote {}", path.display()));
     }
     Ok(run)
 }
@@ -139,7 +140,8 @@ impl Scripts {
         seed: u64,
     ) -> anyhow::Result<Self> {
         let package = Package::random("scripts".parse()?, "1".parse()?, bytes, seed);
-        let (blob, payload) = (package.content_blob(), package.payload);
+        let blob = package.content_blob();
+        let payload = package.payload;
         taskd.server.push(package).await.context("the package can't be pushed")?;
         Ok(Self { nginx, blob, payload, count })
     }
@@ -151,14 +153,16 @@ impl Scripts {
             .map(|_| memory_directory("taskbench-script-"))
             .collect::<anyhow::Result<Vec<_>>>()?;
         let cpu_s = || anyhow::Ok(self.nginx.usage().cpu_s + ended_children_cpu_s()?);
-        let (begun, before) = (Instant::now(), cpu_s()?);
-        let said = try_join_all(dirs.iter().map(|dir| self.run_one(dir.path()))).await?;
-        let (wall, after) = (begun.elapsed(), cpu_s()?);
-        for (said, dir) in said.iter().zip(&dirs) {
+        let begun = Instant::now();
+        let before = cpu_s()?;
+        let digests = try_join_all(dirs.iter().map(|dir| self.run_one(dir.path()))).await?;
+        let wall = begun.elapsed();
+        let after = cpu_s()?;
+        for (digest, dir) in digests.iter().zip(&dirs) {
             ensure!(
-                said.trim() == self.blob.digest.hex(),
+                digest.trim() == self.blob.digest.hex(),
                 "a script has hashed the blob to {:?}",
-                said.trim()
+                digest.trim()
             );
             self.check(dir)?;
         }

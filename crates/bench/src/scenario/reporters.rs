@@ -7,22 +7,22 @@ use anyhow::{Context as _, bail};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
 use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
-use task_proto::report::{HostFacts, Phase, Progress, Report, TaskReport};
-use task_proto::topic::{RobotTopic, Topic};
+use task_proto::messages::report::{HostFacts, Phase, Progress, Report, TaskReport};
+use task_proto::messages::topic::{RobotTopic, Topic};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId};
 use tokio::io::AsyncWriteExt as _;
 
-use crate::enrolment::enrol;
-use crate::mqtt::{Heard, Link, Login, message};
-use crate::taskd::Taskd;
+use crate::measure::mqtt::{Link, Login, Packet, message};
+use crate::programs::enrollment::enroll_robots;
+use crate::programs::taskd::Taskd;
 
 /// Connections opened at a time.
-const CONNECTS_AT_ONCE: usize = 64;
+const CONCURRENT_CONNECTS: usize = 64;
 /// One in this many reports shows the next phase of the task; the others show progress within a
 /// phase.
 const REPORTS_PER_PHASE: u64 = 10;
 /// Time limit for the last acknowledgements.
-const PATIENCE: Duration = Duration::from_secs(60);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// From ordering the reports until the first is due.
 const LEAD: Duration = Duration::from_millis(500);
 
@@ -35,8 +35,9 @@ pub struct Reporter {
 
 /// Registers `count` robots, orders a package for them and connects them.
 pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter>> {
-    let robots = enrol(&taskd.server, count).await?;
-    let (package, version) = ("status".parse()?, "1".parse()?);
+    let robots = enroll_robots(&taskd.server, count).await?;
+    let package = "status".parse()?;
+    let version = "1".parse()?;
     let manifest = taskd.server.push_package(&package, &version).await?;
     let order = CreateDeployment {
         delivery: DeliveryChoice::Poll,
@@ -54,13 +55,14 @@ pub async fn connect(taskd: &Taskd, count: usize) -> anyhow::Result<Vec<Reporter
             Ok(Reporter { link, topic, report: report(robot, deployment)? })
         }
     });
-    futures_util::stream::iter(connecting).buffered(CONNECTS_AT_ONCE).try_collect().await
+    futures_util::stream::iter(connecting).buffered(CONCURRENT_CONNECTS).try_collect().await
 }
 
 /// A robot's report during a fetch.
 fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<Report> {
     let blob = BlobRef { digest: Digest::of(b""), size: 0 };
-    let (name, version) = ("status".parse()?, "1".parse()?);
+    let name = "status".parse()?;
+    let version = "1".parse()?;
     let task = DesiredTask {
         task: "status".parse()?,
         deployment: deployment.clone(),
@@ -102,7 +104,8 @@ pub async fn report_at(
     rate: u32,
     seconds: u64,
 ) -> anyhow::Result<(Instant, Vec<anyhow::Result<Vec<f64>>>)> {
-    let (count, total) = (robots.len(), usize::try_from(u64::from(rate) * seconds)?);
+    let count = robots.len();
+    let total = usize::try_from(u64::from(rate) * seconds)?;
     let begin = Instant::now() + LEAD;
     let due = |number: usize| begin + Duration::from_secs_f64(number as f64 / f64::from(rate));
     let reporting = robots.iter_mut().enumerate().map(|(first, robot)| {
@@ -120,16 +123,16 @@ impl Reporter {
         let mut sent = 0;
         while stored.len() < due.len() {
             let next = due.get(sent).copied();
-            let until = next.unwrap_or_else(|| Instant::now() + PATIENCE);
+            let until = next.unwrap_or_else(|| Instant::now() + ANSWER_TIMEOUT);
             tokio::select! {
                 heard = self.link.reader.next() => {
-                    if let Heard::Acknowledged(_) = heard? {
+                    if let Packet::Acknowledged(_) = heard? {
                         stored.push(due[stored.len()].elapsed().as_secs_f64() * 1000.0);
                     }
                 }
                 () = tokio::time::sleep_until(until.into()) => {
                     if next.is_none() {
-                        bail!("no acknowledgement within {PATIENCE:?}");
+                        bail!("no acknowledgement within {ANSWER_TIMEOUT:?}");
                     }
                     self.send().await?;
                     sent += 1;

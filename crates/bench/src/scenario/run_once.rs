@@ -10,10 +10,10 @@ use task_proto::api::{
 };
 use task_proto::{Digest, TaskName, Version};
 
-use crate::clock::monotonic_ns;
-use crate::fleet::{Arrivals, Fleet, first};
-use crate::package::Package;
-use crate::taskd::Taskd;
+use crate::programs::package::Package;
+use crate::programs::taskd::Taskd;
+use crate::simulated::fleet::{Arrivals, Fleet, first};
+use crate::system::clock::monotonic_ns;
 
 /// The name of every package.
 const NAME: &str = "taskbench";
@@ -25,7 +25,7 @@ const CHECKED_BYTES: u64 = 20_000_000;
 
 /// Parameters of one order.
 #[derive(Debug, Clone, Copy)]
-pub struct OneOrder {
+pub struct DeliveryArgs {
     /// The delivery mechanism to use.
     pub choice: DeliveryChoice,
     /// Size of the payload.
@@ -62,11 +62,13 @@ pub struct Outcome {
 pub async fn run_once(
     taskd: &Taskd,
     fleet: &mut Fleet,
-    order: OneOrder,
+    order: DeliveryArgs,
 ) -> anyhow::Result<Outcome> {
     let (name, version): (TaskName, Version) =
         (NAME.parse()?, format!("{:016x}", order.seed).parse()?);
-    let (of, bytes, seed) = (name.clone(), order.payload_bytes, order.seed);
+    let of = name.clone();
+    let bytes = order.payload_bytes;
+    let seed = order.seed;
     let package =
         tokio::task::spawn_blocking(move || Package::random(of, version, bytes, seed)).await?;
     let payload = package.payload;
@@ -77,7 +79,8 @@ pub async fn run_once(
         ..CreateDeployment::new(name.clone(), manifest, selector)
     };
     let (before, own) = own_bytes(taskd).await?;
-    let (server, robots) = (taskd.usage(), fleet.usage());
+    let server = taskd.usage();
+    let robots = fleet.usage();
     let ordered_ns = monotonic_ns();
     let deployment = match taskd.server.order(&create).await {
         Ok(deployment) => deployment,
@@ -92,8 +95,8 @@ pub async fn run_once(
         }
     };
     let arrivals = fleet.verified(&deployment.id, order.robots, ordered_ns, order.limit).await?;
-    let (server_cpu_s, robots_cpu_s) =
-        (taskd.usage().cpu_s - server.cpu_s, fleet.usage().cpu_s - robots.cpu_s);
+    let server_cpu_s = taskd.usage().cpu_s - server.cpu_s;
+    let robots_cpu_s = fleet.usage().cpu_s - robots.cpu_s;
     let after = taskd.server.info().await?;
     let view = taskd.server.deployment(&deployment.id).await?;
     let mut outcome = Outcome {
@@ -134,7 +137,8 @@ impl Outcome {
         }
         let is_plain = choice == DeliveryChoice::PushPull;
         let untold = assignments().filter(|one| one.delivery.is_none() && !is_plain);
-        other.extend(untold.map(|_| "the server does not say how it delivers".to_owned()));
+        other
+            .extend(untold.map(|_| "the server does not report its delivery mechanism".to_owned()));
         if !other.is_empty() {
             // The figures would be another mechanism's.
             self.arrivals = Arrivals { arrived: Vec::new(), failures: other };

@@ -11,15 +11,14 @@ use anyhow::Context as _;
 use clap::Args;
 
 use super::reporters::{Reporter, connect, report_at};
-use crate::machine::allow_files;
-use crate::progress::{RunProgress, say};
-use crate::run::{Point, Run, RunFlags, Unit};
-use crate::taskd::{Taskd, TaskdFlags, TaskdOrder};
+use crate::programs::taskd::{Taskd, TaskdArgs, TaskdFlags};
+use crate::results::run::{Point, Run, RunFlags, Unit};
+use crate::system::machine::allow_files;
+use crate::system::progress::{RunProgress, print_line};
 
 /// Syncs before and after each measurement.
 const SYNCS: usize = 200;
 
-/// What to measure.
 #[derive(Debug, Args)]
 pub struct StatusFlags {
     /// How many robots report
@@ -45,23 +44,23 @@ pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
     let began = Instant::now();
     let mut run = Run::begin("status", flags.run.seed()).await;
     allow_files(u64::from(flags.robots) + 200)?;
-    let mut databases = vec![("SQLite", TaskdOrder::default())];
+    let mut databases = vec![("SQLite", TaskdArgs::default())];
     match &flags.postgres {
         Some(url) => {
-            let mut order = TaskdOrder::default();
+            let mut order = TaskdArgs::default();
             order.settings.push(("TASKD_DATABASE".to_owned(), url.clone()));
             databases.push(("Postgres", order));
         }
-        None => say("no --postgres: SQLite is measured alone"),
+        None => print_line("no --postgres: SQLite is measured alone"),
     }
     let mut progress = RunProgress::new(databases.len() * flags.rate.len());
     for (name, order) in databases {
-        progress.says(&format!("{name}: connecting {} robots", flags.robots));
+        progress.set_message(&format!("{name}: connecting {} robots", flags.robots));
         let taskd = Taskd::start(&flags.taskd, &order).await?;
         run.versions.insert("taskd".to_owned(), taskd.version.clone());
         let mut robots = connect(&taskd, flags.robots.into()).await.context(name)?;
         for &rate in &flags.rate {
-            progress.says(&format!("{name}: {rate} reports each second"));
+            progress.set_message(&format!("{name}: {rate} reports each second"));
             let mut point = Point::new(
                 name,
                 [("reports_per_s", f64::from(rate)), ("robots", f64::from(flags.robots))],
@@ -74,7 +73,7 @@ pub async fn run(flags: StatusFlags) -> anyhow::Result<Run> {
         taskd.end().await?;
     }
     for path in run.write(&flags.run.out, began)? {
-        say(&format!("wrote {}", path.display()));
+        print_line(&format!("wrote {}", path.display()));
     }
     Ok(run)
 }

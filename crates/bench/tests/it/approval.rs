@@ -7,9 +7,9 @@ use std::path::Path;
 use std::process::{ExitStatus, Stdio};
 
 use serde_json::Value;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
-use crate::harness::{PATIENCE, Robot, Server, eventually, program, write_package};
+use crate::harness::{Robot, Server, TIMEOUT, eventually, program, write_package};
 
 /// The output of the robot's command.
 fn printed(data: &Path) -> String {
@@ -27,19 +27,19 @@ fn enroll(data: &Path, more: &[&str], token: Option<&str>) -> tokio::process::Ch
     command.spawn().expect("task-agent starts")
 }
 
-async fn until_it_waits(data: &Path) {
+async fn wait_until_pending(data: &Path) {
     eventually("the command to wait", async || {
-        printed(data).contains("waits to be approved").then_some(())
+        printed(data).contains("is waiting for approval").then_some(())
     })
     .await;
 }
 
 async fn ended(mut child: tokio::process::Child) -> ExitStatus {
-    tokio::time::timeout(PATIENCE, child.wait()).await.expect("it ends").expect("reaped")
+    tokio::time::timeout(TIMEOUT, child.wait()).await.expect("it ends").expect("reaped")
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
+async fn robot_waits_for_approval_across_restarts_and_then_continues() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let token = server.operate(["enroll-token", "create", "--approval"]).await.trim().to_owned();
@@ -48,10 +48,10 @@ async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
     let more = ["--server", &url, "--name", "atlas", "--mac", "02:00:00:00:00:01"];
 
     let mut first = enroll(&data, &more, Some(&token));
-    until_it_waits(&data).await;
+    wait_until_pending(&data).await;
     first.kill().await.expect("killed");
     let again = enroll(&data, &[], None);
-    until_it_waits(&data).await;
+    wait_until_pending(&data).await;
     // An agent that is started meanwhile has nothing, and keeps asking.
     let id = server.robot("atlas").await.expect("listed").id;
     let mut robot = Robot::enrolled(dir.path(), "atlas", id, &[]);
@@ -77,19 +77,20 @@ async fn a_robot_waits_for_its_approval_over_restarts_and_goes_on_by_itself() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_is_rejected_is_told_so_and_is_nobody_again() {
+async fn rejected_robot_is_informed_and_forgotten() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server =
         Server::start_with(&dir.path().join("server"), &[("TASKD_ENROLMENT_APPROVAL", "true")])
             .await;
-    let (token, data) = (server.enrollment_token().await, dir.path().join("atlas"));
+    let token = server.enrollment_token().await;
+    let data = dir.path().join("atlas");
     let url = server.url("");
     let child = enroll(
         &data,
         &["--server", &url, "--name", "atlas", "--mac", "02:00:00:00:00:01"],
         Some(&token),
     );
-    until_it_waits(&data).await;
+    wait_until_pending(&data).await;
     server.operate(["robot", "reject", "atlas"]).await;
     assert!(!ended(child).await.success());
     assert!(printed(&data).contains("did not approve this robot"), "{}", printed(&data));

@@ -11,13 +11,13 @@ use rumqttc::{AsyncClient, Event, EventLoop, MqttOptions, Packet, QoS};
 use serde_json::Value;
 use task_proto::api::{LogsFrom, LogsView, ServerInfo};
 use task_proto::desired::Delivery;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use task_proto::{CaPin, RobotId};
-use taskbench::encryption::Certificate;
+use taskbench::programs::encryption::Certificate;
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 
-use crate::harness::{PATIENCE, Process, Robot, Server, add_ballast, eventually, write_package};
+use crate::harness::{Process, Robot, Server, TIMEOUT, add_ballast, eventually, write_package};
 use crate::proxy::Proxy;
 
 pub const PASSWORD: &str = "the-servers-password";
@@ -67,7 +67,8 @@ impl Mosquitto {
     /// certificate.
     fn encrypt(&mut self) -> CaPin {
         let certificate = Certificate::new().expect("a certificate");
-        let (chain, key) = (self.dir.join("chain.pem"), self.dir.join("key.pem"));
+        let chain = self.dir.join("chain.pem");
+        let key = self.dir.join("key.pem");
         let conf = self.dir.join("conf");
         let mut text = std::fs::read_to_string(&conf).expect("written");
         text.push_str(&format!("certfile {}\nkeyfile {}\n", chain.display(), key.display()));
@@ -103,7 +104,8 @@ impl Mosquitto {
     /// directory and on loopback only.
     pub async fn configure(&self, server: &Server) {
         let conf = server.operate(["broker", "conf"]).await;
-        let (port, path) = (self.address.port(), self.dir.display().to_string());
+        let port = self.address.port();
+        let path = self.dir.display().to_string();
         let conf =
             conf.replace(&format!("listener {port}\n"), &format!("listener {port} 127.0.0.1\n"));
         let conf = conf.replace("/etc/mosquitto/taskd.", &format!("{path}/"));
@@ -187,7 +189,7 @@ fn server_log(server: &Server) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessions() {
+async fn fleet_works_through_mosquitto_and_survives_lost_sessions() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::start(dir.path()).await;
     let mut server =
@@ -246,7 +248,7 @@ async fn a_fleet_works_through_mosquitto_and_survives_the_loss_of_all_its_sessio
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
+async fn direct_push_works_through_mosquitto() {
     let dir = TempDir::new().expect("temp dir");
     let mosquitto = Mosquitto::start(dir.path()).await;
     let server =
@@ -279,7 +281,7 @@ async fn packages_travel_inside_mosquittos_messages_when_the_order_says_so() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
+async fn encrypted_mosquitto_is_verified_by_its_pin() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::new(dir.path());
     let pin = mosquitto.encrypt();
@@ -299,7 +301,7 @@ async fn an_encrypted_mosquitto_is_known_by_its_pin_on_both_sides() {
     runs(&server, "robot-1", "1.0.0").await;
     // A server that trusts only the system's roots does not trust this broker.
     server.restart_with("TASKD_BROKER_PIN", None).await;
-    says(&server, "no TLS with").await;
+    says(&server, "the TLS handshake with").await;
 }
 
 /// A client with a robot's own name and password at the broker.
@@ -319,10 +321,8 @@ pub async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient
 
 pub async fn next(events: &mut EventLoop) -> Packet {
     loop {
-        if let Event::Incoming(packet) = tokio::time::timeout(PATIENCE, events.poll())
-            .await
-            .expect("in time")
-            .expect("a session")
+        if let Event::Incoming(packet) =
+            tokio::time::timeout(TIMEOUT, events.poll()).await.expect("in time").expect("a session")
         {
             return packet;
         }
@@ -348,7 +348,7 @@ async fn publish(
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
+async fn robot_password_at_mosquitto_opens_only_its_own_topics() {
     let dir = TempDir::new().expect("temp dir");
     let mosquitto = Mosquitto::start(dir.path()).await;
     let server =
@@ -362,7 +362,8 @@ async fn a_robots_password_at_mosquitto_opens_its_own_topics_only() {
     }
     mosquitto.learn(&server).await;
     server.wait_ready().await;
-    let (own, other) = (&robots[0].id, &robots[1].id);
+    let own = &robots[0].id;
+    let other = &robots[1].id;
     let (client, mut events) = spy(&mosquitto, &robots[0], own.as_str()).await;
     for filter in
         ["#", "taskd/v1/#", "taskd/v1/r/+/desired", "taskd/v1/r/+/status", "taskd/v1/server"]
@@ -400,7 +401,7 @@ async fn is_at(server: &Server, broker: &Mosquitto) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn robot_at_another_broker_than_the_server_comes_to_the_servers() {
+async fn robot_moves_to_the_servers_broker() {
     let dir = TempDir::new().expect("temp dir");
     let mut brokers =
         [Mosquitto::named(dir.path(), "first"), Mosquitto::named(dir.path(), "second")];
@@ -475,7 +476,7 @@ async fn server_and_robots_fail_over_to_the_next_broker_of_the_list() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn robots_follow_the_server_from_broker_to_broker_without_enrolling_again() {
+async fn robots_follow_the_server_to_another_broker_without_reenrollment() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::new(dir.path());
     let mut server = Server::start(&dir.path().join("server")).await;

@@ -16,7 +16,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
 use crate::broker::{Mosquitto, PASSWORD, logs, next, runs, wait_connected, worker};
-use crate::harness::{PATIENCE, Process, Robot, Server, eventually, required};
+use crate::harness::{Process, Robot, Server, TIMEOUT, eventually, required};
 
 /// The robot's identity file.
 fn identity(robot: &Robot) -> Value {
@@ -46,7 +46,7 @@ async fn known_ids(server: &Server, robot: &Robot) -> [String; 2] {
     let key = info["key"]
         .as_str()
         .expect("a key")
-        .parse::<task_proto::envelope::PublicKey>()
+        .parse::<task_proto::trust::envelope::PublicKey>()
         .expect("a key");
     [format!("taskd-{}", key.id()), robot.id.to_string()]
 }
@@ -70,7 +70,7 @@ async fn assert_undisturbed(server: &Server, robot: &str, robots: u64) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn robot_with_anothers_client_id_displaces_nobody_at_mosquitto() {
+async fn robot_with_another_client_id_displaces_no_session_at_mosquitto() {
     let dir = TempDir::new().expect("temp dir");
     let mut mosquitto = Mosquitto::start(dir.path()).await;
     let server =
@@ -153,8 +153,9 @@ impl Nats {
         let [mqtt, client] = free.each_ref().map(|listener| listener.local_addr().expect("bound"));
         let path = dir.display();
         let conf = format!(
-            "server_name: nats\nlisten: \"{client}\"\nmax_payload: 4MB\njetstream {{ store_dir: \"{path}/js\" }}\n\
-             mqtt {{ listen: \"{mqtt}\" }}\nlog_file: \"{path}/log\"\ninclude ./taskd.conf\n"
+            "server_name: nats\nlisten: \"{client}\"\nmax_payload: 4MB\n\
+             jetstream {{ store_dir: \"{path}/js\" }}\nmqtt {{ listen: \"{mqtt}\" }}\n\
+             log_file: \"{path}/log\"\ninclude ./taskd.conf\n"
         );
         std::fs::write(dir.join("nats.conf"), conf).expect("written");
         Self { process: None, dir, mqtt, client }
@@ -188,7 +189,7 @@ impl Nats {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
+async fn fleet_works_through_nats_with_per_robot_subjects() {
     let dir = TempDir::new().expect("temp dir");
     let mut nats = Nats::new(dir.path());
     let server =
@@ -221,10 +222,8 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     assert_undisturbed(&server, "robot-2", 1).await;
 
     let (client, mut events) = connect_as(nats.mqtt, &attacker, "spy").await;
-    let (own, other) = (
-        format!("taskd/v1/r/{}/desired", attacker.id),
-        format!("taskd/v1/r/{}/desired", victim.id),
-    );
+    let own = format!("taskd/v1/r/{}/desired", attacker.id);
+    let other = format!("taskd/v1/r/{}/desired", victim.id);
     let refused = [
         "#",
         "+/#",
@@ -261,7 +260,7 @@ async fn fleet_works_through_nats_where_robots_reach_their_own_subjects_only() {
     );
     stream.write_all(hello.as_bytes()).await.expect("sent");
     let mut answer = String::new();
-    let closing = tokio::time::timeout(PATIENCE, stream.read_to_string(&mut answer)).await;
+    let closing = tokio::time::timeout(TIMEOUT, stream.read_to_string(&mut answer)).await;
     closing.expect("NATS' own protocol is open to it").expect("it is closed");
     assert!(answer.contains("Authorization Violation") && !answer.contains("PONG"), "{answer}");
 }

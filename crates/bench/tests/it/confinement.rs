@@ -4,7 +4,7 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
 use task_proto::api::RobotView;
-use task_proto::report::{Failure, Isolation, Phase, TaskAccounts};
+use task_proto::messages::report::{Failure, Isolation, Phase, TaskAccounts};
 
 use crate::harness::{Fleet, Robot, Server, eventually, open_directory, write_package};
 use crate::leftovers::processes_with;
@@ -26,7 +26,9 @@ async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
     open_directory(&found);
     let identity = fleet.robots[0].data().join("identity.json");
     let script = format!(
-        "id -u > {0}/user; cat {1} > {0}/identity; grep ^Seccomp: /proc/self/status > {0}/calls; touch \"$HOME/log\" written && echo \"$HOME\" > {0}/home\n",
+        "id -u > {0}/user; cat {1} > {0}/identity; \
+         grep ^Seccomp: /proc/self/status > {0}/calls; \
+         touch \"$HOME/log\" written && echo \"$HOME\" > {0}/home\n",
         found.display(),
         identity.display()
     );
@@ -59,7 +61,9 @@ got ls "$VICTIM"
 got cat "$VICTIM/src/main.sh"
 got cat "$VICTIM_HOME/secret"
 got touch "$VICTIM_HOME/new" "$TASKS/new" "$TASKS/victim/new"
-for name in ../src/main.sh ../run.sh ../task.json ../new main.sh; do got dd if=/dev/zero "of=$name" count=1; done
+for name in ../src/main.sh ../run.sh ../task.json ../new main.sh; do
+  got dd if=/dev/zero "of=$name" count=1
+done
 count=0
 while [ $count -lt 200 ]; do
   got kill -9 $VICTIM_PID
@@ -83,7 +87,7 @@ fn version_of(robot: &Robot, task: &str) -> std::path::PathBuf {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn task_can_neither_change_nor_kill_nor_read_its_neighbour_nor_change_its_own_package() {
+async fn task_cannot_touch_its_neighbour_or_change_its_own_package() {
     if !nix::unistd::geteuid().is_root() {
         return eprintln!("unavailable: only root can run tasks under accounts of their own");
     }
@@ -115,7 +119,7 @@ async fn task_can_neither_change_nor_kill_nor_read_its_neighbour_nor_change_its_
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn package_that_was_changed_on_the_disk_is_not_started_and_comes_anew() {
+async fn package_changed_on_disk_is_fetched_again_before_start() {
     if !nix::unistd::geteuid().is_root() {
         return eprintln!("unavailable: only root can keep what tasks run from them");
     }
@@ -143,7 +147,44 @@ async fn package_that_was_changed_on_the_disk_is_not_started_and_comes_anew() {
     assert_eq!(std::fs::read_to_string(&main).expect("there"), script);
     let log =
         std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log")).expect("a log");
-    assert!(log.contains("src is not what was unpacked"), "{log}");
+    assert!(log.contains("src was changed after unpacking"), "{log}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn fallback_changed_on_disk_is_fetched_again_before_start() {
+    if !nix::unistd::geteuid().is_root() {
+        return eprintln!("unavailable: only root can keep what tasks run from them");
+    }
+    let fleet = Fleet::start(1).await;
+    let found = fleet.dir.path().join("found");
+    open_directory(&found);
+    let started = found.join("started");
+    let script = format!("echo good >> {}; exec sleep 1000\n", started.display());
+    fleet.server.push(&fleet.package("steady", "1.0.0", "service", &script), "*").await;
+    fleet.server.wait_phase("robot-1", "steady", Phase::Running).await;
+    let has_started = |runs: usize| {
+        (std::fs::read_to_string(&started).ok()? == "good\n".repeat(runs)).then_some(())
+    };
+    eventually("the script to run", async || has_started(1)).await;
+    let main = version_of(&fleet.robots[0], "steady").join("src/main.sh");
+    std::fs::write(&main, script.replace("good", "evil")).expect("changed");
+    let broken = fleet.package("steady", "2.0.0", "service", "exit 3\n");
+    let toml = std::fs::read_to_string(broken.join("task.toml")).expect("task.toml");
+    let unready = toml.replace("[ready]\nhold_s = 0", "restart = \"never\"\n[ready]\nhold_s = 20");
+    assert_ne!(unready, toml);
+    std::fs::write(broken.join("task.toml"), unready).expect("changed");
+    fleet.server.push(&broken, "*").await;
+    eventually("the first version again", async || {
+        let view = robot(&fleet.server).await;
+        let task = view.tasks.iter().find(|task| task.phase == Phase::RolledBack)?;
+        (task.active.as_ref()?.version.as_str() == "1.0.0").then_some(())
+    })
+    .await;
+    eventually("the script to run again", async || has_started(2)).await;
+    assert_eq!(std::fs::read_to_string(&main).expect("there"), script);
+    let log =
+        std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log")).expect("a log");
+    assert!(log.contains("src was changed after unpacking"), "{log}");
 }
 
 /// Gives a tree to the account of all tasks, as earlier agents did that let tasks own their files.
@@ -158,7 +199,7 @@ fn give_to_all_tasks(path: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_its_task_wrote() {
+async fn version_of_an_earlier_agent_is_adopted_with_its_task_files() {
     if !nix::unistd::geteuid().is_root() {
         return eprintln!("unavailable: only root can give files to another user");
     }
@@ -182,8 +223,8 @@ async fn version_of_an_earlier_agent_is_taken_over_at_its_next_start_with_what_i
     std::fs::remove_dir_all(version.join("work")).expect("removed");
     std::fs::remove_file(version.with_extension("seal")).expect("removed");
     give_to_all_tasks(&version);
-    let (handed_over, old) =
-        (std::fs::metadata(version.join("task.json")).expect("there"), version.join("src/written"));
+    let handed_over = std::fs::metadata(version.join("task.json")).expect("there");
+    let old = version.join("src/written");
     let since = (handed_over.ctime(), handed_over.ctime_nsec());
     // The clock of files does not tick at each write.
     while std::fs::metadata(&old).map_or(true, |about| (about.mtime(), about.mtime_nsec()) <= since)
@@ -213,7 +254,7 @@ fn own_home(robot: &Robot) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_a_task_user_a_robot_says_what_to_do_and_runs_nothing() {
+async fn robot_without_a_task_user_runs_nothing_and_reports_the_remedy() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let settings = [("TASK_AGENT_TASK_USER", "no-such-user")];
@@ -234,7 +275,7 @@ async fn without_a_task_user_a_robot_says_what_to_do_and_runs_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_task_that_wants_eight_gigabytes_fails_alone_and_by_name() {
+async fn task_above_its_memory_limit_fails_alone_and_by_name() {
     let fleet = Fleet::start(1).await;
     let calm = fleet.package("calm", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&calm, "*").await;
@@ -254,7 +295,7 @@ async fn a_task_that_wants_eight_gigabytes_fails_alone_and_by_name() {
     {
         Isolation::Cgroup => {
             assert_eq!(failure.code.as_str(), "out_of_memory");
-            assert!(failure.text.contains("200 MiB"), "{failure}");
+            assert!(failure.text.contains("200 MB"), "{failure}");
         }
         Isolation::None => {
             assert_eq!(failure.code.as_str(), "process_exited");

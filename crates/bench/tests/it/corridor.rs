@@ -14,7 +14,7 @@ const KNOWN: f64 = 0.95;
 const WALLS_TRUE: f64 = 0.95;
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_corridors_map_is_built_on_a_robot_and_comes_back() {
+async fn corridor_map_is_built_on_a_robot_and_uploaded() {
     let stage = Stage::bare().await;
     let package = stage.dir.path().join("corridor_mapping");
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/corridor_mapping"), &package);

@@ -6,7 +6,7 @@ use std::io::Write as _;
 use rand::RngExt as _;
 use rand::SeedableRng as _;
 use task_proto::api::RobotView;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Fleet, Robot, Server, eventually, open_directory, write_package};
 use crate::proxy::Proxy;
@@ -16,7 +16,7 @@ fn pid_of(robot: &RobotView, task: &str) -> Option<u32> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
+async fn fetch_resumes_after_a_power_cut() {
     const SIZE: usize = 200_000_000;
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
@@ -63,7 +63,7 @@ async fn a_fetch_goes_on_where_the_power_cut_stopped_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_running_task_outlives_its_agent() {
+async fn running_task_survives_its_agent() {
     let mut fleet = Fleet::start(1).await;
     let package = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&package, "*").await;
@@ -81,7 +81,7 @@ async fn a_running_task_outlives_its_agent() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_order_survives_the_server() {
+async fn order_survives_a_server_crash() {
     let mut fleet = Fleet::start(2).await;
     let package = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&package, "*").await;
@@ -93,7 +93,7 @@ async fn an_order_survives_the_server() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn nothing_is_stuck_or_lost_after_a_hundred_power_cuts() {
+async fn nothing_is_lost_after_a_hundred_power_cuts() {
     let seed = rand::random::<u64>();
     println!("seed {seed}");
     let mut random = rand::rngs::SmallRng::seed_from_u64(seed);

@@ -2,7 +2,7 @@
 
 use task_proto::api::DeploymentView;
 use task_proto::desired::Delivery;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Robot, Server, add_ballast, eventually, write_package};
 use crate::proxy::Proxy;
@@ -31,7 +31,7 @@ async fn deliver(server: &Server, package: &std::path::Path, delivery: &str) -> 
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
+async fn small_package_arrives_inline_without_http() {
     const BYTES: usize = 24_000;
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
@@ -54,7 +54,7 @@ async fn a_small_package_comes_with_the_order_and_nothing_of_it_over_http() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
+async fn unannounced_order_is_found_by_polling() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let often = [("TASK_AGENT_POLL_INTERVAL_S", "1")];
@@ -71,7 +71,7 @@ async fn an_order_that_is_not_announced_is_found_by_the_robots_own_timer() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_without_mqtt_pulls_what_is_pushed() {
+async fn robot_without_mqtt_pulls_a_direct_push() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let alone = [("TASK_AGENT_MQTT", "false"), ("TASK_AGENT_POLL_INTERVAL_WITHOUT_MQTT_S", "1")];

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use task_proto::api::{AssignmentView, DeploymentView};
 use task_proto::desired::Delivery;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use tempfile::TempDir;
 
 use crate::harness::{Fleet, Robot, Server, add_ballast, eventually, write_package};
@@ -74,7 +74,7 @@ impl Setting {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_is_pushed_inside_messages_is_not_pulled() {
+async fn pushed_content_is_not_pulled() {
     let setting = Setting::start(3).await;
     let before = setting.http.bytes_to_clients();
     let ordered = setting.push().await;
@@ -90,7 +90,7 @@ async fn what_is_pushed_inside_messages_is_not_pulled() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_freezes_holds_up_nobody_and_pulls_when_it_is_back() {
+async fn frozen_robot_does_not_delay_others_and_pulls_later() {
     let setting = Setting::start(3).await;
     let ordered = setting.push().await;
     setting.wait_for_parts(BALLAST_BYTES / 2).await;
@@ -109,7 +109,7 @@ async fn a_robot_that_freezes_holds_up_nobody_and_pulls_when_it_is_back() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_power_cut_of_the_server_in_the_middle_loses_nothing() {
+async fn server_power_cut_during_fan_out_loses_nothing() {
     let mut setting = Setting::start(3).await;
     setting.push().await;
     setting.wait_for_parts(BALLAST_BYTES).await;
@@ -121,7 +121,7 @@ async fn a_power_cut_of_the_server_in_the_middle_loses_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_that_comes_late_gets_what_it_missed() {
+async fn late_robot_gets_the_missed_parts() {
     let mut setting = Setting::start(2).await;
     setting.fleet.robots[1].kill();
     setting.push().await;

@@ -22,7 +22,7 @@ fn verdict(checkup: &Value, check: &str) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_finds_its_server_by_both_ways() {
+async fn doctor_reaches_the_server_over_http_and_mqtt() {
     let mut fleet = Fleet::start(1).await;
     fleet.server.wait_online("robot-1").await;
     let checkup = doctor(&fleet.robots[0]).await;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rumqttc::{AsyncClient, MqttOptions, QoS};
 use serde_json::Value;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use tokio::task::JoinSet;
 
 use crate::harness::{Robot, Server, eventually, write_package};
@@ -47,7 +47,7 @@ async fn flood_http(client: reqwest::Client, url: String, token: String, refused
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flood_by_one_robot_keeps_nothing_from_another() {
+async fn flood_by_one_robot_does_not_delay_another() {
     let dir = tempfile::tempdir().expect("temp dir");
     let settings = [
         ("TASKD_ROBOTS_PATIENCE", "1s"),
@@ -57,7 +57,8 @@ async fn a_flood_by_one_robot_keeps_nothing_from_another() {
     let server = Server::start_with(&dir.path().join("server"), &settings).await;
     let mut bad = Robot::start(&server, dir.path(), "bad", 1).await;
     let _good = Robot::start(&server, dir.path(), "good", 2).await;
-    let (id, token) = (bad.id.to_string(), token_of(&bad));
+    let id = bad.id.to_string();
+    let token = token_of(&bad);
     bad.terminate();
 
     let mut flood = JoinSet::new();

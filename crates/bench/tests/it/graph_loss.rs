@@ -6,7 +6,7 @@ use std::net::UdpSocket;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{eventually, within};
 use crate::ros::{Stage, pid_of};
@@ -46,7 +46,7 @@ async fn is_answered(stage: &Stage) -> bool {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn packets_that_state_gigabytes_cost_a_robot_no_memory() {
+async fn packets_with_gigabyte_lengths_allocate_no_memory() {
     let stage = Stage::start().await;
     stage.push("watched", "--node watched", READY).await;
     let before = stage.runs("watched").await;
@@ -88,7 +88,7 @@ async fn a_task_keeps_running_while_the_process_on_its_graph_is_killed_and_comes
     let before = stage.runs("watched").await;
     let (agent, graph) = agent_and_graph(&stage).expect("the agent and its process on the graph");
     kill(Pid::from_raw(i32::try_from(graph).expect("a pid")), Signal::SIGKILL).expect("killed");
-    let back = within(crate::harness::PATIENCE, async || {
+    let back = within(crate::harness::TIMEOUT, async || {
         let task = stage.task("watched").await?;
         assert_eq!(task.phase, Phase::Running, "{task:?}");
         assert_eq!((pid_of(&task), task.restarts), (pid_of(&before), before.restarts));

@@ -14,7 +14,7 @@ use nix::sys::signal::Signal;
 use rand::{RngExt as _, SeedableRng as _};
 use serde_json::Value;
 use task_proto::api::{DeploymentView, INSTANCE_HEADER, PLACE_HEADER, RobotView};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use task_proto::{CaPin, InstanceId, RobotId};
 use task_transport::Trust;
 use tempfile::TempDir;
@@ -22,7 +22,7 @@ use tempfile::TempDir;
 use crate::leftovers;
 
 /// Time limit for any expected event on a busy machine.
-pub const PATIENCE: Duration = Duration::from_secs(90);
+pub const TIMEOUT: Duration = Duration::from_secs(90);
 
 /// Maximum number of log lines shown when a test fails.
 const MAX_SHOWN: usize = 100;
@@ -50,9 +50,9 @@ pub fn required(variable: &str) -> String {
         .unwrap_or_else(|_| panic!("{variable} is not set: run the tests with ./scripts/test"))
 }
 
-/// Polls until `ask` returns an answer; fails with `what` after [`PATIENCE`].
+/// Polls until `ask` returns an answer; fails with `what` after [`TIMEOUT`].
 pub async fn eventually<T>(what: &str, ask: impl AsyncFnMut() -> Option<T>) -> T {
-    eventually_within(PATIENCE, what, ask).await
+    eventually_within(TIMEOUT, what, ask).await
 }
 
 /// The same with another time limit, for events that take longer than most.
@@ -108,6 +108,11 @@ impl Process {
     pub fn terminate(&mut self) -> Option<i32> {
         self.signal(Signal::SIGTERM);
         self.0.wait().expect("reaped").code()
+    }
+
+    /// The exit code, once the process has ended by itself.
+    fn exit_code(&mut self) -> Option<i32> {
+        self.0.try_wait().expect("a child")?.code()
     }
 
     /// Sends any signal.
@@ -181,9 +186,25 @@ impl Server {
         }
     }
 
-    async fn launch(&mut self) {
-        let addresses = self.data.join("addresses.json");
-        let _ = std::fs::remove_file(&addresses);
+    /// Starts a server that ends by itself; returns its exit code and its log.
+    pub async fn start_refused(data: &Path, settings: &[(&str, &str)]) -> (i32, String) {
+        let mut server = Self::new(data, settings);
+        server.spawn();
+        (server.wait_ended().await, server.log())
+    }
+
+    /// Waits until the server has ended by itself, and returns its exit code.
+    pub async fn wait_ended(&mut self) -> i32 {
+        let process = self.process.as_mut().expect("server runs");
+        eventually("taskd to end", async || process.exit_code()).await
+    }
+
+    /// The log of all of its starts.
+    pub fn log(&self) -> String {
+        std::fs::read_to_string(self.data.with_extension("server.log")).expect("a log")
+    }
+
+    fn spawn(&mut self) {
         let log = log_file(&self.data.with_extension("server.log"));
         let mut command = Command::new(program("taskd"));
         command.arg("serve").arg("--data").arg(&self.data);
@@ -191,6 +212,12 @@ impl Server {
         command.envs(self.settings.iter().map(|(k, v)| (k, v)));
         command.stdout(log.try_clone().expect("log")).stderr(log);
         self.process = Some(Process::spawn(&mut command));
+    }
+
+    async fn launch(&mut self) {
+        let addresses = self.data.join("addresses.json");
+        let _ = std::fs::remove_file(&addresses);
+        self.spawn();
         let found: Value = eventually("taskd to write its addresses", async || {
             serde_json::from_slice(&std::fs::read(&addresses).ok()?).ok()
         })
@@ -309,8 +336,8 @@ impl Server {
     /// Runs an operator's command that must exit with status 0.
     pub async fn operate<S: AsRef<OsStr>>(&self, args: impl IntoIterator<Item = S>) -> String {
         let output = self.try_operate(args).await;
-        let (out, err) =
-            (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        let out = String::from_utf8_lossy(&output.stdout);
+        let err = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success(), "{}\nstdout: {out}\nstderr: {err}", output.status);
         out.into_owned()
     }
@@ -390,7 +417,7 @@ impl Robot {
     }
 
     /// Enrolls the robot anew with this token; the agent must not be running.
-    pub async fn enroll_anew(&self, number: u8, token: &str) {
+    pub async fn enroll_again(&self, number: u8, token: &str) {
         enroll(&self.data, number, &self.environment, &["--token", token, "--force"]).await;
     }
 
@@ -401,7 +428,8 @@ impl Robot {
         for file in ["identity.json", "agent.toml"] {
             std::fs::copy(self.data.join(file), data.join(file)).expect("copied");
         }
-        let (environment, id) = (self.environment.clone(), self.id.clone());
+        let environment = self.environment.clone();
+        let id = self.id.clone();
         let mut thief = Self { process: None, data, environment, name: self.name.clone(), id };
         thief.restart();
         thief
@@ -413,7 +441,8 @@ impl Robot {
         let copied =
             Command::new("cp").arg("-a").arg(&self.data).arg(&data).status().expect("cp runs");
         assert!(copied.success(), "the data directory is copied");
-        let (environment, id) = (self.environment.clone(), self.id.clone());
+        let environment = self.environment.clone();
+        let id = self.id.clone();
         Self { process: None, data, environment, name: self.name.clone(), id }
     }
 
@@ -528,7 +557,9 @@ impl Fleet {
 pub fn write_package(dir: &Path, name: &str, version: &str, kind: &str, script: &str) {
     std::fs::create_dir_all(dir).expect("package directory");
     let toml = format!(
-        "name = {name:?}\nversion = {version:?}\n[run]\nexec = [\"sh\", \"main.sh\"]\nkind = {kind:?}\nstop_timeout_s = 2\n[ready]\nhold_s = 0\n"
+        "name = {name:?}\nversion = {version:?}\n\
+         [run]\nexec = [\"sh\", \"main.sh\"]\nkind = {kind:?}\nstop_timeout_s = 2\n\
+         [ready]\nhold_s = 0\n"
     );
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
     std::fs::write(dir.join("main.sh"), script).expect("main.sh");

@@ -10,7 +10,7 @@ use rumqttc::{
 use serde_json::json;
 use task_proto::Digest;
 use task_proto::desired::BlobRef;
-use task_proto::oci::ImageManifest;
+use task_proto::packages::oci::ImageManifest;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
@@ -71,7 +71,7 @@ async fn upload(server: &Server, name: &str, tar: &[u8], entries: usize) -> (u16
     let answer = client
         .put(server.url(&format!("/v2/{name}/manifests/1.0.0")))
         .bearer_auth(server.operator_token())
-        .header("content-type", task_proto::oci::MANIFEST_TYPE)
+        .header("content-type", task_proto::packages::oci::MANIFEST_TYPE)
         .body(manifest)
         .send()
         .await
@@ -103,7 +103,7 @@ async fn hostile_archive_is_refused_at_push_with_its_reason() {
         (
             "bomb",
             vec![entry("zeros", b'0', "", &vec![0; 300_000_000])],
-            "uncompressed bytes for so few",
+            "uncompressed bytes for this compressed size",
         ),
     ];
     for (name, entries, reason) in cases {
@@ -161,14 +161,15 @@ async fn next_packet(events: &mut rumqttc::EventLoop) -> Result<Packet, Connecti
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_robots_credentials_reach_no_other_robot() {
+async fn robot_credentials_reach_no_other_robot() {
     let mut fleet = Fleet::start(2).await;
     let identity: serde_json::Value = serde_json::from_slice(
         &std::fs::read(fleet.robots[0].data().join("identity.json")).expect("identity"),
     )
     .expect("json");
     fleet.robots[0].terminate();
-    let (own, other) = (fleet.robots[0].id.to_string(), fleet.robots[1].id.to_string());
+    let own = fleet.robots[0].id.to_string();
+    let other = fleet.robots[1].id.to_string();
     let options = |password: &str| {
         let mut options =
             MqttOptions::new(&own, fleet.server.mqtt.ip().to_string(), fleet.server.mqtt.port());

@@ -11,7 +11,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use serde_json::Value;
 
-use crate::harness::PATIENCE;
+use crate::harness::TIMEOUT;
 
 /// Ends all that the agent with this data directory has started.
 pub fn end(data: &Path) {
@@ -49,7 +49,7 @@ fn cgroups_of(data: &Path) -> BTreeSet<PathBuf> {
 /// groups there.
 fn remove_cgroup(group: &Path) {
     let start = Instant::now();
-    while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < PATIENCE {
+    while group.exists() && std::fs::remove_dir(group).is_err() && start.elapsed() < TIMEOUT {
         let inside = std::fs::read_to_string(group.join("cgroup.procs")).unwrap_or_default();
         for pid in inside.lines().filter_map(|line| line.parse().ok()) {
             let _ = kill(Pid::from_raw(pid), Signal::SIGKILL);

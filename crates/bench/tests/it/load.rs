@@ -16,8 +16,8 @@ async fn a_load_run_measures_every_phase_and_leaves_no_robots() {
         .kill_on_drop(true)
         .output();
     let output = run.await.expect("taskbench runs");
-    let (out, err) =
-        (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    let out = String::from_utf8_lossy(&output.stdout);
+    let err = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{}\n{out}\n{err}", output.status);
 
     let result: Value = serde_json::from_str(&out).unwrap_or_else(|error| panic!("{error}: {out}"));

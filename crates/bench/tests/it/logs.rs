@@ -8,10 +8,10 @@ use std::process::{Child, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 
 use task_proto::api::{LogsFrom, LogsView};
-use task_proto::log::{LogLevel, LogLine};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
+use task_proto::telemetry::log::{LogLevel, LogLine};
 
-use crate::harness::{Fleet, PATIENCE, eventually, open_directory};
+use crate::harness::{Fleet, TIMEOUT, eventually, open_directory};
 
 /// A robot with a task that follows the test's commands.
 struct Bench {
@@ -30,7 +30,8 @@ impl Bench {
         // Held open both ways, so that no order falls between the end of one and the beginning of
         // the next.
         let script = format!(
-            "mkfifo {path}\nexec 3<>{path}\n{first}\nwhile read -r order <&3; do eval \"$order\"; done\n"
+            "mkfifo {path}\nexec 3<>{path}\n{first}\n\
+             while read -r order <&3; do eval \"$order\"; done\n"
         );
         fleet.server.push(&fleet.package("speaker", "1.0.0", "service", &script), "*").await;
         fleet.server.wait_phase("robot-1", "speaker", Phase::Running).await;
@@ -66,7 +67,8 @@ impl Bench {
             .command([&["logs", "-f", "robot-1", "-o", "json"], arguments].concat());
         let mut child =
             command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("taskd runs");
-        let (lines, remarks) = (lines_of(child.stdout.take()), lines_of(child.stderr.take()));
+        let lines = lines_of(child.stdout.take());
+        let remarks = lines_of(child.stderr.take());
         Follower { child, lines, remarks }
     }
 }
@@ -89,7 +91,7 @@ struct Follower {
 
 impl Follower {
     fn next(&self) -> LogLine {
-        let line = self.lines.recv_timeout(PATIENCE).expect("a line in time");
+        let line = self.lines.recv_timeout(TIMEOUT).expect("a line in time");
         serde_json::from_str(&line).unwrap_or_else(|error| panic!("{error}: {line}"))
     }
 
@@ -97,7 +99,7 @@ impl Follower {
         loop {
             let remark = self
                 .remarks
-                .recv_timeout(PATIENCE)
+                .recv_timeout(TIMEOUT)
                 .unwrap_or_else(|_| panic!("nothing says {text:?}"));
             if remark.contains(text) {
                 return remark;
@@ -118,7 +120,7 @@ fn texts(view: &LogsView) -> Vec<&str> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn lines_are_fetched_with_their_levels_and_remembered_when_the_robot_is_away() {
+async fn log_lines_keep_levels_and_stay_available_offline() {
     let first = "echo hello; echo oops >&2; echo '[ERROR] [1.5] [arm.driver]: broken' >&2";
     let mut bench = Bench::start(first).await;
     let view = eventually("all three lines", async || {
@@ -160,7 +162,7 @@ async fn lines_are_fetched_with_their_levels_and_remembered_when_the_robot_is_aw
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
+async fn follow_shows_each_line_once_across_a_server_restart() {
     let mut bench = Bench::start("echo before").await;
     eventually("the past", async || {
         texts(&bench.logs(&[]).await).contains(&"before").then_some(())
@@ -187,13 +189,13 @@ async fn following_shows_each_line_once_also_over_a_restart_of_the_server() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_flood_is_counted_and_stays_within_its_bounds() {
+async fn log_flood_is_counted_and_bounded() {
     let bench = Bench::start("echo up").await;
     let follower = bench.follow(&["--level", "warn"]);
     bench.order("echo ready >&2\n".to_owned()).await;
     while follower.next().text != "ready" {}
     bench.order("seq 25000 >&2\n".to_owned()).await;
-    follower.remark("more lines were left out");
+    follower.remark("more lines were dropped");
     let view = eventually("the end of the flood", async || {
         let view = bench.logs(&["-n", "10"]).await;
         texts(&view).last().is_some_and(|last| *last == "25000").then_some(view)

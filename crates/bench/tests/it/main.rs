@@ -4,6 +4,7 @@
 mod approval;
 mod broker;
 mod client_ids;
+mod cluster;
 mod confinement;
 mod corridor;
 mod crash;

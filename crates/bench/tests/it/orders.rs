@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Fleet, Robot, Server, eventually, write_package};
 use crate::proxy::Proxy;

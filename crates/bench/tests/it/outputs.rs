@@ -6,7 +6,7 @@ use tempfile::TempDir;
 use crate::harness::{Robot, Server, eventually, write_package};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_the_server_would_not_keep_does_not_travel_and_says_why() {
+async fn outputs_the_server_would_refuse_are_not_uploaded() {
     let dir = TempDir::new().expect("temp dir");
     let server =
         Server::start_with(&dir.path().join("server"), &[("TASKD_ROBOTS_OUTPUT_BYTES", "64MB")])

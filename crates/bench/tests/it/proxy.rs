@@ -26,7 +26,8 @@ impl Proxy {
             to_client: Arc::default(),
             bytes_per_s: Arc::new(AtomicU64::new(bytes_per_s)),
         };
-        let (counter, rate) = (proxy.to_client.clone(), proxy.bytes_per_s.clone());
+        let counter = proxy.to_client.clone();
+        let rate = proxy.bytes_per_s.clone();
         tokio::spawn(async move {
             while let Ok((client, _)) = listener.accept().await {
                 tokio::spawn(forward(client, target, counter.clone(), rate.clone()));

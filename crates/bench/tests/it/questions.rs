@@ -32,7 +32,7 @@ fn named<'a>(list: &'a Value, name: &str) -> &'a Value {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_operator_looks_at_nodes_and_changes_them() {
+async fn operator_inspects_and_changes_nodes() {
     let stage = Stage::start().await;
     let rest = "restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\nlifecycle = ['/asked']\n";
     stage.push("asked", "--node asked --lifecycle --service /say --topic /ticks", rest).await;

@@ -102,8 +102,8 @@ async fn crane_copies_a_package_under_another_name() {
     let host = server.http.to_string();
     let token = server.operator_token();
     crane(dir.path(), &["auth", "login", &host, "-u", "anyone", "-p", &token]).await;
-    let (own, mirror) =
-        (format!("{host}/talker:1.0.0"), format!("{host}/mirror/team/talker:1.0.0"));
+    let own = format!("{host}/talker:1.0.0");
+    let mirror = format!("{host}/mirror/team/talker:1.0.0");
     crane(dir.path(), &["copy", "--insecure", &own, &mirror]).await;
     let digest = crane(dir.path(), &["digest", "--insecure", &own]).await;
     assert_eq!(crane(dir.path(), &["digest", "--insecure", &mirror]).await, digest);

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Fleet, eventually};
 
@@ -20,7 +20,7 @@ fn copy_database(from: &Path, to: &Path) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_restored_database_harms_no_running_task() {
+async fn restored_database_stops_no_running_task() {
     let mut fleet = Fleet::start(2).await;
     let first = fleet.package("first", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&first, "*").await;

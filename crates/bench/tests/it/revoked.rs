@@ -4,12 +4,12 @@
 
 use rumqttc::{AsyncClient, ConnectReturnCode, ConnectionError, MqttOptions};
 use serde_json::Value;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tokio::net::TcpStream;
 
 use crate::harness::{
-    Fleet, PATIENCE, Robot, Server, add_ballast, eventually, from_restarted_agent, program,
+    Fleet, Robot, Server, TIMEOUT, add_ballast, eventually, from_restarted_agent, program,
 };
 
 /// More than all buffers between the server and a client that reads nothing.
@@ -47,7 +47,7 @@ async fn refused_over_mqtt(server: &Server, robot: &str, token: &str) -> Connect
     let mut options = MqttOptions::new(robot, server.mqtt.ip().to_string(), server.mqtt.port());
     options.set_credentials(robot, token);
     let (_client, mut events) = AsyncClient::new(options, 1);
-    match tokio::time::timeout(PATIENCE, events.poll()).await.expect("an answer") {
+    match tokio::time::timeout(TIMEOUT, events.poll()).await.expect("an answer") {
         Err(ConnectionError::ConnectionRefused(code)) => code,
         other => panic!("expected a refusal, got {other:?}"),
     }
@@ -57,8 +57,9 @@ async fn refused_over_mqtt(server: &Server, robot: &str, token: &str) -> Connect
 async fn half_a_report(server: &Server, robot: &str, token: &str) -> TcpStream {
     let mut stream = TcpStream::connect(server.http).await.expect("listens");
     let head = format!(
-        "POST /api/v1/robots/{robot}/report HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {token}\r\n\
-         content-type: application/json\r\ncontent-length: 100\r\nexpect: 100-continue\r\n\r\n"
+        "POST /api/v1/robots/{robot}/report HTTP/1.1\r\nhost: x\r\n\
+         authorization: Bearer {token}\r\ncontent-type: application/json\r\n\
+         content-length: 100\r\nexpect: 100-continue\r\n\r\n"
     );
     stream.write_all(head.as_bytes()).await.expect("sent");
     // The server asks for the body once the robot is admitted.
@@ -69,8 +70,32 @@ async fn half_a_report(server: &Server, robot: &str, token: &str) -> TcpStream {
     stream
 }
 
+/// Registers the first robot anew with its own command; the agent is stopped before.
+async fn enroll_again(fleet: &mut Fleet) {
+    let out =
+        fleet.server.operate(["enroll-token", "create", "--robot", "robot-1", "--uses", "1"]).await;
+    fleet.robots[0].terminate();
+    let data = fleet.robots[0].data().to_owned();
+    #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
+    let mut enroll = std::process::Command::new(program("task-agent"));
+    enroll.args([
+        "enroll",
+        "--force",
+        "--mac",
+        "02:00:00:00:00:01",
+        "--server",
+        &fleet.server.url(""),
+        "--data",
+    ]);
+    enroll.arg(&data).env("TASK_AGENT_ENROLL_TOKEN", out.trim());
+    let enrolled = tokio::task::spawn_blocking(move || enroll.output().expect("runs"))
+        .await
+        .expect("no panic");
+    assert!(enrolled.status.success(), "{}", String::from_utf8_lossy(&enrolled.stderr));
+}
+
 #[tokio::test(flavor = "multi_thread")]
-async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
+async fn revoked_robot_is_disconnected_and_its_task_keeps_running() {
     let mut fleet = Fleet::start(1).await;
     let steady = fleet.package("steady", "1.0.0", "service", "exec sleep 1000\n");
     fleet.server.push(&steady, "*").await;
@@ -82,8 +107,10 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     // half a minute.
     fleet.robots[0].freeze();
     let blob = fleet.server.push(&heavy, "*").await.package.content;
-    let (server, robot) = (&fleet.server, &fleet.robots[0]);
-    let (id, token) = (robot.id.to_string(), token_of(robot));
+    let server = &fleet.server;
+    let robot = &fleet.robots[0];
+    let id = robot.id.to_string();
+    let token = token_of(robot);
 
     let client = reqwest::Client::new();
     let url = server.url(&format!("/v2/heavy/blobs/{}", blob.digest));
@@ -99,7 +126,7 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
 
     server.operate(["robot", "revoke", "robot-1", "--yes"]).await;
 
-    let cut = tokio::time::timeout(PATIENCE, async {
+    let cut = tokio::time::timeout(TIMEOUT, async {
         loop {
             match download.chunk().await {
                 Ok(Some(chunk)) => got += chunk.len() as u64,
@@ -110,8 +137,7 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     });
     assert!(cut.await.expect("an end") && got < blob.size, "{got} of {} bytes came", blob.size);
     let mut rest = Vec::new();
-    let ended =
-        tokio::time::timeout(PATIENCE, report.read_to_end(&mut rest)).await.expect("an end");
+    let ended = tokio::time::timeout(TIMEOUT, report.read_to_end(&mut rest)).await.expect("an end");
     assert!(
         ended.is_err() || rest.is_empty(),
         "the report was answered: {}",
@@ -147,41 +173,12 @@ async fn a_revoked_robot_is_out_at_once_and_keeps_what_runs() {
     assert!(out.contains("offline revoked"), "{out}");
 
     // The robot comes back, and to the orders made meanwhile, once it is registered anew.
-    let out =
-        fleet.server.operate(["enroll-token", "create", "--robot", "robot-1", "--uses", "1"]).await;
-    fleet.robots[0].terminate();
-    let data = fleet.robots[0].data().to_owned();
-    #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
-    let mut enroll = std::process::Command::new(program("task-agent"));
-    enroll.args([
-        "enroll",
-        "--force",
-        "--mac",
-        "02:00:00:00:00:01",
-        "--server",
-        &fleet.server.url(""),
-        "--data",
-    ]);
-    enroll.arg(&data).env("TASK_AGENT_ENROLL_TOKEN", out.trim());
-    let enrolled = tokio::task::spawn_blocking(move || enroll.output().expect("runs"))
-        .await
-        .expect("no panic");
-    assert!(enrolled.status.success(), "{}", String::from_utf8_lossy(&enrolled.stderr));
+    enroll_again(&mut fleet).await;
     fleet.robots[0].restart();
     let view = fleet.server.wait_phase("robot-1", "heavy", Phase::Running).await;
-    assert!(
-        view.conditions.iter().all(|condition| condition.code != "revoked"),
-        "{:?}",
-        view.conditions
-    );
-    let same = view
-        .tasks
-        .iter()
-        .find(|task| task.task.as_str() == "steady")
-        .and_then(|task| task.active.as_ref());
-    assert_eq!(
-        same.map(|active| u64::from(active.pid)),
-        Some(pid),
-        "what ran is not started again"
-    );
+    let conditions = &view.conditions;
+    assert!(conditions.iter().all(|condition| condition.code != "revoked"), "{conditions:?}");
+    let same = view.tasks.iter().find(|task| task.task.as_str() == "steady");
+    let same_pid = same.and_then(|task| task.active.as_ref()).map(|active| u64::from(active.pid));
+    assert_eq!(same_pid, Some(pid), "a running task is not started again");
 }

@@ -11,11 +11,11 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use task_proto::api::RobotTask;
-use task_proto::report::{Failure, Phase};
+use task_proto::messages::report::{Failure, Phase};
 use tempfile::TempDir;
 
 use crate::harness::{
-    PATIENCE, Process, Robot, Server, eventually, eventually_within, required, within,
+    Process, Robot, Server, TIMEOUT, eventually, eventually_within, required, within,
 };
 use crate::leftovers::processes_with;
 use crate::talker::trigger;
@@ -153,7 +153,7 @@ impl Stage {
         which: impl Fn(RobotTask) -> Option<T>,
     ) -> T {
         let mut seen = None;
-        let answer = within(PATIENCE, async || {
+        let answer = within(TIMEOUT, async || {
             seen = self.task(name).await;
             which(seen.clone().filter(|task| task.phase == phase)?)
         })
@@ -205,7 +205,8 @@ fn write_toml(dir: &Path, name: &str, version: &str, arguments: &str, rest: &str
         ["install/graph_probe/lib/graph_probe/probe"].into_iter().chain(arguments.split(' '));
     let words: Vec<&str> = words.collect();
     let toml = format!(
-        "name = {name:?}\nversion = {version:?}\n[run]\nexec = {words:?}\nstop_timeout_s = 30\n{rest}"
+        "name = {name:?}\nversion = {version:?}\n\
+         [run]\nexec = {words:?}\nstop_timeout_s = 30\n{rest}"
     );
     std::fs::write(dir.join("task.toml"), toml).expect("task.toml");
 }
@@ -238,7 +239,7 @@ pub fn pid_of(task: &RobotTask) -> u32 {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
+async fn task_runs_once_ros_is_ready_and_stops_gracefully() {
     let stage = Stage::start().await;
     let ready = |what: &str| format!("[ready]\nhold_s = 1\ntimeout_s = 60\n{what}\n");
     // This one is built on the robot.
@@ -255,7 +256,8 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
             &ready("topics = { '/ticks' = { min_hz = 10 } }"),
         )
         .await;
-    let late = "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n[parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
+    let late = "lifecycle = ['/by_lifecycle']\nservices = ['/ask']\n\
+                [parameters.'/by_lifecycle']\nlate = 7\nresolution = 0.5";
     stage
         .push("by-lifecycle", "--node by_lifecycle --lifecycle --service /ask", &ready(late))
         .await;
@@ -285,13 +287,14 @@ async fn a_task_runs_when_ros_says_so_and_stops_in_good_order() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_never_gets_ready_fails_and_says_what_is_missing() {
+async fn task_that_never_gets_ready_fails_with_the_missing_condition() {
     let stage = Stage::start().await;
     let by = |timeout_s: u32, what: &str| {
         format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\n{what}\n")
     };
     // A missing item is judged at the deadline, a refused one as soon as the refusal is seen.
-    let (short, long) = (|what: &str| by(30, what), |what: &str| by(80, what));
+    let short = |what: &str| by(30, what);
+    let long = |what: &str| by(80, what);
     stage.push("absent", "--node lidar", &short("nodes = ['/mapper']")).await;
     stage
         .push(
@@ -327,7 +330,11 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
 
     let failures = [
         ("absent", "not_ready", "`/mapper` did not appear within 30 s; on the graph: "),
-        ("slow", "not_ready", "`/slow` did not come at 10 Hz within 30 s; it came at "),
+        (
+            "slow",
+            "not_ready",
+            "`/slow` was not published at 10 Hz within 30 s; it was published at ",
+        ),
         ("picky", "parameter_rejected", "`/picky` resolution = -1: must be positive"),
         ("stubborn", "lifecycle_failed", "`/stubborn` failed to configure and is unconfigured"),
         ("taken", "node_name_taken", "`/taken` is already on the graph: process "),
@@ -340,7 +347,7 @@ async fn what_never_gets_ready_fails_and_says_what_is_missing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
+async fn lost_readiness_degrades_the_task_with_a_reason() {
     let stage = Stage::start().await;
     let ready =
         |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
@@ -391,7 +398,7 @@ async fn what_breaks_while_it_runs_degrades_the_task_and_says_why() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
+async fn restarted_agent_adopts_running_tasks_unchanged() {
     let mut stage = Stage::start().await;
     let ready =
         |what: &str| format!("restart = 'never'\n[ready]\nhold_s = 0\ntimeout_s = 60\n{what}\n");
@@ -415,7 +422,7 @@ async fn a_new_agent_sees_running_tasks_as_they_are_and_leaves_them_alone() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_version_that_does_not_get_ready_gives_way_to_the_one_before() {
+async fn version_that_never_gets_ready_is_rolled_back() {
     let stage = Stage::start().await;
     let ready = |node: &str, timeout_s: u32| {
         format!("[ready]\nhold_s = 0\ntimeout_s = {timeout_s}\nlifecycle = ['/{node}']\n")

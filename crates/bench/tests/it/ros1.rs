@@ -5,7 +5,7 @@
 use std::net::TcpListener;
 use std::path::Path;
 
-use task_proto::report::{FailureCode, Phase};
+use task_proto::messages::report::{FailureCode, Phase};
 
 use crate::harness::{Fleet, Robot, Server, eventually, required};
 use crate::leftovers::processes_with;
@@ -106,9 +106,11 @@ async fn a_robot_without_a_ros_package_is_unmet_before_the_content_travels() {
     );
     let package = fleet.dir.path().join("navigator");
     std::fs::create_dir(&package).expect("made");
-    let xml = "<package format=\"3\"><name>navigator</name><version>1.0.0</version><description>d</description>\
+    let xml = "<package format=\"3\"><name>navigator</name><version>1.0.0</version>\
+        <description>d</description>\
         <maintainer email=\"a@example.org\">A</maintainer><license>Apache-2.0</license>\
-        <exec_depend>rclpy</exec_depend><exec_depend>std_msgs</exec_depend><exec_depend>python3-numpy</exec_depend>\
+        <exec_depend>rclpy</exec_depend><exec_depend>std_msgs</exec_depend>\
+        <exec_depend>python3-numpy</exec_depend>\
         <exec_depend>taskd_absent_bringup</exec_depend><exec_depend>taskd_absent_msgs</exec_depend>\
         <exec_depend condition=\"$ROS_VERSION == 1\">taskd_absent_of_ros_1</exec_depend>\
         <export><build_type>ament_python</build_type></export></package>";
@@ -124,7 +126,7 @@ async fn a_robot_without_a_ros_package_is_unmet_before_the_content_travels() {
     let view = fleet.server.wait_phase("robot-1", "navigator", Phase::Unmet).await;
     let failure = view.tasks[0].failure.clone().expect("why");
     assert_eq!(failure.code, FailureCode::REQUIREMENTS_UNMET);
-    let list = "requires: ROS package taskd_absent_bringup, ROS package taskd_absent_msgs";
+    let list = "navigator 1.0.0: ROS package taskd_absent_bringup, ROS package taskd_absent_msgs";
     assert!(failure.text.ends_with(list), "{failure}");
     let log = std::fs::read_to_string(fleet.robots[0].data().with_extension("agent.log"))
         .expect("the agent's log");

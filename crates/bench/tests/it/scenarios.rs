@@ -10,7 +10,8 @@ use crate::harness::program;
 use crate::leftovers::processes_with;
 
 async fn taskbench(dir: &Path, arguments: &[&str]) -> Output {
-    let (data, out) = (dir.join("data"), dir.join("out"));
+    let data = dir.join("data");
+    let out = dir.join("out");
     std::fs::create_dir(&data).expect("a directory");
     let run = tokio::process::Command::new(program("taskbench"))
         .args(arguments)
@@ -66,7 +67,7 @@ const MECHANISMS: [&str; 8] = [
 ];
 
 #[tokio::test(flavor = "multi_thread")]
-async fn every_robot_gets_the_very_bytes_by_every_mechanism_of_the_paper() {
+async fn every_mechanism_delivers_identical_bytes_to_every_robot() {
     let dir = tempfile::tempdir().expect("temp dir");
     let output = taskbench(dir.path(), &["paper", "--quick"]).await;
     let points = arrived(dir.path(), "paper", &output);
@@ -84,7 +85,7 @@ async fn every_robot_gets_the_very_bytes_by_every_mechanism_of_the_paper() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_fleet_connects_and_each_robot_of_it_gets_the_package() {
+async fn fleet_connects_and_every_robot_gets_the_package() {
     for encrypted in [None, Some("--tls")] {
         let dir = tempfile::tempdir().expect("temp dir");
         let arguments =
@@ -98,7 +99,7 @@ async fn a_fleet_connects_and_each_robot_of_it_gets_the_package() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_link_is_made_of_namespaces_that_go_with_the_run_or_refused_in_words() {
+async fn link_uses_temporary_namespaces_or_is_refused_with_a_reason() {
     let dir = tempfile::tempdir().expect("temp dir");
     let arguments =
         ["paper", "--quick", "--only", "push-pull", "--max-payload", "1000", "--link", "50mbit"];

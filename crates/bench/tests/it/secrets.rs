@@ -4,7 +4,7 @@
 #![expect(clippy::disallowed_methods, reason = "a test starts processes")]
 
 use std::collections::BTreeSet;
-use std::io::{BufRead as _, BufReader, Write as _};
+use std::io::Write as _;
 use std::net::SocketAddr;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
@@ -15,14 +15,14 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use task_proto::report::Phase;
-use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use task_proto::messages::report::Phase;
+use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, AsyncWriteExt as _, BufReader};
 use tokio::net::{TcpListener, TcpStream};
 
-use crate::harness::{Robot, Server, from_restarted_agent, program, write_package};
+use crate::harness::{Robot, Server, TIMEOUT, from_restarted_agent, program, write_package};
 
 /// Files that may hold a secret, if only their owner can read them.
-const KEEPERS: [&str; 3] = ["operator.token", "identity.json", "credentials.json"];
+const TOKEN_FILES: [&str; 3] = ["operator.token", "identity.json", "credentials.json"];
 
 /// Secrets that must not appear anywhere, each with a description.
 #[derive(Default)]
@@ -83,8 +83,8 @@ impl Witness {
 /// Stands before the server and records all bytes sent to the server.
 async fn listen_in(target: SocketAddr) -> (SocketAddr, Arc<Mutex<Vec<u8>>>) {
     let listener = TcpListener::bind("127.0.0.1:0").await.expect("port");
-    let (address, heard) =
-        (listener.local_addr().expect("bound"), Arc::new(Mutex::new(Vec::new())));
+    let address = listener.local_addr().expect("bound");
+    let heard = Arc::new(Mutex::new(Vec::new()));
     let kept = heard.clone();
     tokio::spawn(async move {
         while let Ok((client, _)) = listener.accept().await {
@@ -128,25 +128,29 @@ async fn run(mut command: Command, input: &str) -> Output {
     tokio::task::spawn_blocking(run).await.expect("no panic")
 }
 
-/// Runs the command until its standard error contains `words`, then kills the process. Returns its
-/// complete standard error.
-async fn run_until(mut command: Command, words: &'static str) -> Vec<u8> {
-    let run = move || {
-        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().expect("runs");
-        let mut said = Vec::new();
-        let mut errors = BufReader::new(child.stderr.take().expect("piped"));
+/// Runs the command until its standard error contains `words`, then kills the process. Returns the
+/// standard error up to there.
+async fn run_until(command: Command, words: &str) -> Vec<u8> {
+    let mut child = tokio::process::Command::from(command)
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("runs");
+    let mut errors = BufReader::new(child.stderr.take().expect("piped"));
+    let mut said = Vec::new();
+    let reading = async {
         while !String::from_utf8_lossy(&said).contains(words) {
-            assert_ne!(
-                errors.read_until(b'\n', &mut said).expect("readable"),
-                0,
-                "it ended without {words:?}"
-            );
+            if errors.read_until(b'\n', &mut said).await.expect("readable") == 0 {
+                return false;
+            }
         }
-        child.kill().expect("killed");
-        child.wait().expect("ended");
-        said
+        true
     };
-    tokio::task::spawn_blocking(run).await.expect("no panic")
+    let is_said = tokio::time::timeout(TIMEOUT, reading).await;
+    child.kill().await.expect("killed");
+    let text = String::from_utf8_lossy(&said);
+    assert_eq!(is_said, Ok(true), "no {words:?} within {TIMEOUT:?}, only {text:?}");
+    said
 }
 
 fn files_below(dir: &Path, found: &mut Vec<PathBuf>) {
@@ -165,7 +169,7 @@ fn mangled(token: &str) -> String {
 }
 
 /// Users' mistakes with secrets at the command line; each must fail.
-async fn do_wrong(
+async fn misuse_credentials(
     server: &Server,
     dir: &Path,
     secrets: &Secrets,
@@ -202,7 +206,7 @@ async fn do_wrong(
         wrong.push(enroll);
     }
     // A server waits for a database that is away, and says so.
-    let said = run_until(serve(&[("TASKD_DATABASE", &url)], &[]), "the server waits").await;
+    let said = run_until(serve(&[("TASKD_DATABASE", &url)], &[]), "waiting for it").await;
     secrets.assert_absent("a server whose database is away", &said);
     for command in wrong {
         let shown = format!("{command:?}").replace(password, "…");
@@ -223,7 +227,7 @@ async fn do_wrong(
 }
 
 /// The same over HTTP: gives all answers.
-async fn ask_wrongly(server: &Server, tokens: &[String], password: &str) -> Vec<u8> {
+async fn send_bad_credentials(server: &Server, tokens: &[String], password: &str) -> Vec<u8> {
     let client = reqwest::Client::new();
     let post = |path: &str, body: Value| {
         client.post(server.url(path)).header("origin", server.url("")).json(&body)
@@ -377,7 +381,7 @@ fn look_through(dir: &Path, secrets: &Secrets) {
         let found = secrets.found_in(&bytes);
         let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mode = std::fs::metadata(&path).expect("there").permissions().mode() & 0o777;
-        let is_kept = KEEPERS.contains(&name.as_str()) && mode == 0o600 || name == "wrong.toml";
+        let is_kept = TOKEN_FILES.contains(&name.as_str()) && mode == 0o600 || name == "wrong.toml";
         assert!(found.is_empty() || is_kept, "{} ({mode:o}) holds {found:?}", path.display());
     }
 }
@@ -389,16 +393,19 @@ async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     let mut server =
         Server::start_with(&dir.path().join("server"), &[("TASKD_LOG", "trace")]).await;
     let (proxy, heard) = listen_in(server.http).await;
-    let (password, mut secrets) =
-        (format!("hush-{:032x}", rand::random::<u128>()), Secrets::default());
+    let password = format!("hush-{:032x}", rand::random::<u128>());
+    let mut secrets = Secrets::default();
     secrets.0.push(("the password", password.clone()));
     secrets.token("the first token", &server.operator_token());
     let signed_in = person(&server, dir.path(), proxy, &password, &mut secrets).await;
     let (mut agent, [enrolment, token]) = robot(&server, dir.path(), proxy, &mut secrets).await;
 
     let tokens = [server.operator_token(), signed_in, enrolment, token];
-    do_wrong(&server, dir.path(), &secrets, &tokens, &password).await;
-    secrets.assert_absent("an error over HTTP", &ask_wrongly(&server, &tokens, &password).await);
+    misuse_credentials(&server, dir.path(), &secrets, &tokens, &password).await;
+    secrets.assert_absent(
+        "an error over HTTP",
+        &send_bad_credentials(&server, &tokens, &password).await,
+    );
     read_all(&server, &secrets).await;
 
     agent.terminate();

@@ -2,7 +2,7 @@
 //! restart, and later without a server.
 
 use nix::sys::signal::Signal;
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::eventually;
 use crate::ros::{Stage, activate, pid_of};
@@ -10,11 +10,11 @@ use crate::ros::{Stage, activate, pid_of};
 const READY: &str = "[ready]\nhold_s = 0\ntimeout_s = 60\nservices = ['/say']\n";
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_has_its_ros_from_the_server() {
+async fn robot_takes_its_ros_settings_from_the_server() {
     let mut stage = Stage::with(|_| vec![("TASK_AGENT_VITALS_INTERVAL_S", "1".to_owned())]).await;
     stage.build().await;
-    let (underlays, domain) =
-        (format!("underlays={}", activate()), format!("ros_domain_id={}", stage.domain.id));
+    let underlays = format!("underlays={}", activate());
+    let domain = format!("ros_domain_id={}", stage.domain.id);
     stage.server.operate(["robot", "edit", "robot-1", "--set", &underlays, "--set", &domain]).await;
     stage.push("talker", "--node talker --service /say", READY).await;
     let before = pid_of(&stage.runs("talker").await);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 use task_proto::api::RobotView;
-use task_proto::report::{Failure, FailureCode, Phase};
+use task_proto::messages::report::{Failure, FailureCode, Phase};
 
 use crate::harness::{Robot, Server, eventually, write_package};
 
@@ -87,7 +87,7 @@ impl Site {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn what_enough_publishers_have_signed_runs_whatever_way_it_takes_and_nothing_else_does() {
+async fn only_packages_with_enough_signatures_run_by_any_delivery() {
     let (site, keys) = Site::start(2, &["ada.key", "bob.key"]).await;
     let [ada, bob] = [0, 1].map(|at: usize| keys[at].0.as_str());
     let (eve, _) = new_key(&site.server, site.dir.path(), "eve.key").await;
@@ -104,7 +104,7 @@ async fn what_enough_publishers_have_signed_runs_whatever_way_it_takes_and_nothi
         let (view, failure) = site.refused(&order).await;
         assert_eq!(failure.code, FailureCode::UNTRUSTED_PACKAGE);
         let count = usize::from(!signers.is_empty());
-        let text = format!("{count} of the 2 trusted publishers that it takes have signed it");
+        let text = format!("signed by {count} of the 2 required trusted publishers");
         assert!(failure.text.contains(&text), "{failure}");
         assert!(!site.has_fetched(&order).await);
         assert_eq!(
@@ -117,13 +117,13 @@ async fn what_enough_publishers_have_signed_runs_whatever_way_it_takes_and_nothi
     // any machine.
     let shown = site.server.operate(["robot", "info", "robot-1"]).await;
     assert!(shown.contains("untrusted_package"), "{shown}");
-    assert!(shown.contains("those of its own settings"), "{shown}");
+    assert!(shown.contains("from the robot's own settings"), "{shown}");
     let order = site.push("6.0", &["--sign", bob]).await;
     site.wait(&order, Phase::Running).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_list_rotates_and_revokes_keys_and_what_runs_is_not_started_again_without() {
+async fn publisher_list_rotates_keys_and_blocks_restarts_of_revoked_packages() {
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let ada = keys[0].0.clone();
     let (bob, bob_public) = new_key(&site.server, site.dir.path(), "bob.key").await;

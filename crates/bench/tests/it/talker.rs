@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Robot, Server, eventually, required};
 use crate::leftovers::processes_with;

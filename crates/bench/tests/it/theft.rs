@@ -15,9 +15,9 @@ use serde_json::{Value, json};
 use task_proto::DeploymentId;
 use task_proto::api::{DeploymentView, RobotView};
 use task_proto::desired::{BlobRef, DesiredState, PackageRef};
-use task_proto::digest::unhex;
-use task_proto::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
-use task_proto::report::{FailureCode, Phase, Report, TaskReport};
+use task_proto::ids::digest::unhex;
+use task_proto::messages::report::{FailureCode, Phase, Report, TaskReport};
+use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
 use tokio::task::JoinHandle;
 
 use crate::harness::{Server, eventually, from_restarted_agent, open_directory, write_package};
@@ -111,7 +111,7 @@ async fn stolen_blob(server: &Server, blob: BlobRef) -> Vec<u8> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_publishers_token_without_a_trusted_key_runs_nothing_whatever_is_pushed() {
+async fn publisher_token_without_a_trusted_key_runs_nothing() {
     let (site, keys) = Site::start(1, &["ada.key"]).await;
     let order = site.push("1.0", &["--sign", &keys[0].0]).await;
     let running = site.wait(&order, Phase::Running).await.tasks.remove(0).active;
@@ -171,7 +171,7 @@ async fn a_publishers_token_without_a_trusted_key_runs_nothing_whatever_is_pushe
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_else() {
+async fn stolen_server_key_cannot_run_unsigned_packages() {
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let order = site.push("1.0", &["--sign", &keys[0].0]).await;
     let running = site.wait(&order, Phase::Running).await.tasks.remove(0).active;
@@ -222,7 +222,7 @@ async fn whoever_has_stolen_the_servers_key_can_not_make_a_robot_run_anything_el
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_replayed_old_state_is_refused_also_after_a_restart_of_the_agent() {
+async fn replayed_state_is_refused_even_after_an_agent_restart() {
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let sign = ["--sign", keys[0].0.as_str()];
     let order = site.push("1.0", &sign).await;
@@ -252,7 +252,7 @@ async fn a_replayed_old_state_is_refused_also_after_a_restart_of_the_agent() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_the_next_enrolment() {
+async fn cloned_identity_is_shown_gets_no_work_and_ends_with_reenrollment() {
     let (mut site, keys) = Site::start(1, &["ada.key"]).await;
     let sign = ["--sign", keys[0].0.as_str()];
     let thief = site.robot.stolen(site.dir.path(), "thief");
@@ -267,7 +267,7 @@ async fn a_robots_identity_used_elsewhere_is_shown_gets_no_work_and_ends_with_th
         site.server.operate(["enroll-token", "create", "--robot", "robot-1", "-o", "json"]).await;
     let made: Value = serde_json::from_str(&made).expect("json");
     site.robot.terminate();
-    site.robot.enroll_anew(1, made["token"].as_str().expect("a token")).await;
+    site.robot.enroll_again(1, made["token"].as_str().expect("a token")).await;
     site.robot.restart();
     let view = site.wait(&order, Phase::Running).await;
     assert!(!has(&view, "duplicate_identity"));
@@ -296,7 +296,7 @@ async fn is_noticed(site: &Site) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_there() {
+async fn copied_robot_data_gets_no_order_while_the_original_is_online() {
     let (site, keys) = with_a_known_robot().await;
     let mut copy = site.robot.copied(site.dir.path(), "copy");
     let order = site.push("1.0", &["--sign", &keys[0].0]).await;
@@ -311,7 +311,7 @@ async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_there() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn copy_of_a_robots_data_gets_no_order_while_the_original_is_briefly_away() {
+async fn copied_robot_data_gets_no_order_while_the_original_is_briefly_offline() {
     let (mut site, keys) = with_a_known_robot().await;
     let sign = ["--sign", keys[0].0.as_str()];
     let mut copy = site.robot.copied(site.dir.path(), "copy");

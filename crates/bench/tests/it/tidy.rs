@@ -1,13 +1,13 @@
 //! Holds the countable rules of style: each file states its purpose, files and functions stay
-//! short, and each test that the table of attacks names exists. The test reads formatted source as
+//! short, and each test that the lists of attacks name exists. The test reads formatted source as
 //! text and never judges anything that needs understanding.
 
 use std::path::{Path, PathBuf};
 
 /// Lines of a file before its unit tests.
-const MAX_FILE_LINES: usize = 700;
+const MAX_FILE_LINES: usize = 660;
 /// Lines of a function, from its signature to its closing brace.
-const MAX_FUNCTION_LINES: usize = 130;
+const MAX_FUNCTION_LINES: usize = 96;
 
 fn rust_files(dir: &Path, found: &mut Vec<PathBuf>) {
     for entry in std::fs::read_dir(dir).expect("readable directory") {
@@ -70,7 +70,7 @@ fn problems(name: &str, source: &str) -> Vec<String> {
 }
 
 #[test]
-fn files_and_functions_are_tidy() {
+fn files_and_functions_follow_the_rules() {
     let crates = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("workspace");
     let mut files = Vec::new();
     rust_files(crates, &mut files);
@@ -88,25 +88,36 @@ fn files_and_functions_are_tidy() {
     assert!(found.is_empty(), "\n{}", found.join("\n"));
 }
 
-/// The texts in backquotes in the column "shown by" of a page's tables.
-fn tests_named(page: &str) -> Vec<&str> {
-    let (mut column, mut named) = (None, Vec::new());
-    for line in page.lines() {
-        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
-        match cells.iter().position(|cell| *cell == "shown by") {
-            Some(at) => column = Some(at),
-            None if !line.starts_with('|') => column = None,
-            None => {}
-        }
-        if let Some(cell) = column.and_then(|at| cells.get(at)) {
-            named.extend(cell.split('`').skip(1).step_by(2));
+/// The entries of the list of attacks: the items below the page's heading "Attacks", each joined to
+/// one line.
+fn attacks(page: &str) -> Vec<String> {
+    let mut entries: Vec<String> = Vec::new();
+    let mut is_entry = false;
+    let section = page.lines().skip_while(|line| *line != "## Attacks").skip(1);
+    for line in section.take_while(|line| !line.starts_with("## ")) {
+        if let Some(first) = line.strip_prefix("- ") {
+            entries.push(first.to_owned());
+            is_entry = true;
+        } else if let (true, Some(entry), Some(rest)) =
+            (is_entry, entries.last_mut(), line.strip_prefix("  "))
+        {
+            *entry += " ";
+            *entry += rest.trim_start();
+        } else {
+            is_entry = false;
         }
     }
-    named
+    entries
+}
+
+/// The tests that an entry names: the texts in backquotes after "Tests:".
+fn tests_named(entry: &str) -> Vec<&str> {
+    let tests = entry.split_once(" Tests: ").map_or("", |(_, tests)| tests);
+    tests.split('`').skip(1).step_by(2).collect()
 }
 
 #[test]
-fn every_test_in_a_table_of_attacks_exists() {
+fn every_test_in_a_list_of_attacks_exists() {
     let crates = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("workspace");
     let mut files = Vec::new();
     rust_files(crates, &mut files);
@@ -115,26 +126,38 @@ fn every_test_in_a_table_of_attacks_exists() {
     files.extend(page_tests.map(|entry| entry.expect("an entry").path()));
     let sources: Vec<String> =
         files.iter().map(|path| std::fs::read_to_string(path).expect("readable")).collect();
-    for (name, least) in [("people.md", 20), ("security.md", 40)] {
+    for (name, least) in [("people.md", 30), ("security.md", 130)] {
         let page =
             std::fs::read_to_string(crates.join("../docs").join(name)).expect("readable page");
-        let named = tests_named(&page);
-        assert!(named.len() >= least, "found only {} tests in the tables of {name}", named.len());
+        let entries = attacks(&page);
+        assert!(entries.len() >= least, "found only {} attacks in {name}", entries.len());
+        let untested: Vec<_> =
+            entries.iter().filter(|entry| tests_named(entry).is_empty()).collect();
+        assert!(untested.is_empty(), "docs/{name} names no test for {untested:?}");
         let is_there = |test: &str| {
             sources.iter().any(|source| {
                 source.contains(&format!("fn {test}("))
                     || source.contains(&format!("\ntest('{test}'"))
             })
         };
-        let absent: Vec<_> = named.iter().filter(|test| !is_there(test)).collect();
+        let named = entries.iter().flat_map(|entry| tests_named(entry));
+        let absent: Vec<_> = named.filter(|test| !is_there(test)).collect();
         assert!(absent.is_empty(), "docs/{name} names tests that are not there: {absent:?}");
     }
-    let page = "| a | shown by |\n|---|---|\n| `no` | `x_y`, `z` |\n\n| b | c |\n| d | `no` |\n";
-    assert_eq!(tests_named(page), ["x_y", "z"]);
 }
 
 #[test]
-fn untidy_source_is_found() {
+fn attacks_are_read_with_their_tests() {
+    let page = "- no\n## Attacks\n\nText\n  `no`\n- ✓ **A `no`.** B. Tests:\n  `x_y`, `z\n  w`\n\n\
+                ### C\n\n- **D.** `no`\n\n## E\n- Tests: `no`\n";
+    let entries = attacks(page);
+    assert_eq!(entries, ["✓ **A `no`.** B. Tests: `x_y`, `z w`", "**D.** `no`"]);
+    assert_eq!(tests_named(&entries[0]), ["x_y", "z w"]);
+    assert_eq!(tests_named(&entries[1]), [""; 0]);
+}
+
+#[test]
+fn rule_violations_are_found() {
     assert_eq!(problems("a.rs", "//! A.\n\nfn short() {\n}\n"), Vec::<String>::new());
     assert_eq!(problems("a.rs", "fn short() {}\n").len(), 1);
     let long_function = format!(

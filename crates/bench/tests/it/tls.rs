@@ -8,7 +8,7 @@ use std::process::Command;
 
 use nix::sys::signal::Signal;
 use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair};
-use task_proto::report::Phase;
+use task_proto::messages::report::Phase;
 
 use crate::harness::{Process, Robot, Server, eventually, program, write_package};
 
@@ -41,7 +41,7 @@ async fn connected(server: &Server) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn one_token_is_all_a_robot_needs_and_another_server_gets_nothing() {
+async fn token_pins_its_server_and_another_server_gets_nothing() {
     let dir = tempfile::tempdir().expect("temp dir");
     let mut server = Server::start_with(&dir.path().join("server"), &[ENCRYPTED, KEYED]).await;
     let _robot = Robot::start(&server, dir.path(), "robot-1", 1).await;
@@ -74,7 +74,8 @@ async fn one_token_is_all_a_robot_needs_and_another_server_gets_nothing() {
 async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start_with(&dir.path().join("server"), &[ENCRYPTED]).await;
-    let (token, plain) = (server.enrollment_token().await, format!("http://{}", server.http));
+    let token = server.enrollment_token().await;
+    let plain = format!("http://{}", server.http);
     let agent = async |arguments: &[&str]| {
         let mut command = Command::new(program("task-agent"));
         command
@@ -92,7 +93,7 @@ async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
     let said = String::from_utf8_lossy(&refused.stderr);
     assert!(
         !refused.status.success()
-            && said.contains("--server: the token is for a server that encrypts"),
+            && said.contains("--server: the token requires an encrypted server"),
         "{said}"
     );
     // The robot's own server is not trusted either, with any of the robot's settings.
@@ -101,15 +102,16 @@ async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
     let said = String::from_utf8_lossy(&refused.stderr);
     assert!(
         !refused.status.success()
-            && said.contains("server: the token is for a server that encrypts"),
+            && said.contains("server: the token requires an encrypted server"),
         "{said}"
     );
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn an_own_certificate_is_taken_from_its_files_without_a_restart() {
+async fn own_certificate_is_reloaded_without_a_restart() {
     let dir = tempfile::tempdir().expect("temp dir");
-    let (certificate, key) = (dir.path().join("own.pem"), dir.path().join("own.key"));
+    let certificate = dir.path().join("own.pem");
+    let key = dir.path().join("own.key");
     let authority = Authority::new(&dir.path().join("root.pem"));
     let put_in_place = || {
         let (chain, own_key) = authority.issue();
@@ -132,10 +134,7 @@ async fn an_own_certificate_is_taken_from_its_files_without_a_restart() {
     server.signal(Signal::SIGHUP);
     let log = dir.path().join("server.server.log");
     eventually("the server to take the new certificate", async || {
-        std::fs::read_to_string(&log)
-            .ok()?
-            .contains("new connections are shown the certificate")
-            .then_some(())
+        std::fs::read_to_string(&log).ok()?.contains("loaded the new certificate").then_some(())
     })
     .await;
     run_something(&server, dir.path(), "1.0.0").await;
@@ -145,7 +144,7 @@ async fn an_own_certificate_is_taken_from_its_files_without_a_restart() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_proxys_one_port_is_enough() {
+async fn robot_works_through_a_proxy_with_one_port() {
     let dir = tempfile::tempdir().expect("temp dir");
     let authority = Authority::new(&dir.path().join("root.pem"));
     // The MQTT port announced to robots has no listener, as behind a firewall.
@@ -165,7 +164,7 @@ async fn a_proxys_one_port_is_enough() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_setting_takes_mqtt_over_the_servers_own_http_port() {
+async fn mqtt_over_the_http_port_is_selected_by_a_setting() {
     let dir = tempfile::tempdir().expect("temp dir");
     let closed = free_address().port().to_string();
     let server = Server::start_with(
@@ -217,7 +216,8 @@ struct Proxy {
 
 impl Proxy {
     async fn start(server: &Server, authority: &Authority, dir: &Path) -> Self {
-        let (address, prefix) = (free_address(), dir.join("nginx"));
+        let address = free_address();
+        let prefix = dir.join("nginx");
         std::fs::create_dir(&prefix).expect("made");
         let (certificate, key) = authority.issue();
         std::fs::write(prefix.join("proxy.pem"), certificate).expect("written");
@@ -226,8 +226,8 @@ impl Proxy {
         let configuration = format!(
             "daemon off; master_process off; pid nginx.pid; error_log error.log; events {{}}
              http {{
-                 access_log off; client_body_temp_path .; proxy_temp_path .; fastcgi_temp_path .; uwsgi_temp_path .;
-                 scgi_temp_path .;
+                 access_log off; client_body_temp_path .; proxy_temp_path .;
+                 fastcgi_temp_path .; uwsgi_temp_path .; scgi_temp_path .;
                  map $http_upgrade $connection_upgrade {{ default upgrade; '' ''; }}
                  server {{
                      listen {address} ssl;
@@ -236,7 +236,8 @@ impl Proxy {
                      location / {{
                          proxy_pass http://{}; proxy_http_version 1.1; proxy_read_timeout 1h;
                          proxy_set_header Host $http_host;
-                         proxy_set_header Upgrade $http_upgrade; proxy_set_header Connection $connection_upgrade;
+                         proxy_set_header Upgrade $http_upgrade;
+                         proxy_set_header Connection $connection_upgrade;
                      }}
                  }}
              }}\n",

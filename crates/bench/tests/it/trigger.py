@@ -1,4 +1,5 @@
-"""Calls a std_srvs/Trigger service and prints its message: an independent witness that a node really runs.
+"""Calls a std_srvs/Trigger service and prints its message: an independent witness that a node
+really runs.
 
 An answer may be lost while the server does not know this client yet, so it is asked again."""
 import sys

@@ -1,6 +1,8 @@
-"""A node that does what its arguments say; on SIGUSR1 it breaks a promise in the way `--breaks` says.
+"""A node that does what its arguments say; on SIGUSR1 it breaks a promise in the way `--breaks`
+says.
 
-`--below` runs the node in a child process, as a launch file does; `--respawn` starts a new child when one ends.
+`--below` runs the node in a child process, as a launch file does; `--respawn` starts a new child
+when one ends.
 """
 import argparse
 import os
@@ -30,7 +32,8 @@ class Endpoints:
             self.service = self.create_service(Trigger, arguments.service, self.on_say)
         if arguments.topic:
             self.topic = self.create_publisher(String, arguments.topic, 10)
-            self.ticks = self.create_timer(1 / arguments.hz, lambda: self.topic.publish(String(data="tick")))
+            tick = String(data="tick")
+            self.ticks = self.create_timer(1 / arguments.hz, lambda: self.topic.publish(tick))
         self.create_timer(0.05, self.break_promise)
 
     def check(self, parameters):

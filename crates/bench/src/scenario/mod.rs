@@ -1,0 +1,12 @@
+//! Owns the scenarios, each a subcommand of `taskbench`; they never call one another.
+
+pub mod blob;
+pub mod broker;
+pub mod fleet;
+pub mod load;
+pub mod page;
+pub mod paper;
+pub mod pull;
+mod reporters;
+mod run_once;
+pub mod status;

@@ -1,1 +1,2 @@
-"""An L-shaped corridor, a robot that drives through it, and a particle filter that draws its map."""
+"""An L-shaped corridor, a robot that drives through it, and a particle filter that draws its
+map."""

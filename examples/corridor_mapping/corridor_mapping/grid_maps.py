@@ -1,17 +1,19 @@
 """Occupancy grids, one for each particle, as arrays whose first axis is the particle.
 
-Each has two layers: the log-odds of being occupied, which becomes the map, and the log-likelihood of seeing an echo at a
-place, which scans are matched with: a likelihood field, in which a cell has the likelihood of the nearest echo that showed
-a new wall. It forgets none: it is for buildings, not for crowds. Maps grow to hold what was seen, up to a limit.
+Each has two layers: the log-odds of being occupied, which becomes the map, and the log-likelihood
+of seeing an echo at a place, which scans are matched with: a likelihood field, in which a cell has
+the likelihood of the nearest echo that showed a new wall. It forgets none: it is for buildings, not
+for crowds. Maps grow to hold what was seen, up to a limit.
 """
 
 import numpy as np
 
 # What one scan adds to a cell it found occupied, or free, and how sure a map gets.
 OCCUPIED_GAIN, FREE_GAIN, SURE = 0.9, 0.4, 6.0
-# The likelihood field: how far from a wall its echoes lie, as a standard deviation in cells; what an echo far from any wall
-# is worth, which is never nothing: people walk by, and walls are seen for the first time; how many cells from a wall that
-# is; and what an echo is worth at most that shows a wall the field does not have yet.
+# The likelihood field: how far from a wall its echoes lie, as a standard deviation in cells; what
+# an echo far from any wall is worth, which is never nothing: people walk by, and walls are seen for
+# the first time; how many cells from a wall that is; and what an echo is worth at most that shows a
+# wall the field does not have yet.
 FIELD_SIGMA = 0.8
 NO_WALL = -4.0
 FIELD_REACH = FIELD_SIGMA * (-2 * NO_WALL) ** 0.5
@@ -34,11 +36,13 @@ class GridMaps:
         self.particles = particles
         self.resolution = resolution
         self.max_cells = max_cells
-        self.corner = np.zeros(2, int)  # the lower left cell's column and row, counted from the frame's origin
+        # The lower left cell's column and row, counted from the frame's origin.
+        self.corner = np.zeros(2, int)
         self.log_odds = np.zeros((particles, 0, 0), np.float32)
         self.field = np.zeros((particles, 0, 0), np.float32)
         reach = int(np.ceil(FIELD_REACH))
-        self.stamp = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
+        square = np.meshgrid(*[np.arange(-reach, reach + 1)] * 2)
+        self.stamp = np.stack(square, axis=-1).reshape(-1, 2)
 
     @property
     def origin(self):
@@ -46,7 +50,7 @@ class GridMaps:
         return self.corner * self.resolution
 
     def probability(self, particle):
-        """One particle's map: how probably each cell is occupied, and whether anything is known about it."""
+        """How probably each cell of a particle's map is occupied, and whether it is known."""
         log_odds = self.log_odds[particle]
         return 1 / (1 + np.exp(-log_odds)), log_odds != 0
 
@@ -79,20 +83,24 @@ class GridMaps:
     def match(self, lasers, points):
         """How well a scan's echoes fit, as a log-likelihood.
 
-        `lasers` are candidate poses (particle, candidate, 3), `points` the echoes as the laser sees them (echo, 2).
+        `lasers` are candidate poses (particle, candidate, 3), `points` the echoes as the laser sees
+        them (echo, 2).
         """
         return self._likelihoods(lasers, points).sum(axis=-1)
 
     def _likelihoods(self, lasers, points):
-        """The field at each echo (particle, candidate, echo), between the centres of the four cells around it."""
-        placed = self._placed(lasers, points) / np.float32(self.resolution) - (self.corner + 0.5).astype(np.float32)
+        """The field at each echo (particle, candidate, echo), between the centres of the four cells
+        around it."""
+        placed = self._placed(lasers, points) / np.float32(self.resolution)
+        placed = placed - (self.corner + 0.5).astype(np.float32)
         height, width = self.field.shape[1:]
         column, row = placed[..., 0], placed[..., 1]
         column = np.clip(column, 0, width - 1.001)
         row = np.clip(row, 0, height - 1.001)
         left, low = column.astype(np.int32), row.astype(np.int32)
         right, up = column - left, row - low
-        base = np.arange(self.particles, dtype=np.int32).reshape(-1, 1, 1) * (height * width) + low * width + left
+        first = np.arange(self.particles, dtype=np.int32).reshape(-1, 1, 1) * (height * width)
+        base = first + low * width + left
         field = self.field.ravel()
         below = field[base] * (1 - right) + field[base + 1] * right
         above = field[base + width] * (1 - right) + field[base + width + 1] * right
@@ -101,13 +109,15 @@ class GridMaps:
     def _stamp_field(self, lasers, points, echoes):
         """Adds the echoes that the field does not explain yet.
 
-        Those it explains would only smear it: the first echoes of a wall are what later scans hold on to.
+        Those it explains would only smear it: the first echoes of a wall are what later scans hold
+        on to.
         """
         offsets = echoes / np.float32(self.resolution) - (self.corner + 0.5).astype(np.float32)
         particle, echo = np.nonzero(self._likelihoods(lasers[:, None], points)[:, 0] < NEW_WALL)
         offsets = offsets[particle, echo]
         cells = np.rint(offsets).astype(np.int32)[:, None] + self.stamp.astype(np.int32)
-        likelihood = np.square(cells - offsets[:, None]).sum(axis=-1) * np.float32(-0.5 / FIELD_SIGMA**2)
+        squares = np.square(cells - offsets[:, None]).sum(axis=-1)
+        likelihood = squares * np.float32(-0.5 / FIELD_SIGMA**2)
         height, width = self.field.shape[1:]
         touched = (particle[:, None] * height + cells[..., 1]) * width + cells[..., 0]
         np.maximum.at(self.field.reshape(-1), touched.ravel(), likelihood.ravel())
@@ -121,7 +131,8 @@ class GridMaps:
         return np.stack([x, y], axis=-1)
 
     def _cells(self, places):
-        return np.floor(places / np.float32(self.resolution)).astype(np.int32) - self.corner.astype(np.int32)
+        cells = np.floor(places / np.float32(self.resolution)).astype(np.int32)
+        return cells - self.corner.astype(np.int32)
 
     def _flat(self, cells):
         """Indices into a layer made flat, of cells (particle, cells..., 2)."""
@@ -148,7 +159,8 @@ class GridMaps:
         width, height = size + before + after
         if width * height * self.particles > self.max_cells:
             raise MapTooLarge(
-                f"{self.particles} maps of {width} x {height} cells are more than {self.max_cells} cells together"
+                f"{self.particles} maps of {width} x {height} cells are more than {self.max_cells} "
+                "cells together"
             )
         around = ((0, 0), (before[1], after[1]), (before[0], after[0]))
         self.log_odds = np.pad(self.log_odds, around)

@@ -1,4 +1,5 @@
-"""Maps as files: a PGM picture and a YAML file beside it, as `map_server` and `map_saver` have them."""
+"""Maps as files: a PGM picture and a YAML file beside it, as `map_server` and `map_saver` have
+them."""
 
 import os
 import re
@@ -78,6 +79,7 @@ def _load_pgm(path):
     if header is None:
         raise ValueError(f"{path}: not an 8-bit binary PGM file")
     width, height = int(header[1]), int(header[2])
-    if len(content) - header.end() != width * height:
-        raise ValueError(f"{path}: {len(content) - header.end()} bytes of pixels, not {width} times {height}")
+    found = len(content) - header.end()
+    if found != width * height:
+        raise ValueError(f"{path}: {found} bytes of pixels, not {width} times {height}")
     return np.frombuffer(content, np.uint8, offset=header.end()).reshape(height, width)[::-1].copy()

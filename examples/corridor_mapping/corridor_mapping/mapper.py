@@ -1,7 +1,8 @@
 """The lifecycle node `mapper`: draws a map from a lidar's scans and odometry.
 
-It subscribes to `scan` and `odom`, publishes `map`, its `pose` in the map and the transform from map to odom, and saves the map
-when the drive is over (`drive_finished`), when it is deactivated, and when it is shut down.
+It subscribes to `scan` and `odom`, publishes `map`, its `pose` in the map and the transform from
+map to odom, and saves the map when the drive is over (`drive_finished`), when it is deactivated,
+and when it is shut down.
 """
 
 import array
@@ -28,7 +29,8 @@ from corridor_mapping.particle_filter import Settings
 from corridor_mapping.transforms import Broadcaster, heading_of, quaternion
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Best effort, because that matches lidars of both kinds; deep, so that a slow machine falls behind rather than miss scans.
+# Best effort, because that matches lidars of both kinds; deep, so that a slow machine falls behind
+# rather than miss scans.
 SENSOR = QoSProfile(depth=2000, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOMETRY_KEPT, SCANS_KEPT = 2000, 2000
 SCANS_PER_MAP, SCANS_PER_LOG = 10, 25
@@ -44,7 +46,8 @@ LIMITS = {
 
 
 class Mapper(LifecycleNode):
-    """Feeds a `MappingRun`. `on_end` is called once, with None when the map is saved or with what went wrong."""
+    """Feeds a `MappingRun`. `on_end` is called once, with None when the map is saved or with what
+    went wrong."""
 
     def __init__(self, on_end=lambda problem: None):
         super().__init__("mapper")
@@ -187,13 +190,15 @@ class Mapper(LifecycleNode):
     def use(self, scan, odometry):
         geometry = (scan.angle_min, scan.angle_increment, len(scan.ranges))
         if self.run is None:
-            if not scan.ranges or not math.isfinite(scan.angle_min) or not math.isfinite(scan.angle_increment):
+            angles = (scan.angle_min, scan.angle_increment)
+            if not scan.ranges or not all(map(math.isfinite, angles)):
                 return
             self.geometry = geometry
             bearings = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
             self.run = MappingRun(self.settings, bearings, self.mount)
         if geometry != self.geometry:
-            self.get_logger().warning("a scan with other beams than the first is left out", throttle_duration_sec=5.0)
+            problem = "a scan with other beams than the first is left out"
+            self.get_logger().warning(problem, throttle_duration_sec=5.0)
             return
         ranges = np.frombuffer(scan.ranges, np.float32)
         if not self.run.hear(odometry, ranges):

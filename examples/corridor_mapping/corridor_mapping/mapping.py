@@ -1,9 +1,12 @@
-"""The whole experiment as one command: simulator and mapper together, until the map is saved and scored.
+"""The whole experiment as one command: simulator and mapper together, until the map is saved and
+scored.
 
-    mapping [--activate] [--ros-args -p simulator:seed:=2 -p simulator:rate:=8.0 -p mapper:particles:=30]
+    mapping [--activate]
+            [--ros-args -p simulator:seed:=2 -p simulator:rate:=8.0 -p mapper:particles:=30]
 
-The robot sets off when /mapper is active: somebody else's task, or this command's with --activate. Both nodes share one
-executor, so the robot waits for the mapper and not the other way round: a busy machine takes longer, and the map is the same.
+The robot sets off when /mapper is active: somebody else's task, or this command's with --activate.
+Both nodes share one executor, so the robot waits for the mapper and not the other way round: a busy
+machine takes longer, and the map is the same.
 """
 
 import argparse
@@ -23,10 +26,13 @@ from corridor_mapping.simulator import Simulator
 
 
 def main():
-    parser = argparse.ArgumentParser(description="Drives through the simulated corridor and maps it.")
-    parser.add_argument("--activate", action="store_true", help="configure and activate /mapper instead of waiting for it")
+    description = "Drives through the simulated corridor and maps it."
+    parser = argparse.ArgumentParser(description=description)
+    help_text = "configure and activate /mapper instead of waiting for it"
+    parser.add_argument("--activate", action="store_true", help=help_text)
     arguments = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    # A signal ends the run between two callbacks; rclpy's own handlers would take ROS away in the middle of one.
+    # A signal ends the run between two callbacks; rclpy's own handlers would take ROS away in the
+    # middle of one.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     outcome = Future()
 

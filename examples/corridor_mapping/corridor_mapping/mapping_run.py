@@ -1,4 +1,5 @@
-"""Both maps of one run: the particle filter's, and the one that raw odometry gives, drawn from the same scans."""
+"""Both maps of one run: the particle filter's, and the one that raw odometry gives, drawn from the
+same scans."""
 
 import numpy as np
 
@@ -21,7 +22,8 @@ class MappingRun:
             return False
         self.filter.update(odometry, ranges)
         bearings, ranges = self.filter.echoes(ranges)
-        self.odometry_map.integrate(compose(np.array([odometry]), self.filter.mount), bearings, ranges)
+        laser = compose(np.array([odometry]), self.filter.mount)
+        self.odometry_map.integrate(laser, bearings, ranges)
         return True
 
     def picture(self):

@@ -1,8 +1,9 @@
 """Simultaneous localisation and mapping by a Rao-Blackwellised particle filter on grid maps.
 
-The family of FastSLAM and Gmapping (Grisetti, Stachniss, Burgard, 2007): each particle is a guess at the robot's way with
-the map that follows from it. Odometry proposes a step, matching the scan with the particle's own map improves it, a
-Gaussian around the match is what the new pose is drawn from, and particles are resampled when few of them carry the weight.
+The family of FastSLAM and Gmapping (Grisetti, Stachniss, Burgard, 2007): each particle is a guess
+at the robot's way with the map that follows from it. Odometry proposes a step, matching the scan
+with the particle's own map improves it, a Gaussian around the match is what the new pose is drawn
+from, and particles are resampled when few of them carry the weight.
 """
 
 from dataclasses import dataclass
@@ -12,13 +13,17 @@ import numpy as np
 from corridor_mapping.geometry import between, compose
 from corridor_mapping.grid_maps import GridMaps
 
-# The odometry's errors: standard deviations per metre and per radian, and at least so much for each step.
-FORWARD_ERROR = np.array([0.10, 0.02, 0.01])  # metres for each metre, metres for each radian, metres
+# The odometry's errors: standard deviations per metre and per radian, and at least so much for each
+# step.
+# Metres for each metre, metres for each radian, metres.
+FORWARD_ERROR = np.array([0.10, 0.02, 0.01])
 SIDE_ERROR = np.array([0.05, 0.02, 0.01])
-HEADING_ERROR = np.array([0.03, 0.05, 0.004])  # radians for each metre, for each radian, radians
+# Radians for each metre, for each radian, radians.
+HEADING_ERROR = np.array([0.03, 0.05, 0.004])
 # A scan's echoes are not independent witnesses: so many of them count as one.
 ECHOES_PER_WITNESS = 3.0
-# The search for the best match: step lengths in metres, each paired with one in radians, and moves tried with each.
+# The search for the best match: step lengths in metres, each paired with one in radians, and moves
+# tried with each.
 SEARCH_STEPS = [(0.06, 0.02), (0.03, 0.01), (0.015, 0.005), (0.008, 0.0025)]
 MOVES_PER_STEP = 4
 # The Gaussian around the match is measured at this many places, spread like this.
@@ -82,7 +87,8 @@ class ParticleFilter:
         self.scans_used += 1
 
     def echoes(self, ranges):
-        """The beams that say something: one without an echo may have met glass as well as open space."""
+        """The beams that say something: one without an echo may have met glass as well as open
+        space."""
         ranges = np.asarray(ranges, float)
         heard = np.isfinite(ranges) & (ranges > 0) & (ranges <= self.settings.max_range)
         return self.bearings[heard], ranges[heard]
@@ -94,9 +100,11 @@ class ParticleFilter:
         guesses = compose(self.poses, step)
 
         def target(offsets):
-            """Log-likelihood of the scan and of the odometry, for offsets (particle, candidate, 3) from the guesses."""
+            """Log-likelihood of the scan and of the odometry, for offsets (particle, candidate, 3)
+            from the guesses."""
             lasers = compose(compose(guesses[:, None], offsets), self.mount)
-            return self.maps.match(lasers, points) / ECHOES_PER_WITNESS - 0.5 * np.square(offsets / error).sum(axis=-1)
+            likelihood = self.maps.match(lasers, points) / ECHOES_PER_WITNESS
+            return likelihood - 0.5 * np.square(offsets / error).sum(axis=-1)
 
         summit = self._climb(target)
         places = summit[:, None] + self.random.normal(size=(PLACES, 3)) * SPREAD
@@ -107,7 +115,8 @@ class ParticleFilter:
         total = shares.sum(axis=1)
         mean = np.einsum("pk,pki->pi", shares, places) / total[:, None]
         away = places - mean[:, None]
-        covariance = np.einsum("pk,pki,pkj->pij", shares, away, away) / total[:, None, None] + np.eye(3) * 1e-8
+        covariance = np.einsum("pk,pki,pkj->pij", shares, away, away) / total[:, None, None]
+        covariance = covariance + np.eye(3) * 1e-8
         noise = np.linalg.cholesky(covariance) @ self.random.normal(size=(len(mean), 3, 1))
         self.poses = compose(guesses, mean + noise[..., 0])
         self.log_weights += peak[:, 0] + np.log(total / PLACES)
@@ -140,7 +149,8 @@ class ParticleFilter:
 
 
 def systematic(weights, start):
-    """Indices drawn in proportion to the weights, with one random number from [0, 1) for all of them."""
+    """Indices drawn in proportion to the weights, with one random number from [0, 1) for all of
+    them."""
     count = len(weights)
     ticks = (np.arange(count) + start) / count
     return np.minimum(np.searchsorted(np.cumsum(weights), ticks, side="right"), count - 1)

@@ -1,4 +1,5 @@
-"""The experiment without ROS and without waiting: the same robot and the same mapper, with a score for each seed.
+"""The experiment without ROS and without waiting: the same robot and the same mapper, with a score
+for each seed.
 
     python3 -m corridor_mapping.rehearsal 1 2 3 4 5
 """
@@ -16,7 +17,8 @@ from corridor_mapping.simulation import Simulation
 
 
 def rehearse(seed, settings, steps=None):
-    """Drives all of the way, or so many steps of it; the run and how far off the filter was at each scan used, in metres."""
+    """Drives all of the way, or so many steps of it; the run and how far off the filter was at each
+    scan used, in metres."""
     simulation = Simulation(seed)
     run = MappingRun(settings, world.LIDAR.bearings(), world.LIDAR.mount)
     errors = []
@@ -29,13 +31,15 @@ def rehearse(seed, settings, steps=None):
 
 def main():
     parser = argparse.ArgumentParser(description="Maps the simulated corridor without ROS.")
-    parser.add_argument("seeds", type=int, nargs="*", default=[1], help="of the robot's errors and of the filter")
+    seeds_help = "of the robot's errors and of the filter"
+    parser.add_argument("seeds", type=int, nargs="*", default=[1], help=seeds_help)
     for seed in parser.parse_args().seeds:
         run, errors = rehearse(seed, Settings(seed=seed))
         with tempfile.TemporaryDirectory() as directory:
             run.save(Path(directory))
             figures = score.score_files(directory)
-        print(f"seed {seed}: {run.filter.scans_used} scans, off by {np.mean(errors):.3f} m, at most {np.max(errors):.3f} m")
+        off = f"off by {np.mean(errors):.3f} m, at most {np.max(errors):.3f} m"
+        print(f"seed {seed}: {run.filter.scans_used} scans, {off}")
         print(score.report(figures), flush=True)
 
 

@@ -22,8 +22,9 @@ TURNS_APART = 10
 def score(picture):
     """Shares from 0 to 1.
 
-    known: of the cells that the lidar could see, those the map knows. walls_true: of the map's wall cells, those within one
-    cell of a true wall. walls_found: of the wall cells that the lidar could see, those with one of the map's within one cell.
+    known: of the cells that the lidar could see, those the map knows. walls_true: of the map's wall
+    cells, those within one cell of a true wall. walls_found: of the wall cells that the lidar could
+    see, those with one of the map's within one cell.
     """
     shape = picture.cells.shape
     seen, seen_walls = visible(picture)
@@ -41,7 +42,8 @@ def score(picture):
 
 
 def visible(picture):
-    """Rows and columns of the cells that a lidar without noise could see on the way, and of those with an echo."""
+    """Rows and columns of the cells that a lidar without noise could see on the way, and of those
+    with an echo."""
     lidar, walls = world.LIDAR, world.walls()
     bearings = np.linspace(-np.pi, np.pi, lidar.beams * RAYS_PER_BEAM, endpoint=False)
     along = np.arange(0, lidar.max_range, picture.resolution / 2)
@@ -51,10 +53,12 @@ def visible(picture):
     seen, echoes = np.zeros((2, *(high - low)[::-1]), bool)
 
     def mark(cells, points):
-        columns, rows = (np.floor((points - picture.origin) / picture.resolution).astype(int) - low).T
+        places = np.floor((points - picture.origin) / picture.resolution).astype(int)
+        columns, rows = (places - low).T
         cells[rows, columns] = True
 
-    for x, y, heading in compose(true_drive()[:: TURNS_APART * round(lidar.period_s / STEP_S), :3], lidar.mount):
+    turns = true_drive()[:: TURNS_APART * round(lidar.period_s / STEP_S), :3]
+    for x, y, heading in compose(turns, lidar.mount):
         place = np.array([x, y])
         ranges = cast(walls, place, bearings + heading, lidar.max_range)
         rays = np.stack([np.cos(bearings + heading), np.sin(bearings + heading)], axis=-1)
@@ -84,28 +88,33 @@ def widened(cells):
     """The cells and their eight neighbours."""
     padded = np.pad(cells, 1)
     height, width = cells.shape
-    return np.any([padded[r : r + height, c : c + width] for r in range(3) for c in range(3)], axis=0)
+    shifted = [padded[r : r + height, c : c + width] for r in range(3) for c in range(3)]
+    return np.any(shifted, axis=0)
 
 
 def report(scores):
     """The figures as lines for people."""
     lines = [f"{'':10} {'cells known':>12} {'walls true':>12} {'walls found':>12}"]
     for name, figures in scores.items():
-        lines.append(f"{name:10} " + " ".join(f"{figures[key]:12.1%}" for key in ("known", "walls_true", "walls_found")))
+        shares = (figures[key] for key in ("known", "walls_true", "walls_found"))
+        lines.append(f"{name:10} " + " ".join(f"{share:12.1%}" for share in shares))
     return "\n".join(lines)
 
 
 def score_files(directory):
     """Scores both maps of a run and writes score.json beside them."""
     directory = Path(directory)
-    scores = {name: score(map_file.load(directory / f"{name}.yaml")) for name in ("corridor", "odometry")}
+    names = ("corridor", "odometry")
+    scores = {name: score(map_file.load(directory / f"{name}.yaml")) for name in names}
     map_file.write_whole(directory / "score.json", (json.dumps(scores, indent=2) + "\n").encode())
     return scores
 
 
 def main():
-    parser = argparse.ArgumentParser(description="Compares the maps of a run with the true corridor.")
-    parser.add_argument("directory", nargs="?", default="maps", help="where corridor.yaml and odometry.yaml are")
+    description = "Compares the maps of a run with the true corridor."
+    parser = argparse.ArgumentParser(description=description)
+    place = "where corridor.yaml and odometry.yaml are"
+    parser.add_argument("directory", nargs="?", default="maps", help=place)
     try:
         print(report(score_files(parser.parse_args().directory)))
     except (OSError, ValueError) as error:

@@ -44,7 +44,8 @@ def true_drive():
 
 
 def cast(walls, origin, bearings, max_range):
-    """How far each ray from `origin` (x, y) goes until it meets a wall; infinity beyond `max_range`."""
+    """How far each ray from `origin` (x, y) goes until it meets a wall; infinity beyond
+    `max_range`."""
     directions = np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)[:, None]
     begins, edges = walls[:, 0] - origin, walls[:, 1] - walls[:, 0]
     cross = directions[..., 0] * edges[:, 1] - directions[..., 1] * edges[:, 0]
@@ -82,16 +83,19 @@ class Simulation:
         return self.drive[self.steps_driven, :3]
 
     def step(self, drives=True):
-        """The next moment; the robot stands still until it drives and when the drive is over, and its sensors go on."""
+        """The next moment; the robot stands still until it drives and when the drive is over, and
+        its sensors go on."""
         drives = drives and not self.finished
         self.steps_driven += drives
-        # Errors depend on the seed and the place on the way alone, not on how long the robot stood before it.
+        # Errors depend on the seed and the place on the way alone, not on how long the robot stood
+        # before it.
         random = np.random.default_rng([self.seed, self.steps_driven])
         speed, turn_rate = self.drive[self.steps_driven - 1, 3:] if drives else (0.0, 0.0)
         if drives:
             self._roll(between(self.drive[self.steps_driven - 1, :3], self.pose), random)
         turned = (self.steps_driven if drives else self.ticks) % self.steps_per_turn == 0
-        moment = Moment(self.ticks * STEP_S, self.odometry, speed, turn_rate, self._scan(random) if turned else None)
+        scan = self._scan(random) if turned else None
+        moment = Moment(self.ticks * STEP_S, self.odometry, speed, turn_rate, scan)
         self.ticks += 1
         return moment
 
@@ -102,7 +106,8 @@ class Simulation:
 
     def _roll(self, motion, random):
         length, turn = np.hypot(*motion[:2]), abs(motion[2])
-        slip = random.normal(size=3) * [0.004 * length**0.5, 0.002 * length**0.5, 0.004 * (length + turn) ** 0.5]
+        spread = [0.004 * length**0.5, 0.002 * length**0.5, 0.004 * (length + turn) ** 0.5]
+        slip = random.normal(size=3) * spread
         motion = motion * [self.scale, self.scale, 1.01] + [0, 0, self.veer * length] + slip
         self.odometry = compose(self.odometry, motion)
 
@@ -111,7 +116,8 @@ class Simulation:
         x, y, heading = compose(self.pose, lidar.mount)
         ranges = cast(self.walls, np.array([x, y]), lidar.bearings() + heading, lidar.max_range)
         ranges = ranges + random.normal(size=lidar.beams) * lidar.range_noise
-        # As REP 117 has it: not a number for a reading that failed, infinity where nothing came back.
+        # As REP 117 has it: not a number for a reading that failed, infinity where nothing came
+        # back.
         ranges[random.random(lidar.beams) < lidar.dropout] = np.nan
         ranges[ranges > lidar.max_range] = np.inf
         ranges[ranges < lidar.min_range] = -np.inf

@@ -1,7 +1,8 @@
 """The node `simulator`: a robot with odometry and a lidar in the corridor.
 
-It stands still until somebody publishes a map, drives through both legs and back, says so on `drive_finished`, and stands
-still again. `rate` is how much faster than the clock on the wall its time runs.
+It stands still until somebody publishes a map, drives through both legs and back, says so on
+`drive_finished`, and stands still again. `rate` is how much faster than the clock on the wall its
+time runs.
 """
 
 import array
@@ -41,7 +42,8 @@ class Simulator(Node):
         self.finished = self.create_publisher(Header, "drive_finished", LATCHED)
         self.transforms = Broadcaster(self)
         self.static_transforms = Broadcaster(self, static=True)
-        self.static_transforms.send(self.started.to_msg(), "base_link", "laser", self.simulation.lidar.mount)
+        mount = self.simulation.lidar.mount
+        self.static_transforms.send(self.started.to_msg(), "base_link", "laser", mount)
         self.map = self.create_subscription(OccupancyGrid, "map", self.on_map, LATCHED)
         self.timer = self.create_timer(STEP_S / rate, self.on_timer)
 
@@ -49,14 +51,17 @@ class Simulator(Node):
         for parameter in parameters:
             if parameter.name == "rate":
                 if not 0.1 <= parameter.value <= 20:
-                    return SetParametersResult(reason=f"rate is {parameter.value}, must be from 0.1 to 20")
+                    reason = f"rate is {parameter.value}, must be from 0.1 to 20"
+                    return SetParametersResult(reason=reason)
                 if self.timer is not None:
                     self.timer.timer_period_ns = round(STEP_S / parameter.value * 1e9)
             elif parameter.name == "seed":
                 if not 0 <= parameter.value < 2**31:
-                    return SetParametersResult(reason=f"seed is {parameter.value}, must be from 0 to 2147483647")
+                    reason = f"seed is {parameter.value}, must be from 0 to 2147483647"
+                    return SetParametersResult(reason=reason)
                 if self.drives and parameter.value != self.simulation.seed:
-                    return SetParametersResult(reason="seed can't change any more: the robot has set off")
+                    reason = "seed can't change any more: the robot has set off"
+                    return SetParametersResult(reason=reason)
                 if self.simulation is not None and not self.drives:
                     # The robot's clock never goes back.
                     ticks = self.simulation.ticks
@@ -67,7 +72,8 @@ class Simulator(Node):
     def on_map(self, _map):
         if not self.drives:
             self.drives = True
-            self.get_logger().info(f"setting off, for {len(self.simulation.drive) * STEP_S:.0f} s of the robot's time")
+            length_s = len(self.simulation.drive) * STEP_S
+            self.get_logger().info(f"setting off, for {length_s:.0f} s of the robot's time")
 
     def on_timer(self):
         was_finished = self.simulation.finished

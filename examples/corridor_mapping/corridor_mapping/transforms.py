@@ -1,7 +1,8 @@
-"""TF, where the robot has `tf2_msgs`: the transforms between the frames map, odom, base_link and laser.
+"""TF, where the robot has `tf2_msgs`: the transforms between the frames map, odom, base_link and
+laser.
 
-Nothing here depends on TF: all that it says is in other topics and parameters too. So a robot without `tf2_msgs` maps as
-well, and only those who draw pictures of it miss something.
+Nothing here depends on TF: all that it says is in other topics and parameters too. So a robot
+without `tf2_msgs` maps as well, and only those who draw pictures of it miss something.
 """
 
 import numpy as np
@@ -34,14 +35,16 @@ class Broadcaster:
         if TFMessage is None:
             node.get_logger().info("no tf2_msgs here: transforms are not published")
         else:
-            self.publisher = node.create_publisher(TFMessage, "/tf_static" if static else "/tf", STATIC if static else 100)
+            topic, qos = ("/tf_static", STATIC) if static else ("/tf", 100)
+            self.publisher = node.create_publisher(TFMessage, topic, qos)
 
     def send(self, stamp, parent, child, pose):
         if self.publisher is None:
             return
         transform = TransformStamped(child_frame_id=child)
         transform.header.stamp, transform.header.frame_id = stamp, parent
-        transform.transform.translation.x, transform.transform.translation.y = float(pose[0]), float(pose[1])
+        translation = transform.transform.translation
+        translation.x, translation.y = float(pose[0]), float(pose[1])
         transform.transform.rotation = quaternion(pose[2])
         self.publisher.publish(TFMessage(transforms=[transform]))
 

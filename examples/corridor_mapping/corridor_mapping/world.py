@@ -1,14 +1,17 @@
-"""The true world, as data: the corridor's walls, the way the robot drives, and what its lidar can do.
+"""The true world, as data: the corridor's walls, the way the robot drives, and what its lidar can
+do.
 
-The simulator drives in it and the score compares maps with it; the mapper never sees it. Lengths are in metres. All of
-it is given in the map's frame, which is where the robot starts: at (0, 0), looking along x.
+The simulator drives in it and the score compares maps with it; the mapper never sees it. Lengths
+are in metres. All of it is given in the map's frame, which is where the robot starts: at (0, 0),
+looking along x.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# Where the robot starts, in the plan's own coordinates. Odd on purpose: walls must not fall on the edges of map cells.
+# Where the robot starts, in the plan's own coordinates. Odd on purpose: walls must not fall on the
+# edges of map cells.
 START = np.array([1.03, 1.12])
 
 # The way through both legs and back, in the plan's coordinates.
@@ -52,7 +55,8 @@ LIDAR = Lidar()
 def wall(start, end, *recesses):
     """The corners of a wall from start to end, the corridor on its left.
 
-    A recess (from, to, depth), measured along the wall, is a door or a niche; with a negative depth it is a pillar.
+    A recess (from, to, depth), measured along the wall, is a door or a niche; with a negative depth
+    it is a pillar.
     """
     start, end = np.array(start, float), np.array(end, float)
     along = (end - start) / np.linalg.norm(end - start)
@@ -66,12 +70,14 @@ def wall(start, end, *recesses):
 
 def plan():
     """The closed outline of the corridor, counter-clockwise, in the plan's coordinates."""
+    lower = [(3.0, 4.0, 0.2), (6.9, 7.2, -0.2), (8.5, 9.5, 0.2), (13.0, 13.9, 0.2)]
+    upper = [(3.6, 4.6, 0.2), (6.8, 7.1, -0.2), (9.2, 10.6, 0.8), (13.1, 14.0, 0.2)]
     return np.array(
-        wall((0.0, 0.0), (18.0, 0.0), (3.0, 4.0, 0.2), (6.9, 7.2, -0.2), (8.5, 9.5, 0.2), (13.0, 13.9, 0.2))
+        wall((0.0, 0.0), (18.0, 0.0), *lower)
         + wall((18.0, 0.0), (18.0, 13.0), (3.0, 4.0, 0.2), (6.2, 7.6, 0.8), (10.0, 11.0, 0.2))
         + wall((18.0, 13.0), (15.8, 13.0), (0.5, 1.4, 0.2))
         + wall((15.8, 13.0), (15.8, 2.2), (1.7, 2.7, 0.2), (4.9, 5.9, 0.2), (8.0, 8.3, -0.2))
-        + wall((15.8, 2.2), (0.0, 2.2), (3.6, 4.6, 0.2), (6.8, 7.1, -0.2), (9.2, 10.6, 0.8), (13.1, 14.0, 0.2))
+        + wall((15.8, 2.2), (0.0, 2.2), *upper)
         + wall((0.0, 2.2), (0.0, 0.0))
     )
 

@@ -1,4 +1,5 @@
-"""Simulator and mapper as two processes; the mapper waits to be configured and activated, the robot for the first map."""
+"""Simulator and mapper as two processes; the mapper waits to be configured and activated, the robot
+for the first map."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
@@ -14,9 +15,21 @@ def number(name, kind):
 def generate_launch_description():
     return LaunchDescription(
         [
-            DeclareLaunchArgument("seed", default_value="1", description="decides the errors of odometry and lidar"),
-            DeclareLaunchArgument("rate", default_value="4.0", description="how much faster than real time"),
-            DeclareLaunchArgument("map_dir", default_value="maps", description="where the map is saved"),
+            DeclareLaunchArgument(
+                "seed",
+                default_value="1",
+                description="decides the errors of odometry and lidar",
+            ),
+            DeclareLaunchArgument(
+                "rate",
+                default_value="4.0",
+                description="how much faster than real time",
+            ),
+            DeclareLaunchArgument(
+                "map_dir",
+                default_value="maps",
+                description="where the map is saved",
+            ),
             Node(
                 package="corridor_mapping",
                 executable="simulator",

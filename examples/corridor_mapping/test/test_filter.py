@@ -13,7 +13,9 @@ from corridor_mapping.particle_filter import Settings, systematic
 from corridor_mapping.rehearsal import rehearse
 from corridor_mapping.simulation import Simulation, cast, true_drive
 
-ROOM = np.array([[[-1, -1], [2, -1]], [[2, -1], [2, 1]], [[2, 1], [-1, 1]], [[-1, 1], [-1, -1]]], float)
+ROOM = np.array(
+    [[[-1, -1], [2, -1]], [[2, -1], [2, 1]], [[2, 1], [-1, 1]], [[-1, 1], [-1, -1]]], float
+)
 
 
 class Geometry(unittest.TestCase):
@@ -45,7 +47,8 @@ class Drive(unittest.TestCase):
             for _ in range(standing):
                 simulation.step(drives=False)
             moments = [simulation.step() for _ in range(40)]
-            return np.concatenate([np.concatenate([m.odometry, m.ranges]) for m in moments if m.ranges is not None])
+            heard = [m for m in moments if m.ranges is not None]
+            return np.concatenate([np.concatenate([m.odometry, m.ranges]) for m in heard])
 
         np.testing.assert_array_equal(readings(5, 0), readings(5, 7))
         self.assertFalse(np.array_equal(readings(5, 0), readings(6, 0), equal_nan=True))
@@ -55,9 +58,10 @@ class Grids(unittest.TestCase):
     def seen(self, lasers):
         bearings = np.linspace(-np.pi, np.pi, 720, endpoint=False)
         maps = GridMaps(len(lasers), 0.05)
+        ranges = cast(ROOM, np.array([0.012, 0.012]), bearings, 8.0)
         # Once is not enough to be sure of free space.
         for _ in range(3):
-            maps.integrate(np.array(lasers, float), bearings, cast(ROOM, np.array([0.012, 0.012]), bearings, 8.0))
+            maps.integrate(np.array(lasers, float), bearings, ranges)
         return maps
 
     def test_scans_draw_walls_and_the_space_before_them(self):

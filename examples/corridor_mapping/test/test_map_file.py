@@ -31,13 +31,15 @@ class MapFile(unittest.TestCase):
             "image: room.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.5, 2, 0]\nnegate: 0\n"
             "occupied_thresh: 0.65\nfree_thresh: 0.25\n",
         )
-        self.assertEqual(sorted(path.name for path in (self.directory / "maps").iterdir()), ["room.pgm", "room.yaml"])
+        names = sorted(path.name for path in (self.directory / "maps").iterdir())
+        self.assertEqual(names, ["room.pgm", "room.yaml"])
         again = load(self.directory / "maps" / "room.yaml")
         np.testing.assert_array_equal(again.cells, cells)
         self.assertEqual((again.resolution, again.origin.tolist()), (0.05, [-1.5, 2.0]))
 
     def test_broken_files_are_refused_by_name(self):
-        (self.directory / "a.yaml").write_text("image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+        yaml = "image: a.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n"
+        (self.directory / "a.yaml").write_text(yaml)
         (self.directory / "a.pgm").write_bytes(b"P5\n3 2\n255\n\0\0\0\0\0")
         with self.assertRaisesRegex(ValueError, "a.pgm: 5 bytes of pixels, not 3 times 2"):
             load(self.directory / "a.yaml")

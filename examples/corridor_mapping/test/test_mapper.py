@@ -6,7 +6,8 @@ import tempfile
 import unittest
 from pathlib import Path
 
-# The nodes talk to nobody. With LOCALHOST they would share memory, whatever FASTDDS_BUILTIN_TRANSPORTS says.
+# The nodes talk to nobody. With LOCALHOST they would share memory, whatever
+# FASTDDS_BUILTIN_TRANSPORTS says.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
 
 import numpy as np
@@ -56,29 +57,32 @@ class Nodes(unittest.TestCase):
 
     def active_mapper(self):
         mapper = self.mapper()
-        self.assertEqual([mapper.trigger_configure(), mapper.trigger_activate()], [SUCCESS, SUCCESS])
+        results = [mapper.trigger_configure(), mapper.trigger_activate()]
+        self.assertEqual(results, [SUCCESS, SUCCESS])
         return mapper
 
     def refused(self, node, reason, **values):
-        result = node.set_parameters_atomically([Parameter(name, value=value) for name, value in values.items()])
+        parameters = [Parameter(name, value=value) for name, value in values.items()]
+        result = node.set_parameters_atomically(parameters)
         self.assertEqual((result.successful, result.reason), (reason is None, reason or ""))
 
     def test_nonsense_is_refused_with_the_reason(self):
         mapper = self.mapper()
         self.refused(mapper, "resolution is 7.0, must be from 0.02 to 0.5 m", resolution=7.0)
-        self.refused(mapper, "resolution is nan, must be from 0.02 to 0.5 m", resolution=float("nan"))
+        reason = "resolution is nan, must be from 0.02 to 0.5 m"
+        self.refused(mapper, reason, resolution=float("nan"))
         self.refused(mapper, "particles is 0, must be from 1 to 100", particles=0)
         self.refused(mapper, "map_dir must name a directory", map_dir="")
-        self.refused(
-            mapper, "laser_mount must be three finite numbers: x, y and heading on the robot", laser_mount=[0.0, 1.0]
-        )
+        reason = "laser_mount must be three finite numbers: x, y and heading on the robot"
+        self.refused(mapper, reason, laser_mount=[0.0, 1.0])
 
     def test_what_the_map_is_made_with_stays_while_it_is_made(self):
         mapper = self.active_mapper()
         reason = "resolution can't change while /mapper is configured: clean it up first"
         self.refused(mapper, reason, resolution=0.1)
         self.refused(mapper, None, resolution=0.05, map_dir=str(self.maps))
-        self.assertEqual([mapper.trigger_deactivate(), mapper.trigger_cleanup()], [SUCCESS, SUCCESS])
+        results = [mapper.trigger_deactivate(), mapper.trigger_cleanup()]
+        self.assertEqual(results, [SUCCESS, SUCCESS])
         self.refused(mapper, None, resolution=0.1)
         self.assertEqual(mapper.trigger_configure(), SUCCESS)
 
@@ -95,7 +99,8 @@ class Nodes(unittest.TestCase):
         mapper.on_odometry(odometry(4, 0.5))
         self.assertEqual(self.ends, [None])
         self.assertEqual(mapper.run.filter.scans_used, 2)
-        self.assertGreater((map_file.load(self.maps / "corridor.yaml").cells == map_file.OCCUPIED).sum(), BEAMS / 2)
+        corridor = map_file.load(self.maps / "corridor.yaml")
+        self.assertGreater((corridor.cells == map_file.OCCUPIED).sum(), BEAMS / 2)
         self.assertTrue((self.maps / "odometry.pgm").exists())
 
     def test_the_map_so_far_is_saved_on_deactivation(self):

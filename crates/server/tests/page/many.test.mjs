@@ -18,6 +18,7 @@ import {
   until,
 } from './harness.mjs';
 
+const GB = 2 ** 30;
 const PASSWORD = 'correct horse battery';
 const HOSTILE =
   "<img src=x onerror=\"document.title='owned'\"><script>document.title='owned'</script>";
@@ -491,8 +492,8 @@ test('the keyboard focus follows a row that moves', async (t) => {
       await puppets[index].vitals({
         at_ms: 1,
         cpu_percent,
-        memory_used_bytes: 3e9,
-        memory_total_bytes: 8e9,
+        memory_used_bytes: 3 * GB,
+        memory_total_bytes: 8 * GB,
       });
   };
   await loads(90, 50, 10);
@@ -622,11 +623,12 @@ test('the robot list shows new vitals without a reload', async (t) => {
   await page.getByText('Columns').click();
   for (const column of ['CPU', 'Memory']) await page.getByLabel(column).check();
   const row = page.locator('[data-robot]', { hasText: 'atlas' });
+  const memory = { memory_used_bytes: 3 * GB, memory_total_bytes: 8 * GB };
   for (const [cpu_percent, said] of [
     [12, '12 %'],
     [57.4, '57 %'],
   ]) {
-    await atlas.vitals({ at_ms: 1, cpu_percent, memory_used_bytes: 3e9, memory_total_bytes: 8e9 });
+    await atlas.vitals({ at_ms: 1, cpu_percent, ...memory });
     await row.locator('.cpu', { hasText: said }).waitFor();
   }
   await row.locator('.memory', { hasText: '3.0 GB' }).waitFor();

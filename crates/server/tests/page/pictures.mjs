@@ -38,7 +38,7 @@ const NAMES = [
   'mica',
   'nova',
 ];
-const GB = 1e9;
+const GB = 2 ** 30;
 /** Two nodes that look like a mapping robot's in the graph and the log. */
 const SLAM = `import math
 import rclpy

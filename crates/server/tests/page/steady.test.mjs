@@ -13,7 +13,7 @@ const FAILURE = {
 };
 
 const progress = (megabytes) => ({
-  each: () => ({ progress: { done: megabytes * MB, total: 400 * MB } }),
+  each: () => ({ progress: { done: Math.round(megabytes * MB), total: 400 * MB } }),
 });
 const failure = { each: () => ({ failure: FAILURE }) };
 const fails = (index) => index % 3 === 0;

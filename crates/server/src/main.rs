@@ -107,8 +107,14 @@ async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
         }
     };
     tracing::info!("stopping; a second signal exits immediately");
+    let stopping = async {
+        if code == ExitCode::SUCCESS {
+            server.drain().await;
+        }
+        server.stop().await;
+    };
     tokio::select! {
-        () = server.stop() => Ok(code),
+        () = stopping => Ok(code),
         () = signals.next() => Ok(ExitCode::FAILURE),
     }
 }

@@ -444,6 +444,15 @@ impl Broker {
         self.health.clone()
     }
 
+    /// Ends the robots' sessions one after the other within `time`, so that not all reconnect at
+    /// once. Sessions at an external broker are not ours to end.
+    pub async fn drain(&self, time: Duration) {
+        match &self.kind {
+            Kind::Embedded(front) => front.drain(time).await,
+            Kind::External(_) => {}
+        }
+    }
+
     /// Stops accepting, ends every session of the embedded broker and waits until all have ended,
     /// at most for `patience`.
     pub async fn shutdown(&self, patience: Duration) {

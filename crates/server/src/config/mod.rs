@@ -83,6 +83,8 @@ pub struct Config {
     pub trusted_proxies: Vec<IpAddr>,
     /// The addresses of balancers that begin each connection with a PROXY protocol header.
     pub proxies: Vec<IpAddr>,
+    /// Time from a stop signal to the stop, for a balancer and for robots to move to another server.
+    pub drain: Duration,
     /// The OpenID provider for sign-ins; without an issuer, such sign-ins are off.
     pub oidc: OidcSettings,
     /// Maximum size of one blob, in bytes.
@@ -295,6 +297,7 @@ impl Config {
             max_silent_per_address: 2048,
             trusted_proxies: Vec::new(),
             proxies: Vec::new(),
+            drain: Duration::ZERO,
             oidc: OidcSettings::default(),
             max_blob_bytes: 16 << 30,
             max_upload_bytes: 4 << 30,

@@ -3,10 +3,11 @@
 
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
+use std::time::Duration;
 
 use task_proto::messages::part::{MAX_PART_BYTES, MIN_PART_BYTES};
 use task_proto::size::format_bytes;
-use task_proto::time::parse_lifetime;
+use task_proto::time::{parse_duration, parse_lifetime};
 
 use super::oidc::{private_url, public_url};
 use super::{BlobRead, Config};
@@ -238,6 +239,13 @@ pub(super) const SETTINGS: &[Setting] = &[
         help: "Addresses of balancers that begin each connection, HTTP and MQTT, with a PROXY protocol v2 header; \
                see docs/tls.md [default: none]",
         set: |config, text| ip_addresses(text).map(|proxies| config.proxies = proxies),
+    },
+    Setting {
+        name: "drain",
+        value_name: "TIME",
+        help: "Time before a stop in which /readyz answers 503 and robots' sessions end one after the other; \
+               see docs/cluster.md [default: 0s]",
+        set: |config, text| drain(text).map(|time| config.drain = time),
     },
     Setting {
         name: "oidc-issuer",
@@ -475,6 +483,15 @@ fn ip_addresses(text: &str) -> Result<Vec<IpAddr>, String> {
         Err(_) => Err(format!("{text:?} is not an IP address")),
     });
     parsed.collect()
+}
+
+/// At most five minutes: longer, and a service manager kills the server before it stops.
+fn drain(text: &str) -> Result<Duration, String> {
+    const MAX: Duration = Duration::from_secs(5 * 60);
+    match parse_duration(text) {
+        Some(time) if time <= MAX => Ok(time),
+        _ => Err(format!("{text:?} is not a time of at most 5m: expected for example 0s or 10s")),
+    }
 }
 
 fn host_names(text: &str) -> Result<Vec<String>, String> {

@@ -136,6 +136,8 @@ pub struct Server {
     store: Store,
     unusable: watch::Receiver<Option<String>>,
     broker: Broker,
+    readiness: Readiness,
+    drain_time: Duration,
     tls: Option<Tls>,
     stop: CancellationToken,
     tasks: TaskTracker,
@@ -190,6 +192,7 @@ impl Server {
             robots;
         let Base { clock, store, presence, changes, tls, http_connections } = base;
         let provider = provider(&config)?;
+        let (readiness, drain_time) = (Readiness::default(), config.drain);
         let transfers = Transfers::new(&config.transfers, config.delivery.site_label.clone());
         let facts = Arc::new(ServerFacts::new(
             &config,
@@ -228,7 +231,7 @@ impl Server {
             http_traffic: Arc::default(),
             people: Arc::new(PersonLimits::new(config.people)),
             data: data.path().to_owned(),
-            readiness: Readiness::default(),
+            readiness: readiness.clone(),
             stop: stop.clone(),
         });
         start_readiness(&tasks, &app).await;
@@ -238,7 +241,20 @@ impl Server {
         let http = serve_http(http, app, tls.clone(), &config);
         let addresses = addresses(http_address, &broker, tls.as_ref().map(Tls::pin));
         publish(&data, &addresses)?;
-        Ok(Self { data, addresses, store, unusable, broker, tls, stop, tasks, http, reports })
+        Ok(Self {
+            data,
+            addresses,
+            store,
+            unusable,
+            broker,
+            readiness,
+            drain_time,
+            tls,
+            stop,
+            tasks,
+            http,
+            reports,
+        })
     }
 
     /// The addresses of the listeners.
@@ -276,6 +292,17 @@ impl Server {
             why = database => Failure::Broken(why),
             successor = self.store.state().taken_over() => Failure::TakenOver { successor },
         }
+    }
+
+    /// Prepares the stop for the setting's time: `/readyz` answers 503 from now on, and after half of
+    /// the time, in which a balancer notices, the robots' sessions end one after the other.
+    pub async fn drain(&self) {
+        if self.drain_time.is_zero() {
+            return;
+        }
+        self.readiness.begin_drain();
+        tokio::time::sleep(self.drain_time / 2).await;
+        self.broker.drain(self.drain_time / 2).await;
     }
 
     /// Stops within ten seconds: listeners close, requests and sessions end, received reports are

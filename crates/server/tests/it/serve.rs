@@ -279,14 +279,19 @@ impl Program {
         Self::start_logging_to(Stdio::null())
     }
 
-    #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
     fn start_logging_to(log: Stdio) -> Self {
+        Self::start_with(&[], log)
+    }
+
+    #[expect(clippy::disallowed_methods, reason = "the test starts the program it tests")]
+    fn start_with(options: &[&str], log: Stdio) -> Self {
         let directory = tempfile::TempDir::new().expect("a directory");
         let data = directory.path().join("data");
         let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_taskd"));
         command
             .args(["serve", "--http", "127.0.0.1:0", "--mqtt", "127.0.0.1:0", "--data"])
-            .arg(&data);
+            .arg(&data)
+            .args(options);
         command.env_clear().stdin(Stdio::null()).stdout(Stdio::piped()).stderr(log);
         let mut process = command.spawn().expect("it starts");
         // The first line comes when both listeners accept.
@@ -306,6 +311,26 @@ impl Program {
 
     fn data(&self) -> std::path::PathBuf {
         self.directory.path().join("data")
+    }
+
+    /// A new robot, and its session.
+    async fn connected_robot(&self) -> (task_proto::RobotId, Raw) {
+        let client = crate::registry::client();
+        let post = |path: &str, token: &str, body: &Value| {
+            let request = client.post(format!("http://{}/api/v1/{path}", self.http));
+            answer::<Value>(request.bearer_auth(token).json(body))
+        };
+        let enrollment = post("enrollment-tokens", &self.token, &json!({})).await;
+        let enrollment = enrollment["token"].as_str().expect("a token");
+        let body = json!({ "mac": "02:00:00:00:00:07", "name": "atlas" });
+        let robot = post("enroll", enrollment, &body).await;
+        let id: task_proto::RobotId =
+            robot["robot_id"].as_str().expect("an id").parse().expect("an id");
+        let mut raw = Raw { stream: TcpStream::connect(&self.mqtt).await.expect("connects") };
+        let password = robot["token"].as_str().map(str::to_owned);
+        raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
+        raw.expect(&[0x20, 2, 0, 0]).await;
+        (id, raw)
     }
 
     /// Begins an upload of ten bytes and sends five.
@@ -362,6 +387,25 @@ async fn signal_lets_running_requests_end() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn draining_server_is_not_ready_and_ends_sessions_before_it_stops() {
+    let program = Program::start_with(&["--drain", "6s"], Stdio::null());
+    let (_, mut robot) = program.connected_robot().await;
+    program.signal(Signal::SIGTERM);
+    let client = crate::registry::client();
+    let readiness = async || {
+        let request = client.get(format!("http://{}/readyz", program.http));
+        request.send().await.expect("the listener is open").json::<Value>().await.expect("json")
+    };
+    let stopping = async { while readiness().await["status"] != "stopping" {} };
+    tokio::time::timeout(Duration::from_secs(3), stopping).await.expect("it is not ready");
+    // The session is still served.
+    robot.send(&[0xc0, 0]).await;
+    robot.expect(&[0xd0, 0]).await;
+    robot.expect_close().await;
+    assert_eq!(program.exit_code().await, Some(0));
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn second_signal_ends_the_server_at_once() {
     let program = Program::start();
     let _upload = program.half_an_upload().await;
@@ -382,25 +426,7 @@ async fn robot_text_is_one_line_of_the_log() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let path = directory.path().join("log");
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
-    let client = crate::registry::client();
-    let post = |path: &str, token: &str, body: &Value| {
-        answer::<Value>(
-            client
-                .post(format!("http://{}/api/v1/{path}", program.http))
-                .bearer_auth(token)
-                .json(body),
-        )
-    };
-    let enrollment = post("enrollment-tokens", &program.token, &json!({})).await;
-    let enrollment = enrollment["token"].as_str().expect("a token");
-    let robot =
-        post("enroll", enrollment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
-    let id: task_proto::RobotId =
-        robot["robot_id"].as_str().expect("an id").parse().expect("an id");
-    let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
-    let password = robot["token"].as_str().map(str::to_owned);
-    raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
-    raw.expect(&[0x20, 2, 0, 0]).await;
+    let (id, mut raw) = program.connected_robot().await;
     let level = "x\n2026-01-01T00:00:00Z ERROR forged\r\u{1b}[2J\u{9b}2J\u{202e}";
     let batch = json!({ "robot_id": id, "lines": [{ "level": level }] }).to_string();
     raw.send(&publish(&topic(&id, RobotTopic::Log), 1, 7, batch.as_bytes())).await;
@@ -420,25 +446,7 @@ async fn repeated_robot_errors_do_not_fill_the_log_and_data_is_private() {
     let directory = tempfile::TempDir::new().expect("a directory");
     let path = directory.path().join("log");
     let program = Program::start_logging_to(std::fs::File::create(&path).expect("created").into());
-    let client = crate::registry::client();
-    let post = |path: &str, token: &str, body: &Value| {
-        answer::<Value>(
-            client
-                .post(format!("http://{}/api/v1/{path}", program.http))
-                .bearer_auth(token)
-                .json(body),
-        )
-    };
-    let enrollment = post("enrollment-tokens", &program.token, &json!({})).await;
-    let enrollment = enrollment["token"].as_str().expect("a token");
-    let robot =
-        post("enroll", enrollment, &json!({ "mac": "02:00:00:00:00:07", "name": "atlas" })).await;
-    let id: task_proto::RobotId =
-        robot["robot_id"].as_str().expect("an id").parse().expect("an id");
-    let mut raw = Raw { stream: TcpStream::connect(&program.mqtt).await.expect("connects") };
-    let password = robot["token"].as_str().map(str::to_owned);
-    raw.send(&Connect { password, ..Connect::robot(&id) }.packet()).await;
-    raw.expect(&[0x20, 2, 0, 0]).await;
+    let (id, mut raw) = program.connected_robot().await;
     for number in 1..=200_u8 {
         raw.send(&publish(&topic(&id, RobotTopic::Telemetry), 1, number.into(), b"no vitals"))
             .await;

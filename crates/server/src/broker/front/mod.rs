@@ -40,6 +40,9 @@ pub(super) use parts::{Grant, NotGranted};
 use slots::SessionSlots;
 use traffic::Totals;
 
+/// Interval between the ends of sessions before a stop.
+const DRAIN_INTERVAL: Duration = Duration::from_millis(50);
+
 pub(super) struct Front {
     local_addr: SocketAddr,
     context: Arc<Context>,
@@ -230,6 +233,17 @@ impl Front {
 
     pub(super) fn stop(&self) -> CancellationToken {
         self.context.stop.clone()
+    }
+
+    /// Ends the sessions of the robots that are connected now, evenly over `time`.
+    pub(super) async fn drain(&self, time: Duration) {
+        let robots = self.context.slots.robots();
+        let steps = (time.as_millis() / DRAIN_INTERVAL.as_millis()).max(1) as usize;
+        let mut ticks = tokio::time::interval(DRAIN_INTERVAL);
+        for some in robots.chunks(robots.len().div_ceil(steps).max(1)) {
+            ticks.tick().await;
+            some.iter().for_each(|robot| self.context.slots.evict(robot));
+        }
     }
 
     pub(super) async fn shutdown(&self, patience: Duration) {

@@ -152,6 +152,15 @@ impl SessionSlots {
         }
     }
 
+    /// The robots with a slot.
+    pub(super) fn robots(&self) -> Vec<RobotId> {
+        let robot = |name: &SlotKey| match name {
+            SlotKey::Robot(robot) => Some(robot.clone()),
+            _ => None,
+        };
+        self.table().sessions.keys().filter_map(robot).collect()
+    }
+
     /// Evicts all of a person's sessions.
     pub(super) fn evict_person(&self, person: &UserName) {
         for (name, session) in &self.table().sessions {

@@ -30,8 +30,15 @@ pub(in crate::http) async fn readyz(
     State(stop): State<CancellationToken>,
 ) -> Response {
     let verdicts = readiness.verdicts();
-    let is_ready = verdicts.values().all(Option::is_none) && !stop.is_cancelled();
-    let mut body = json!({ "status": if is_ready { "ready" } else { "not_ready" } });
+    let is_stopping = readiness.is_draining() || stop.is_cancelled();
+    let is_healthy = verdicts.values().all(Option::is_none);
+    let is_ready = is_healthy && !is_stopping;
+    let status = match (is_stopping, is_healthy) {
+        (true, _) => "stopping",
+        (false, true) => "ready",
+        (false, false) => "not_ready",
+    };
+    let mut body = json!({ "status": status });
     for (component, problem) in verdicts {
         body[component.as_str()] = problem.unwrap_or_else(|| "ok".to_owned()).into();
     }

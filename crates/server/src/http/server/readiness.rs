@@ -50,7 +50,10 @@ impl Component {
 /// The last verdict on each component: `None` for a healthy one, otherwise the problem. Clones
 /// share the verdicts.
 #[derive(Debug, Clone, Default)]
-pub struct Readiness(Arc<Mutex<BTreeMap<Component, Option<String>>>>);
+pub struct Readiness {
+    verdicts: Arc<Mutex<BTreeMap<Component, Option<String>>>>,
+    draining: CancellationToken,
+}
 
 impl Readiness {
     /// Replaces the verdict on a component.
@@ -63,9 +66,19 @@ impl Readiness {
         self.lock().clone()
     }
 
+    /// From now on the server is not ready, because it is about to stop.
+    pub fn begin_drain(&self) {
+        self.draining.cancel();
+    }
+
+    /// Whether the server is about to stop.
+    pub fn is_draining(&self) -> bool {
+        self.draining.is_cancelled()
+    }
+
     fn lock(&self) -> MutexGuard<'_, BTreeMap<Component, Option<String>>> {
         // Every change under this lock is one insertion.
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.verdicts.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 

@@ -4,6 +4,7 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use task_proto::{Digest, InstanceId, RobotId};
@@ -26,7 +27,7 @@ const MAX_CHANGES: usize = 8;
 pub struct Presence {
     window_ms: u64,
     /// Robots not seen since then count as offline since then.
-    started_ms: u64,
+    started_ms: AtomicU64,
     robots: Mutex<HashMap<RobotId, PresenceRecord>>,
 }
 
@@ -105,7 +106,13 @@ struct Connection {
 impl Presence {
     /// Starts with no robots. A polling robot is online for `window_ms` after its last request.
     pub fn new(window_ms: u64, now_ms: u64) -> Self {
-        Self { window_ms, started_ms: now_ms, robots: Mutex::default() }
+        Self { window_ms, started_ms: now_ms.into(), robots: Mutex::default() }
+    }
+
+    /// Counts robots that are not seen as offline since `now_ms`: a standby, which could not see
+    /// them, takes over.
+    pub fn restart(&self, now_ms: u64) {
+        self.started_ms.store(now_ms, Ordering::Relaxed);
     }
 
     /// The robot's MQTT session number `connection` began.
@@ -218,12 +225,13 @@ impl Presence {
         now_ms: u64,
     ) -> Vec<Option<u64>> {
         let known = self.robots();
+        let started_ms = self.started_ms.load(Ordering::Relaxed);
         let offline_ms = |robot: &RobotId| {
             let since_ms =
                 match known.get(robot).and_then(|record| record.view(self.window_ms, now_ms)) {
                     Some(sighting) if sighting.online => return None,
-                    Some(sighting) => sighting.last_seen_ms.max(self.started_ms),
-                    None => self.started_ms,
+                    Some(sighting) => sighting.last_seen_ms.max(started_ms),
+                    None => started_ms,
                 };
             Some(now_ms.saturating_sub(since_ms))
         };

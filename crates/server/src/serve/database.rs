@@ -117,6 +117,7 @@ impl Database {
         {
             self.presence.remember(&robot, AgentIdentity { instance, place }, now_ms);
         }
+        self.presence.restart(now_ms);
         self.is_ready = true;
         Ok(())
     }

@@ -2,10 +2,16 @@
 
 #![expect(clippy::disallowed_methods, reason = "the test acts for other servers in SQL")]
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::Connection as _;
+use task_proto::RobotId;
+use task_proto::trust::token::{Token, TokenKind};
+use taskd::fleet::presence::Presence;
+use taskd::serve::database::{Database, FirstOperator};
 use taskd::store::{LockAttempt, ServerIdentity, Store, StoreError, lock_holder};
+use taskd::system::clock::Clock;
 
 use crate::database::{self, TestDatabase};
 
@@ -116,4 +122,19 @@ async fn write_of_a_stopped_server_ends_after_some_seconds() {
     let begun = tokio::time::timeout(Duration::from_secs(15), next.begin()).await;
     begun.expect("in time").expect("begins").commit().await.expect("commits");
     assert!(stuck.commit().await.is_err(), "its session has ended");
+}
+
+#[tokio::test]
+async fn robots_are_not_offline_since_before_a_standby_took_over() {
+    let database = database::postgres().await;
+    let presence = Arc::new(Presence::new(1, 0));
+    let operator = FirstOperator { token: Token::random(TokenKind::Operator), path: "".into() };
+    let (standby, clock) = (server(&database, "b"), Clock::system());
+    let taken_ms = clock.now_ms();
+    let opened = Database::open(standby, operator, presence.clone(), clock.clone()).await;
+    let opened = opened.expect("the lock is free");
+    let robot = RobotId::random();
+    let offline_ms = presence.offline_ms([&robot], clock.now_ms())[0].expect("not seen");
+    assert!(offline_ms <= clock.now_ms() - taken_ms, "{offline_ms}");
+    opened.store().close().await;
 }

@@ -3,7 +3,7 @@
 
 use serde_json::Value;
 
-use crate::harness::{Fleet, Robot, program};
+use crate::harness::{Fleet, Robot, eventually, program};
 
 async fn doctor(robot: &Robot) -> Value {
     #[expect(clippy::disallowed_methods, reason = "the robot's own command line")]
@@ -24,7 +24,11 @@ fn verdict(checkup: &Value, check: &str) -> String {
 #[tokio::test(flavor = "multi_thread")]
 async fn doctor_reaches_the_server_over_http_and_mqtt() {
     let mut fleet = Fleet::start(1).await;
-    fleet.server.wait_online("robot-1").await;
+    // The enrollment is a request as well: it makes a robot online whose agent does not run yet.
+    eventually("the agent's session", async || {
+        fleet.server.robot("robot-1").await?.mqtt.is_some().then_some(())
+    })
+    .await;
     let checkup = doctor(&fleet.robots[0]).await;
     for check in [
         "settings",

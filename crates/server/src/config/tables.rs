@@ -7,10 +7,11 @@ use std::path::Path;
 
 use task_proto::desired::Delivery;
 use task_proto::ids::LabelValue;
+use task_proto::size::parse_bytes;
 use task_proto::time::{millis, parse_duration};
 
 use super::oidc::TableError;
-use super::settings::{Setting, size};
+use super::settings::Setting;
 use super::{Config, ConfigError, Origin, oidc, suggestion};
 use crate::domain::delivery::{Condition, ConditionKey, MAX_RULES, Quantity, Rule, Rules, Unit};
 
@@ -194,9 +195,11 @@ fn condition(key: ConditionKey, value: &toml::Value) -> Result<Condition, String
     };
     let whole = value.as_integer().and_then(|number| u64::try_from(number).ok());
     let (read, expected) = match quantity.unit() {
-        Unit::Bytes => (whole.or_else(|| size(value.as_str()?)), "a size, for example \"256 KB\""),
+        Unit::Bytes => {
+            (whole.or_else(|| parse_bytes(value.as_str()?)), "a size, for example \"256 KB\"")
+        }
         Unit::BytesPerSecond => {
-            let rate = |text: &str| size(text.strip_suffix("/s").unwrap_or(text));
+            let rate = |text: &str| parse_bytes(text.strip_suffix("/s").unwrap_or(text));
             (whole.or_else(|| rate(value.as_str()?)), "a rate, for example \"500 KB/s\"")
         }
         Unit::Milliseconds => {
@@ -271,7 +274,8 @@ fn sites(value: toml::Value) -> Result<BTreeMap<LabelValue, SiteLimits>, TableEr
             let (limit, found, expected) = match key.as_str() {
                 "max" => (&mut read.max, whole.filter(at_least(1)), "a whole number from 1"),
                 "bytes_per_s" => {
-                    let bytes = whole.or_else(|| size(value.as_str()?)).filter(at_least(1024));
+                    let bytes =
+                        whole.or_else(|| parse_bytes(value.as_str()?)).filter(at_least(1024));
                     (&mut read.bytes_per_s, bytes, "a size from 1 KB, for example \"10 MB\"")
                 }
                 _ => {

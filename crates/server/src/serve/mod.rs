@@ -17,7 +17,7 @@ use task_proto::CaPin;
 use task_proto::api::ListenerView;
 use task_proto::data_directory::Addresses;
 use task_proto::time::millis;
-use task_proto::trust::envelope::PublicKey;
+use task_proto::trust::envelope::{PublicKey, SigningKey};
 use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -171,22 +171,8 @@ impl Server {
         let (load, http_connections) =
             (Arc::<ServerLoad>::default(), Arc::<HttpConnections>::default());
         let planner = DeliveryPlanner::new(&config.delivery, presence.clone(), load.clone());
-        let desired_states = DesiredStates::new(
-            store.clone(),
-            clock.clone(),
-            key.clone(),
-            millis(config.desired_lifetime),
-        );
-        let settings = action_settings(&config, tls.as_ref());
-        let actions = Actions::new(
-            store.clone(),
-            clock.clone(),
-            changes.clone(),
-            key,
-            settings,
-            planner.clone(),
-        );
         let base = Base { clock, store, presence, changes, tls, http_connections };
+        let (desired_states, actions) = orders(&config, &base, key, &planner);
         let robots = start_robot_traffic(&config, &data, &base, planner).await?;
         let RobotTraffic { writer, reports, requests, logs, vitals, robot_limiter, broker, mqtt } =
             robots;
@@ -339,6 +325,22 @@ struct Base {
     changes: Changes,
     tls: Option<Tls>,
     http_connections: Arc<HttpConnections>,
+}
+
+/// The signed desired states, and the orders that change them.
+fn orders(
+    config: &Config,
+    base: &Base,
+    key: Arc<SigningKey>,
+    planner: &DeliveryPlanner,
+) -> (DesiredStates, Actions) {
+    let Base { clock, store, changes, tls, .. } = base;
+    let lifetime_ms = millis(config.desired_lifetime);
+    let states = DesiredStates::new(store.clone(), clock.clone(), key.clone(), lifetime_ms);
+    let settings = action_settings(config, tls.as_ref());
+    let actions =
+        Actions::new(store.clone(), clock.clone(), changes.clone(), key, settings, planner.clone());
+    (states, actions)
 }
 
 /// The MQTT broker and the parts that take messages from robots.

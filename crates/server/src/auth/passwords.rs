@@ -110,6 +110,11 @@ impl Passwords {
         self.turn().await?.work(move || hashed(&password)).await?
     }
 
+    /// Whether `password` is longer than any user's.
+    pub fn is_too_long(password: &str) -> bool {
+        password.len() > MAX_BYTES
+    }
+
     /// Whether `password` matches the hash. Without a hash the call takes as long, and returns
     /// false.
     pub async fn verify(
@@ -118,7 +123,7 @@ impl Passwords {
         password: &str,
         hash: Option<&PasswordHash>,
     ) -> Result<bool, PasswordError> {
-        if password.len() > MAX_BYTES {
+        if Self::is_too_long(password) {
             return Ok(false);
         }
         let (password, has_hash) = (password.to_owned(), hash.is_some());

@@ -2,7 +2,7 @@
 //! in from an address, the pair of both has a separate count, and no other count applies to it. So
 //! neither strangers elsewhere nor neighbours behind the same address can lock the account's owner
 //! out. Every attempt counts as failed until it has succeeded, so concurrent attempts all count.
-//! The windows of accounts are kept by the caller; everything else is in memory, which is bounded.
+//! The windows of names are kept by the caller; everything else is in memory, which is bounded.
 //! This module never sees a password.
 
 use std::collections::HashMap;
@@ -10,13 +10,17 @@ use std::hash::Hash;
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use hmac::{Hmac, KeyInit as _, Mac as _};
+use sha2::Sha256;
 use task_proto::UserName;
+use task_proto::ids::digest::hex;
+use task_proto::trust::envelope::SigningKey;
 
 /// Period for which failures count.
 pub const WINDOW_MS: u64 = 15 * 60 * 1000;
-/// Maximum failures for one account: from all unfamiliar addresses together, or from one familiar
+/// Maximum failures for one name: from all unfamiliar addresses together, or from one familiar
 /// address.
-const MAX_FOR_ACCOUNT: u64 = 10;
+const MAX_FOR_NAME: u64 = 10;
 /// Maximum failures from one address, for accounts unfamiliar there. A whole lab may share one
 /// address.
 const MAX_FROM_ADDRESS: u64 = 50;
@@ -30,9 +34,6 @@ pub struct SignInLimiter(Mutex<Counts>);
 
 #[derive(Debug, Default)]
 struct Counts {
-    /// Names without an account: answered like others, but not stored. Such a name may be a
-    /// password in the wrong field.
-    unknown_names: Windows<UserName>,
     addresses: Windows<IpAddr>,
     /// Attempts of which only the address is known. Wrong passwords don't count here, and these
     /// attempts don't count as wrong passwords.
@@ -59,9 +60,28 @@ pub enum Familiarity {
     Unfamiliar,
 }
 
+/// A name at a sign-in in the form that is stored: 64 hex digits, which reveal nothing without the
+/// server's key. The name may be a password in the wrong field.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NameDigest(String);
+
+impl NameDigest {
+    pub fn of(name: &UserName, key: &SigningKey) -> Self {
+        let mut mac =
+            Hmac::<Sha256>::new_from_slice(&key.to_bytes()).expect("HMAC takes keys of any length");
+        mac.update(b"name at a sign-in ");
+        mac.update(name.as_str().as_bytes());
+        Self(hex(&mac.finalize().into_bytes()))
+    }
+
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
 impl SignInLimiter {
-    /// Counts an attempt before it is made. The caller counts an unfamiliar one for the name as
-    /// well: in the account's [`Window`], or without an account by [`Self::count_unknown_name`].
+    /// Counts an attempt before it is made. The caller counts an unfamiliar one in the [`Window`] of
+    /// the name as well.
     pub fn begin(
         &self,
         user: &UserName,
@@ -72,21 +92,11 @@ impl SignInLimiter {
         let mut counts = self.lock();
         let pair = (user.clone(), address);
         if counts.familiar.contains_key(&pair) {
-            counts.pairs.count(pair, MAX_FOR_ACCOUNT, now_ms)?;
+            counts.pairs.count(pair, MAX_FOR_NAME, now_ms)?;
             return Ok(Familiarity::Familiar);
         }
         counts.addresses.count(address, MAX_FROM_ADDRESS, now_ms)?;
         Ok(Familiarity::Unfamiliar)
-    }
-
-    /// Counts an unfamiliar attempt for a name without an account.
-    pub fn count_unknown_name(&self, name: &UserName, now_ms: u64) -> Result<(), Blocked> {
-        self.lock().unknown_names.count(name.clone(), MAX_FOR_ACCOUNT, now_ms)
-    }
-
-    /// The block of a name without an account.
-    pub fn unknown_name_block(&self, name: &UserName, now_ms: u64) -> Option<Blocked> {
-        self.lock().unknown_names.active_block(name, MAX_FOR_ACCOUNT, now_ms)
     }
 
     /// Counts an attempt of which only the address is known, before it is made.
@@ -175,14 +185,14 @@ impl Window {
         Self { count: self.count.saturating_sub(1), ..self }
     }
 
-    /// Refuses the attempt of an account that was just added, if there are too many.
-    pub fn check_account(self) -> Result<(), Blocked> {
-        self.check(MAX_FOR_ACCOUNT)
+    /// Refuses the attempt for a name that was just added, if there are too many.
+    pub fn check_name(self) -> Result<(), Blocked> {
+        self.check(MAX_FOR_NAME)
     }
 
-    /// The block of an account; `None`: more attempts are permitted.
-    pub fn account_block(self, now_ms: u64) -> Option<Blocked> {
-        self.block(MAX_FOR_ACCOUNT, now_ms)
+    /// The block of a name; `None`: more attempts are permitted.
+    pub fn name_block(self, now_ms: u64) -> Option<Blocked> {
+        self.block(MAX_FOR_NAME, now_ms)
     }
 
     fn check(self, max: u64) -> Result<(), Blocked> {
@@ -194,11 +204,12 @@ impl Window {
 
     fn block(self, max: u64, now_ms: u64) -> Option<Blocked> {
         let until_ms = self.began_ms + WINDOW_MS;
-        (self.count > max && now_ms < until_ms).then_some(Blocked { until_ms, is_first: false })
+        (self.count > max && !self.is_over(now_ms)).then_some(Blocked { until_ms, is_first: false })
     }
 
+    /// Also true for a window far in the future, from a clock that was wrong.
     fn is_over(self, now_ms: u64) -> bool {
-        now_ms.saturating_sub(self.began_ms) >= WINDOW_MS
+        now_ms.abs_diff(self.began_ms) >= WINDOW_MS
     }
 }
 
@@ -272,7 +283,7 @@ mod tests {
             if familiarity == Familiarity::Unfamiliar {
                 let window = Window::with_attempt(self.window, now_ms);
                 self.window = Some(window);
-                window.check_account()?;
+                window.check_name()?;
             }
             Ok(familiarity)
         }
@@ -290,8 +301,8 @@ mod tests {
     fn account_is_blocked_for_strangers_and_not_for_its_owner() {
         let mut alice = Account::default();
         alice.sign_in(address(1), NOW_MS);
-        for n in 0..MAX_FOR_ACCOUNT {
-            assert_eq!(alice.window.and_then(|window| window.account_block(NOW_MS)), None);
+        for n in 0..MAX_FOR_NAME {
+            assert_eq!(alice.window.and_then(|window| window.name_block(NOW_MS)), None);
             alice.begin(address(100 + n as u8), NOW_MS).expect("allowed");
         }
         let until_ms = NOW_MS + WINDOW_MS;
@@ -299,12 +310,12 @@ mod tests {
         assert_eq!(alice.begin(address(99), NOW_MS + 1), Err(blocked(true)));
         assert_eq!(alice.begin(address(98), NOW_MS + 1), Err(blocked(false)));
         let window = alice.window.expect("attempts were counted");
-        assert_eq!(window.account_block(NOW_MS + 1), Some(blocked(false)));
-        for _ in 0..MAX_FOR_ACCOUNT {
+        assert_eq!(window.name_block(NOW_MS + 1), Some(blocked(false)));
+        for _ in 0..MAX_FOR_NAME {
             alice.begin(address(1), NOW_MS + 2).expect("the owner's address has its own count");
         }
         assert!(alice.begin(address(1), NOW_MS + 2).is_err());
-        assert_eq!(window.account_block(until_ms), None);
+        assert_eq!(window.name_block(until_ms), None);
         assert_eq!(alice.begin(address(99), until_ms), Ok(Familiarity::Unfamiliar));
         assert_eq!(alice.window, Some(Window { began_ms: until_ms, count: 1 }));
     }
@@ -335,7 +346,7 @@ mod tests {
         }
         let blocked =
             alice.sign_ins.begin(&user("ghost"), address(1), NOW_MS).expect_err("blocked");
-        for _ in 0..MAX_FOR_ACCOUNT {
+        for _ in 0..MAX_FOR_NAME {
             alice.begin(address(1), NOW_MS).expect("she is known there");
         }
         assert_eq!(
@@ -364,17 +375,24 @@ mod tests {
     }
 
     #[test]
-    fn unknown_name_is_blocked_like_any_other() {
-        let (sign_ins, ghost) = (SignInLimiter::default(), user("ghost"));
-        for _ in 0..MAX_FOR_ACCOUNT {
-            assert_eq!(sign_ins.unknown_name_block(&ghost, NOW_MS), None);
-            sign_ins.count_unknown_name(&ghost, NOW_MS).expect("allowed");
-        }
-        let blocked = sign_ins.count_unknown_name(&ghost, NOW_MS).expect_err("too many");
-        assert_eq!(blocked, Blocked { until_ms: NOW_MS + WINDOW_MS, is_first: true });
-        let later = Blocked { is_first: false, ..blocked };
-        assert_eq!(sign_ins.unknown_name_block(&ghost, NOW_MS), Some(later));
-        assert_eq!(sign_ins.unknown_name_block(&user("other"), NOW_MS), None);
+    fn window_from_a_clock_that_was_wrong_is_over() {
+        let blocked = |began_ms| Window { began_ms, count: MAX_FOR_NAME + 1 }.name_block(NOW_MS);
+        assert!(blocked(NOW_MS + WINDOW_MS - 1).is_some() && blocked(NOW_MS + WINDOW_MS).is_none());
+        let stored = Window { began_ms: NOW_MS + WINDOW_MS, count: MAX_FOR_NAME };
+        assert_eq!(
+            Window::with_attempt(Some(stored), NOW_MS),
+            Window { began_ms: NOW_MS, count: 1 }
+        );
+    }
+
+    #[test]
+    fn name_is_stored_as_a_digest_with_the_servers_key() {
+        let (one, other) = (SigningKey::random(), SigningKey::random());
+        let digest = NameDigest::of(&user("alice"), &one);
+        assert_eq!(digest, NameDigest::of(&user("alice"), &one));
+        assert_ne!(digest, NameDigest::of(&user("bob"), &one));
+        assert_ne!(digest, NameDigest::of(&user("alice"), &other));
+        assert!(digest.as_str().len() == 64 && !digest.as_str().contains("alice"));
     }
 
     #[test]
@@ -383,15 +401,12 @@ mod tests {
         for n in 0..2 * MAX_COUNTS as u32 {
             let (name, from) = (user(&format!("u{n}")), IpAddr::from(n.to_be_bytes()));
             let _ = sign_ins.begin(&name, from, NOW_MS);
-            let _ = sign_ins.count_unknown_name(&name, NOW_MS);
             let at_ms = NOW_MS + u64::from(n);
             sign_ins.succeeded(&name, from, Familiarity::Unfamiliar, at_ms);
         }
         let counts = sign_ins.lock();
         assert!(
-            counts.addresses.counts.len() <= MAX_COUNTS
-                && counts.unknown_names.counts.len() <= MAX_COUNTS
-                && counts.familiar.len() <= MAX_FAMILIAR
+            counts.addresses.counts.len() <= MAX_COUNTS && counts.familiar.len() <= MAX_FAMILIAR
         );
     }
 }

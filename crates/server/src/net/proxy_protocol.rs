@@ -173,11 +173,14 @@ where
     let (source, rest) = addresses.split_first_chunk::<N>()?;
     let (_destination, rest) = rest.split_first_chunk::<N>()?;
     let ([high, low, _, _], _extensions) = rest.split_first_chunk()?;
-    Some(SocketAddr::new(IpAddr::from(*source), u16::from_be_bytes([*high, *low])))
+    // A balancer that listens on IPv6 may map the addresses of IPv4 clients.
+    let source = IpAddr::from(*source).to_canonical();
+    Some(SocketAddr::new(source, u16::from_be_bytes([*high, *low])))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::net::Ipv4Addr;
     use std::sync::Mutex;
 
     use futures_util::FutureExt as _;
@@ -214,6 +217,9 @@ mod tests {
         (addresses[15], addresses[33]) = (7, 9);
         let v6 = header(PROXY, TCP_V6, &addresses);
         assert_eq!(client(&v6), Ok(Some("[2001:db8::7]:9".to_owned())));
+        addresses[..16].copy_from_slice(&Ipv4Addr::new(192, 0, 2, 7).to_ipv6_mapped().octets());
+        let mapped = header(PROXY, TCP_V6, &addresses);
+        assert_eq!(client(&mapped), Ok(Some("192.0.2.7:9".to_owned())));
         let extended = header(PROXY, TCP_V4, &[&v4()[FIXED_BYTES..], &[4; 500]].concat());
         assert_eq!(client(&extended), Ok(Some("192.0.2.7:49153".to_owned())));
     }

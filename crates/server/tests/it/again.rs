@@ -1,6 +1,8 @@
 //! Orders that follow from earlier ones, told on every database: restarting a task, retrying
 //! failures, and rolling back.
 
+use std::collections::BTreeSet;
+
 use task_proto::api::{PackageView, RetryDeployment};
 use task_proto::desired::DesiredTask;
 use task_proto::ids::selector::Selector;
@@ -526,6 +528,9 @@ async fn robot_may_fetch_the_package_that_it_goes_back_to(database: TestDatabase
     fleet.deploy("4", |order| order.selector = selector("r1")).await;
     assert!(may(0, content("4")).await && may(1, content("4")).await, "it is ordered");
     assert!(may(0, content("2")).await, "it ran before the orders that failed");
+    let kept = fleet.database.store.deployments().packages_in_use().await.expect("reads");
+    let kept: BTreeSet<_> = kept.iter().map(|package| package.version.as_str()).collect();
+    assert_eq!(kept, BTreeSet::from(["2", "3", "4"]), "the collector keeps them");
     assert!(!may(1, content("2")).await, "it never was on this robot");
     assert!(!may(0, content("1")).await, "a later package ran since");
     fleet.deploy("5", |order| order.selector = selector("r0")).await;

@@ -35,7 +35,10 @@ use taskd::system::clock::Clock;
 
 use crate::database::TestDatabase;
 
-const SEED: [u8; 32] = [7; 32];
+/// The server's signing key.
+pub fn key() -> SigningKey {
+    SigningKey::from_bytes([7; 32])
+}
 /// The lifetime of signed desired states.
 pub const STATE_LIFETIME_MS: u64 = 30 * 24 * 60 * 60 * 1000;
 /// The number of every robot's MQTT session.
@@ -116,7 +119,7 @@ impl Fleet {
             let (clock, changes) = (clock.clone(), changes.clone());
             ReportWriter::start(store.clone(), clock, changes, planner.clone()).0
         });
-        let key = Arc::new(SigningKey::from_bytes(SEED));
+        let key = Arc::new(key());
         let desired_states = DesiredStates::new(
             database.store.clone(),
             clock.clone(),
@@ -273,7 +276,7 @@ impl Fleet {
 
     pub async fn desired(&self, robot: &Robot) -> Result<DesiredState, DesiredStateError> {
         let desired = self.desired_states.get(&robot.id).await?;
-        let key = SigningKey::from_bytes(SEED).public_key();
+        let key = key().public_key();
         let payload =
             desired.envelope.open(DESIRED_STATE_TYPE, &key).expect("signed by the server");
         Ok(serde_json::from_slice(&payload).expect("a desired state"))

@@ -8,13 +8,13 @@ use serde_json::{Value, json};
 use task_proto::api::{Me, SessionView};
 use task_proto::trust::token::{Token, TokenKind};
 use task_proto::{Digest, UserName};
-use taskd::auth::sign_ins::{WINDOW_MS, Window};
+use taskd::auth::sign_ins::{NameDigest, WINDOW_MS, Window};
 use taskd::orders::actions::PAGE_LIFETIME_MS;
 use taskd::store::NewPageSession;
 use tempfile::TempDir;
 
 use crate::database::{TestDatabase, on_both_databases, rows};
-use crate::fleet::Fleet;
+use crate::fleet::{Fleet, key};
 use crate::harness::{NOW_MS, TestServer, answer, refusal};
 use crate::people::PASSWORD;
 use crate::story::code;
@@ -29,7 +29,9 @@ on_both_databases! {
     sessions_are_bounded_by_person_and_in_total,
     ended_sessions_and_old_failures_are_removed,
     simultaneous_wrong_passwords_all_count,
-    name_without_an_account_is_not_stored,
+    names_at_a_sign_in_are_stored_as_digests,
+    long_password_is_refused_without_a_write,
+    new_password_ends_the_block_of_its_account,
 }
 
 /// Less than the interval at which a stream checks its rights by itself.
@@ -125,11 +127,12 @@ async fn sign_in_limit_holds_over_a_restart(database: TestDatabase) {
         let request = server.bare(Method::POST, "/api/v1/login");
         request.json(&json!({ "user": name, "password": password }))
     };
-    for _ in 0..10 {
-        assert_eq!(refusal(log_in(&server, "alice", "wrong")).await.0, 401);
+    for name in ["alice", "ghost"].repeat(10) {
+        assert_eq!(refusal(log_in(&server, name, "wrong")).await.0, 401);
     }
     let server = restart(&database, server).await;
     assert_eq!(refusal(log_in(&server, "alice", PASSWORD)).await.0, 429);
+    assert_eq!(refusal(log_in(&server, "ghost", PASSWORD)).await.0, 429, "it has no account");
     assert_eq!(status(log_in(&server, "bob", PASSWORD)).await, 201);
     server.clock.advance_ms(WINDOW_MS);
     assert_eq!(status(log_in(&server, "alice", PASSWORD)).await, 201);
@@ -240,16 +243,18 @@ async fn ended_sessions_and_old_failures_are_removed(database: TestDatabase) {
     ] {
         store.page_sessions().begin(&new, None).await.expect("stored");
     }
-    let failures = async |began_ms: u64, user: &UserName| {
+    let digest_of = |name: &str| NameDigest::of(&name.parse().expect("a name"), &key());
+    let failures = async |began_ms: u64, name: &str| {
         let mut write = store.begin().await.expect("begins");
         let window = Window { began_ms, count: 3 };
-        write.sign_in_failures().put(user, window).await.expect("stored");
+        write.sign_in_failures().put(&digest_of(name), window).await.expect("stored");
         write.commit().await.expect("stored");
     };
     // The first session's last millisecond, and the last of the first window.
     let later_ms = numbered(&kept, &alice, 0).expires_at_ms;
-    failures(later_ms - WINDOW_MS - 1, &alice).await;
-    failures(later_ms - WINDOW_MS, &"bob".parse().expect("a name")).await;
+    failures(later_ms - WINDOW_MS, "alice").await;
+    failures(later_ms - WINDOW_MS + 1, "bob").await;
+    failures(later_ms + WINDOW_MS, "carol").await;
     fleet.clock.advance_ms(later_ms - now_ms);
     fleet.actions.expire().await.expect("expires");
     let [sessions, failures] = ["page_sessions", "sign_in_failures"]
@@ -257,7 +262,8 @@ async fn ended_sessions_and_old_failures_are_removed(database: TestDatabase) {
     let (sessions, failures) = (sessions.await, failures.await);
     let digest = numbered(&kept, &alice, WINDOW_MS).digest.to_string();
     assert!(sessions.len() == 1 && sessions[0].contains(&digest), "{sessions:?}");
-    assert!(failures.len() == 1 && failures[0].contains("bob"), "{failures:?}");
+    let bob = digest_of("bob");
+    assert!(failures.len() == 1 && failures[0].contains(bob.as_str()), "{failures:?}");
 }
 
 async fn simultaneous_wrong_passwords_all_count(database: TestDatabase) {
@@ -271,14 +277,39 @@ async fn simultaneous_wrong_passwords_all_count(database: TestDatabase) {
 }
 
 /// Such a name may be a password in the wrong field.
-async fn name_without_an_account_is_not_stored(database: TestDatabase) {
+async fn names_at_a_sign_in_are_stored_as_digests(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     fleet.add("alice", "operator", None).await;
     let here = IpAddr::from([192, 0, 2, 1]);
-    let stored = async || rows(&fleet.database.url, "sign_in_failures").await;
-    assert_eq!(code(fleet.sign_in("hunter2-my-cat", "wrong", here).await), "unauthorized");
-    assert!(stored().await.is_empty());
-    assert_eq!(code(fleet.sign_in("alice", "wrong", here).await), "unauthorized");
-    let row = stored().await.concat();
-    assert!(row.contains("alice") && row.ends_with("Some(1)"), "{row}");
+    for name in ["hunter2-my-cat", "alice"] {
+        assert_eq!(code(fleet.sign_in(name, "wrong", here).await), "unauthorized");
+        let stored = rows(&fleet.database.url, "sign_in_failures").await.concat();
+        let digest = NameDigest::of(&name.parse().expect("a name"), &key());
+        assert!(stored.contains(digest.as_str()) && !stored.contains(name), "{stored}");
+    }
+}
+
+async fn long_password_is_refused_without_a_write(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    fleet.add("alice", "operator", None).await;
+    for n in 0..60 {
+        let (from, long) = (IpAddr::from([192, 0, 2, 1]), "x".repeat(1_025 + n));
+        assert_eq!(code(fleet.sign_in("alice", &long, from).await), "unauthorized");
+    }
+    assert!(rows(&fleet.database.url, "sign_in_failures").await.is_empty());
+}
+
+async fn new_password_ends_the_block_of_its_account(database: TestDatabase) {
+    let fleet = Fleet::new(database).await;
+    fleet.add("alice", "operator", None).await;
+    let sign_in = async |n: u8, password: &str| {
+        code(fleet.sign_in("alice", password, IpAddr::from([192, 0, 2, n])).await)
+    };
+    for n in 0..10 {
+        assert_eq!(sign_in(n, "wrong").await, "unauthorized");
+    }
+    assert_eq!(sign_in(10, PASSWORD).await, "too_many_requests");
+    let (alice, new) = ("alice".parse().expect("a name"), "another horse battery");
+    fleet.actions.people.set_password(&fleet.operator, &alice, new).await.expect("set");
+    assert!(fleet.sign_in("alice", new, IpAddr::from([192, 0, 2, 11])).await.is_ok());
 }

@@ -8,7 +8,6 @@ use task_proto::messages::report::Phase;
 use super::deployments::revert;
 use super::robots::expire_pending;
 use super::{Actions, DAY_MS, DeploymentActions};
-use crate::auth::sign_ins::WINDOW_MS;
 use crate::orders::changes::Change;
 use crate::store::StoreError;
 
@@ -26,7 +25,7 @@ impl Actions {
         write.idempotency().delete_before(now_ms.saturating_sub(KEY_LIFETIME_MS)).await?;
         let users = write.tokens().forget_ended(now_ms).await?;
         write.page_sessions().delete_ended(now_ms).await?;
-        write.sign_in_failures().delete_before(now_ms.saturating_sub(WINDOW_MS)).await?;
+        write.sign_in_failures().delete_ended(now_ms).await?;
         let given_up = expire_pending(&mut write, now_ms).await?;
         let overdue = write.assignments().overdue(now_ms).await?;
         let notifications = revert(&mut write, planner, &overdue, Phase::Expired, now_ms).await?;

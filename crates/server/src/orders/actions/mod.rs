@@ -90,7 +90,7 @@ impl Actions {
                 clock: clock.clone(),
                 changes: changes.clone(),
                 planner: planner.clone(),
-                key,
+                key: key.clone(),
                 enrollment_limits: Arc::new(EnrollmentLimits::per_minute(
                     settings.enrollments_per_minute,
                 )),
@@ -100,6 +100,7 @@ impl Actions {
                 store: store.clone(),
                 clock: clock.clone(),
                 changes: changes.clone(),
+                key,
                 passwords: Passwords::default(),
                 sign_ins: Arc::default(),
             },

@@ -23,14 +23,19 @@ pub struct FetchGrant {
 }
 
 /// The start of a statement about the needed assignments of some robots, whose ids are the first
-/// parameters: the desired assignments and, for each that has not run, those that it has replaced,
-/// down to one that ran. The robot goes back to that one if none of the later ones gets ready.
+/// parameters.
 fn with_needed(robots: usize) -> String {
-    let ids = values(1, robots, &["TEXT"]);
+    with_needed_where(&format!("desired = 1 AND robot_id IN ({})", values(1, robots, &["TEXT"])))
+}
+
+/// The start of a statement about needed assignments: those that meet the condition and, for each
+/// that has not run, those that it has replaced, down to one that ran. The robot goes back to that
+/// one if none of the later ones gets ready.
+pub(in crate::store) fn with_needed_where(condition: &str) -> String {
     format!(
         "WITH RECURSIVE needed (robot_id, deployment_id, previous, ran) AS (
              SELECT robot_id, deployment_id, previous, ran FROM assignments
-             WHERE desired = 1 AND robot_id IN ({ids})
+             WHERE {condition}
              UNION
              SELECT older.robot_id, older.deployment_id, older.previous, older.ran
              FROM needed newer

@@ -10,9 +10,10 @@ CREATE TABLE page_sessions (
 CREATE INDEX page_sessions_by_user ON page_sessions (user_name, expires_at_ms);
 CREATE INDEX page_sessions_by_expiry ON page_sessions (expires_at_ms);
 
--- Wrong passwords of accounts, since the beginning of the window that counts.
+-- Wrong passwords, since the beginning of the window that counts. name_digest: an HMAC of the name, which may be a
+-- password in the wrong field.
 CREATE TABLE sign_in_failures (
-    user_name TEXT PRIMARY KEY,
+    name_digest TEXT PRIMARY KEY,
     began_ms BIGINT NOT NULL,
     count BIGINT NOT NULL
 );

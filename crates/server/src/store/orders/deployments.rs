@@ -15,6 +15,7 @@ use task_proto::{DeploymentId, RobotId, RobotName};
 
 use crate::domain::deployment;
 use crate::domain::rollout::{RobotProgress, Rollout};
+use crate::store::fleet::needed_packages::with_needed_where;
 use crate::store::repositories::Deployments;
 use crate::store::rows::{
     from_json, from_optional_json, from_word, groups, id, json, number, priority, stored, values,
@@ -274,13 +275,15 @@ impl Deployments<&Store> {
 
     /// The packages that a robot should have, or may get (back): they must not be collected.
     pub async fn packages_in_use(self) -> Result<Vec<PackageRef>, StoreError> {
-        let rows: Vec<String> = sqlx::query_scalar(
-            "SELECT DISTINCT d.package FROM deployments d WHERE d.id IN (
-                 SELECT deployment_id FROM assignments WHERE desired = 1 OR ended = 0
+        let sql = format!(
+            "{} SELECT DISTINCT d.package FROM deployments d WHERE d.id IN (
+                 SELECT deployment_id FROM assignments WHERE ended = 0
+                 UNION SELECT deployment_id FROM needed
                  UNION SELECT previous FROM assignments WHERE desired = 1 AND previous IS NOT NULL)",
-        )
-        .fetch_all(&self.0.reads)
-        .await?;
+            with_needed_where("desired = 1")
+        );
+        let rows: Vec<String> =
+            sqlx::query_scalar(AssertSqlSafe(sql)).fetch_all(&self.0.reads).await?;
         rows.iter().map(|row| from_json("deployments.package", row)).collect()
     }
 

@@ -147,12 +147,11 @@ impl Users<&mut Transaction> {
         Ok(())
     }
 
-    /// Removes a user with all their tokens, page sessions and wrong passwords.
+    /// Removes a user with all their tokens and page sessions.
     pub async fn remove(&mut self, name: &UserName) -> Result<(), StoreError> {
         for sql in [
             "DELETE FROM tokens WHERE user_name = $1",
             "DELETE FROM page_sessions WHERE user_name = $1",
-            "DELETE FROM sign_in_failures WHERE user_name = $1",
             "DELETE FROM users WHERE name = $1",
         ] {
             sqlx::query(sql).bind(name.as_str()).execute(self.0.connection()).await?;

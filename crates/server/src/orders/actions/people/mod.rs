@@ -10,11 +10,12 @@ use std::sync::Arc;
 
 use task_proto::api::{AddUser, ChangePassword, EditUser, TokenOrigin, UserView};
 use task_proto::ids::selector::Selector;
+use task_proto::trust::envelope::SigningKey;
 use task_proto::{Digest, TokenId, UserName};
 
 use super::OrderError;
 use crate::auth::passwords::{PasswordError, Passwords};
-use crate::auth::sign_ins::SignInLimiter;
+use crate::auth::sign_ins::{NameDigest, SignInLimiter};
 use crate::domain::person::{Person, first_name};
 use crate::orders::changes::Changes;
 use crate::store::{AuditAction, AuditEvent, Store, StoreError, Transaction, User};
@@ -37,6 +38,7 @@ pub struct PersonActions {
     pub(super) store: Store,
     pub(super) clock: Clock,
     pub(super) changes: Changes,
+    pub(super) key: Arc<SigningKey>,
     pub(super) passwords: Passwords,
     pub(super) sign_ins: Arc<SignInLimiter>,
 }
@@ -203,6 +205,7 @@ impl PersonActions {
                 write.tokens().revoke(&token.id, now_ms).await?;
             }
         }
+        write.sign_in_failures().delete(&NameDigest::of(name, &self.key)).await?;
         write.audit().record(&AuditEvent::by(by, AuditAction::UserPassword, name), now_ms).await?;
         write.commit().await?;
         self.changes.announce_rights();

@@ -8,8 +8,8 @@ use task_proto::api::{LogIn, TokenOrigin};
 use task_proto::trust::token::{Token, TokenKind};
 
 use super::{MAX_TOKENS, PersonActions, PersonError, check_name_free};
-use crate::auth::passwords::PasswordHash;
-use crate::auth::sign_ins::{Blocked, Familiarity, Window};
+use crate::auth::passwords::{PasswordHash, Passwords};
+use crate::auth::sign_ins::{Blocked, Familiarity, NameDigest, Window};
 use crate::config::RoleRule;
 use crate::orders::actions::{DAY_MS, lifetime_ms};
 use crate::store::{AuditAction, AuditEvent, NewToken, StoreError, Transaction, User};
@@ -41,6 +41,7 @@ pub struct ProviderUser {
 /// An attempt to sign in with a password.
 struct Attempt<'a> {
     name: &'a UserName,
+    digest: NameDigest,
     password: &'a str,
     /// The hash of the account's password; `None`: there is no account with a password.
     hash: Option<&'a PasswordHash>,
@@ -170,16 +171,27 @@ impl PersonActions {
         password: &str,
         address: IpAddr,
     ) -> Result<User, PersonError> {
+        // Such a password is nobody's, so it costs neither a turn nor a write.
+        if Passwords::is_too_long(password) {
+            return Err(PersonError::SignInRefused);
+        }
         let user = self.store.users().get(name).await?;
         let hash = user.as_ref().and_then(|user| user.password.as_ref());
         let now_ms = self.clock.now_ms();
-        let attempt = Attempt { name, password, hash, address, now_ms };
+        let digest = NameDigest::of(name, &self.key);
+        let attempt = Attempt { name, digest, password, hash, address, now_ms };
         let verified = match self.sign_ins.begin(name, address, now_ms) {
-            Ok(Familiarity::Familiar) => self.verify_familiar(&attempt).await.map(Ok),
-            Ok(Familiarity::Unfamiliar) => self.verify_unfamiliar(&attempt).await,
-            Err(blocked) => Ok(Err(blocked)),
+            Ok(familiarity) => {
+                let verified = match familiarity {
+                    Familiarity::Familiar => self.verify_familiar(&attempt).await.map(Ok),
+                    Familiarity::Unfamiliar => self.verify_unfamiliar(&attempt).await,
+                };
+                // A fault of the server is no wrong password.
+                verified.inspect_err(|_| self.sign_ins.cancelled(name, address, familiarity))?
+            }
+            Err(blocked) => Err(blocked),
         };
-        match verified? {
+        match verified {
             Ok(true) => user.ok_or(PersonError::SignInRefused),
             Ok(false) => Err(match self.sign_ins.blocked_at(address, now_ms) {
                 Some(blocked) => too_many_failures(blocked, now_ms),
@@ -197,17 +209,13 @@ impl PersonActions {
 
     /// Whether the password is right, where the account has recently signed in from the address.
     async fn verify_familiar(&self, attempt: &Attempt<'_>) -> Result<bool, PersonError> {
-        let &Attempt { name, password, hash, address, now_ms } = attempt;
-        let verified = match self.passwords.turn().await {
-            Ok(turn) => self.passwords.verify(turn, password, hash).await,
-            Err(error) => Err(error),
-        };
-        match verified {
-            Ok(true) => self.sign_ins.succeeded(name, address, Familiarity::Familiar, now_ms),
-            Ok(false) => {}
-            Err(_) => self.sign_ins.cancelled(name, address, Familiarity::Familiar),
+        let &Attempt { name, password, hash, address, now_ms, .. } = attempt;
+        let turn = self.passwords.turn().await?;
+        let is_right = self.passwords.verify(turn, password, hash).await?;
+        if is_right {
+            self.sign_ins.succeeded(name, address, Familiarity::Familiar, now_ms);
         }
-        Ok(verified?)
+        Ok(is_right)
     }
 
     /// Whether the password is right, or else the block of the name.
@@ -215,59 +223,41 @@ impl PersonActions {
         &self,
         attempt: &Attempt<'_>,
     ) -> Result<Result<bool, Blocked>, PersonError> {
-        let &Attempt { name, password, hash, address, now_ms } = attempt;
+        let Attempt { name, digest, password, hash, address, now_ms } = attempt;
         // A refused attempt neither waits for a turn nor writes.
-        if let Some(blocked) = self.name_block(attempt).await? {
+        let stored = self.store.sign_in_failures().get(digest).await?;
+        if let Some(blocked) = stored.and_then(|window| window.name_block(*now_ms)) {
             return Ok(Err(blocked));
         }
-        let turn = self.passwords.turn().await.inspect_err(|_| {
-            self.sign_ins.cancelled(name, address, Familiarity::Unfamiliar);
-        })?;
-        // Turns are few, and so are these writes.
-        if let Err(blocked) = self.count_for_name(attempt).await? {
+        let turn = self.passwords.turn().await?;
+        // Turns are few, and so are these writes and rows.
+        if let Err(blocked) = self.count_for_name(digest, *now_ms).await? {
             return Ok(Err(blocked));
         }
-        let is_right = self.passwords.verify(turn, password, hash).await?;
+        let is_right = self.passwords.verify(turn, password, *hash).await?;
         if is_right {
             let mut write = self.store.begin_without_auth_invalidation().await?;
-            if let Some(window) = write.sign_in_failures().get(name).await? {
-                write.sign_in_failures().put(name, window.without_attempt()).await?;
+            if let Some(window) = write.sign_in_failures().get(digest).await? {
+                write.sign_in_failures().put(digest, window.without_attempt()).await?;
             }
             write.commit().await?;
-            self.sign_ins.succeeded(name, address, Familiarity::Unfamiliar, now_ms);
+            self.sign_ins.succeeded(name, *address, Familiarity::Unfamiliar, *now_ms);
         }
         Ok(Ok(is_right))
     }
 
-    /// The present block of the attempt's name.
-    async fn name_block(&self, attempt: &Attempt<'_>) -> Result<Option<Blocked>, StoreError> {
-        // Also read for a name without an account: the time of the answer would tell.
-        let stored = self.store.sign_in_failures().get(attempt.name).await?;
-        Ok(match attempt.hash {
-            Some(_) => stored.and_then(|window| window.account_block(attempt.now_ms)),
-            None => self.sign_ins.unknown_name_block(attempt.name, attempt.now_ms),
-        })
-    }
-
-    /// Counts the attempt for its name.
+    /// Counts an attempt for its name. A name without an account is counted in the same way: the
+    /// time of the answer, and a block that lasts over a restart, would tell accounts from others.
     async fn count_for_name(
         &self,
-        attempt: &Attempt<'_>,
+        name: &NameDigest,
+        now_ms: u64,
     ) -> Result<Result<(), Blocked>, StoreError> {
-        let &Attempt { name, hash, now_ms, .. } = attempt;
-        // A name without an account takes a write as well: the time of the answer would tell.
         let mut write = self.store.begin_without_auth_invalidation().await?;
-        let latest = write.sign_in_failures().get(name).await?;
-        let counted = match hash {
-            Some(_) => {
-                let window = Window::with_attempt(latest, now_ms);
-                write.sign_in_failures().put(name, window).await?;
-                window.check_account()
-            }
-            None => self.sign_ins.count_unknown_name(name, now_ms),
-        };
+        let window = Window::with_attempt(write.sign_in_failures().get(name).await?, now_ms);
+        write.sign_in_failures().put(name, window).await?;
         write.commit().await?;
-        Ok(counted)
+        Ok(window.check_name())
     }
 
     /// The error of a blocked attempt. The first one is recorded in the audit.

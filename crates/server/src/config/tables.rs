@@ -396,8 +396,8 @@ mod tests {
                 "delivery.rules[2].size_over in taskd.toml: there is no such condition",
             ),
             (
-                "size_above = \"9.7 MB\"",
-                "delivery.rules[2].size_above in taskd.toml: \"9.7 MB\" is not a size, for",
+                "size_above = \"9.7 mb/s\"",
+                "delivery.rules[2].size_above in taskd.toml: \"9.7 mb/s\" is not a size, for",
             ),
             ("size_above = -1", "delivery.rules[2].size_above in taskd.toml: -1 is not a size"),
             (

@@ -88,7 +88,7 @@ async function allRows() {
 async function countEvents() {
   await page.evaluate(() => {
     window.eventsTakenIn = 0;
-    const { port } = new SharedWorker('/ui/worker.js', { type: 'module', name: 'taskd' });
+    const { port } = new SharedWorker('/ui/api/worker.js', { type: 'module', name: 'taskd' });
     port.onmessage = ({ data }) => (window.eventsTakenIn += data.events?.length ?? 0);
     port.postMessage('join');
   });

@@ -1,5 +1,5 @@
-// The page: signs users in, subscribes to events, selects the view of the current route, and draws
-// it once per frame.
+// Owns the start of the page: the session, the messages of the event stream, the choice of the view
+// and the frame around it; it never draws the content of a view.
 //
 // A view is a class with `constructor(app)`, `onNavigate(route)` for changes of the query or of
 // later path segments, and `draw(now)`, which returns a template. Optional are `afterDraw()`,
@@ -7,29 +7,35 @@
 // data may be stale, `onKey(event)` for otherwise unhandled keys (returns whether it handled the
 // key), `isUnsaved`, and `leave()`. All views share `app`, below.
 
-import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
 import { repeat } from './vendor/lit-html-3.3.3/directives/repeat.js';
-import * as api from './api.js';
-import { preserveFocus } from './cursor.js';
-import { closeDialog, dialogView, isDialogOpen, syncDialog, handleDialogKey } from './dialog.js';
+import { html, nothing, render } from './vendor/lit-html-3.3.3/lit-html.js';
+import * as api from './api/api.js';
+import { subscribe } from './api/events.js';
+import { DeploymentView } from './deployments/deployment.js';
+import { DeploymentsView } from './deployments/deployments.js';
+import { preserveFocus } from './display/cursor.js';
+import {
+  closeDialog,
+  dialogView,
+  isDialogOpen,
+  syncDialog,
+  handleDialogKey,
+} from './display/dialog.js';
+import { change, setRenderer } from './display/display.js';
+import { ago, plural } from './display/format.js';
+import { showHelp } from './display/help.js';
+import { notifyError, hide as hideNotice, noticeView } from './display/notice.js';
+import { hrefTo, currentRoute } from './display/router.js';
+import { statusDot } from './display/status.js';
 import { Fleet, Selection } from './fleet.js';
-import { ago, plural } from './format.js';
-import { change, setRenderer } from './frame.js';
-import { showHelp } from './help.js';
-import { subscribe } from './events.js';
-import { notifyError, hide as hideNotice, noticeView } from './notice.js';
-import { hrefTo, currentRoute } from './router.js';
-import { restorePlace, takeLinkParameters, providerError, signInView } from './sign-in.js';
-import { statusDot } from './status.js';
-import { DeploymentView } from './deployment.js';
-import { DeploymentsView } from './deployments.js';
-import { PackageView } from './package.js';
-import { PackagesView } from './packages.js';
+import { PackageView } from './packages/package.js';
+import { PackagesView } from './packages/packages.js';
 import { Uploads } from './packages/uploads.js';
-import { RobotView } from './robot.js';
-import { RobotsView } from './robots.js';
-import { ServerView } from './server.js';
-import { SettingsView } from './settings.js';
+import { RobotView } from './robots/robot.js';
+import { RobotsView } from './robots/robots.js';
+import { ServerView } from './server/server.js';
+import { SettingsView } from './server/settings.js';
+import { restorePlace, takeLinkParameters, providerError, signInView } from './sign-in.js';
 
 const REFETCH_PAUSE_MS = 2_000;
 const MAX_PAUSE_MS = 30_000;

@@ -1,7 +1,7 @@
-// The state of the fleet, and the sorted and filtered list of robots. It draws nothing and sends no
-// requests.
+// Owns the state of the fleet, and the sorted and filtered list of robots; it draws nothing and
+// sends no requests.
 
-import { tone } from './format.js';
+import { tone } from './display/format.js';
 
 // Minimum interval between sorts, so that rows do not move constantly.
 const SORT_PAUSE_MS = 1_000;

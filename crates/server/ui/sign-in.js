@@ -1,4 +1,6 @@
-// The sign-in view: by username and password, with a token, or with the identity provider.
+// Owns the sign-in view; it never stores a password or a token.
+//
+// A user signs in by username and password, with a token, or with the identity provider.
 
 import { html, nothing } from './vendor/lit-html-3.3.3/lit-html.js';
 

@@ -1,7 +1,7 @@
 //! Holds the order of the modules. ARCHITECTURE.md has a table of the rooms of each crate, from top
-//! to bottom; this test compares it with the paths in the source. A room uses only the rooms that
-//! its row names, all of them below it, and modules that lie side by side never use each other in a
-//! circle.
+//! to bottom, and one of the rooms of the page; this test compares them with the paths in the source
+//! and with the page's imports. A room uses only the rooms that its row names, all of them below it,
+//! and modules never use each other in a circle.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -11,6 +11,10 @@ use proc_macro2::{TokenStream, TokenTree};
 
 /// Entries of a directory of source beside its `mod.rs`, `lib.rs` and `main.rs`.
 const MAX_ENTRIES: usize = 13;
+/// The page's modules and styles.
+const PAGE: &str = "crates/server/ui";
+/// The server serves the files of the page below this path.
+const PAGE_URL: &str = "/ui/";
 
 /// A row of a table of rooms.
 #[derive(Debug, PartialEq, Eq)]
@@ -38,7 +42,7 @@ fn tables(page: &str) -> BTreeMap<String, Vec<Row>> {
     for line in page.lines() {
         let cells: Vec<&str> = line.trim().trim_matches('|').split(" | ").map(str::trim).collect();
         match (line.starts_with('|'), cells.as_slice()) {
-            (true, [name, "owns", "may use"]) if name.contains("/src") => {
+            (true, [name, "owns", "may use"]) if name.starts_with("crates/") => {
                 directory = Some((*name).to_owned())
             }
             (true, [room, owns, uses]) if directory.is_some() && !room.starts_with("--") => {
@@ -56,9 +60,9 @@ fn tables(page: &str) -> BTreeMap<String, Vec<Row>> {
     tables
 }
 
-/// The first paragraph of a file's `//!`, on one line.
-fn first_paragraph(source: &str) -> String {
-    let lines = source.lines().map_while(|line| line.strip_prefix("//!")).map(str::trim);
+/// The first paragraph of the comment that opens a file, on one line. `mark` begins its lines.
+fn first_paragraph(source: &str, mark: &str) -> String {
+    let lines = source.lines().map_while(|line| line.strip_prefix(mark)).map(str::trim);
     lines.take_while(|line| !line.is_empty()).collect::<Vec<_>>().join(" ")
 }
 
@@ -177,6 +181,84 @@ fn modules(source: &Path) -> Vec<Module> {
     modules
 }
 
+/// The files of the page that a module of it loads, as they stand in the source: imports, dynamic
+/// imports and workers.
+fn imports(source: &str) -> Vec<&str> {
+    let code = source.lines().filter(|line| !line.trim_start().starts_with(['/', '*']));
+    let loads = ["from '", "import '", "import('", "Worker('"];
+    code.flat_map(|line| loads.iter().filter_map(move |load| Some(line.split_once(load)?.1)))
+        .filter_map(|rest| Some(rest.split_once('\'')?.0))
+        .filter(|name| name.starts_with('.') || name.starts_with(PAGE_URL))
+        .collect()
+}
+
+/// The path of a module of the page that `from` imports as `name`: a list of directories, and the
+/// name without its extension. None if it is not of JavaScript or leaves the page.
+fn imported(from: &[String], name: &str) -> Option<Vec<String>> {
+    let (mut path, relative) = match name.strip_prefix(PAGE_URL) {
+        Some(name) => (Vec::new(), name),
+        None => (from[..from.len().checked_sub(1)?].to_vec(), name),
+    };
+    for segment in relative.strip_suffix(".js")?.split('/') {
+        match segment {
+            "." => {}
+            ".." => drop(path.pop()?),
+            name => path.push(name.to_owned()),
+        }
+    }
+    Some(path)
+}
+
+/// The modules of the page below `source`, without those of others in `vendor`.
+fn page_modules(source: &Path) -> Vec<Module> {
+    let mut modules = Vec::new();
+    let mut directories = vec![source.to_owned()];
+    while let Some(directory) = directories.pop() {
+        for entry in fs::read_dir(&directory).expect("a directory") {
+            let file = entry.expect("an entry").path();
+            if file.is_dir() && !file.ends_with("vendor") {
+                directories.push(file);
+            } else if file.extension().is_some_and(|extension| extension == "js") {
+                let inside = file.strip_prefix(source).expect("below the source");
+                let inside = inside.with_extension("");
+                let path: Vec<String> =
+                    inside.iter().filter_map(|name| name.to_str()).map(str::to_owned).collect();
+                let text = fs::read_to_string(&file).expect("source");
+                modules.push(page_module(path, &text));
+            }
+        }
+    }
+    modules
+}
+
+fn page_module(path: Vec<String>, source: &str) -> Module {
+    let found = imports(source).into_iter().map(|name| {
+        imported(&path, name).unwrap_or_else(|| panic!("{} imports {name}", path.join("/")))
+    });
+    let uses = found.collect();
+    Module { path, uses }
+}
+
+/// Imports of files that do not exist, and circles of files: in JavaScript each file is a module of
+/// its own, also the one that a directory is named after.
+fn page_violations(modules: &[Module], exists: impl Fn(&str) -> bool) -> Vec<String> {
+    let mut violations = Vec::new();
+    let mut graph: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for Module { path, uses } in modules {
+        let module = path.join("/");
+        let uses: BTreeSet<String> = uses.iter().map(|used| used.join("/")).collect();
+        let absent = uses.iter().filter(|used| !exists(used));
+        violations
+            .extend(absent.map(|used| format!("{module} imports {used}, which is not there")));
+        graph.insert(module, uses);
+    }
+    let names: Vec<String> = graph.keys().cloned().collect();
+    graph.values_mut().for_each(|uses| uses.retain(|used| names.contains(used)));
+    let circle = circle(&graph).map(|circle| format!("a circle of {}", circle.join(" → ")));
+    violations.extend(circle);
+    violations
+}
+
 /// Which of the entries of `directory` use which others of them.
 fn siblings(modules: &[Module], directory: &[String]) -> BTreeMap<String, BTreeSet<String>> {
     let depth = directory.len();
@@ -272,13 +354,21 @@ fn rooms_use_only_rooms_below_them() {
     let mut found = Vec::new();
     for (directory, rows) in &tables {
         let source = repository.join(directory);
-        let modules = modules(&source);
+        let is_page = directory == PAGE;
+        let modules = if is_page { page_modules(&source) } else { modules(&source) };
         assert!(modules.len() > 20, "found only {} modules below {directory}", modules.len());
+        let (main, extension, mark) =
+            if is_page { (None, "js", "//") } else { (Some("mod"), "rs", "//!") };
         let paragraph = |room: &String| {
-            let files = [source.join(room).join("mod.rs"), source.join(format!("{room}.rs"))];
+            let inside = source.join(room).join(main.unwrap_or(room)).with_extension(extension);
+            let files = [inside, source.join(room).with_extension(extension)];
             let text = files.iter().find_map(|file| fs::read_to_string(file).ok())?;
-            Some((room.clone(), first_paragraph(&text)))
+            Some((room.clone(), first_paragraph(&text, mark)))
         };
+        if is_page {
+            let exists = |name: &str| source.join(format!("{name}.js")).is_file();
+            found.extend(page_violations(&modules, exists));
+        }
         let paragraphs = rows.iter().filter_map(|row| paragraph(&row.room)).collect();
         found.extend(
             violations(rows, &modules, &paragraphs)
@@ -293,7 +383,8 @@ fn rooms_use_only_rooms_below_them() {
             "crates/bench/src",
             "crates/cli/src",
             "crates/proto/src",
-            "crates/server/src"
+            "crates/server/src",
+            PAGE,
         ]
     );
     assert!(found.is_empty(), "\n{}", found.join("\n"));
@@ -317,18 +408,21 @@ fn directories_of_source_have_about_a_dozen_entries() {
     ]
     .map(|name| repository.join("crates").join(name).join("src"))
     .to_vec();
+    directories.push(repository.join(PAGE));
     while let Some(directory) = directories.pop() {
         let mut entries = BTreeSet::new();
         for entry in fs::read_dir(&directory).expect("a directory") {
             let path = entry.expect("an entry").path();
-            let is_source =
-                path.is_dir() || path.extension().is_some_and(|extension| extension == "rs");
+            let is_source = path.is_dir()
+                || path.extension().is_some_and(|extension| {
+                    ["rs", "js", "css", "html", "svg"].contains(&extension.to_str().unwrap_or(""))
+                });
             let stem =
                 path.file_stem().and_then(|stem| stem.to_str()).unwrap_or_default().to_owned();
             if is_source && !["mod", "lib", "main"].contains(&stem.as_str()) {
                 entries.insert(stem);
             }
-            if path.is_dir() {
+            if path.is_dir() && !path.ends_with("vendor") {
                 directories.push(path);
             }
         }
@@ -373,5 +467,53 @@ fn upward_uses_and_cycles_are_found() {
         module("low/b", "use super::{a::A};"),
     ];
     assert_eq!(violations(&rows, &circle, &paragraphs), ["low: a circle of a → b"]);
-    assert_eq!(first_paragraph("//! One\n//! two.\n//!\n//! Three.\n"), "One two.");
+    assert_eq!(first_paragraph("//! One\n//! two.\n//!\n//! Three.\n", "//!"), "One two.");
+}
+
+#[test]
+fn upward_imports_and_cycles_of_the_page_are_found() {
+    let module = |path: &str, source: &str| {
+        page_module(path.split('/').map(str::to_owned).collect(), source)
+    };
+    let page = "| crates/x/ui | owns | may use |\n|---|---|---|\n\
+                | `top` | The top. | `low` |\n| `low` | The low. | |\n";
+    let rows = tables(page).remove("crates/x/ui").expect("a table");
+    let paragraphs = BTreeMap::from(
+        [("top", "The top."), ("low", "The low.")].map(|(a, b)| (a.to_owned(), b.to_owned())),
+    );
+    let all = |modules: &[Module]| {
+        let exists = |name: &str| {
+            let is_module = modules.iter().any(|module| module.path.join("/") == name);
+            is_module || name == "vendor/x/y.z"
+        };
+        [violations(&rows, modules, &paragraphs), page_violations(modules, exists)].concat()
+    };
+    let good = [
+        module("top", "import { A } from './low/low.js';\nawait import('/ui/low/a/b.js');"),
+        module("low/low", "// from '../top.js'\nimport {\n  b,\n} from './a/b.js';"),
+        module("low/a/b", "import { html } from '../../vendor/x/y.z.js';\nimport data from 'top';"),
+    ];
+    assert_eq!(all(&good), Vec::<String>::new());
+    let upward = [
+        module("top", "import { A } from './low/low.js';"),
+        module("low/low", "new SharedWorker('/ui/top.js', {});"),
+    ];
+    let found = all(&upward);
+    assert_eq!(
+        found,
+        [
+            "low uses top, which its row does not name",
+            ": a circle of low → top",
+            "a circle of low/low → top"
+        ]
+    );
+    let circle = [
+        module("top", "import './low/low.js';"),
+        module("low/low", "import { a } from './a.js';"),
+        module("low/a", "import { low } from './low.js';"),
+    ];
+    let found = all(&circle);
+    assert_eq!(found, ["low: a circle of a → low", "a circle of low/a → low/low"]);
+    let absent = [module("top", "import './low/low.js';"), module("low/low", "import './b.js';")];
+    assert_eq!(all(&absent), ["low/low imports low/b, which is not there"]);
 }

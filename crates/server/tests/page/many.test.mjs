@@ -516,7 +516,7 @@ test('a dialog opened right after another closes stays open', async (t) => {
   const server = await Server.start(t);
   const page = await open(t, server);
   await page.evaluate(async () => {
-    const { openDialog, closeDialog } = await import('/ui/dialog.js');
+    const { openDialog, closeDialog } = await import('/ui/display/dialog.js');
     const frame = () => new Promise((resume) => requestAnimationFrame(resume));
     const ask = (title) => openDialog({ title, body: () => '' });
     ask('First');

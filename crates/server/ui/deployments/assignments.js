@@ -1,6 +1,6 @@
 // The assignments of a deployment, as the server listed them and as events have updated them since.
 
-import { tone } from '../format.js';
+import { tone } from '../display/format.js';
 
 // The throughput is measured over this window.
 const WINDOW_MS = 10_000;

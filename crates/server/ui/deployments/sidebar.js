@@ -1,9 +1,9 @@
 // The sidebar of a deployment: reasons of failures, and delivery mechanisms.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
-import { number, plural, words } from '../format.js';
-import { hrefTo } from '../router.js';
-import { isNarrow } from '../virtual-list.js';
+import { number, plural, words } from '../display/format.js';
+import { hrefTo } from '../display/router.js';
+import { isNarrow } from '../display/virtual-list.js';
 import { canRetry } from './assignments.js';
 
 const SHOWN_NAMES = 4;

@@ -1,6 +1,6 @@
 // Reads dropped or selected files and folders as packages to upload.
 
-import { number } from '../format.js';
+import { number } from '../display/format.js';
 
 // As the server, which refuses more.
 const MAX_FILES = 100_000;

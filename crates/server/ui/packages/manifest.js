@@ -1,7 +1,7 @@
 // A task manifest in readable form, and the differences between two manifests.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
-import { number, plural, size } from '../format.js';
+import { number, plural, size } from '../display/format.js';
 
 const LAUNCHERS = { catkin: 'roslaunch' };
 const BUILDS = {

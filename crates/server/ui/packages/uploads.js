@@ -1,11 +1,11 @@
 // Uploads of packages. They continue while the user visits other views.
 
 import { html, nothing } from '../vendor/lit-html-3.3.3/lit-html.js';
-import { SignedOut, upload } from '../api.js';
-import { bytes } from '../format.js';
-import { change } from '../frame.js';
-import { notify } from '../notice.js';
-import { hrefTo } from '../router.js';
+import { SignedOut, upload } from '../api/api.js';
+import { change } from '../display/display.js';
+import { bytes } from '../display/format.js';
+import { notify } from '../display/notice.js';
+import { hrefTo } from '../display/router.js';
 import { pack } from './pack.js';
 
 const MEDIA_TYPES = [

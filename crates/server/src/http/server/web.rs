@@ -38,7 +38,7 @@ pub async fn index(headers: HeaderMap) -> Result<Response, ApiError> {
     responses((status = 200, description = "The page.", body = String, content_type = "text/html"),
         (status = 304, description = "Not modified: `If-None-Match` names the current version.")))]
 pub async fn docs(headers: HeaderMap) -> Result<Response, ApiError> {
-    serve("docs.html", &headers)
+    serve("docs/docs.html", &headers)
 }
 
 /// Returns a file of the page.

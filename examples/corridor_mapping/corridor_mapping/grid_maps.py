@@ -8,12 +8,12 @@ for crowds. Maps grow to hold what was seen, up to a limit.
 
 import numpy as np
 
-# What one scan adds to a cell it found occupied, or free, and how sure a map gets.
+# The log odds that one scan adds to an occupied or a free cell, and their bound.
 OCCUPIED_GAIN, FREE_GAIN, SURE = 0.9, 0.4, 6.0
-# The likelihood field: how far from a wall its echoes lie, as a standard deviation in cells; what
-# an echo far from any wall is worth, which is never nothing: people walk by, and walls are seen for
-# the first time; how many cells from a wall that is; and what an echo is worth at most that shows a
-# wall the field does not have yet.
+# The likelihood field: the distance of echoes from their wall, as a standard deviation in cells;
+# the log weight of an echo far from any wall, which is finite, because people walk by and walls are
+# seen for the first time; the distance in cells from which that weight applies; and the maximum
+# weight of an echo at a wall that the field does not have yet.
 FIELD_SIGMA = 0.8
 NO_WALL = -4.0
 FIELD_REACH = FIELD_SIGMA * (-2 * NO_WALL) ** 0.5
@@ -26,7 +26,7 @@ SAMPLES_PER_CELL = 1.4
 
 
 class MapTooLarge(Exception):
-    """What was seen would not fit into the limit."""
+    """The map would exceed its limit."""
 
 
 class GridMaps:

@@ -140,7 +140,7 @@ class Mapper(LifecycleNode):
         self.settings = None
         self.forget()
 
-    # What is heard.
+    # Subscriptions.
 
     def on_odometry(self, message):
         position, orientation = message.pose.pose.position, message.pose.pose.orientation
@@ -210,7 +210,7 @@ class Mapper(LifecycleNode):
         if used % SCANS_PER_LOG == 0:
             self.get_logger().info(f"{used} scans in the map")
 
-    # What is said.
+    # Publications.
 
     def publish_pose(self, stamp, odometry):
         pose = self.run.filter.pose

@@ -4,7 +4,8 @@ scored.
     mapping [--activate]
             [--ros-args -p simulator:seed:=2 -p simulator:rate:=8.0 -p mapper:particles:=30]
 
-The robot sets off when /mapper is active: somebody else's task, or this command's with --activate.
+The robot sets off when /mapper is active. Another program activates it, or this command with
+--activate.
 Both nodes share one executor, so the robot waits for the mapper and not the other way round: a busy
 machine takes longer, and the map is the same.
 """
@@ -52,7 +53,7 @@ def main():
                 sys.exit("mapping: /mapper could not be activated")
     executor.spin_until_future_complete(outcome)
     if mapper.active:
-        # Only does something when the run was stopped: what there is of the map is worth keeping.
+        # Has an effect only if the run was stopped: the unfinished map is saved.
         mapper.save()
     executor.shutdown()
     rclpy.shutdown()

@@ -13,14 +13,13 @@ import numpy as np
 from corridor_mapping.geometry import between, compose
 from corridor_mapping.grid_maps import GridMaps
 
-# The odometry's errors: standard deviations per metre and per radian, and at least so much for each
-# step.
+# The odometry's errors: standard deviations per metre and per radian, and a minimum for each step.
 # Metres for each metre, metres for each radian, metres.
 FORWARD_ERROR = np.array([0.10, 0.02, 0.01])
 SIDE_ERROR = np.array([0.05, 0.02, 0.01])
 # Radians for each metre, for each radian, radians.
 HEADING_ERROR = np.array([0.03, 0.05, 0.004])
-# A scan's echoes are not independent witnesses: so many of them count as one.
+# The echoes of a scan are not independent: this many count as one.
 ECHOES_PER_WITNESS = 3.0
 # The search for the best match: step lengths in metres, each paired with one in radians, and moves
 # tried with each.

@@ -14,7 +14,7 @@ from corridor_mapping import map_file, world
 from corridor_mapping.geometry import compose
 from corridor_mapping.simulation import STEP_S, cast, true_drive
 
-# Rays for what could be seen: so many for each beam of the lidar, from every so many turns of it.
+# Rays that find the visible cells: this many for each beam, from every tenth turn of the lidar.
 RAYS_PER_BEAM = 4
 TURNS_APART = 10
 

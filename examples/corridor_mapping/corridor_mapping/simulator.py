@@ -1,8 +1,7 @@
 """The node `simulator`: a robot with odometry and a lidar in the corridor.
 
-It stands still until somebody publishes a map, drives through both legs and back, says so on
-`drive_finished`, and stands still again. `rate` is how much faster than the clock on the wall its
-time runs.
+It stands still until a map is published, drives through both legs and back, reports that on
+`drive_finished`, and stands still again. `rate` is the speed of its time relative to wall time.
 """
 
 import array

@@ -1,4 +1,4 @@
-"""The lifecycle node, with real rclpy: what it refuses, and when it saves."""
+"""The lifecycle node, with real rclpy: its refusals, and the times of its saves."""
 
 import array
 import os
@@ -6,8 +6,8 @@ import tempfile
 import unittest
 from pathlib import Path
 
-# The nodes talk to nobody. With LOCALHOST they would share memory, whatever
-# FASTDDS_BUILTIN_TRANSPORTS says.
+# The nodes need no discovery. With LOCALHOST they would share memory in spite of
+# FASTDDS_BUILTIN_TRANSPORTS.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "OFF"
 
 import numpy as np

@@ -718,7 +718,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gate_is_a_program_by_its_absolute_path() {
+    fn gate_is_a_program_by_its_absolute_path() {
         assert_eq!(load("", &[]).expect("valid").gate, None);
         let file = "[gate]\ncommand = [\"/opt/gate\", \"--battery\"]\ndefault = \"allow\"\n";
         let gate =
@@ -781,7 +781,7 @@ mod tests {
     }
 
     #[test]
-    fn a_written_file_reads_back() {
+    fn written_file_reads_back() {
         let dir = tempfile::tempdir().expect("a directory");
         let publishers = PublisherSettings {
             keys: Some(vec![SigningKey::from_bytes([1; 32]).public_key()]),

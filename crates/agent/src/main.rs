@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use clap::{CommandFactory as _, Parser, Subcommand};
 use task_agent::commands;
 
-/// Runs task packages on this robot, as its server orders.
+/// Run task packages on this robot, as its server orders
 #[derive(Parser)]
 #[command(name = "task-agent", version, max_term_width = 110)]
 struct CommandLine {
@@ -21,22 +21,22 @@ enum Command {
     Enroll(commands::enroll::Arguments),
     /// Prompt for this robot's settings and write them to agent.toml
     Configure(commands::configure::Arguments),
-    /// Run the agent until a signal; tasks keep running afterwards
+    /// Run the agent until SIGINT or SIGTERM; tasks keep running afterwards
     Run(commands::run::Arguments),
     /// Show the state of this robot's tasks; works without a server or a running agent
     Status(commands::status::Arguments),
     /// Block starts and switches of tasks until `release`; running tasks continue
     Hold(commands::hold::Arguments),
-    /// Release a `hold`
+    /// Release a hold: starts and switches of tasks continue
     Release(commands::hold::Arguments),
-    /// Check this robot for common problems and suggest fixes
+    /// Check this robot for common problems and suggest remedies
     Doctor(commands::doctor::Arguments),
-    /// Write man pages
+    /// Write man pages to a directory
     Man(commands::man::Arguments),
     /// Supervise one task for the agent; called only by the agent
     #[command(hide = true)]
     Shim {
-        /// The run's directory
+        /// Directory of the run
         #[arg(long)]
         dir: PathBuf,
     },

@@ -1,4 +1,4 @@
-// Looks at the page in headless Chromium and prints what it saw as one JSON object: node look.mjs
+// Looks at the page in headless Chromium and prints its measurements as one JSON object: node look.mjs
 // DIRECTORY URL ROBOTS SECONDS, with the operator's token in TASKD_TOKEN. DIRECTORY has
 // playwright-core.
 
@@ -84,7 +84,7 @@ async function allRows() {
   );
 }
 
-/** Counts what comes from the stream from now on, through the worker that all tabs share. */
+/** Counts the messages of the stream from now on, through the worker that all tabs share. */
 async function countEvents() {
   await page.evaluate(() => {
     window.eventsTakenIn = 0;
@@ -95,7 +95,7 @@ async function countEvents() {
 }
 
 /**
- * Scrolls down and up like a hand on a wheel, while the browser traces what its main thread does.
+ * Scrolls down and up like a hand on a wheel, while the browser traces its main thread.
  */
 async function scroll() {
   const events = [];

@@ -38,7 +38,7 @@ enum Command {
     /// Enroll simulated robots, connect them over MQTT, deploy to them, and measure each step
     ///
     /// The robots are one machine's TCP connections with the MQTT client of an independent
-    /// implementation. They verify and report what they are ordered like a real agent, but fetch
+    /// implementation. They verify and report orders like a real agent, but fetch
     /// and run nothing. In the end they are removed, and so is the package that was ordered; the
     /// deployment stays in the server's history. The exit code is 0 if nothing failed. Ctrl-C stops
     /// the run and cleans up; a second one ends it at once.
@@ -60,7 +60,7 @@ enum Command {
     )]
     Paper(PaperFlags),
 
-    /// How one server bears a fleet: all robots connect at once, then one deployment goes to all
+    /// The load of a fleet on one server: all robots connect at once, then one deployment goes to all
     ///
     /// Robots are the agent's own driver, link, fetch and verification, all in one process; they
     /// build and start nothing. The exit code is 0 if nothing failed.
@@ -104,23 +104,23 @@ enum Command {
 
     /// Look at the page in a browser while a fleet reports, and scroll
     ///
-    /// Needs node, Chromium and what `scripts/need page` installs. First rows are timed from asking
+    /// Needs node, Chromium and the packages of `scripts/need page`. First rows are timed from asking
     /// for the page, with a session; main-thread times are the browser's own trace.
     #[command(
         after_help = "Example:\n  taskbench page --robots 10000 --rate 1000 --browser \"$(scripts/need page)\""
     )]
     Page(PageFlags),
 
-    /// Show what has changed between two results of the same scenario
+    /// Show the differences between two results of the same scenario
     #[command(after_help = "Example:\n  taskbench compare old/blob.json new/blob.json --least 5")]
     Compare(CompareFlags),
 
     /// Draw the HTML page of a result again, from its JSON file
     #[command(after_help = "Example:\n  taskbench report taskbench-results/paper.json paper.html")]
     Report {
-        /// The result
+        /// JSON file of the result
         json: PathBuf,
-        /// The page [default: beside the result]
+        /// HTML file to write [default: beside the result]
         html: Option<PathBuf>,
     },
 }

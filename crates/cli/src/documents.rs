@@ -16,7 +16,7 @@ use crate::{CommandError, Outcome};
 /// The shell to complete for.
 #[derive(Debug, Args)]
 pub struct CompletionsArgs {
-    /// Shell
+    /// Shell to complete for
     shell: Shell,
 }
 

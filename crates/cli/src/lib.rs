@@ -51,7 +51,7 @@ pub enum Command {
     Start(task::TaskArgs),
     /// Stop a task; it stays installed
     Stop(task::TaskArgs),
-    /// Restart a task; where it is stopped, start it
+    /// Restart a task; start it where it is stopped
     Restart(task::TaskArgs),
     /// Return a task to the version that ran before the current one
     Rollback(task::TaskArgs),

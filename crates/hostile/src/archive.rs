@@ -87,7 +87,7 @@ fn unpacked(content: &[u8], facts: &ContentFacts) -> Option<u64> {
     }
     match unpacked {
         Ok(()) => {
-            let listed = list(content, size, facts).expect("what can be unpacked can be listed");
+            let listed = list(content, size, facts).expect("an archive that unpacks can be listed");
             assert!(listed.is_sorted_by(|one, next| one.path < next.path), "{listed:?}");
             None
         }

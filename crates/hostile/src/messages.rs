@@ -68,8 +68,8 @@ pub(crate) fn round_trip<T: DeserializeOwned + Serialize + PartialEq + Debug>(
     bytes: &[u8],
 ) -> Option<T> {
     let read: T = serde_json::from_slice(bytes).ok()?;
-    let written = serde_json::to_vec(&read).expect("what was read can be written");
-    let again: T = serde_json::from_slice(&written).expect("what was written can be read");
+    let written = serde_json::to_vec(&read).expect("a parsed value can be written");
+    let again: T = serde_json::from_slice(&written).expect("a written value can be parsed");
     assert_eq!(again, read);
     Some(read)
 }

@@ -1,4 +1,4 @@
-//! What a package says of itself: the files its author wrote, and the manifest as robots read it.
+//! The description of a package: the files its author wrote, and the manifest as robots read it.
 
 use std::path::{Component, Path};
 
@@ -30,9 +30,10 @@ pub fn task_toml(bytes: &[u8]) {
         content: ContentFacts { tar_digest: Digest::of(b""), tar_size: 0, entries: 0 },
     };
     if problems.is_empty() {
-        let written = serde_json::to_vec(&manifest).expect("what was read can be written");
+        let written = serde_json::to_vec(&manifest).expect("a parsed value can be written");
         assert_eq!(
-            serde_json::from_slice::<TaskManifest>(&written).expect("what was written can be read"),
+            serde_json::from_slice::<TaskManifest>(&written)
+                .expect("a written value can be parsed"),
             manifest
         );
         self::manifest(&written);

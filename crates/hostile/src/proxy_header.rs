@@ -4,7 +4,7 @@ use futures_util::FutureExt as _;
 use taskd::net::proxy_protocol::{HeaderError, Parsed, parse, read_header};
 use tokio::io::AsyncReadExt as _;
 
-/// The longest header.
+/// The longest header that the parser accepts.
 const MAX_BYTES: usize = 16 + 4096;
 
 /// The beginning of a connection: the reader agrees with the parser, however the bytes are split,

@@ -16,9 +16,9 @@ pub fn oci_manifest(bytes: &[u8]) {
         assert!(texts.into_iter().flatten().all(|text| !text.contains(char::is_control)));
         let Some(package) = parsed.package else { continue };
         assert_eq!(parsed.artifact_type.as_deref(), Some(PACKAGE_TYPE));
-        let written = serde_json::to_vec(&package).expect("what was read can be written");
+        let written = serde_json::to_vec(&package).expect("a parsed value can be written");
         let again =
-            ParsedManifest::new(content_type, &written).expect("what was written can be read");
+            ParsedManifest::new(content_type, &written).expect("a written value can be parsed");
         assert_eq!((again.package.as_ref(), &again.parts), (Some(&package), &parsed.parts));
         if let Some((config, content)) = package.package_blobs() {
             assert!(

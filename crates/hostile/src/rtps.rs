@@ -1,4 +1,4 @@
-//! What anybody on the network sends to a participant of the ROS graph: datagrams, and samples of
+//! Input from the network to a participant of the ROS graph: datagrams, and samples of
 //! discovery in them.
 
 use std::alloc::{GlobalAlloc, Layout, System};

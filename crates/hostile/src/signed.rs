@@ -1,4 +1,4 @@
-//! Envelopes and the desired states in them, as a robot receives them from whoever.
+//! Envelopes and the desired states in them, as a robot receives them from any source.
 
 use task_agent::reconcile::admission::{AdmissionError, admit};
 use task_proto::desired::{BlobRef, DesiredNotice, DesiredState, Inline};

@@ -143,7 +143,7 @@ mod tests {
     }
 
     #[test]
-    fn a_package_is_listed_and_compared() {
+    fn package_contents_are_listed_and_compared() {
         let old = listed(&packed(&[("data/a.txt", "a"), ("data/b.txt", "b"), ("gone.txt", "")]));
         let paths: Vec<&str> = old.iter().map(|file| file.path.as_str()).collect();
         assert_eq!(paths, ["data", "data/a.txt", "data/b.txt", "gone.txt", "link", "task.toml"]);
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_of_foreign_bytes_is_refused() {
+    fn contents_list_of_foreign_bytes_is_refused() {
         let packed = packed(&[("data/a.txt", "a")]);
         let content = std::fs::read(packed.content.path()).unwrap();
         let facts = ContentFacts { entries: 2, ..packed.manifest.content };

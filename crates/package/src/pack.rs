@@ -195,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn a_fixed_tree_has_a_fixed_digest() {
+    fn fixed_tree_has_a_fixed_digest() {
         let long = format!("data/{}/{}.txt", "d".repeat(120), "f".repeat(120));
         let dir = plain();
         fs::create_dir_all(dir.path().join(&long).parent().unwrap()).unwrap();
@@ -537,7 +537,7 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(64))]
 
         #[test]
-        fn the_same_tree_has_the_same_digest(files in files(), now in 1_000i64..2_000_000_000) {
+        fn same_tree_has_the_same_digest(files in files(), now in 1_000i64..2_000_000_000) {
             let (_one, first) = write_tree(files.iter(), 0o044, 5);
             let (_other, second) = write_tree(files.iter().rev(), 0, now);
             let (first, second) = (pack(&first).unwrap(), pack(&second).unwrap());

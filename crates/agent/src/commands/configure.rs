@@ -20,16 +20,16 @@ use crate::system::layout::DataDir as Layout;
 
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// The server's URL
+    /// URL of the server
     #[arg(long, value_name = "URL")]
     server: Option<String>,
-    /// The robot's name
+    /// Name of the robot
     #[arg(long)]
     name: Option<RobotName>,
-    /// A label; repeatable. Replaces all existing labels
+    /// Label of the robot, in place of all existing labels; may be repeated
     #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
     labels: Vec<(LabelKey, LabelValue)>,
-    /// A setup file to source before a task is built or run; repeatable
+    /// Setup file to source before a task is built or run; may be repeated
     #[arg(long = "underlay", value_name = "FILE")]
     underlays: Vec<PathBuf>,
     /// Do not prompt; settings that are not given keep their values

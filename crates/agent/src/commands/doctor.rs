@@ -51,7 +51,7 @@ const WANTED_FILES: u64 = 1024;
 
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// How to print the result
+    /// Output format
     #[arg(short, long, value_enum, default_value_t = Output::Table, value_name = "FORMAT")]
     output: Output,
     #[command(flatten)]

@@ -28,17 +28,17 @@ const MAX_PAUSE_MS: u64 = 4000;
 
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// The server's URL [default: the one in the property file]
+    /// URL of the server [default: the one in agent.toml]
     #[arg(long, value_name = "URL")]
     server: Option<String>,
-    /// The enrollment token: `taskd enroll-token create` makes one. Other users of the machine can
-    /// read it here, but not in the variable
+    /// Enrollment token, from `taskd enroll-token create`. Prefer the variable: other users of the
+    /// machine can read the command line
     #[arg(long, value_name = "TOKEN", env = "TASK_AGENT_ENROLL_TOKEN", hide_env_values = true)]
     token: Option<String>,
-    /// The robot's name
+    /// Name of the robot
     #[arg(long)]
     name: Option<RobotName>,
-    /// A label; repeatable
+    /// Label of the robot; may be repeated
     #[arg(long = "label", value_name = "K=V", value_parser = parse_label)]
     labels: Vec<(LabelKey, LabelValue)>,
     /// MAC address that identifies the robot [default: that of its first physical network

@@ -33,12 +33,12 @@ pub struct DataDir {
     pub data: PathBuf,
 }
 
-/// How to print the result.
+/// The format of a result.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum Output {
-    /// For people.
+    /// A table, for reading
     Table,
-    /// For programs.
+    /// One JSON document, for programs
     Json,
 }
 

@@ -160,7 +160,7 @@ async fn drive(arguments: Arguments) -> anyhow::Result<()> {
     let stop = tokio::spawn(cancel_on_signal(shutdown));
     driver.run(messages).await;
     stop.abort();
-    tracing::info!("task-agent ends; its tasks go on running");
+    tracing::info!("task-agent ends; its tasks keep running");
     Ok(())
 }
 
@@ -262,7 +262,7 @@ fn start_logging() {
 }
 
 /// Prevents a second agent from using the data directory while this one lives. Only this user may
-/// access the file: a user who could open it could lock it, and so keep every agent from starting.
+/// access the file: a user who could open it could lock it, and so prevent each agent from starting.
 fn lock(data: &Layout) -> anyhow::Result<File> {
     let path = data.root().join("lock");
     let open = || {

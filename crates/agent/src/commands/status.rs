@@ -14,7 +14,7 @@ use crate::task::run::ActiveRun;
 
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
-    /// How to print the result
+    /// Output format
     #[arg(short, long, value_enum, default_value_t = Output::Table, value_name = "FORMAT")]
     output: Output,
     #[command(flatten)]

@@ -127,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn the_robots_own_file_and_environment_win() {
+    fn robots_own_file_and_environment_win() {
         let file = "underlays = [\"/own/setup.bash\"]\n[limits]\nlog_bytes = 9000\n[logs]\nforward_level = \"info\"\n";
         let own = own(file, &[("ROS_DOMAIN_ID", "3")]);
         let set = set(json!({
@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_that_trusts_publishers_takes_no_setup_file_from_its_server() {
+    fn robot_that_trusts_publishers_takes_no_setup_file_from_its_server() {
         let key = task_proto::trust::envelope::SigningKey::from_bytes([7; 32]).public_key();
         let trusting = format!("[trusted_publishers]\nkeys = [\"{key}\"]\n");
         let set = set(

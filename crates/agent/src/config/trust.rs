@@ -405,7 +405,7 @@ mod tests {
         assert_eq!(
             robot.check_package(3, PackageUse::Restart, NOW_MS + 1000),
             Ok(1),
-            "what runs goes on"
+            "running tasks continue"
         );
         assert_eq!(
             robot.check_package(9, PackageUse::New, NOW_MS + 1000),

@@ -344,7 +344,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_log_is_limited_and_the_tail_is_the_end() {
+    fn log_is_limited_and_the_tail_is_the_end() {
         let temp = tempfile::tempdir().unwrap();
         let path = temp.path().join("build.log");
         let (reader, mut writer) = io::pipe().unwrap();
@@ -361,7 +361,7 @@ mod tests {
     }
 
     #[test]
-    fn a_package_name_is_read_and_an_odd_one_is_not_followed() {
+    fn package_name_is_read_and_a_malformed_one_is_ignored() {
         let temp = tempfile::tempdir().unwrap();
         let path = temp.path().join("package.xml");
         fs::write(&path, "<package format=\"3\">\n  <name> talker </name></package>").unwrap();

@@ -203,10 +203,10 @@ fn report_failure(failure: &SessionEnd, link_state: &LinkState, was_up: bool) ->
             return (MIN_REFUSED_BACKOFF_MS + spread_ms, MAX_REFUSED_BACKOFF_MS);
         }
         SessionEnd::Unreachable(error) => {
-            tracing::info!(error = %chain(error), "no MQTT session");
+            tracing::info!(error = %chain(error), "cannot open an MQTT session");
         }
         SessionEnd::Lost(error) => {
-            tracing::info!(%error, "no MQTT session");
+            tracing::info!(%error, "the MQTT session was lost");
             if was_up {
                 link_state.meter.reconnected(Instant::now());
             }

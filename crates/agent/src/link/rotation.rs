@@ -77,7 +77,7 @@ impl Rotation {
                 if self.store_identity(identity) { Duration::ZERO } else { spread(RETRY) }
             }
             Err(error) => {
-                tracing::info!(error = %chain(&error), "no new token");
+                tracing::info!(error = %chain(&error), "cannot get a new token");
                 spread(CHECK)
             }
         }

@@ -295,7 +295,7 @@ fn server_message(outcome: Result<Option<DesiredResponse>, ServerError>) -> Serv
             ServerMessage::StateUnavailable { code, text: message }
         }
         Err(error) => {
-            tracing::info!(error = %chain(&error), "no desired state over HTTP");
+            tracing::info!(error = %chain(&error), "cannot fetch the desired state over HTTP");
             ServerMessage::StateUnavailable {
                 code: "server_unreachable".to_owned(),
                 text: chain(&error),
@@ -345,7 +345,7 @@ pub async fn post(
                     continue;
                 }
                 Err(error) => {
-                    tracing::info!(error = %chain(&error), "no report over HTTP");
+                    tracing::info!(error = %chain(&error), "cannot send the report over HTTP");
                     failures += 1;
                     retry = Duration::from_millis(
                         backoff_ms(failures, MAX_POST_BACKOFF_MS, rand::random()).max(100),

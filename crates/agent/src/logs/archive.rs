@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_lines_of_all_files_come_in_order_of_time() {
+    fn newest_lines_of_all_files_come_in_order_of_time() {
         let temp = tempfile::tempdir().unwrap();
         let [one, two] = ["one.log", "two.log"].map(|name| temp.path().join(name));
         use LogSource::{Stderr, Stdout};
@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn a_rotated_log_is_read_through_all_its_files() {
+    fn rotated_log_is_read_through_all_its_files() {
         let temp = tempfile::tempdir().unwrap();
         let path = temp.path().join("task.log");
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 10_000, files: 4 });

@@ -219,7 +219,7 @@ mod tests {
     }
 
     #[test]
-    fn a_logger_names_its_node() {
+    fn logger_names_its_node() {
         assert_eq!(node_of("robot.talker").expect("a name").as_str(), "/robot/talker");
         for other in ["", "talker-1", "a..b", "1st"] {
             assert_eq!(node_of(other), None, "{other}");

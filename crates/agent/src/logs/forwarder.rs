@@ -359,7 +359,7 @@ mod tests {
         assert_eq!(
             bench.next_batch(SECOND, Some(LogLevel::Debug)),
             (vec![], 0),
-            "what was passed over is kept, not sent"
+            "skipped lines are kept, not sent"
         );
         bench.say("one", LogSource::Stdout, ["more".to_owned()]);
         assert_eq!(bench.next_batch(SECOND, Some(LogLevel::Info)), (vec!["more".to_owned()], 0));

@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_line_longer_than_a_file_is_cut_and_one_file_is_enough() {
+    fn line_longer_than_a_file_is_cut_and_one_file_is_enough() {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("task.log");
         let mut log = RotatedLog::new(LogSpec { path: path.clone(), max_bytes: 4, files: 1 });
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn an_earlier_log_is_continued() {
+    fn earlier_log_is_continued() {
         let temp = tempfile::tempdir().expect("temp dir");
         let path = temp.path().join("task.log");
         for line in [b"one\n", b"two\n"] {

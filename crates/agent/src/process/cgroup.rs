@@ -5,7 +5,7 @@
 //!
 //! ```text
 //! <place>/taskd/            no processes of its own, so that its children can have limits
-//! <place>/taskd/shims/      the shims of all runs, out of reach of what ends an agent
+//! <place>/taskd/shims/      the shims of all runs, not ended with an agent
 //! <place>/taskd/<key>/      one run or build
 //! ```
 //!
@@ -410,7 +410,7 @@ mod tests {
                           35 25 0:30 / /sys/fs/cgroup/unified rw,relatime shared:9 - cgroup2 cgroup2 rw\n";
 
     #[test]
-    fn the_mount_is_found_in_every_layout() {
+    fn mount_is_found_in_every_layout() {
         let hybrid = Mount::find(HYBRID).expect("found");
         assert_eq!(hybrid.point, Path::new("/sys/fs/cgroup/unified"));
         let unified =

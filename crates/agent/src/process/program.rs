@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn a_command_name_may_look_like_fields() {
+    fn command_name_may_look_like_fields() {
         let line = b"42 (a) R 1 (b) S 7 8 9 0 -1 0 0 0 0 0 0 0 0 0 20 0 1 0 12345 0 0";
         let entry = ProcessEntry::parse(42, line).expect("parsed");
         assert_eq!((entry.parent, entry.group, entry.start_ticks), (7, 8, 12345));
@@ -605,7 +605,7 @@ mod tests {
     }
 
     #[test]
-    fn the_process_table_holds_this_process_with_its_environment() {
+    fn process_table_holds_this_process_with_its_environment() {
         let own = std::process::id();
         let entry = ProcessEntry::all()
             .expect("table")
@@ -619,7 +619,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn a_build_and_the_gate_lead_sessions_of_their_own() {
+    async fn build_and_the_gate_lead_sessions_of_their_own() {
         let temp = tempfile::tempdir().expect("a directory");
         let script = temp.path().join("script");
         // Process group and session.
@@ -643,7 +643,7 @@ mod tests {
 
     /// The kernel's `prctl_mm_map`: the address ranges that a process claims for its memory areas.
     #[repr(C)]
-    struct Claim {
+    struct PrctlMmMap {
         code_data_and_heap: [u64; 6],
         stack: u64,
         arguments: [u64; 2],
@@ -658,7 +658,7 @@ mod tests {
         let mut memory = vec![0; 64 << 20];
         memory[..9].copy_from_slice(b"LIE=told\0");
         let start = memory.as_ptr() as u64;
-        let claim = |bytes: u64| Claim {
+        let claim = |bytes: u64| PrctlMmMap {
             code_data_and_heap: [start, start + 1, start, start + 1, start, start],
             stack: start,
             arguments: [start; 2],
@@ -675,7 +675,7 @@ mod tests {
                 nix::unistd::ForkResult::Parent { child } => child,
                 // SAFETY: the claim and the answer are copies that outlive the calls.
                 nix::unistd::ForkResult::Child => unsafe {
-                    let size = size_of::<Claim>();
+                    let size = size_of::<PrctlMmMap>();
                     let refused = libc::prctl(
                         libc::PR_SET_MM,
                         libc::PR_SET_MM_MAP,

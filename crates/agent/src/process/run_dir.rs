@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn the_files_read_back_and_have_the_documented_shape() {
+    fn run_files_read_back_and_have_the_documented_shape() {
         let temp = tempfile::tempdir().expect("temp dir");
         let dir = RunDir::create(&temp.path().join("run")).expect("create");
         assert_eq!(dir.ended().expect("read"), None);
@@ -259,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn a_damaged_file_is_named() {
+    fn damaged_file_is_named() {
         let temp = tempfile::tempdir().expect("temp dir");
         let dir = RunDir::create(temp.path()).expect("create");
         std::fs::write(dir.path().join("pid.json"), "{").expect("write");

@@ -275,6 +275,9 @@ mod tests {
                 io::ErrorKind::StorageFull
             }))
         });
-        assert!(never.is_err() && count == 2, "what room does not mend is told at once");
+        assert!(
+            never.is_err() && count == 2,
+            "an error other than a full disk is reported at once"
+        );
     }
 }

@@ -105,7 +105,7 @@ pub fn is_expired(state: &DesiredState, wall_ms: u64) -> bool {
 
 #[cfg(test)]
 mod tests {
-    use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
+    use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, TargetState};
     use task_proto::trust::envelope::SigningKey;
     use task_proto::{DeploymentId, Digest};
 
@@ -121,7 +121,7 @@ mod tests {
             task: name.clone(),
             deployment: DeploymentId::random(),
             package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run: 1,
             delivery: Delivery::PushPull,
             priority: 0,

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use task_proto::desired::{DesiredState, DesiredTask, Wanted};
+use task_proto::desired::{DesiredState, DesiredTask, TargetState};
 use task_proto::error_chain::chain;
 use task_proto::ids::Labels;
 use task_proto::messages::report::{Condition, Progress};
@@ -290,7 +290,7 @@ impl<E: Effects> Driver<E> {
     /// repeats it.
     fn is_removal(&self, task: &TaskName, step: &Step) -> bool {
         let is_wanted =
-            self.desired_task(task).is_some_and(|desired| desired.wanted == Wanted::Running);
+            self.desired_task(task).is_some_and(|desired| desired.wanted == TargetState::Running);
         matches!(step, Step::Stop(_) | Step::Remove) && !is_wanted
     }
 
@@ -474,10 +474,9 @@ impl<E: Effects> Driver<E> {
         let is_there = |task| {
             self.views.get(task).and_then(|view| view.prepared.as_ref()).is_some_and(|p| p.content)
         };
-        let ordered =
-            self.ledger.tasks.iter().filter(|(task, record)| {
-                record.order.wanted == Wanted::Running && !is_there(*task)
-            });
+        let ordered = self.ledger.tasks.iter().filter(|(task, record)| {
+            record.order.wanted == TargetState::Running && !is_there(*task)
+        });
         let wanted: Vec<Digest> =
             ordered.map(|(_, record)| record.to_prepare().0.content.digest).collect();
         if self.kept_parts.as_ref() != Some(&wanted) {

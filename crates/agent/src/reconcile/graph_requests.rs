@@ -266,7 +266,7 @@ mod tests {
     use task_proto::telemetry::ros::Endpoint;
 
     #[test]
-    fn a_topic_lists_each_of_its_nodes_once() {
+    fn topic_lists_each_node_once() {
         let endpoint =
             |kind: &str| Endpoint { name: "/scan".parse().expect("valid"), kind: kind.to_owned() };
         let node = |name: &str, publishers: Vec<Endpoint>, subscriptions: Vec<Endpoint>| Node {

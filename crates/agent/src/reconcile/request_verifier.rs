@@ -95,7 +95,7 @@ mod tests {
             transition: Transition::Activate,
         };
         let changed = Request { ask: activate, ..request(&action(), &key) };
-        assert_eq!(verifier.verify(&changed), Ok(ask.clone()), "what was signed counts");
+        assert_eq!(verifier.verify(&changed), Ok(ask.clone()), "the signed question counts");
         let refused = [
             good,
             Request { signed: None, ..request(&action(), &key) },

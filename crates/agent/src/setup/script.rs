@@ -177,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_launched_package_sources_underlay_and_overlay() {
+    fn launched_package_sources_underlay_and_overlay() {
         let run = Run {
             launch: Some(["talker".to_owned(), "talk.launch.py".to_owned()]),
             args: BTreeMap::from([("frame".to_owned(), "it's $(here)".to_owned())]),
@@ -216,7 +216,7 @@ exec -- 'ros2' 'launch' 'talker' 'talk.launch.py' 'frame:=it'\''s $(here)'
     }
 
     #[test]
-    fn a_catkin_package_is_launched_by_roslaunch() {
+    fn catkin_package_is_launched_by_roslaunch() {
         let run =
             Run { launch: Some(["base".to_owned(), "base.launch".to_owned()]), ..Run::default() };
         let (version, _) = version("/data");
@@ -224,7 +224,7 @@ exec -- 'ros2' 'launch' 'talker' 'talk.launch.py' 'frame:=it'\''s $(here)'
         assert!(script.ends_with("exec -- 'roslaunch' 'base' 'base.launch'\n"), "{script}");
     }
 
-    #[expect(clippy::disallowed_methods, reason = "what bash makes of a text only bash knows")]
+    #[expect(clippy::disallowed_methods, reason = "only bash can tell how it reads a text")]
     fn bash(script: &str) -> Vec<u8> {
         std::process::Command::new("/bin/bash").args(["-c", script]).output().unwrap().stdout
     }

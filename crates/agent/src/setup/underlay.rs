@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn a_virtual_environment_is_an_underlay_and_a_missing_file_is_named() {
+    fn virtual_environment_is_an_underlay_and_a_missing_file_is_named() {
         let temp = tempfile::tempdir().unwrap();
         // This name must not be mistaken for the directory where distributions are installed.
         let venv = temp.path().join("ros");
@@ -232,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn the_ros_1_of_the_operating_system_needs_no_setup_file() {
+    fn ros_1_of_the_operating_system_needs_no_setup_file() {
         let temp = tempfile::tempdir().unwrap();
         let paths = paths(temp.path());
         assert_eq!(setup_files(&find(&[], &paths), None, &[]), Ok(vec![]));

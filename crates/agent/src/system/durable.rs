@@ -124,7 +124,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_is_swapped_and_its_old_target_stays() {
+    fn symlink_is_swapped_and_its_old_target_stays() {
         let dir = tempfile::tempdir().unwrap();
         let current = dir.path().join("current");
         let old = dir.path().join("old");

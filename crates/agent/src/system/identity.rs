@@ -168,7 +168,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mac_is_a_physical_permanent_address() {
+    fn mac_is_a_physical_permanent_address() {
         let root = tempfile::tempdir().expect("a directory");
         assert_eq!(find_mac(root.path(), |_| None), Err(MacError::NoneFound));
         interface(root.path(), "docker0", "00:11:22:33:44:50", "0", false);
@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn an_identity_is_private_and_reads_back() {
+    fn identity_is_private_and_reads_back() {
         let dir = tempfile::tempdir().expect("a directory");
         let path = dir.path().join("identity.json");
         assert!(matches!(Identity::read(&path), Err(IdentityError::Missing(_))));

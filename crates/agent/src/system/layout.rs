@@ -1,29 +1,29 @@
 //! Paths in the agent's data directory:
 //!
 //! ```text
-//! identity.json                     who this robot is (0600)
-//! ledger.json                       what the agent was doing
-//! publishers.json                   the list of publishers it goes by, if it was shown one
+//! identity.json                     the identity of this robot (0600)
+//! ledger.json                       the orders, and the progress of each
+//! publishers.json                   the accepted list of publishers, if the server has one
 //! blobs/sha256/<hex>.part           bytes of a package's content that have arrived so far
-//! blobs/sha256/<hex>.parts          the same where they come as parts in any order: a file with holes
-//! blobs/sha256/<hex>.parts-note     which of its parts are on the disk
-//! accounts.json                     which account each task runs under
+//! blobs/sha256/<hex>.parts          the same for parts, which arrive in any order: a file with holes
+//! blobs/sha256/<hex>.parts-note     list of the parts on the disk
+//! accounts.json                     account of each task
 //! staging/                          trees being unpacked; emptied at every start
 //! survey/                           script of the last probe of the ROS installations
 //! logs/                             messages of nodes that belong to no task
 //! tasks/<name>/current              link to the active version
 //! tasks/<name>/run/                 the shim's files: pid, exit status
-//! tasks/<name>/logs/                the task's and the build's output, and what its nodes say on ROS topics
-//! tasks/<name>/home/                the task's home directory, where it runs as a user of its own
-//! tasks/<name>/build_home/          that of its builds
-//! tasks/<name>/uploads.json         which uploads of its files are under way
-//! tasks/<name>/<hex>.signatures     what publishers have signed about a version, out of the task's reach
-//! tasks/<name>/<hex>.seal           what was unpacked and built of a version, by digests
+//! tasks/<name>/logs/                output of the task, its build and its nodes
+//! tasks/<name>/home/                home directory of the task, if it has an account of its own
+//! tasks/<name>/build_home/          home directory of its builds
+//! tasks/<name>/uploads.json         uploads under way
+//! tasks/<name>/<hex>.signatures     publishers' signatures of a version, out of the task's reach
+//! tasks/<name>/<hex>.seal           digests of the unpacked and built files of a version
 //! tasks/<name>/<hex>/               one version, by the digest of its OCI manifest
 //!   task.json                       the task manifest, byte for byte as it was pulled
 //!   src/  build/  install/  run.sh  read-only to the task
 //!   work/                           the directory that the task runs in
-//!   node_logs/                      what its nodes write into logs of their own
+//!   node_logs/                      log files of its nodes
 //! ```
 //!
 //! This module owns the names and the rules for cleaning up. The contents of the files belong to

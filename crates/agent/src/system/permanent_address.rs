@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_answer_is_six_bytes_that_are_not_zero() {
+    fn permanent_address_is_six_nonzero_bytes() {
         let mut answer = PermanentAddress { command: 0, size: 6, address: [0; MAX_ADDRESS] };
         assert_eq!(parse(&answer), None);
         answer.address[..MAC].copy_from_slice(&[0, 0x11, 0x22, 0x33, 0x44, 0xff]);
@@ -109,7 +109,7 @@ mod tests {
     /// Runs in a network namespace of its own, which lasts as long as this thread.
     #[test]
     #[expect(clippy::disallowed_methods, reason = "ip makes the interface that the test looks at")]
-    fn an_interface_without_hardware_has_none() {
+    fn interface_without_hardware_has_none() {
         let looked = std::thread::spawn(|| {
             nix::sched::unshare(nix::sched::CloneFlags::CLONE_NEWNET).ok()?;
             let words = [

@@ -418,7 +418,7 @@ mod tests {
     }
 
     #[test]
-    fn an_agent_that_is_not_root_runs_tasks_as_itself() {
+    fn agent_without_root_runs_tasks_under_its_own_account() {
         assert_eq!(choose(None, 1000), Ok(None));
         assert_eq!(choose(Some("1000"), 1000), Ok(None));
         assert!(matches!(choose(Some("root"), 1000), Err(TaskUserError::NotRoot { .. })));

@@ -187,7 +187,7 @@ fn unused_backup_path(path: &Path) -> PathBuf {
 
 #[cfg(test)]
 mod tests {
-    use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
+    use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, TargetState};
     use task_proto::messages::report::{Failure, FailureCode, Phase};
     use task_proto::packages::manifest::TaskManifest;
     use task_proto::{DeploymentId, Digest};
@@ -204,7 +204,7 @@ mod tests {
             task: name.clone(),
             deployment: DeploymentId::random(),
             package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run: 1,
             delivery: Delivery::PushPull,
             priority: 0,
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ledger_reads_back_and_survives_a_crash_while_it_is_written() {
+    fn ledger_reads_back_and_survives_a_crash_while_it_is_written() {
         let dir = tempfile::tempdir().expect("a directory");
         let path = dir.path().join("ledger.json");
         assert!(matches!(Ledger::read(&path), Ok(LedgerFile::Missing)));
@@ -230,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_ledger_that_is_cut_off_or_of_another_format_is_moved_aside() {
+    fn ledger_that_is_cut_off_or_of_another_format_is_moved_aside() {
         let dir = tempfile::tempdir().expect("a directory");
         let path = dir.path().join("ledger.json");
         Ledger::new(3).write(&path).expect("written");

@@ -95,14 +95,14 @@ pub enum Health {
         /// The time since which all promises have held without a break.
         since_ms: u64,
     },
-    /// Something is missing and may still appear.
+    /// A requirement is missing and may still appear.
     Missing(Missing),
     /// A failure that waiting does not mend: `node_name_taken`, `parameter_rejected`,
     /// `lifecycle_failed`. Occurs only before the run was ready.
     Refused(Failure),
 }
 
-/// Something promised that is absent.
+/// A promised part of the graph that is absent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Missing {
     /// The time since which something has been missing without a break.
@@ -112,7 +112,7 @@ pub struct Missing {
     pub code: FailureCode,
     /// The absence, as a sentence without its end: "`/mapper` did not appear".
     pub what: String,
-    /// What is present instead: "on the graph: `/lidar`, `/odom`". May be empty.
+    /// The parts that are present instead: "on the graph: `/lidar`, `/odom`". May be empty.
     pub seen: String,
     /// Whether the run itself lacks something, so that a restart may help. False if a stranger on
     /// the graph is the cause, or if the agent sees nothing.
@@ -307,7 +307,7 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_without_ros_lacks_it_for_ros_packages_only() {
+    fn robot_without_ros_lacks_it_for_ros_packages_only() {
         let robot = robot(Vec::new());
         assert_eq!(robot.lacks(&manifest("colcon", &["rclpy"])), ["ROS 2 (no ROS 2 found)"]);
         assert_eq!(robot.lacks(&manifest("catkin", &["rospy"])), ["ROS 1 (no ROS 1 found)"]);

@@ -23,7 +23,7 @@
 //! anew. The ordered version goes first: another run waits until the order is over.
 
 use task_proto::TaskName;
-use task_proto::desired::{DesiredTask, Wanted};
+use task_proto::desired::{DesiredTask, TargetState};
 use task_proto::messages::report::Phase;
 
 use crate::task::ledger::TaskRecord;
@@ -146,7 +146,7 @@ pub fn supervise(s: &PlanInput<'_>) -> Next {
 /// Whether the ordered version may take over now.
 fn takes_over(s: &PlanInput<'_>) -> bool {
     s.desired == Some(&s.record.order)
-        && s.record.order.wanted == Wanted::Running
+        && s.record.order.wanted == TargetState::Running
         && s.record.preparation.phase == Phase::Staged
         && s.prepared.content
         && s.prepared.built
@@ -158,7 +158,7 @@ fn takes_over(s: &PlanInput<'_>) -> bool {
 
 fn with_process(s: &PlanInput<'_>, active: &ActiveRun, process: &ProcessRecord) -> Next {
     let replaced = !active.is_for(&s.record.order) && takes_over(s);
-    let wanted = s.desired.is_some_and(|task| task.wanted == Wanted::Running);
+    let wanted = s.desired.is_some_and(|task| task.wanted == TargetState::Running);
     let stops = (!wanted || replaced)
         && active.pending_stop().is_none()
         && gate::decision(s) == GateDecision::Proceed;
@@ -175,7 +175,7 @@ fn without_process(s: &PlanInput<'_>, active: Option<&ActiveRun>) -> Next {
             false => Next::Act(Step::Remove),
         };
     }
-    if order.wanted == Wanted::Stopped {
+    if order.wanted == TargetState::Stopped {
         return prune_surplus(s, None);
     }
     let decision = gate::decision(s);

@@ -53,8 +53,8 @@ pub enum OutputError {
     /// The files exceed a limit.
     #[error("outputs.paths: {0}")]
     TooMuch(String),
-    /// The agent can't take the rights of the task's user.
-    #[error("cannot take the rights of the user that tasks run as")]
+    /// The agent can't switch to the task's user.
+    #[error("cannot read the outputs as the user of the task")]
     User(#[source] io::Error),
     /// A file can't be read.
     #[error("cannot read {path}")]

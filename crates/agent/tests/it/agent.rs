@@ -176,7 +176,7 @@ async fn new_token_is_stored_before_use_and_the_old_one_kept_until_it_works() {
     rotation.step(8_000_000).await;
     fake.set((409, "application/json", REFUSAL.replace("unauthorized", "diverged")));
     rotation.step(8_000_000).await;
-    assert_eq!(tokens(), is("newer", None), "whoever is told no was recognised");
+    assert_eq!(tokens(), is("newer", None), "the refused robot was recognised");
     // The robot was registered anew beside the running agent.
     let anew = Identity { token: "anew".to_owned(), ..Identity::read(&path).unwrap() };
     anew.write(&path).unwrap();
@@ -213,7 +213,7 @@ async fn altered_foreign_and_old_states_are_refused() {
 }
 
 #[tokio::test]
-async fn a_report_is_sent_again_until_it_is_stored() {
+async fn report_is_sent_again_until_it_is_stored() {
     let robot = RobotId::random();
     let (fake, url) = Fake::start((503, "text/plain", String::new())).await;
     let link_state = LinkState::new(CancellationToken::new());

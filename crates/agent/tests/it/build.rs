@@ -139,7 +139,7 @@ def main():
 }
 
 #[tokio::test]
-async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
+async fn real_ros_package_is_built_and_runs_under_its_shim() {
     let found = underlay::find(&[ros()], &SearchPaths::of_this_machine());
     let setups = underlay::setup_files(&found, Some(RosVersion::Ros2), &["kilted".to_owned()]);
     let mut build = TestBuild::new(setups.expect("kilted is there"));
@@ -183,7 +183,7 @@ async fn a_real_ros_package_is_built_and_runs_under_its_shim() {
 }
 
 #[tokio::test]
-async fn a_catkin_package_is_built_and_installed() {
+async fn catkin_package_is_built_and_installed() {
     let mut build = TestBuild::new(Vec::new());
     build.spec.tool = BuildTool::Catkin;
     write(
@@ -206,7 +206,7 @@ async fn a_catkin_package_is_built_and_installed() {
     build
         .run()
         .await
-        .unwrap_or_else(|error| panic!("{error}: ./scripts/test installs what this needs"));
+        .unwrap_or_else(|error| panic!("{error}: ./scripts/test installs the requirements"));
     let install = build.spec.version.install();
     assert!(
         install.join("lib/mapper/mapper.sh").is_file()
@@ -239,7 +239,7 @@ async fn package_skipped_by_colcon_fails() {
 }
 
 #[tokio::test]
-async fn a_missing_tool_and_a_missing_underlay_are_named() {
+async fn missing_tool_and_a_missing_underlay_are_named() {
     let mut build = TestBuild::new(Vec::new());
     build.spec.environment.insert("PATH".to_owned(), "/nonexistent".to_owned());
     let error = build.run().await.expect_err("failed").to_string();
@@ -276,7 +276,7 @@ async fn build_is_optimized_and_skips_tests() {
 }
 
 #[tokio::test]
-async fn a_build_is_nice_and_limited() {
+async fn build_has_low_priority_and_limits() {
     let mut build = TestBuild::with_colcon(
         "echo nice $(nice), memory $(ulimit -d); mkdir -p install/talker; exit 0",
     );

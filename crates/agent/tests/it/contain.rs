@@ -101,7 +101,7 @@ async fn nothing_outlives_the_stop_of_its_task() {
 }
 
 #[tokio::test]
-async fn a_start_that_hangs_is_ended_with_its_control_group() {
+async fn hanging_start_is_ended_with_its_control_group() {
     let run = TestRun::grouped("echo up");
     let Some(cgroups) = Cgroups::find() else {
         return eprintln!("unavailable: this machine has no control groups that may be written to");
@@ -148,7 +148,7 @@ async fn nothing_outlives_a_task_that_ends_by_itself() {
 }
 
 #[tokio::test]
-async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environment() {
+async fn new_agent_finds_the_control_group_and_needs_neither_shim_nor_environment() {
     let run = TestRun::grouped(RUNAWAY);
     let started = within("the start", run.supervisor.start(&run.run_dir(), &run.spec))
         .await
@@ -171,7 +171,7 @@ async fn a_new_agent_finds_the_control_group_and_needs_neither_shim_nor_environm
 }
 
 #[tokio::test]
-async fn a_fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
+async fn fork_bomb_stays_within_its_limit_and_ends_with_its_task() {
     let Some(user) = other_user() else { return };
     let neighbour = neighbour(&user).await;
     let mut bomb = TestRun::grouped("bomb() { bomb | bomb & }; bomb; while :; do wait; done");
@@ -213,7 +213,7 @@ async fn task_over_its_memory_limit_is_reported_out_of_memory() {
 }
 
 #[tokio::test]
-async fn a_task_goes_before_its_agent_and_shim_when_the_machine_runs_out_of_memory() {
+async fn task_goes_before_its_agent_and_shim_when_the_machine_runs_out_of_memory() {
     let run =
         TestRun::grouped("cat /proc/self/oom_score_adj /proc/$PPID/oom_score_adj; sleep 1000");
     let before: i32 = std::fs::read_to_string("/proc/self/oom_score_adj")

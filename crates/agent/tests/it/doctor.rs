@@ -1,4 +1,4 @@
-//! `task-agent doctor` where no server is needed to be found wanting, and its man pages.
+//! `task-agent doctor` on problems that show without a server, and its man pages.
 
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;

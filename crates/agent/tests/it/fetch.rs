@@ -18,7 +18,7 @@ use crate::flips::Fault;
 use crate::site::{Answer, Site, TOKEN, client, settings};
 
 #[tokio::test]
-async fn a_package_gets_its_place_once() {
+async fn package_is_placed_once() {
     let site = Site::new(&tar()).await;
     let manifest = site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap();
     assert_eq!(manifest, site.manifest);
@@ -34,7 +34,7 @@ async fn a_package_gets_its_place_once() {
 
     site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap();
     site.pull().await.unwrap();
-    assert_eq!(site.asked(), [0; 0], "what is there is not pulled again");
+    assert_eq!(site.asked(), [0; 0], "present blobs are not pulled again");
     fs::write(site.version().manifest(), "{}").unwrap();
     assert_eq!(
         site.fetcher.manifest(&site.package, &CancellationToken::new()).await.unwrap(),
@@ -67,7 +67,7 @@ async fn archive_with_another_tar_digest_is_refused_and_leaves_nothing() {
 }
 
 #[tokio::test]
-async fn a_cut_is_continued_within_the_pull() {
+async fn interrupted_download_continues_within_the_pull() {
     let site = Site::new(&tar()).await;
     site.answers([Answer::Cut(1 << 20), Answer::Cut(1 << 20)]);
     site.pull().await.unwrap();
@@ -108,7 +108,7 @@ async fn dropped_pull_resumes_at_its_offset() {
 }
 
 #[tokio::test]
-async fn a_cancelled_pull_leaves_only_the_part() {
+async fn cancelled_pull_leaves_only_the_part_file() {
     let site = Site::new(&tar()).await;
     site.answers([Answer::Stall(1 << 20)]);
     let progress = watch::Sender::new(Progress { done: 0, total: 0 });
@@ -390,7 +390,7 @@ async fn transfers_measure_the_link() {
 }
 
 #[tokio::test]
-async fn a_server_that_stalls_is_given_up() {
+async fn stalled_server_ends_the_pull() {
     let site = Site::with(
         &tar(),
         FetchSettings { stall_timeout: Duration::from_millis(50), ..settings() },
@@ -415,7 +415,7 @@ async fn transfer_below_the_minimum_rate_is_cut() {
 }
 
 #[tokio::test]
-async fn a_refused_archive_is_blamed_only_when_its_bytes_are_the_ordered_ones() {
+async fn archive_is_refused_only_if_its_bytes_match_the_digest() {
     let hostile = Tar::default().file("../escape", b"x").file("data", &noise()).end();
     let site = Site::new(&hostile).await;
     let error = site.pull().await.unwrap_err();
@@ -463,7 +463,7 @@ async fn manifest_of_another_package_is_refused() {
 }
 
 #[tokio::test]
-async fn an_unreachable_server_is_tried_again_later() {
+async fn unreachable_server_is_retried_later() {
     let site = Site::new(&tar()).await;
     let nowhere = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap().local_addr().unwrap();
     let server = format!("http://{nowhere}").parse().unwrap();

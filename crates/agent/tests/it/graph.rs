@@ -38,7 +38,7 @@ fn endpoint(of: &str, kind: &str) -> Endpoint {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_node_appears_with_its_endpoints_and_vanishes() {
+async fn node_appears_with_its_endpoints_and_vanishes() {
     let graph = open(81).await;
     assert!(graph.snapshot().nodes.is_empty());
     let node = RosNode::start("talker.py", 81, &["--ros-args", "-r", "__ns:=/robot"]).await;
@@ -66,7 +66,7 @@ async fn a_node_appears_with_its_endpoints_and_vanishes() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_node_vanishes_when_its_lease_ends() {
+async fn killed_node_vanishes_when_its_lease_ends() {
     let graph = open(82).await;
     let node = RosNode::start("talker.py", 82, &[]).await;
     shows(&graph, "the talker", |snapshot| has(snapshot, "/talker")).await;
@@ -75,7 +75,7 @@ async fn a_killed_node_vanishes_when_its_lease_ends() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_service_answers_once_its_server_is_matched() {
+async fn service_answers_once_its_server_is_matched() {
     let graph = open(83).await;
     let say = name("/say");
     let nobody = graph.service_answers(&say, None, std::time::Duration::from_millis(100)).await;
@@ -89,7 +89,7 @@ async fn a_service_answers_once_its_server_is_matched() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_lifecycle_node_is_brought_to_active_and_shut_down() {
+async fn lifecycle_node_is_activated_and_shut_down() {
     let graph = open(84).await;
     let mapper = name("/mapper");
     graph.prepare(&mapper).await.unwrap();
@@ -293,7 +293,7 @@ async fn invalid_domain_id_is_refused_by_its_key() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_closed_graph_says_so() {
+async fn closed_graph_returns_an_error() {
     let graph = open(91).await;
     let (other, mut changes) = (graph.clone(), graph.changes());
     within("the graph to close", graph.close()).await;
@@ -320,7 +320,7 @@ async fn nodes_of_a_robot_with_another_distribution_see_the_agent() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_killed_node_is_not_taken_for_the_one_started_after_it() {
+async fn killed_node_is_not_confused_with_its_successor() {
     let graph = open(97).await;
     let killed = RosNode::start("talker.py", 97, &[]).await;
     let before = shows(&graph, "the talker", |snapshot| has(snapshot, "/talker")).await;

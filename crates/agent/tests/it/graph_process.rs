@@ -278,7 +278,7 @@ async fn node_log_reader_leaves_a_closed_domain() {
     let before = access.open(Some(&facts(171))).await.unwrap();
     let mut changes = before.changes();
     let now = access.open(Some(&facts(172))).await.unwrap();
-    assert!(!before.is_closed(), "who watches a task there still sees it");
+    assert!(!before.is_closed(), "a watcher of the task still sees it");
     drop(before);
     let closed = async { while changes.changed().await.is_ok() {} };
     within("the graph of the domain before to be closed", closed).await;

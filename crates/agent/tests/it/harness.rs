@@ -155,7 +155,7 @@ pub fn grouped_supervisor() -> Supervisor {
 
 /// A user id that no other test uses; `None`, with a printed note, for tests that do not run as
 /// root.
-#[expect(clippy::print_stderr, reason = "what is not tested is said aloud")]
+#[expect(clippy::print_stderr, reason = "a skipped test is reported")]
 pub fn other_user() -> Option<TaskUser> {
     static USED: AtomicU32 = AtomicU32::new(0);
     if !nix::unistd::geteuid().is_root() {

@@ -176,7 +176,7 @@ async fn stop_signals_only_the_launcher() {
 }
 
 #[tokio::test]
-async fn a_launcher_that_dies_leaves_no_node() {
+async fn dead_launcher_leaves_no_node() {
     let launched =
         Launched::by(&LAUNCHER.replace("text=True)", "text=True, start_new_session=True)"), &[]);
     launched.start().await;
@@ -194,7 +194,7 @@ async fn a_launcher_that_dies_leaves_no_node() {
 }
 
 #[tokio::test]
-async fn a_stop_is_noticed_while_an_underlay_is_sourced() {
+async fn stop_is_noticed_while_an_underlay_is_sourced() {
     let launched = Launched::by("#!/bin/bash\necho never\n", &[]);
     write(&launched.run.path("setup.bash"), "echo sourcing; while :; do sleep 0.05; done\n");
     launched.start().await;

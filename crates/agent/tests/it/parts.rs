@@ -151,7 +151,7 @@ impl Rig {
             ranges.iter().map(|&(from, to)| PartRange { from, to }).collect();
         let mut part_requests = self.part_requests.subscribe();
         within(
-            "what is lacking",
+            "the missing parts",
             part_requests.wait_for(|part_requests| part_requests.missing.as_ref() == Some(&ranges)),
         )
         .await
@@ -488,7 +488,7 @@ async fn slow_writer_stops_part_delivery() {
 }
 
 #[tokio::test]
-async fn a_package_may_come_as_one_message() {
+async fn package_in_one_message_is_accepted() {
     let rig = Rig::new(patient()).await;
     let pull = rig.listen().await;
     let size = u32::try_from(rig.site.content.len()).unwrap();

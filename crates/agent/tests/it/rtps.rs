@@ -121,7 +121,7 @@ fn ports(domain_id: u16) -> [u16; 2] {
 }
 
 /// Sends each of these to the first participant of this domain on this host. The others have
-/// parsers of their own, of which some bear less.
+/// parsers of their own, some of which have lower limits.
 pub fn send(socket: &UdpSocket, domain_id: u16, datagrams: impl IntoIterator<Item = Vec<u8>>) {
     for datagram in datagrams {
         for port in ports(domain_id) {

@@ -23,7 +23,7 @@ use task_agent::telemetry::outputs::Registry;
 use task_agent::transfer::credential::Credential;
 use task_agent::transfer::parts::PartSubscriptions;
 use task_proto::desired::{
-    BlobRef, DesiredState, DesiredTask, Evidence, PackageRef, SignatureRef, Wanted,
+    BlobRef, DesiredState, DesiredTask, Evidence, PackageRef, SignatureRef, TargetState,
 };
 use task_proto::messages::report::{FailureCode, Progress};
 use task_proto::packages::manifest::TaskManifest;
@@ -92,7 +92,7 @@ fn order(package: &PackageRef) -> DesiredTask {
         task: package.name.clone(),
         deployment: DeploymentId::random(),
         package: package.clone(),
-        wanted: Wanted::Running,
+        wanted: TargetState::Running,
         run: 1,
         delivery: Default::default(),
         priority: 0,
@@ -308,7 +308,7 @@ async fn newer_publisher_list_is_followed_without_an_order() {
     assert_eq!(
         robot.signature_policy.facts().refused_list,
         None,
-        "who follows and who waits have both had it"
+        "the following and the waiting robot have both received it"
     );
     let epoch = robot.signature_policy.facts().epoch;
     robot.told(&talker, &[&first, &second], &[&ada]);
@@ -339,7 +339,7 @@ async fn unavailable_publisher_list_is_reported_and_retried() {
     let [ada, bob] = [1, 2].map(|seed| signature(seed, &talker));
     robot.told(&talker, &[&list(1, &[1])], &[&ada]);
     robot.ensure_trusted(&talker).await.unwrap();
-    // Something in between answers in the server's place.
+    // A machine in between answers in the server's place.
     let revoking = list(2, &[2]);
     let lists = vec![robot.shelve(&list(1, &[1])), robot.shelve(&revoking)];
     robot.shelf.lock().unwrap().blobs.clear();

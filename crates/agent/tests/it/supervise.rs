@@ -25,7 +25,7 @@ async fn run_to_end(script: &str) -> (TestRun, RunState) {
 }
 
 #[tokio::test]
-async fn the_exit_code_and_the_signal_are_kept() {
+async fn exit_code_and_signal_are_kept() {
     assert_eq!(run_to_end("exit 0").await.1, RunState::Exited(ExitStatus::Code(0)));
     assert_eq!(run_to_end("exit 7").await.1, RunState::Exited(ExitStatus::Code(7)));
     assert_eq!(run_to_end("kill -SEGV $$").await.1, RunState::Exited(ExitStatus::Signal(11)));
@@ -39,7 +39,7 @@ async fn the_exit_code_and_the_signal_are_kept() {
 }
 
 #[tokio::test]
-async fn a_task_gets_the_environment_it_was_promised_and_nothing_else() {
+async fn task_gets_the_documented_environment_and_nothing_else() {
     let (run, _) =
         run_to_end("env; echo descriptors $(ls /proc/self/fd); cat; echo stdin is empty").await;
     let log = run.log();
@@ -197,7 +197,7 @@ fn spawn_starter(dir: &Path) -> std::process::Child {
 }
 
 #[tokio::test]
-async fn a_task_outlives_the_agent_and_is_adopted() {
+async fn task_outlives_the_agent_and_is_adopted() {
     let run = TestRun::of(
         "trap 'echo asked; exit 4' INT; echo up; while :; do sleep 1000 & wait $!; done",
     );
@@ -259,7 +259,7 @@ async fn start_stubborn(script: &str) -> (TestRun, Started, Vec<u32>) {
 }
 
 #[tokio::test]
-async fn a_stubborn_task_and_its_daemons_are_ended() {
+async fn stubborn_task_and_its_daemons_are_killed() {
     let (run, _, pids) = start_stubborn(STUBBORN).await;
     let stopped = within("the stop", run.supervisor.stop(&run.run_dir(), SHORT_GRACE))
         .await
@@ -289,7 +289,7 @@ async fn dropped_stop_can_be_repeated() {
 }
 
 #[tokio::test]
-async fn a_task_that_ends_takes_its_daemons_with_it() {
+async fn ended_task_leaves_no_daemons() {
     let (run, ended) = run_to_end(
         "setsid sleep 1000 & setsid bash -c 'trap \"\" TERM; sleep 1000' & echo $!; exit 5",
     )
@@ -335,7 +335,7 @@ async fn reused_pid_is_not_mistaken_for_the_task() {
 }
 
 #[tokio::test]
-async fn a_flood_of_output_neither_blocks_the_task_nor_fills_the_disk() {
+async fn flood_of_output_neither_blocks_the_task_nor_fills_the_disk() {
     let mut run = TestRun::of("yes 'a line of output' | head -c 20000000; echo the end");
     run.spec.log.max_bytes = 100_000;
     run.spec.log.files = 3;
@@ -370,7 +370,7 @@ async fn output_and_errors_are_told_apart_and_a_prompt_is_not_held_back() {
 }
 
 #[tokio::test]
-async fn a_log_that_cannot_be_written_does_not_stop_the_task() {
+async fn unwritable_log_does_not_stop_the_task() {
     let mut run = TestRun::of("yes | head -c 1000000; exit 6");
     run.spec.log.path = PathBuf::from("/nonexistent/task.log");
     within("the start", run.supervisor.start(&run.run_dir(), &run.spec)).await.expect("started");

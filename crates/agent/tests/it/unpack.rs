@@ -358,7 +358,7 @@ fn limits_hold_before_and_while_unpacking() {
 }
 
 #[test]
-fn a_bomb_writes_nothing_beyond_what_was_announced() {
+fn archive_bomb_writes_no_more_than_announced() {
     let zeros = 256 << 20;
     let mut encoder = zstd::Encoder::new(Vec::new(), 3).unwrap();
     let header = Header { name: b"zeros", size: zeros, ..Header::default() }.block();
@@ -376,7 +376,7 @@ fn a_bomb_writes_nothing_beyond_what_was_announced() {
 }
 
 #[test]
-fn a_window_that_would_fill_the_memory_is_refused() {
+fn window_larger_than_the_memory_limit_is_refused() {
     let mut encoder = zstd::Encoder::new(Vec::new(), 1).unwrap();
     encoder.window_log(27).unwrap();
     io::copy(&mut io::repeat(7).take(1 << 20), &mut encoder).unwrap();
@@ -386,7 +386,7 @@ fn a_window_that_would_fill_the_memory_is_refused() {
 }
 
 #[test]
-fn a_source_that_fails_is_not_blamed_on_the_archive() {
+fn failed_source_is_no_archive_error() {
     struct Broken;
     impl Read for Broken {
         fn read(&mut self, _: &mut [u8]) -> io::Result<usize> {

@@ -62,7 +62,7 @@ pub enum Until {
 
 /// Results of all connections, from the moment when all were open to the end of the last one.
 #[derive(Debug, Clone, Copy)]
-pub struct Got {
+pub struct Downloads {
     /// Number of complete answers.
     pub fetches: u64,
     /// Bytes in their bodies.
@@ -78,7 +78,7 @@ pub async fn download(
     targets: &[Target],
     until: Until,
     started: impl FnOnce(),
-) -> anyhow::Result<Got> {
+) -> anyhow::Result<Downloads> {
     let streams = connect_all(targets).await?;
     let start = Arc::new(Barrier::new(targets.len() + 1));
     let stop = Arc::new(AtomicBool::new(false));
@@ -118,7 +118,7 @@ pub async fn download(
         task.await.context("a download broke down")??;
     }
     let [fetches, bytes] = [0, 1].map(|index: usize| counts[index].load(Ordering::Relaxed));
-    Ok(Got { fetches, bytes, wall: begun.elapsed() })
+    Ok(Downloads { fetches, bytes, wall: begun.elapsed() })
 }
 
 /// A connection to a server.

@@ -84,7 +84,7 @@ impl Server {
     ) -> Result<EnrollResponse, ServerError> {
         loop {
             let post = self.http.post(self.url("/api/v1/enroll")).bearer_auth(token);
-            match read("an enrolment", post.json(request)).await {
+            match read("an enrollment", post.json(request)).await {
                 Err(ServerError::Refused(_, StatusCode::TOO_MANY_REQUESTS, _)) => {
                     tokio::time::sleep(AGAIN).await
                 }

@@ -10,11 +10,11 @@ use crate::results::run::{Figure, Point, Quantity, Run};
 
 #[derive(Debug, Args)]
 pub struct CompareFlags {
-    /// The earlier result
+    /// JSON file of the earlier result
     old: PathBuf,
-    /// The later one
+    /// JSON file of the later result
     new: PathBuf,
-    /// Leave out what has changed by less than this many percent
+    /// Leave out differences of less than this many percent
     #[arg(long, value_name = "P", default_value_t = 0.0)]
     least: f64,
 }

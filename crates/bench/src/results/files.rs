@@ -92,7 +92,7 @@ mod tests {
     use crate::results::run::tests::sample;
 
     #[test]
-    fn a_run_is_written_and_read_back_with_its_failures() {
+    fn run_is_written_and_read_back_with_its_failures() {
         let dir = tempfile::tempdir().expect("a directory");
         let mut run = sample();
         let files = run.write(&dir.path().join("new"), Instant::now()).expect("written");

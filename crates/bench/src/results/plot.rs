@@ -19,7 +19,7 @@ const MARK: f64 = 3.6;
 
 /// All points of one series at one position of the horizontal axis.
 #[derive(Debug, Default)]
-struct Spot {
+struct PointGroup {
     values: Vec<f64>,
     high: Vec<f64>,
     failures: BTreeMap<String, u64>,
@@ -41,12 +41,12 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
         return None;
     }
     let series = gather(plot, &shown);
-    let spots = || series.values().flat_map(BTreeMap::values);
+    let groups = || series.values().flat_map(BTreeMap::values);
     let quantities = shown.iter().filter_map(|point| point.quantities.get(&plot.y));
     let frame = Frame {
         x: Axis::over(shown.iter().map(|point| point.settings[&plot.x]), plot.x_log),
         y: Axis::over(
-            spots().flat_map(|spot| spot.values.iter().chain(&spot.high).copied()),
+            groups().flat_map(|group| group.values.iter().chain(&group.high).copied()),
             plot.y_log,
         )
         .from_zero(),
@@ -58,9 +58,9 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
         escaped(&plot.title)
     );
     frame.draw_grid(&mut svg, plot);
-    for (name, spots) in &series {
+    for (name, groups) in &series {
         let colour = colours.get(name).copied().unwrap_or(0);
-        frame.draw_series(&mut svg, plot, name, colour, spots);
+        frame.draw_series(&mut svg, plot, name, colour, groups);
     }
     svg.push_str("</svg>");
     Some(svg)
@@ -68,19 +68,19 @@ pub fn svg(plot: &Plot, points: &[Point], colours: &BTreeMap<&str, usize>) -> Op
 
 /// Spots by series and by the bits of their position. The bits sort like the positions, which are
 /// not negative.
-fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u64, Spot>> {
-    let mut series: BTreeMap<&str, BTreeMap<u64, Spot>> = BTreeMap::new();
+fn gather<'a>(plot: &Plot, shown: &[&'a Point]) -> BTreeMap<&'a str, BTreeMap<u64, PointGroup>> {
+    let mut series: BTreeMap<&str, BTreeMap<u64, PointGroup>> = BTreeMap::new();
     for point in shown {
         let place = point.settings[&plot.x].max(0.0).to_bits();
-        let spot = series.entry(&point.series).or_default().entry(place).or_default();
+        let group = series.entry(&point.series).or_default().entry(place).or_default();
         if let Some(quantity) = point.quantities.get(&plot.y) {
-            spot.values.push(quantity.figure(plot.figure));
+            group.values.push(quantity.figure(plot.figure));
             if plot.figure == Figure::Median {
-                spot.high.push(quantity.p99);
+                group.high.push(quantity.p99);
             }
         }
         for (text, count) in &point.failures {
-            *spot.failures.entry(text.clone()).or_default() += count;
+            *group.failures.entry(text.clone()).or_default() += count;
         }
     }
     series
@@ -145,23 +145,23 @@ impl Frame {
         plot: &Plot,
         name: &str,
         colour: usize,
-        spots: &BTreeMap<u64, Spot>,
+        groups: &BTreeMap<u64, PointGroup>,
     ) {
         let place = |bits: &u64| f64::from_bits(*bits);
         let mut line = String::new();
-        for (bits, spot) in spots {
-            if let Some(value) = mean(&spot.values) {
+        for (bits, group) in groups {
+            if let Some(value) = mean(&group.values) {
                 let letter = if line.is_empty() { 'M' } else { 'L' };
                 let _ =
                     write!(line, "{letter}{:.1} {:.1}", self.x_of(place(bits)), self.y_of(value));
             }
         }
         let _ = write!(svg, "<g class=\"s{colour}\"><path class=\"line\" d=\"{line}\"/>");
-        for (bits, spot) in spots {
+        for (bits, group) in groups {
             let x = self.x_of(place(bits));
-            let value = mean(&spot.values);
+            let value = mean(&group.values);
             let y = value.map_or(TOP + MARK * 2.0, |value| self.y_of(value));
-            if let (Some(_), Some(high)) = (value, mean(&spot.high)) {
+            if let (Some(_), Some(high)) = (value, mean(&group.high)) {
                 let _ = write!(
                     svg,
                     "<path class=\"high\" d=\"M{x:.1} {y:.1}V{:.1}\"/>",
@@ -173,14 +173,14 @@ impl Frame {
             says.push_str(
                 &value.map_or("no value".to_owned(), |value| written(value, self.y_unit)),
             );
-            for (text, count) in &spot.failures {
+            for (text, count) in &group.failures {
                 let _ = write!(says, "\n{count} failed: {text}");
             }
             let _ = write!(svg, "<g><title>{}</title>", escaped(&says));
             if value.is_some() {
                 svg.push_str(&mark(colour, x, y));
             }
-            if !spot.failures.is_empty() {
+            if !group.failures.is_empty() {
                 svg.push_str(&cross(x, y));
             }
             svg.push_str("</g>");
@@ -235,7 +235,7 @@ mod tests {
     use crate::results::run::tests::sample;
 
     #[test]
-    fn a_plot_shows_every_series_and_crosses_for_failures() {
+    fn plot_shows_every_series_and_crosses_for_failures() {
         let run = sample();
         let colours = [("push-pull", 0), ("direct-push", 1)].into();
         let svg = svg(&run.plots[0], &run.points, &colours).expect("points");
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plot_without_points_is_left_out() {
+    fn plot_without_points_is_left_out() {
         let run = sample();
         let plot = Plot { series: vec!["nobody".to_owned()], ..run.plots[0].clone() };
         assert!(svg(&plot, &run.points, &BTreeMap::new()).is_none());

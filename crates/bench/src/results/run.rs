@@ -16,13 +16,13 @@ use crate::system::machine::{Machine, commit};
 /// Single values are kept up to this many of a quantity; beyond it only their figures are.
 const MAX_SAMPLES: usize = 100;
 
-/// Where a run's files go, and what makes it repeatable.
+/// The directory of a run's files, and its seed.
 #[derive(Debug, Clone, Args)]
 pub struct RunFlags {
     /// Directory for the results: NAME.json, NAME.csv and NAME.html
     #[arg(long, value_name = "DIR", default_value = "taskbench-results")]
     pub out: PathBuf,
-    /// What random bytes and the order of the runs come from [default: a random number, which the
+    /// Seed of random bytes and of the order of the runs [default: a random number, which the
     /// results name]
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
@@ -319,7 +319,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_plot_shows_the_points_in_its_ranges() {
+    fn plot_shows_the_points_in_its_ranges() {
         let run = sample();
         let mut plot = run.plots[0].clone();
         assert_eq!(plot.points(&run.points).count(), 4);

@@ -1,4 +1,4 @@
-//! `taskbench blob`: how fast blobs leave the server and at what cost, compared with nginx with the
+//! `taskbench blob`: the speed and the cost of downloads of blobs, compared with nginx with the
 //! same files in the same run. Every connection belongs to a different robot, with its own token
 //! and the right to just these blobs.
 
@@ -14,7 +14,7 @@ use task_proto::CaPin;
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
 use task_proto::desired::BlobRef;
 
-use crate::measure::downloads::{Got, Target, Until, download};
+use crate::measure::downloads::{Downloads, Target, Until, download};
 use crate::programs::encryption::{Certificate, ENCRYPTION_NOTE, client_config};
 use crate::programs::enrollment::enroll_robots;
 use crate::programs::package::Package;
@@ -241,7 +241,8 @@ impl Figures {
         usage: impl Fn() -> Usage,
     ) -> anyhow::Result<()> {
         let mut before = Usage::default();
-        let Got { fetches, bytes, wall } = download(targets, until, || before = usage()).await?;
+        let Downloads { fetches, bytes, wall } =
+            download(targets, until, || before = usage()).await?;
         let cpu_s = usage().cpu_s - before.cpu_s;
         ensure!(bytes > 0 && cpu_s > 0.0, "too little was fetched to be measured");
         self.cpu_s_per_gb.push(cpu_s / (bytes as f64 / 1e9));

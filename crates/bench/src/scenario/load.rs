@@ -36,10 +36,10 @@ const TOKEN_TTL_S: u64 = 3600;
 /// Files this process needs besides its robots' connections.
 const OTHER_FILES: u64 = 100;
 
-/// What to measure, and where.
+/// The server to measure, and the load.
 #[derive(Debug, Args)]
 pub struct LoadFlags {
-    /// The server's URL
+    /// URL of the server
     #[arg(long, value_name = "URL")]
     server: Url,
     /// A file that holds the operator's token (operator.token in the server's data directory)
@@ -48,17 +48,17 @@ pub struct LoadFlags {
     /// How many robots to simulate, at most 20000
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=20_000))]
     robots: u16,
-    /// The MQTT broker [default: what the server tells its robots]
+    /// The MQTT broker [default: the address that the server gives its robots]
     #[arg(long, value_name = "HOST:PORT", value_parser = host_and_port)]
     mqtt: Option<(String, u16)>,
-    /// How long to send steady reports, at most 3600
+    /// Duration of steady reports in seconds, at most 3600
     #[arg(long, value_name = "S", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=3600))]
     seconds: u64,
     /// Steady reports per second, of all robots together; each changes its task's phase. At most
     /// 5000
     #[arg(long, value_name = "R", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=5000))]
     reports_per_s: u32,
-    /// How to print the result
+    /// Output format
     #[arg(short, long, value_enum, default_value_t = Format::Table, value_name = "FORMAT")]
     output: Format,
     /// Leave the robots and the package on the server

@@ -46,7 +46,7 @@ pub struct PageFlags {
 
 /// Measurements from the browser.
 #[derive(Debug, Deserialize)]
-struct Seen {
+struct PageMeasurements {
     browser: String,
     /// From asking for the page, with a session, until rows were drawn.
     first_rows_ms: Vec<f64>,
@@ -112,7 +112,7 @@ async fn watch(
     robots: &mut [Reporter],
     flags: &PageFlags,
     point: &mut Point,
-) -> anyhow::Result<Seen> {
+) -> anyhow::Result<PageMeasurements> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("page/look.mjs");
     let look = Program::named("node")
         .args([script.as_os_str(), flags.browser.as_os_str()])

@@ -176,8 +176,8 @@ impl Scripts {
     }
 
     fn check(&self, dir: &TempDir) -> anyhow::Result<()> {
-        let bytes =
-            std::fs::read(dir.path().join(PAYLOAD_FILE)).context("what a script has unpacked")?;
+        let bytes = std::fs::read(dir.path().join(PAYLOAD_FILE))
+            .context("the payload that a script unpacked")?;
         ensure!(
             Digest::of(&bytes) == self.payload,
             "a script has unpacked other bytes than were pushed"

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, bail};
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use task_proto::api::{CreateDeployment, DeliveryChoice, EnrollResponse};
-use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, Wanted};
+use task_proto::desired::{BlobRef, Delivery, DesiredTask, PackageRef, TargetState};
 use task_proto::messages::report::{HostFacts, Phase, Progress, Report, TaskReport};
 use task_proto::messages::topic::{RobotTopic, Topic};
 use task_proto::{DeploymentId, Digest, Generation, InstanceId};
@@ -67,7 +67,7 @@ fn report(robot: &EnrollResponse, deployment: &DeploymentId) -> anyhow::Result<R
         task: "status".parse()?,
         deployment: deployment.clone(),
         package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-        wanted: Wanted::Running,
+        wanted: TargetState::Running,
         run: 1,
         delivery: Delivery::Poll,
         priority: 0,

@@ -176,7 +176,7 @@ async fn own_bytes(taskd: &Taskd) -> anyhow::Result<(ServerInfo, u64)> {
     let second = taskd.server.info().await?;
     ensure!(
         http_bytes(&second) > http_bytes(&first),
-        "the server does not count what goes over HTTP"
+        "the server does not count the bytes over HTTP"
     );
     let own = http_bytes(&second) - http_bytes(&first);
     Ok((second, own))

@@ -325,7 +325,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_first_robots_are_named() {
+    fn first_robots_are_named() {
         assert_eq!((first(2, 8), first(8, 8)), ("r00000,r00001".to_owned(), "*".to_owned()));
     }
 

@@ -155,7 +155,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_link_is_a_rate_and_perhaps_a_delay() {
+    fn link_has_a_rate_and_an_optional_delay() {
         let link = |bits_per_s, delay_ms| Ok(LinkQuality { bits_per_s, delay_ms });
         assert_eq!("20mbit,30ms".parse(), link(20_000_000, Some(30)));
         assert_eq!("1.5gbit".parse(), link(1_500_000_000, None));

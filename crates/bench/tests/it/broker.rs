@@ -311,7 +311,7 @@ pub async fn spy(mosquitto: &Mosquitto, robot: &Robot, id: &str) -> (AsyncClient
     )
     .expect("json");
     let password =
-        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
+        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrollment");
     assert_ne!(identity["token"], password, "the token is not shown to the broker");
     let mut options =
         MqttOptions::new(id, mosquitto.address.ip().to_string(), mosquitto.address.port());
@@ -368,7 +368,7 @@ async fn robot_password_at_mosquitto_opens_only_its_own_topics() {
     for filter in
         ["#", "taskd/v1/#", "taskd/v1/r/+/desired", "taskd/v1/r/+/status", "taskd/v1/server"]
     {
-        // Mosquitto grants any filter, and passes on what the ACL allows.
+        // Mosquitto grants any filter, and forwards only messages that the ACL allows.
         client.subscribe(filter, QoS::AtLeastOnce).await.expect("queued");
         while !matches!(next(&mut events).await, Packet::SubAck(_)) {}
     }

@@ -32,7 +32,7 @@ async fn connect_as(
 ) -> (AsyncClient, EventLoop) {
     let identity = identity(robot);
     let password =
-        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrolment");
+        identity["mqtt"]["external"]["password"].as_str().expect("a password from the enrollment");
     let mut options = MqttOptions::new(client_id, address.ip().to_string(), address.port());
     options.set_credentials(robot.id.as_str(), password);
     let (client, mut events) = AsyncClient::new(options, 16);

@@ -20,7 +20,7 @@ async fn robot(server: &Server) -> RobotView {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_task_runs_as_the_task_user_in_a_home_of_its_own() {
+async fn task_runs_as_the_task_user_in_a_home_of_its_own() {
     let fleet = Fleet::start(1).await;
     let found = fleet.dir.path().join("found");
     open_directory(&found);
@@ -110,7 +110,7 @@ async fn task_cannot_touch_its_neighbour_or_change_its_own_package() {
     );
     fleet.server.push(&fleet.package("burglar", "1.0.0", "job", &(settings + BURGLAR)), "*").await;
     fleet.server.wait_phase("robot-1", "burglar", Phase::Succeeded).await;
-    let found = std::fs::read_to_string(found.join("found")).expect("what it got");
+    let found = std::fs::read_to_string(found.join("found")).expect("the findings");
     assert_eq!(found, "own directory: writable\ndone\n");
     assert_eq!(pid_of(&robot(&fleet.server).await, "victim"), Some(pid), "it was not killed");
     let accounts =
@@ -121,7 +121,7 @@ async fn task_cannot_touch_its_neighbour_or_change_its_own_package() {
 #[tokio::test(flavor = "multi_thread")]
 async fn package_changed_on_disk_is_fetched_again_before_start() {
     if !nix::unistd::geteuid().is_root() {
-        return eprintln!("unavailable: only root can keep what tasks run from them");
+        return eprintln!("unavailable: only root can protect the programs of tasks from them");
     }
     let fleet = Fleet::start(1).await;
     let found = fleet.dir.path().join("found");
@@ -153,7 +153,7 @@ async fn package_changed_on_disk_is_fetched_again_before_start() {
 #[tokio::test(flavor = "multi_thread")]
 async fn fallback_changed_on_disk_is_fetched_again_before_start() {
     if !nix::unistd::geteuid().is_root() {
-        return eprintln!("unavailable: only root can keep what tasks run from them");
+        return eprintln!("unavailable: only root can protect the programs of tasks from them");
     }
     let fleet = Fleet::start(1).await;
     let found = fleet.dir.path().join("found");

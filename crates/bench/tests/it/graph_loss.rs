@@ -82,7 +82,7 @@ async fn packets_with_gigabyte_lengths_allocate_no_memory() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_task_keeps_running_while_the_process_on_its_graph_is_killed_and_comes_back() {
+async fn task_keeps_running_while_the_process_on_its_graph_is_killed_and_comes_back() {
     let stage = Stage::start().await;
     stage.push("watched", "--node watched", READY).await;
     let before = stage.runs("watched").await;

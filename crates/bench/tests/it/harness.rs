@@ -589,7 +589,7 @@ pub fn open_directory(path: &Path) {
 
 /// Shows the programs' last log lines when a test has failed, because the test's directory is
 /// removed with the test.
-#[expect(clippy::print_stderr, reason = "the test runner shows what a failed test printed")]
+#[expect(clippy::print_stderr, reason = "the test runner shows the output of a failed test")]
 fn show_log_of_failed(path: &Path) {
     if std::thread::panicking() {
         let log = std::fs::read_to_string(path).unwrap_or_default();

@@ -6,7 +6,7 @@ use serde_json::Value;
 use crate::harness::{Server, program};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_load_run_measures_every_phase_and_leaves_no_robots() {
+async fn load_run_measures_every_phase_and_leaves_no_robots() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let token = server.data().join("operator.token");

@@ -55,7 +55,7 @@ async fn two_operators_end_with_one_winner_everywhere() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_cancelled_update_leaves_the_old_version_running() {
+async fn cancelled_update_leaves_the_old_version_running() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let proxy = Proxy::start(server.http, 100_000_000).await;

@@ -32,7 +32,7 @@ async fn outputs_the_server_would_refuse_are_not_uploaded() {
     assert!(largest.is_some_and(|bytes| bytes < 1_000_000), "{largest:?}");
 
     push("small", "head -c 1000 /dev/zero > small.bin").await;
-    let listed = eventually("what there is room for", async || {
+    let listed = eventually("the outputs that fit", async || {
         let list: OutputList = serde_json::from_value(server.get("/api/v1/outputs").await?).ok()?;
         (!list.outputs.is_empty()).then_some(list)
     })

@@ -12,7 +12,7 @@ use oci_client::{Client, Reference};
 use crate::harness::{Server, required, write_package};
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_oci_client_crate_pushes_and_pulls() {
+async fn oci_client_crate_pushes_and_pulls() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start(&dir.path().join("server")).await;
     let client =

@@ -45,7 +45,7 @@ impl Master {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_ros_1_package_is_built_launched_and_stopped() {
+async fn ros_1_package_is_built_launched_and_stopped() {
     let dir = tempfile::tempdir().expect("temp dir");
     let home = dir.path().to_str().expect("utf-8");
     let server = Server::start(&dir.path().join("server")).await;
@@ -94,7 +94,7 @@ async fn a_ros_1_package_is_built_launched_and_stopped() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_robot_without_a_ros_package_is_unmet_before_the_content_travels() {
+async fn robot_without_a_ros_package_is_unmet_before_the_content_travels() {
     let venv = required("TASKD_TEST_ROS");
     let mut fleet = Fleet::start(0).await;
     // The domain is the one of the shell that the agent was started in.

@@ -298,8 +298,8 @@ async fn robot(
     proxy: SocketAddr,
     secrets: &mut Secrets,
 ) -> (Robot, [String; 2]) {
-    let enrolment = server.enrollment_token().await;
-    secrets.token("the enrolment token", &enrolment);
+    let enrollment = server.enrollment_token().await;
+    secrets.token("the enrollment token", &enrollment);
     let data = dir.join("atlas");
     let mut enroll = Command::new(program("task-agent"));
     enroll.args([
@@ -314,7 +314,7 @@ async fn robot(
     enroll
         .arg("--data")
         .arg(&data)
-        .env("TASK_AGENT_ENROLL_TOKEN", &enrolment)
+        .env("TASK_AGENT_ENROLL_TOKEN", &enrollment)
         .env("TASK_AGENT_LOG", "trace");
     let output = run(enroll, "").await;
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -325,7 +325,7 @@ async fn robot(
     secrets.assert_absent("task-agent enroll", &[output.stdout, output.stderr].concat());
     let id = server.robot("atlas").await.expect("listed").id;
     let environment =
-        [("TASK_AGENT_LOG", "trace"), ("TASK_AGENT_ENROLL_TOKEN", enrolment.as_str())];
+        [("TASK_AGENT_LOG", "trace"), ("TASK_AGENT_ENROLL_TOKEN", enrollment.as_str())];
     let mut robot = Robot::enrolled(dir, "atlas", id.clone(), &environment);
     robot.restart();
     let package = dir.join("teller");
@@ -344,7 +344,7 @@ async fn robot(
     let next = from_restarted_agent(next, robot.data());
     let next: Value = next.send().await.expect("sent").json().await.expect("json");
     secrets.token("the robot's next token", next["token"].as_str().expect("a token"));
-    (robot, [enrolment, token])
+    (robot, [enrollment, token])
 }
 
 /// Reads everything that an administrator can read.
@@ -398,9 +398,9 @@ async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     secrets.0.push(("the password", password.clone()));
     secrets.token("the first token", &server.operator_token());
     let signed_in = person(&server, dir.path(), proxy, &password, &mut secrets).await;
-    let (mut agent, [enrolment, token]) = robot(&server, dir.path(), proxy, &mut secrets).await;
+    let (mut agent, [enrollment, token]) = robot(&server, dir.path(), proxy, &mut secrets).await;
 
-    let tokens = [server.operator_token(), signed_in, enrolment, token];
+    let tokens = [server.operator_token(), signed_in, enrollment, token];
     misuse_credentials(&server, dir.path(), &secrets, &tokens, &password).await;
     secrets.assert_absent(
         "an error over HTTP",
@@ -422,8 +422,8 @@ async fn secrets_are_in_no_log_command_line_url_answer_or_error() {
     let shown = secrets.found_in(&heard);
     assert_eq!(
         shown,
-        ["the password", "the first token", "the enrolment token", "the robot's token"],
-        "what has to be shown"
+        ["the password", "the first token", "the enrollment token", "the robot's token"],
+        "the secrets that have to be shown"
     );
     // A body may stand before the next request on its line.
     let lines = heard.split(|&byte| byte == b'\n').filter(|line| line.ends_with(b" HTTP/1.1\r"));

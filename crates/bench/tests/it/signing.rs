@@ -158,7 +158,7 @@ async fn publisher_list_rotates_keys_and_blocks_restarts_of_revoked_packages() {
         (view.host.as_ref()?.publishers == Some(1) && degraded).then_some(view)
     })
     .await;
-    assert_eq!(revoked.tasks[0].phase, Phase::Running, "what runs goes on");
+    assert_eq!(revoked.tasks[0].phase, Phase::Running, "the running task continues");
 
     // The machine goes down and comes back: a package that is no longer vouched for is not started.
     let pid = revoked.tasks[0].active.as_ref().expect("active").pid;

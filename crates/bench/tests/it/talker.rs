@@ -25,7 +25,7 @@ pub async fn trigger(venv: &Path, domain: &str, name: &str) -> String {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_talker_runs_on_two_robots_and_answers() {
+async fn talker_runs_on_two_robots_and_answers() {
     let venv = required("TASKD_TEST_ROS");
     let venv = Path::new(&venv);
     let activate = venv.join("bin/activate");

@@ -149,7 +149,7 @@ async fn publisher_token_without_a_trusted_key_runs_nothing() {
             view.tasks[0].failure.as_ref().expect("why").code,
             FailureCode::UNTRUSTED_PACKAGE
         );
-        assert_eq!(view.tasks[0].active, running, "what was signed goes on");
+        assert_eq!(view.tasks[0].active, running, "the signed task continues");
         view
     };
     is_refused().await;

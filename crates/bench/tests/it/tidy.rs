@@ -50,7 +50,7 @@ fn function_lengths(source: &str) -> Vec<(String, usize)> {
 fn problems(name: &str, source: &str) -> Vec<String> {
     let mut problems = Vec::new();
     if !source.starts_with("//!") {
-        problems.push(format!("{name}: does not begin with //! and what the file is for"));
+        problems.push(format!("{name}: does not begin with //! and its purpose"));
     }
     let body = source.split("\n#[cfg(test)]\nmod tests").next().unwrap_or(source);
     let length = body.lines().count();

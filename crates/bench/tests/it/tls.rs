@@ -71,7 +71,7 @@ async fn token_pins_its_server_and_another_server_gets_nothing() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_token_for_an_encrypted_server_is_not_sent_in_plain_text() {
+async fn token_for_an_encrypted_server_is_not_sent_in_plain_text() {
     let dir = tempfile::tempdir().expect("temp dir");
     let server = Server::start_with(&dir.path().join("server"), &[ENCRYPTED]).await;
     let token = server.enrollment_token().await;

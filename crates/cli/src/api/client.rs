@@ -658,7 +658,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn an_order_is_retried_with_the_same_key() {
+    async fn order_is_retried_with_the_same_key() {
         let client = client(busy_server().await);
         let keys: Vec<String> =
             client.post_with_key("/orders", &serde_json::json!({}), "k1").await.unwrap();

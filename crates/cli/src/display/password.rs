@@ -15,8 +15,8 @@ const MAX_LINE_BYTES: usize = 4 * 1024;
 /// The source of a password. Never an argument: other users could read it.
 #[derive(Debug, Clone, Copy, Args)]
 pub struct PasswordSource {
-    /// Read the password from standard input; to change your own, the current and the new one on a
-    /// line each
+    /// Read the password from standard input; to change your own, give the current and the new
+    /// password on a line each
     #[arg(long)]
     pub password_stdin: bool,
 }

@@ -111,7 +111,7 @@ mod tests {
         );
         let stream = [line(2, "b"), line(2, "b"), line(2, "b"), line(3, "c")]
             .map(|line| printed.accept_streamed(&line));
-        assert_eq!(stream, [false, false, true, true], "three alike are three");
+        assert_eq!(stream, [false, false, true, true], "three equal lines are three lines");
     }
 
     #[test]

@@ -47,8 +47,8 @@ pub enum Action {
         #[arg(long, value_name = "TIME", value_parser = parse_lifetime, default_value = "1d")]
         timeout: Duration,
     },
-    /// Cancel a deployment: robots that have not finished or have failed keep the previous version;
-    /// robots that already run the new version keep it
+    /// Cancel a deployment: unfinished and failed robots keep the previous version; robots that
+    /// run the new version keep it
     Cancel {
         /// Deployment id
         #[arg(add = complete::deployments())]

@@ -49,7 +49,7 @@ pub struct PushArgs {
     /// Number of robots per batch [default: all at once]
     #[arg(long, value_name = "N", value_parser = parse_positive, requires = "to")]
     batch: Option<u64>,
-    /// Pause the rollout when more than this many robots have failed [default: never]
+    /// Pause the rollout when more than this many robots have failed [default: no limit]
     #[arg(long, value_name = "N", requires = "to")]
     max_failures: Option<u64>,
     /// Delivery method

@@ -31,14 +31,14 @@ pub enum Action {
         #[command(flatten)]
         from: PasswordSource,
     },
-    /// List users
+    /// List users and their roles
     List,
     /// Change the roles or the robots of a user
     Edit {
         /// User name
         #[arg(add = complete::users())]
         name: UserName,
-        /// New roles
+        /// New roles, in place of the current ones
         #[arg(long, value_name = "ROLES")]
         role: Option<Roles>,
         /// Limit the user to the robots that match; '*' for no limit

@@ -327,7 +327,7 @@ mod tests {
     use task_proto::telemetry::log::LogSource;
 
     #[test]
-    fn a_line_has_its_columns_and_no_control_characters() {
+    fn line_has_its_columns_and_no_control_characters() {
         let line = LogLine {
             at_ms: 1_700_000_000_123,
             level: LogLevel::Warn,

@@ -211,8 +211,8 @@ fn describe_ros(ros: &RosFacts) -> String {
 
 fn task_row(task: &RobotTask) -> Vec<String> {
     let wanted = match task.wanted {
-        task_proto::desired::Wanted::Running => "running",
-        task_proto::desired::Wanted::Stopped => "stopped",
+        task_proto::desired::TargetState::Running => "running",
+        task_proto::desired::TargetState::Stopped => "stopped",
     };
     vec![
         task.task.to_string(),

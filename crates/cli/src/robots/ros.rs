@@ -90,7 +90,7 @@ pub struct LifecycleArgs {
     /// Full name of the node, such as /mapper
     #[arg(add = complete::nodes())]
     node: GraphName,
-    /// Transition
+    /// Lifecycle transition to request
     #[arg(value_enum)]
     transition: TransitionName,
 }

@@ -102,7 +102,7 @@ pub struct DesiredTask {
     /// The package to run.
     pub package: PackageRef,
     /// Whether the task should be running.
-    pub wanted: Wanted,
+    pub wanted: TargetState,
     /// Number of times the task was asked to start, from 1. A job runs once for each value.
     pub run: u64,
     /// How the package's bytes should travel.
@@ -150,11 +150,11 @@ impl BlobRef {
     }
 }
 
-/// Whether a task should be running.
+/// The state that a task should be in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
-pub enum Wanted {
+pub enum TargetState {
     /// The task should be running.
     Running,
     /// Installed, but not running.

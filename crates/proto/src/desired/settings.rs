@@ -278,7 +278,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_value_out_of_bounds_is_named_by_its_key() {
+    fn value_out_of_bounds_is_named_by_its_key() {
         let check = |json: serde_json::Value| {
             serde_json::from_value::<RobotSettings>(json).expect("parses").check()
         };

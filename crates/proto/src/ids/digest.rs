@@ -1,5 +1,5 @@
 //! Content digests (OCI image-spec, "Digests"): `sha256:<64 hex digits>`, or
-//! `sha512:<128 hex digits>`, which the registry takes as well. What robots get has the first.
+//! `sha512:<128 hex digits>`, which the registry accepts too. Robots receive the first form only.
 
 use std::fmt;
 use std::str::FromStr;

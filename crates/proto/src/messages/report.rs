@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use self::tidy::{MAX_FAILURE_CHARS, clean};
 use crate::desired::settings::{EffectiveSettings, default_if_unreadable};
-use crate::desired::{DesiredTask, PackageRef, Wanted};
+use crate::desired::{DesiredTask, PackageRef, TargetState};
 use crate::messages::part::PartRange;
 use crate::packages::manifest::TaskKind;
 use crate::{DeploymentId, Digest, Generation, InstanceId, MacAddress, RobotId, TaskName, Version};
@@ -203,7 +203,7 @@ pub struct TaskReport {
     /// The package that the deployment ordered.
     pub package: PackageRef,
     /// Whether the task should run, by the latest desired state.
-    pub wanted: Wanted,
+    pub wanted: TargetState,
     /// The run requested last.
     pub run: u64,
     /// Service or job; unknown until the task manifest has been fetched.

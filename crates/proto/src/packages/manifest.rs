@@ -502,7 +502,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plain_command_has_no_problems() {
+    fn plain_command_has_no_problems() {
         assert_eq!(manifest(run(&["true"])).problems(), []);
     }
 

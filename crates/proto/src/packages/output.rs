@@ -1,4 +1,4 @@
-//! What tasks bring back: the files that `[outputs]` names, as one OCI artifact per run in a
+//! Outputs of tasks: the files that `[outputs]` names, as one OCI artifact per run in a
 //! repository of the robot's own. Pushed by the robot, read by operators with any OCI client.
 
 use serde::{Deserialize, Serialize};
@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_repository_names_its_owner() {
+    fn repository_names_its_owner() {
         let robot = RobotId::random();
         let task: TaskName = "corridor_mapping".parse().expect("valid");
         let name = repository(&robot, &task).expect("a name");

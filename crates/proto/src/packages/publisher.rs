@@ -374,7 +374,7 @@ mod tests {
     }
 
     #[test]
-    fn a_signature_is_about_one_package_with_all_its_digests_and_sizes() {
+    fn signature_covers_one_package_with_all_digests_and_sizes() {
         let (talker, publishers) = (package("talker"), role(&[1], 1));
         let envelopes = [signed_by(1, &talker)];
         assert!(check_threshold(&publishers, &talker, &envelopes).is_ok());
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_follows_if_the_keepers_before_it_and_its_own_have_signed() {
+    fn publisher_list_follows_if_old_and_new_keepers_signed_it() {
         let before = role(&[1, 2], 2);
         let next = list(2, role(&[5], 1), role(&[2, 3], 1));
         assert_eq!(
@@ -460,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn an_older_list_never_follows() {
+    fn older_publisher_list_never_follows() {
         let keepers = role(&[1], 1);
         for (version, known) in [(1, 1), (1, 2), (0, 0)] {
             let old = sealed(&list(version, role(&[5], 1), keepers.clone()), &[1]);
@@ -470,7 +470,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_has_limits() {
+    fn publisher_list_has_limits() {
         let keepers = role(&[1], 1);
         let follow = |list: &PublisherList| {
             PublisherList::verify_successor(&sealed(list, &[1]), &keepers, 0)

@@ -151,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn a_chain_holds_and_survives_an_export() {
+    fn audit_chain_holds_and_survives_an_export() {
         let records = chain((1..=4).map(entry));
         let last = verified(&records).expect("holds");
         assert_eq!((last.number, last.digest), (4, records[3].digest));

@@ -194,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn a_role_is_a_fixed_set_of_permissions() {
+    fn role_is_a_fixed_set_of_permissions() {
         let allowed = |text: &str| -> Vec<&str> {
             Permission::ALL
                 .into_iter()

@@ -1,5 +1,5 @@
 //! Civil time, in UTC, of milliseconds since the Unix epoch, and back; and lengths of time as
-//! people say and write them. It never asks what time it is.
+//! people say and write them. It never reads a clock.
 
 use std::time::Duration;
 

@@ -9,7 +9,7 @@ use task_proto::api::{
     VitalsView,
 };
 use task_proto::desired::settings::{EffectiveSettings, RobotLimits, RobotSettings};
-use task_proto::desired::{Delivery, DesiredState, Wanted};
+use task_proto::desired::{Delivery, DesiredState, TargetState};
 use task_proto::messages::report::{Failure, FailureCode, Phase, Report};
 use task_proto::packages::manifest::TaskKind;
 use task_proto::telemetry::log::LogLevel;
@@ -115,7 +115,7 @@ fn task_history_documents() {
         package: package(),
         kind: TaskKind::Service,
         released: true,
-        wanted: Some(Wanted::Running),
+        wanted: Some(TargetState::Running),
         phase: Phase::Failed,
         progress: None,
         failure: Some(Failure::new(FailureCode::DISK_FULL, "2 GB are needed, 1 GB is free")),

@@ -17,7 +17,7 @@ use task_proto::api::{
 };
 use task_proto::desired::{
     BlobRef, Delivery, DesiredNotice, DesiredState, DesiredTask, Evidence, Inline, PackageRef,
-    SignatureRef, Wanted,
+    SignatureRef, TargetState,
 };
 use task_proto::messages::part::{Part, PartRange};
 use task_proto::messages::report::{
@@ -72,7 +72,7 @@ fn desired_state() -> DesiredState {
             task: parsed("talker"),
             deployment: parsed("d00000000000000b2"),
             package: package(),
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run: 1,
             delivery: Delivery::PushPull,
             priority: 5,
@@ -132,7 +132,7 @@ fn report() -> Report {
                 task: parsed("mapper"),
                 deployment: parsed("d00000000000000b1"),
                 package: package(),
-                wanted: Wanted::Running,
+                wanted: TargetState::Running,
                 run: 2,
                 kind: None,
                 phase: Phase::Fetching,
@@ -152,7 +152,7 @@ fn report() -> Report {
                 task: parsed("talker"),
                 deployment: parsed("d00000000000000b2"),
                 package: package(),
-                wanted: Wanted::Running,
+                wanted: TargetState::Running,
                 run: 1,
                 kind: Some(TaskKind::Service),
                 phase: Phase::Failed,
@@ -240,7 +240,7 @@ pub fn check_text<T: Serialize + DeserializeOwned>(name: &str, value: &T) {
     let written = serde_json::to_string_pretty(value).expect("json") + "\n";
     update_golden(name, &written);
     assert_eq!(written, golden(name), "{name} has changed on the wire");
-    serde_json::from_str::<T>(&written).expect("reads what it wrote");
+    serde_json::from_str::<T>(&written).expect("parses its own output");
 }
 
 /// A reader of this version must ignore additions of a later version. Only where maps hold no free

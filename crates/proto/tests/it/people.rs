@@ -68,7 +68,7 @@ fn people_and_token_documents() {
     check_tolerance::<Me>("me.json");
 }
 
-/// An entry's bytes and their chaining may never change: written entries must stay valid for ever.
+/// An entry's bytes and their chaining may never change: written entries must stay valid.
 #[test]
 fn audit_documents() {
     let entry = AuditEntry {

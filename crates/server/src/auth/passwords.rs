@@ -66,9 +66,9 @@ pub struct Passwords {
     last_duration_us: Arc<AtomicU64>,
 }
 
-/// A turn to hash or verify one password. It ends when it is dropped.
+/// The permit to hash or verify one password. It is returned when it is dropped.
 #[derive(Debug)]
-pub struct Turn {
+pub struct HashPermit {
     requested: Instant,
     queued: OwnedSemaphorePermit,
     slot: OwnedSemaphorePermit,
@@ -90,13 +90,13 @@ impl Default for Passwords {
 }
 
 impl Passwords {
-    /// Waits for a turn. Few have one at a time, so a caller may do its own work of a sign-in in the
-    /// turn as well: the same limit then bounds that work.
-    pub async fn turn(&self) -> Result<Turn, PasswordError> {
+    /// Waits for a permit. There are few, so a caller may also do its own work of a sign-in while it
+    /// holds one: the same limit then bounds that work.
+    pub async fn permit(&self) -> Result<HashPermit, PasswordError> {
         let requested = Instant::now();
         let queued = self.queue.clone().try_acquire_owned().map_err(|_| PasswordError::Busy)?;
         let slot = self.slots.clone().acquire_owned().await.map_err(|_| PasswordError::Busy)?;
-        Ok(Turn { requested, queued, slot })
+        Ok(HashPermit { requested, queued, slot })
     }
 
     /// Hashes a new password of `user`.
@@ -107,7 +107,7 @@ impl Passwords {
     ) -> Result<PasswordHash, PasswordError> {
         check(user, password)?;
         let password = password.to_owned();
-        self.turn().await?.work(move || hashed(&password)).await?
+        self.permit().await?.work(move || hashed(&password)).await?
     }
 
     /// Whether `password` is longer than any user's.
@@ -119,7 +119,7 @@ impl Passwords {
     /// false.
     pub async fn verify(
         &self,
-        turn: Turn,
+        permit: HashPermit,
         password: &str,
         hash: Option<&PasswordHash>,
     ) -> Result<bool, PasswordError> {
@@ -128,8 +128,8 @@ impl Passwords {
         }
         let (password, has_hash) = (password.to_owned(), hash.is_some());
         let hash = hash.unwrap_or(&self.decoy).clone();
-        let requested = turn.requested;
-        let checked = turn.work(move || {
+        let requested = permit.requested;
+        let checked = permit.work(move || {
             match Argon2::default().verify_password(password.as_bytes(), hash.as_str()) {
                 Ok(()) => Ok(has_hash),
                 Err(argon2::password_hash::Error::PasswordInvalid) => Ok(false),
@@ -142,14 +142,14 @@ impl Passwords {
         checked
     }
 
-    /// Takes as long as the last verification with its turn, without the work.
+    /// Takes as long as the last verification with its wait for a permit, without the work.
     pub async fn simulate_verify(&self) {
         tokio::time::sleep(Duration::from_micros(self.last_duration_us.load(Ordering::Relaxed)))
             .await;
     }
 }
 
-impl Turn {
+impl HashPermit {
     async fn work<T: Send + 'static>(
         self,
         work: impl FnOnce() -> T + Send + 'static,
@@ -220,7 +220,7 @@ mod tests {
         password: &str,
         hash: Option<&PasswordHash>,
     ) -> Result<bool, PasswordError> {
-        passwords.verify(passwords.turn().await?, password, hash).await
+        passwords.verify(passwords.permit().await?, password, hash).await
     }
 
     #[tokio::test]
@@ -302,11 +302,11 @@ mod tests {
         for _ in 0..held {
             let (passwords, gate) = (passwords.clone(), gate.clone());
             flood.spawn(async move {
-                let turn = passwords.turn().await.expect("a turn");
+                let permit = passwords.permit().await.expect("a permit");
                 let wait = move || {
                     gate.wait();
                 };
-                turn.work(wait).await.is_ok()
+                permit.work(wait).await.is_ok()
             });
         }
         while passwords.slots.available_permits() > 0 {
@@ -315,7 +315,7 @@ mod tests {
         for _ in held..queue {
             let passwords = passwords.clone();
             flood.spawn(async move {
-                passwords.turn().await.expect("a turn").work(|| ()).await.is_ok()
+                passwords.permit().await.expect("a permit").work(|| ()).await.is_ok()
             });
         }
         while passwords.queue.available_permits() > 0 {
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn slot_rests_for_as_long_as_it_has_worked() {
+    async fn slot_rests_as_long_as_it_worked() {
         let passwords = Passwords::default();
         let all = u32::try_from(passwords.slots.available_permits()).expect("few");
         let work = || {
@@ -343,8 +343,8 @@ mod tests {
             hashed("correct horse battery").expect("hashed");
             (begun.elapsed(), Instant::now())
         };
-        let turn = passwords.turn().await.expect("a turn");
-        let (worked, done_at) = turn.work(work).await.expect("done");
+        let permit = passwords.permit().await.expect("a permit");
+        let (worked, done_at) = permit.work(work).await.expect("done");
         let _every_slot = passwords.slots.acquire_many(all).await.expect("open");
         assert!(done_at.elapsed() >= worked, "{:?} after {worked:?}", done_at.elapsed());
     }

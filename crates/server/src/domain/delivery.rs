@@ -617,7 +617,7 @@ mod tests {
 
     /// The built-in rules one by one, as docs/delivery.md shows them.
     #[test]
-    fn the_built_in_rules_decide() {
+    fn built_in_rules_decide() {
         let expect = |size, mechanism, rule: &str, because: &str| {
             let inputs =
                 Inputs { size, batch: 40, robots: 40, connected: true, ..Inputs::default() };
@@ -628,7 +628,7 @@ mod tests {
     }
 
     #[test]
-    fn the_first_rule_that_matches_wins() {
+    fn first_matching_rule_wins() {
         let own = [
             rule("far and slow", &[("rtt_above", 100), ("throughput_below", MB)], Delivery::Poll),
             rule("far", &[("rtt_above", 100)], Delivery::DirectPush),
@@ -676,7 +676,7 @@ mod tests {
     proptest! {
         /// A comparison and its opposite share nothing and leave nothing out.
         #[test]
-        fn a_comparison_or_its_opposite_holds(found in any::<u64>(), value in any::<u64>(), near in 0u64..3) {
+        fn comparison_or_its_opposite_holds(found in any::<u64>(), value in any::<u64>(), near in 0u64..3) {
             for value in [value, found.saturating_add(near), found.saturating_sub(near)] {
                 for comparison in Comparison::ALL {
                     prop_assert_ne!(comparison.holds(found, value), comparison.opposite().holds(found, value));

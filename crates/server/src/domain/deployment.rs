@@ -88,7 +88,7 @@ pub fn state(
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use task_proto::desired::{BlobRef, PackageRef, Wanted};
+    use task_proto::desired::{BlobRef, PackageRef, TargetState};
     use task_proto::{DeploymentId, Digest};
 
     use super::*;
@@ -109,7 +109,7 @@ mod tests {
                 config: blob,
                 content: blob,
             },
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run,
             kind: None,
             phase,

@@ -570,7 +570,7 @@ mod tests {
         presence.remember(&robot, agent(2), 6);
         assert!(
             presence.identify(&robot, None, None, agent(1), 6).is_serving,
-            "what is known is newer"
+            "the known state is newer"
         );
     }
 

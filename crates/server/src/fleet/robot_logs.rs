@@ -306,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn the_newest_lines_of_each_robot_are_remembered() {
+    fn newest_lines_of_each_robot_are_remembered() {
         let (logs, robot) = (RobotLogs::new(), RobotId::random());
         assert_eq!(logs.snapshot(&robot), None);
         for number in 0..3 {

@@ -23,21 +23,21 @@ pub enum Holder {
     /// A person, with all tokens and sessions.
     Person(UserName),
     /// An enrollment token, by its id.
-    Enrolment(String),
+    Enrollment(String),
 }
 
 /// All connections that have a holder. The listener bounds their number.
 #[derive(Debug, Default)]
 pub struct HttpConnections {
-    held: Mutex<Held>,
+    by_holder: Mutex<ConnectionsByHolder>,
     last_number: AtomicU64,
     robots_ended: AtomicU64,
 }
 
 #[derive(Debug, Default)]
-struct Held {
+struct ConnectionsByHolder {
     /// Each holder's connections, the oldest first.
-    by_holder: HashMap<Holder, BTreeMap<u64, CancellationToken>>,
+    connections: HashMap<Holder, BTreeMap<u64, CancellationToken>>,
     /// The same holders in the order of their numbers of connections.
     by_count: BTreeSet<(usize, Holder)>,
 }
@@ -82,7 +82,7 @@ impl HttpConnections {
             return;
         }
         let number = self.last_number.fetch_add(1, Ordering::Relaxed);
-        self.held().change(holder, |connections| {
+        self.by_holder().change(holder, |connections| {
             connections.insert(number, connection.cut.clone());
         });
         *registration =
@@ -92,23 +92,23 @@ impl HttpConnections {
     /// Cuts all connections of the robot.
     pub fn end(&self, robot: &RobotId) {
         self.robots_ended.fetch_add(1, Ordering::SeqCst);
-        let ended = self.held().change(&Holder::Robot(robot.clone()), std::mem::take);
+        let ended = self.by_holder().change(&Holder::Robot(robot.clone()), std::mem::take);
         ended.values().for_each(CancellationToken::cancel);
     }
 
     /// Cuts the oldest connection of the holder with the most, if that is more than its fair share
     /// of `limit` connections. False if no holder exceeds its share.
     pub fn cut_oldest_of_largest(&self, limit: usize) -> bool {
-        let mut held = self.held();
-        let share = held.fair_share(limit);
-        let largest = held
+        let mut by_holder = self.by_holder();
+        let share = by_holder.fair_share(limit);
+        let largest = by_holder
             .by_count
             .last()
             .filter(|(count, _)| *count > share)
             .map(|(_, holder)| holder.clone());
         let Some(holder) = largest else { return false };
-        let oldest = held.change(&holder, BTreeMap::pop_first);
-        drop(held);
+        let oldest = by_holder.change(&holder, BTreeMap::pop_first);
+        drop(by_holder);
         tracing::debug!(
             ?holder,
             share,
@@ -117,17 +117,17 @@ impl HttpConnections {
         oldest.inspect(|(_, cut)| cut.cancel()).is_some()
     }
 
-    fn held(&self) -> MutexGuard<'_, Held> {
+    fn by_holder(&self) -> MutexGuard<'_, ConnectionsByHolder> {
         // Every change under this lock is complete in itself, so a panic elsewhere leaves nothing
         // half-done.
-        self.held.lock().unwrap_or_else(PoisonError::into_inner)
+        self.by_holder.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-impl Held {
+impl ConnectionsByHolder {
     /// Each holder's share of `limit` connections if one more holder comes.
     fn fair_share(&self, limit: usize) -> usize {
-        (limit / (self.by_holder.len() + 1)).max(ALWAYS_ALLOWED.min(limit / 2)).max(1)
+        (limit / (self.connections.len() + 1)).max(ALWAYS_ALLOWED.min(limit / 2)).max(1)
     }
 
     /// Changes a holder's connections, and updates the order by number.
@@ -136,12 +136,12 @@ impl Held {
         holder: &Holder,
         change: impl FnOnce(&mut BTreeMap<u64, CancellationToken>) -> T,
     ) -> T {
-        let connections = self.by_holder.entry(holder.clone()).or_default();
+        let connections = self.connections.entry(holder.clone()).or_default();
         let before = connections.len();
         let changed = change(connections);
         let after = connections.len();
         if after == 0 {
-            self.by_holder.remove(holder);
+            self.connections.remove(holder);
         }
         if before != after {
             self.by_count.remove(&(before, holder.clone()));
@@ -214,7 +214,7 @@ impl Connection {
 impl Drop for Registration {
     fn drop(&mut self) {
         self.connections
-            .held()
+            .by_holder()
             .change(&self.holder, |connections| connections.remove(&self.number));
     }
 }
@@ -257,8 +257,8 @@ mod tests {
         all.end(&one);
         assert_eq!(cut(&strangers), [false]);
         drop((own, strangers));
-        let held = all.held();
-        assert!(held.by_holder.is_empty() && held.by_count.is_empty());
+        let by_holder = all.by_holder();
+        assert!(by_holder.connections.is_empty() && by_holder.by_count.is_empty());
     }
 
     #[test]
@@ -271,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn holder_with_the_most_loses_its_oldest_until_it_has_its_share() {
+    fn largest_holder_loses_its_oldest_connections_down_to_its_share() {
         let all = Arc::new(HttpConnections::default());
         let viewer = connected(&all, &person("viewer"), 60);
         let robots: Vec<_> =
@@ -290,7 +290,7 @@ mod tests {
     }
 
     #[test]
-    fn a_robot_is_a_holder_like_any_other() {
+    fn robot_has_a_fair_share_like_other_holders() {
         let all = Arc::new(HttpConnections::default());
         let flood = connected(&all, &Holder::Robot(RobotId::random()), 30);
         let _operator = connected(&all, &person("operator"), 2);

@@ -46,7 +46,7 @@ pub enum Parsed {
     Incomplete(usize),
 }
 
-/// A whole header.
+/// The content of a complete header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Header {
     /// The address of the proxy's client; absent for a connection of the proxy itself, or if the

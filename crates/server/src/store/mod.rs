@@ -153,7 +153,7 @@ pub enum StoreError {
     Unsuitable {
         /// The database, without its password.
         url: String,
-        /// The missing property.
+        /// The property that the server lacks.
         reason: String,
     },
     /// The integrity check found damaged pages.

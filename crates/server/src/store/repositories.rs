@@ -60,7 +60,7 @@ repositories! {
     page_sessions: PageSessions;
     /// Wrong passwords of accounts.
     sign_in_failures: SignInFailures;
-    /// The audit log.
+    /// The audit log: who changed what, in a chain of hashes.
     audit: Audit;
     /// Manifests in the registry's repositories.
     manifests: Manifests;

@@ -331,12 +331,12 @@ mod tests {
         std::fs::set_permissions(path.join("blobs"), Permissions::from_mode(0o775)).expect("set");
         std::fs::set_permissions(&path, Permissions::from_mode(0o777)).expect("set");
         drop(DataDirectory::open(&path).expect("opens"));
-        assert_eq!(mode(&path), 0o755, "who could read the names still can");
+        assert_eq!(mode(&path), 0o755, "the directory stays readable");
         assert_eq!(mode(&path.join("blobs")), 0o700);
         for file in ["taskd.sqlite", "taskd.sqlite-wal", SIGNING_KEY, LOCK] {
             assert_eq!(mode(&path.join(file)), 0o600, "{file}");
         }
-        assert_eq!(mode(&elsewhere), 0o664, "what a link leads to is not ours");
+        assert_eq!(mode(&elsewhere), 0o664, "the target of a link stays as it was");
     }
 
     #[test]

@@ -140,11 +140,14 @@ async fn tasks_are_stopped_started_and_removed() {
     let matched: MatchedRobots =
         answer(server.order("/api/v1/tasks/talker/stop", "key-2", &order)).await;
     assert_eq!(matched.robots.len(), 1);
-    assert_eq!(server.desired(&robot).await.tasks[0].wanted, task_proto::desired::Wanted::Stopped);
+    assert_eq!(
+        server.desired(&robot).await.tasks[0].wanted,
+        task_proto::desired::TargetState::Stopped
+    );
     let _: MatchedRobots =
         answer(server.order("/api/v1/tasks/talker/start", "key-3", &order)).await;
     let started = server.desired(&robot).await.tasks[0].clone();
-    assert_eq!((started.wanted, started.run), (task_proto::desired::Wanted::Running, 2));
+    assert_eq!((started.wanted, started.run), (task_proto::desired::TargetState::Running, 2));
     let _: MatchedRobots =
         answer(server.order("/api/v1/tasks/talker/remove", "key-4", &order)).await;
     assert!(server.desired(&robot).await.tasks.is_empty());

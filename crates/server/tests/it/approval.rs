@@ -39,7 +39,7 @@ async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) 
     };
     let order =
         CreateEnrollmentToken { approval: true, ttl_s: Some(30 * 24 * 3600), ..Default::default() };
-    let token = fleet.enrolment_token(order).await;
+    let token = fleet.enrollment_token(order).await;
     let one = fleet.try_enroll(&token, mac(1), Some("one")).await.expect("enrolls");
     // An answer that was lost is mended as ever, and the robot goes on waiting.
     let one = fleet
@@ -104,7 +104,7 @@ async fn robot_waits_until_approval_rejection_or_a_week(database: TestDatabase) 
 async fn at_most_a_thousand_robots_wait_for_approval(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let token = fleet
-        .enrolment_token(CreateEnrollmentToken {
+        .enrollment_token(CreateEnrollmentToken {
             approval: true,
             unlimited: true,
             ..Default::default()
@@ -117,10 +117,7 @@ async fn at_most_a_thousand_robots_wait_for_approval(database: TestDatabase) {
     }
     let one_more = async || fleet.try_enroll(&token, mac(1_000), None).await;
     assert_eq!(code(one_more().await), "too_many_requests");
-    assert!(
-        fleet.try_enroll(&token, mac(0), None).await.is_ok(),
-        "who waits already may ask again"
-    );
+    assert!(fleet.try_enroll(&token, mac(0), None).await.is_ok(), "a waiting robot may ask again");
     fleet.robots.approve(&fleet.operator, &first.expect("came")).await.expect("approved");
     assert!(one_more().await.expect("enrolls").awaits_approval);
 }

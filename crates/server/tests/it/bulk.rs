@@ -77,7 +77,7 @@ async fn labels_are_set_and_removed_at_once(database: TestDatabase) {
     assert_eq!(
         code(label(&order("*", &many, &[])).await),
         "invalid_request",
-        "with what they have it is one too many"
+        "with the existing labels this is one too many"
     );
     assert_eq!(fleet.view(&robots[0]).await.labels.len(), 2);
     label(&order("*", &many, &["site", "room"])).await.expect("just as many as there may be");

@@ -215,7 +215,7 @@ pub struct Robot {
     seq: std::cell::Cell<u64>,
 }
 
-/// What could not take the place of another says so, and what goes on.
+/// A version that could not replace another one reports that, and the version that continues.
 #[tokio::test(flavor = "multi_thread")]
 async fn unmet_run_reports_the_version_that_still_runs() {
     let bench = Bench::start().await;
@@ -287,7 +287,7 @@ async fn interrupted_wait_prints_how_to_watch_and_cancel() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_second_push_of_the_same_tree_transfers_no_blob() {
+async fn second_push_of_the_same_tree_transfers_no_blob() {
     let bench = Bench::start().await;
     let package = bench.package("1", "");
     let first = bench.taskd(&["push", &package, "-o", "json"]).await.expect(0, "2 blobs uploaded");
@@ -609,7 +609,7 @@ pub fn closed_pipe() -> Stdio {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn the_examples_can_be_packed() {
+async fn examples_can_be_packed() {
     let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
     for name in ["talker", "plain"] {
         run(command(&["pack", examples.join(name).to_str().unwrap()])).await.expect(0, "");

@@ -289,7 +289,7 @@ async fn runs(bench: &Bench) -> Vec<(String, Value, Value)> {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
+async fn launch_file_runs_with_its_arguments_on_a_robot() {
     let bench = Bench::start().await;
     bench.enroll(1).await;
     let dir = ros_package(&bench);
@@ -329,7 +329,7 @@ async fn a_launch_file_runs_with_its_arguments_on_a_robot() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_deployment_is_watched_until_it_has_settled() {
+async fn deployment_is_watched_until_it_has_settled() {
     let lab = Lab::new().await;
     let deployment = lab.deployment();
     let watched =

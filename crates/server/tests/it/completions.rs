@@ -30,7 +30,7 @@ const ZSH: &str = r#"zmodload zsh/zpty && zpty terminal zsh -f -i || exit 9
         fi
         builtin compadd \"\$@\"
     }"
-    # The words are put together only where they are printed: the terminal shows what is typed as
+    # The words are joined only where they are printed: the terminal shows the typed text as
     # well.
     zpty -w terminal 'ended() { print -r "<""ended>" }; comppostfuncs=(ended); print -r "<""ready>"'
     zpty -r terminal shown '*<ready>*' && zpty -w -n terminal "$1"$'\t' &&
@@ -44,7 +44,7 @@ async fn shell(environment: &[(&str, String)], program: &[&str]) -> Ran {
     let path = format!("{}:{}", programs.display(), std::env::var("PATH").unwrap());
     // A home directory where a shell may keep its files.
     let home = tempfile::tempdir().unwrap();
-    // A shell that waits for ever is ended.
+    // A shell that hangs is ended.
     let mut command = std::process::Command::new("timeout");
     command.arg("60").args(program).env("PATH", path).env("HOME", home.path()).stdin(Stdio::null());
     for directory in ["XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_STATE_HOME"] {
@@ -100,7 +100,7 @@ async fn zsh_once(environment: &[(&str, String)], line: &str) -> Vec<String> {
     std::fs::write(&offered, "").unwrap();
     shell(environment, &["zsh", "-f", "-c", ZSH, "zsh", line, offered.to_str().unwrap()]).await;
     let mut offered = lines(&std::fs::read_to_string(offered).unwrap());
-    // It offers what has the same description row by row of its table, from the last.
+    // It offers words with the same description row by row of its table, from the last.
     offered.sort();
     offered
 }

@@ -1,6 +1,6 @@
 //! A SQLite file with damaged pages: refused at start, detected while served, never written to.
 
-#![expect(clippy::disallowed_methods, reason = "which pages hold what is asked of SQLite")]
+#![expect(clippy::disallowed_methods, reason = "SQLite knows the pages of a table")]
 
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};

@@ -49,7 +49,7 @@ async fn contents(url: &str) -> Vec<String> {
     lines
 }
 
-/// What people see of the fleet.
+/// The view that people have of the fleet.
 async fn lists(server: &TestServer) -> Vec<Value> {
     let mut lists = Vec::new();
     for path in [

@@ -114,7 +114,7 @@ async fn each_robot_gets_the_delivery_of_its_rule(database: TestDatabase) {
     assert_eq!(
         fleet.changes.take_robots_to_notify().await.robots,
         rung.into(),
-        "who polls is not rung"
+        "a polling robot gets no notice"
     );
     let inputs = fleet.database.inputs(&id, &robots[3].id).await;
     let expected = serde_json::json!({

@@ -23,7 +23,7 @@ fn assert_found(ran: &Ran, check: &str, verdict: &str, words: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_healthy_server_has_all_its_checks() {
+async fn healthy_server_passes_all_checks() {
     let bench = Bench::start().await;
     bench.enroll(1).await;
     let told = bench.taskd(&["doctor"]).await.expect(0, "").stdout;

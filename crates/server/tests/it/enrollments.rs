@@ -108,7 +108,7 @@ pub async fn connack(server: &TestServer, robot: &str, token: &str) -> u8 {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn revoked_robot_returns_only_by_a_token_made_for_it() {
+async fn revoked_robot_returns_only_by_a_token_for_it() {
     let server = TestServer::start().await;
     let mut atlas = server.enroll("atlas").await;
     let mac = server.robot(&atlas).await.mac.to_string();
@@ -138,7 +138,7 @@ async fn revoked_robot_returns_only_by_a_token_made_for_it() {
     assert_eq!(
         (view.conditions[0].code.as_str(), view.tasks.len()),
         ("revoked", 1),
-        "what is ordered stays"
+        "the orders stay"
     );
     // Both of the robot's tokens have ended, also once ended tokens have been cleared away, and the
     // robot is told the reason.

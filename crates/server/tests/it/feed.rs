@@ -91,7 +91,7 @@ async fn feed_survives_a_restart(database: TestDatabase) {
         let chunk = chunk.expect("no error").expect("the stream should go on");
         heard.push_str(std::str::from_utf8(&chunk).expect("text"));
     }
-    assert!(!heard.contains("atlas: "), "what happened before is not repeated: {heard}");
+    assert!(!heard.contains("atlas: "), "earlier events are not repeated: {heard}");
 }
 
 async fn newest_entries_are_kept_under_growing_numbers(database: TestDatabase) {
@@ -197,7 +197,7 @@ async fn burst_of_events_is_combined_for_unlimited_readers_only() {
         of_robots.iter().all(|entry| entry.robot.as_ref() == Some(&robots[3].id)),
         "{of_robots:?}"
     );
-    let (last, before) = of_robots.split_last().expect("what became of r3");
+    let (last, before) = of_robots.split_last().expect("the events of r3");
     assert_eq!(last.kind, FeedKind::RobotRevoked);
     assert!(before.iter().all(|entry| entry.kind == FeedKind::RobotEnrolled), "{before:?}");
     let others = json!({ "selector": "*" });

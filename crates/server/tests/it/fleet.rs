@@ -183,7 +183,7 @@ impl Fleet {
         }
     }
 
-    pub async fn enrolment_token(
+    pub async fn enrollment_token(
         &self,
         order: CreateEnrollmentToken,
     ) -> task_proto::trust::token::Token {
@@ -221,7 +221,7 @@ impl Fleet {
     /// Registers `count` robots named `r0`, `r1`, … that are online.
     pub async fn enroll(&self, count: u32) -> Vec<Robot> {
         let token = self
-            .enrolment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() })
+            .enrollment_token(CreateEnrollmentToken { unlimited: true, ..Default::default() })
             .await;
         let mut robots = Vec::new();
         for number in 0..count {

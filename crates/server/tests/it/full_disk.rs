@@ -41,7 +41,7 @@ fn on_small_disk(size: &str, test: impl AsyncFnOnce(TempDir) + Send) {
     let place = TempDir::new().expect("a directory");
     std::thread::scope(|scope| {
         let running = scope.spawn(|| {
-            enter(place.path()).expect("root, who can have mounts of its own");
+            enter(place.path()).expect("root, which may mount");
             let directory = TempDir::new_in(place.path()).expect("a directory");
             let runtime = tokio::runtime::Builder::new_multi_thread()
                 .enable_all()

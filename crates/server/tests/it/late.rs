@@ -3,7 +3,7 @@
 
 use task_proto::Generation;
 use task_proto::api::DeploymentState;
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Condition, Phase, Report};
 use task_proto::packages::manifest::TaskKind;
 use taskd::orders::actions::TaskOrder;
@@ -45,9 +45,9 @@ async fn expired_restart_leaves_the_running_task(database: TestDatabase) {
         fleet.follow(robot, Phase::Running).await;
     }
     for (late, wanted, phase) in [
-        (TaskOrder::Restart, Wanted::Running, Phase::Running),
-        (TaskOrder::Stop, Wanted::Stopped, Phase::Stopped),
-        (TaskOrder::Start, Wanted::Stopped, Phase::Stopped),
+        (TaskOrder::Restart, TargetState::Running, Phase::Running),
+        (TaskOrder::Stop, TargetState::Stopped, Phase::Stopped),
+        (TaskOrder::Start, TargetState::Stopped, Phase::Stopped),
     ] {
         order(late).await;
         if late == TaskOrder::Stop {
@@ -86,7 +86,7 @@ async fn expired_restart_leaves_the_running_task(database: TestDatabase) {
     fleet.clock.advance_ms(8 * 24 * 3_600_000);
     fleet.actions.expire().await.expect("done");
     let desired = fleet.desired(&robots[0]).await.expect("state").tasks.remove(0);
-    assert_eq!((desired.deployment, desired.wanted), (new, Wanted::Stopped));
+    assert_eq!((desired.deployment, desired.wanted), (new, TargetState::Stopped));
 }
 
 async fn stopped_task_stays_stopped_after_a_cancel(database: TestDatabase) {
@@ -109,8 +109,8 @@ async fn stopped_task_stays_stopped_after_a_cancel(database: TestDatabase) {
     order(TaskOrder::Stop).await;
     fleet.follow(&mut robots[0], Phase::Running).await;
     let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);
-    assert_eq!((desired.deployment, desired.wanted), (old.clone(), Wanted::Stopped));
-    // Though what it was stopped in is taken back.
+    assert_eq!((desired.deployment, desired.wanted), (old.clone(), TargetState::Stopped));
+    // Although the deployment that stopped it is reverted.
     order(TaskOrder::Start).await;
     fleet.follow(&mut robots[1], Phase::Running).await;
     fleet.deploy("3", |order| order.selector = "r1".parse().expect("valid")).await;
@@ -118,7 +118,7 @@ async fn stopped_task_stays_stopped_after_a_cancel(database: TestDatabase) {
     fleet.clock.advance_ms(8 * 24 * 3_600_000);
     fleet.actions.expire().await.expect("done");
     let desired = fleet.desired(&robots[1]).await.expect("state").tasks.remove(0);
-    assert_eq!((desired.deployment, desired.wanted), (old, Wanted::Stopped));
+    assert_eq!((desired.deployment, desired.wanted), (old, TargetState::Stopped));
 }
 
 async fn silent_robot_delays_only_its_own_batch(database: TestDatabase) {
@@ -295,7 +295,10 @@ async fn other_state_of_the_same_generation_is_diverged(database: TestDatabase) 
         .await
         .expect("ordered");
     let desired = fleet.desired(robot).await.expect("not withheld any more");
-    assert_eq!((desired.generation, desired.tasks[0].wanted), (Generation(3), Wanted::Stopped));
+    assert_eq!(
+        (desired.generation, desired.tasks[0].wanted),
+        (Generation(3), TargetState::Stopped)
+    );
     assert_eq!(desired.tasks[0].package.version.as_str(), "1");
     assert_eq!(fleet.phases(&late).await, [Phase::Stopped]);
 }

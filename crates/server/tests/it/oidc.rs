@@ -308,7 +308,7 @@ async fn user_without_a_matching_rule_is_refused_and_signed_out() {
     assert_eq!(
         refusal(visitor.asks(Method::GET, "/api/v1/me")).await.0,
         401,
-        "what they were signed in to has ended"
+        "their sessions have ended"
     );
     let expected = [
         act("server", "user.add"),

@@ -198,7 +198,7 @@ async fn robot_pushes_only_its_own_outputs() {
     assert_eq!(
         put.send().await.expect("an answer").status(),
         StatusCode::FORBIDDEN,
-        "what looks like one"
+        "a disguised manifest"
     );
     let lie =
         OutputSet { robot_id: other.id.clone(), ..output(&robot.id, 1, vec![file("a", map)]) };
@@ -254,7 +254,7 @@ async fn outputs_of_one_robot_are_bounded_in_bytes(database: TestDatabase) {
             assert_eq!(
                 waits,
                 answer.status() == StatusCode::TOO_MANY_REQUESTS,
-                "robots wait for what passes only"
+                "robots wait only for temporary failures"
             );
         }
         statuses.dedup();
@@ -272,7 +272,7 @@ async fn outputs_of_one_robot_are_bounded_in_bytes(database: TestDatabase) {
     assert_eq!(
         push(&second, 2, 400 * KB).await,
         StatusCode::CREATED,
-        "what came twice counts once"
+        "a repeated upload counts once"
     );
     assert_eq!(push(&first, 3, 125 * KB).await, full, "all its tasks count together");
     assert_eq!(push(&other, 3, 500 * KB).await, StatusCode::CREATED, "another robot's has room");

@@ -437,7 +437,7 @@ async fn head_request_keeps_a_blob_only_with_push_permission() {
     assert_eq!(
         registry.collect(NOW_MS + grace_ms + 1).await.blobs,
         2,
-        "what was only read, and what was deleted"
+        "the blob that was only read, and the deleted one"
     );
     for (repository, digest, expected) in [
         ("a", read, StatusCode::NOT_FOUND),

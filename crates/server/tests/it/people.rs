@@ -297,11 +297,11 @@ async fn password_change_ends_the_old_password_and_its_sign_ins(database: TestDa
         .expect("changed");
     assert_eq!(code(fleet.sign_in("alice", PASSWORD, HERE).await), "unauthorized");
     fleet.sign_in("alice", "another long one", HERE).await.expect("signed in");
-    assert!(fleet.person(&token).await.is_some(), "the one who changed it");
+    assert!(fleet.person(&token).await.is_some(), "the session that changed it");
     assert_eq!(fleet.person(&other).await, None);
     assert!(
         fleet.person(&made.token.parse().expect("a token")).await.is_some(),
-        "what was made on purpose"
+        "tokens made on purpose"
     );
     // An administrator who sets the password signs out all of the user's sessions.
     fleet.people.set_password(&fleet.operator, &name("alice"), PASSWORD).await.expect("set");
@@ -350,7 +350,7 @@ async fn wrong_passwords_are_limited_by_account_and_address(database: TestDataba
     neighbours_of_a_failing_address(&fleet).await;
     fleet.clock.advance_ms(15 * 60 * 1000);
     fleet.sign_in("alice", PASSWORD, stranger(10)).await.expect("the time is over");
-    fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("likewise");
+    fleet.sign_in("bob", PASSWORD, stranger(99)).await.expect("bob signs in");
 }
 
 /// A user known at an address can sign in there regardless of failing neighbours, and a failed
@@ -475,7 +475,7 @@ async fn audit_has_every_change_and_no_read(database: TestDatabase) {
         .expect("the same again");
     // Robots' reports are not people's acts.
     fleet.follow(&mut robots[0], Phase::Running).await;
-    fleet.actions.expire().await.expect("nobody's business");
+    fleet.actions.expire().await.expect("expiry runs");
     for order in [TaskOrder::Stop, TaskOrder::Start, TaskOrder::Remove] {
         fleet
             .deployments

@@ -370,7 +370,7 @@ fn registry_probes(path: &str) -> Vec<Probe> {
         ],
         "/v2" => &[("GET", "/v2", "/v2")],
         "/v2/" => &[("GET", "/v2/", "/v2/")],
-        other => panic!("{other}: this test has to be told what its handler does"),
+        other => panic!("{other}: this test needs the effect of its handler"),
     };
     let probe = |&(method, path, title): &(&str, &str, &str)| Probe {
         title: format!("`{method} {title}`"),

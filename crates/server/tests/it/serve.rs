@@ -91,7 +91,7 @@ async fn idle_connections_are_closed_at_the_connection_limit() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_restart_keeps_everything() {
+async fn restart_keeps_everything() {
     let server = TestServer::start().await;
     let mut robot = server.enroll("atlas").await;
     let package = server.push("talker", "1.0.0").await;

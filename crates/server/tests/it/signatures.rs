@@ -134,7 +134,11 @@ async fn signature_is_sent_to_the_robots_of_its_package(database: TestDatabase) 
         (before.generation, &before.tasks),
         "nothing else was ordered"
     );
-    assert_ne!(tag(&server.ask_desired(&robot).await), tag_before, "whoever asks again is told");
+    assert_ne!(
+        tag(&server.ask_desired(&robot).await),
+        tag_before,
+        "a repeated request gets the new state"
+    );
     assert!(server.desired(&other).await.evidence.is_empty());
     assert!(
         may_read(&server, &robot, blob(&ada)).await && !may_read(&server, &other, blob(&ada)).await
@@ -268,7 +272,7 @@ async fn deleted_signature_is_not_sent_to_robots(database: TestDatabase) {
     assert!(!may_read(&server, &robot, blob(&signature)).await);
 }
 
-async fn robot_gets_the_signatures_of_the_package_that_it_goes_back_to(database: TestDatabase) {
+async fn reverted_robot_gets_the_signatures_of_the_earlier_package(database: TestDatabase) {
     let server = server(&database).await;
     let mut robot = server.enroll("atlas").await;
     let order = async |robot: &mut TestRobot, version: &str, phase| {
@@ -293,7 +297,7 @@ async fn robot_gets_the_signatures_of_the_package_that_it_goes_back_to(database:
 }
 
 on_both_databases!(
-    robot_gets_the_signatures_of_the_package_that_it_goes_back_to,
+    reverted_robot_gets_the_signatures_of_the_earlier_package,
     signature_is_sent_to_the_robots_of_its_package,
     signature_that_contradicts_its_manifest_is_refused,
     surplus_signatures_do_not_displace_the_first,

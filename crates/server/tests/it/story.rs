@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use task_proto::Generation;
 use task_proto::api::{CreateEnrollmentToken, DeploymentState, EditRobot};
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::Phase;
 use task_proto::packages::manifest::TaskKind;
 use taskd::http::error::ApiError;
@@ -51,7 +51,7 @@ pub fn refusal<T, E: Into<ApiError>>(result: Result<T, E>) -> ApiError {
 
 async fn removed_robot_frees_its_mac_and_name(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
-    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let token = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     let mut robot = Robot::new(old.robot_id.clone());
     let deployment = fleet.deploy("1", |_| ()).await;
@@ -459,14 +459,17 @@ async fn tasks_are_stopped_started_and_removed(database: TestDatabase) {
     assert_eq!(fleet.view(&robots[0]).await.generation, Generation(1));
 
     order(TaskOrder::Stop).await;
-    assert_eq!(fleet.desired(&robots[0]).await.expect("state").tasks[0].wanted, Wanted::Stopped);
+    assert_eq!(
+        fleet.desired(&robots[0]).await.expect("state").tasks[0].wanted,
+        TargetState::Stopped
+    );
     assert_eq!(fleet.phases(&id).await, [Phase::Running]);
     fleet.follow(&mut robots[0], Phase::Stopped).await;
     assert_eq!(fleet.phases(&id).await, [Phase::Stopped]);
 
     order(TaskOrder::Start).await;
     let desired = fleet.desired(&robots[0]).await.expect("state").tasks.remove(0);
-    assert_eq!((desired.wanted, desired.run), (Wanted::Running, 2));
+    assert_eq!((desired.wanted, desired.run), (TargetState::Running, 2));
     assert_eq!(fleet.phases(&id).await, [Phase::Assigned]);
     // The stop of the first run is no word on the second.
     fleet.report(&mut robots[0]).await;
@@ -564,7 +567,7 @@ async fn robots_ahead_of_a_restored_database_are_left_alone(database: TestDataba
     let desired = fleet.desired(&robots[0]).await.expect("not withheld any more");
     assert_eq!((desired.generation, desired.tasks[0].run), (Generation(4), 4));
     assert_eq!(desired.tasks[0].package, lost.tasks[0].package);
-    assert_eq!(desired.tasks[0].wanted, Wanted::Stopped);
+    assert_eq!(desired.tasks[0].wanted, TargetState::Stopped);
     assert_eq!(code(fleet.desired(&robots[1]).await), "diverged");
 
     let next = fleet.deploy("4", |order| order.selector = "r1".parse().expect("valid")).await;
@@ -606,7 +609,7 @@ async fn numbers_at_the_end_of_their_range_stop_no_order(database: TestDatabase)
     }
     for robot in &robots {
         let desired = fleet.desired(robot).await.expect("state");
-        assert_eq!((desired.tasks.len(), desired.tasks[0].wanted), (1, Wanted::Running));
+        assert_eq!((desired.tasks.len(), desired.tasks[0].wanted), (1, TargetState::Running));
         assert!(desired.tasks[0].run > 1, "{desired:?}");
     }
 }

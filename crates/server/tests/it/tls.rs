@@ -342,7 +342,7 @@ async fn certificate_change_under_load_drops_no_connection() {
     }
     stop.store(true, Ordering::SeqCst);
     for asking in load {
-        asking.await.expect("nobody was dropped");
+        asking.await.expect("no client was dropped");
     }
 }
 
@@ -594,7 +594,7 @@ async fn silent_socket_and_slow_handshake_time_out() {
             let ended = timeout(PATIENCE, async {
                 tokio::select! {
                     ended = reading.read_to_end(&mut rest) => ended,
-                    () = dribbling => unreachable!("it goes on for ever"),
+                    () = dribbling => unreachable!("the trickle never ends"),
                 }
             });
             // A reset is an end as well.

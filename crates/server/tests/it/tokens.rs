@@ -28,7 +28,7 @@ async fn enrollment_gives_identities_by_mac(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
     let labels = [("site".parse().expect("key"), "lab".parse().expect("value"))].into();
     let token = fleet
-        .enrolment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() })
+        .enrollment_token(CreateEnrollmentToken { uses: Some(2), labels, ..Default::default() })
         .await;
     let one = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     let now_ms = fleet.clock.now_ms();
@@ -59,7 +59,7 @@ async fn enrollment_gives_identities_by_mac(database: TestDatabase) {
 
     // With a token made for one robot, only that robot comes back as itself.
     let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
-    let bound = fleet.enrolment_token(bound).await;
+    let bound = fleet.enrollment_token(bound).await;
     assert_eq!(code(fleet.try_enroll(&bound, mac(9), None).await), "token_for_other_robot");
     assert_eq!(code(fleet.try_enroll(&bound, mac(2), None).await), "mac_known");
     let again = fleet.try_enroll(&bound, mac(1), Some("renamed")).await.expect("enrolls");
@@ -79,7 +79,7 @@ async fn tokens_identify_their_holder_until_they_end(database: TestDatabase) {
         Some(TokenHolder::Person(Person::first(operator.id().parse().expect("an id"))))
     );
     let enrollment = fleet
-        .enrolment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() })
+        .enrollment_token(CreateEnrollmentToken { ttl_s: Some(60), ..Default::default() })
         .await;
     assert_eq!(
         store.tokens().holder(&enrollment, now_ms).await.expect("reads"),
@@ -90,7 +90,7 @@ async fn tokens_identify_their_holder_until_they_end(database: TestDatabase) {
     assert_eq!(store.tokens().holder(&enrollment, now_ms).await.expect("reads"), None);
     assert_eq!(code(fleet.try_enroll(&enrollment, mac(1), None).await), "unauthorized");
     assert_eq!(code(fleet.try_enroll(&operator, mac(1), None).await), "unauthorized");
-    let lasting = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let lasting = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     fleet.actions.expire().await.expect("forgets the one that has ended");
     assert_eq!(
         store.tokens().holder(&lasting, now_ms).await.expect("reads"),
@@ -142,7 +142,7 @@ async fn first_use_of_a_new_token_ends_the_old_one(database: TestDatabase) {
         }
         _ => None,
     };
-    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let token = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let old = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     let (old_number, is_first_use) = admit(&old.token).await.expect("valid");
     assert!(is_first_use && old_number > 0);
@@ -156,7 +156,7 @@ async fn first_use_of_a_new_token_ends_the_old_one(database: TestDatabase) {
         uses: Some(1),
         ..Default::default()
     };
-    let bound = fleet.enrolment_token(bound).await;
+    let bound = fleet.enrollment_token(bound).await;
     let new = fleet.try_enroll(&bound, mac(1), None).await.expect("enrolls");
     assert_eq!(new.robot_id, old.robot_id);
     // Both are good, and the old agent's reports count, until the new one is used.
@@ -201,7 +201,7 @@ async fn first_use_of_a_new_token_ends_the_old_one(database: TestDatabase) {
 
 async fn concurrent_first_uses_count_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
-    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let token = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let robot = fleet.try_enroll(&token, mac(1), None).await.expect("enrolls");
     let mut uses = tokio::task::JoinSet::new();
     for _ in 0..8 {
@@ -222,7 +222,7 @@ async fn concurrent_first_uses_count_once(database: TestDatabase) {
 
 async fn whole_fleet_authenticates_at_once(database: TestDatabase) {
     let fleet = Fleet::new(database).await;
-    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let token = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let mut robots = Vec::new();
     for number in 0..100 {
         robots.push(fleet.try_enroll(&token, mac(number), None).await.expect("enrolls"));
@@ -260,12 +260,12 @@ async fn repeated_enrollment_recovers_a_lost_answer(database: TestDatabase) {
     let store = fleet.database.store.clone();
     let order = || CreateEnrollmentToken { uses: Some(1), ..Default::default() };
     let (token, other) =
-        (fleet.enrolment_token(order()).await, fleet.enrolment_token(order()).await);
+        (fleet.enrollment_token(order()).await, fleet.enrollment_token(order()).await);
     let lost = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     // No other robot is admitted by this: not by another token, and not under another MAC.
     assert_eq!(code(fleet.try_enroll(&other, mac(1), None).await), "mac_known");
     assert_eq!(code(fleet.try_enroll(&token, mac(2), None).await), "unauthorized");
-    fleet.actions.expire().await.expect("forgets what has ended, which this token has not");
+    fleet.actions.expire().await.expect("expired tokens are deleted, this one is valid");
     let again = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("mended");
     assert_eq!((&again.robot_id, &again.name), (&lost.robot_id, &lost.name));
     assert_eq!(robot_of(&store, &lost.token).await, None);
@@ -282,7 +282,7 @@ async fn repeated_enrollment_recovers_a_lost_answer(database: TestDatabase) {
 
     // The same where a robot comes back as itself.
     let bound = CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..order() };
-    let bound = fleet.enrolment_token(bound).await;
+    let bound = fleet.enrollment_token(bound).await;
     let lost = fleet.try_enroll(&bound, mac(1), None).await.expect("enrolls");
     let mended = fleet.try_enroll(&bound, mac(1), None).await.expect("mended");
     assert_eq!(robot_of(&store, &lost.token).await, None);
@@ -299,7 +299,7 @@ async fn repeated_enrollment_recovers_a_lost_answer(database: TestDatabase) {
         .expect("valid");
     assert_eq!(robot_of(&store, &again.token).await, None);
     // A token for many is spent on a robot as soon as that one is in.
-    let many = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let many = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let first = fleet.try_enroll(&many, mac(3), None).await.expect("enrolls");
     let first = fleet.try_enroll(&many, mac(3), None).await.map(|_| first).expect("mended");
     assert_eq!(robot_of(&store, &first.token).await, None);
@@ -310,7 +310,7 @@ async fn revoked_robots_tokens_and_late_reports_are_refused(database: TestDataba
     let fleet = Fleet::new(database).await;
     let store = fleet.database.store.clone();
     let order = || CreateEnrollmentToken { robot: Some("atlas".to_owned()), ..Default::default() };
-    let token = fleet.enrolment_token(CreateEnrollmentToken::default()).await;
+    let token = fleet.enrollment_token(CreateEnrollmentToken::default()).await;
     let came = fleet.try_enroll(&token, mac(1), Some("atlas")).await.expect("enrolls");
     let admitted = store
         .tokens()
@@ -320,7 +320,7 @@ async fn revoked_robots_tokens_and_late_reports_are_refused(database: TestDataba
         .expect("valid");
     let TokenHolder::Robot { token_number, .. } = admitted.holder else { panic!("{admitted:?}") };
     let next = fleet.robots.next_token(&came.robot_id, token_number).await.expect("a token");
-    let before = fleet.enrolment_token(order()).await;
+    let before = fleet.enrollment_token(order()).await;
     let mut robot = Robot::new(came.robot_id.clone());
     fleet.writer.submit(robot.next_report(), token_number).await.expect("stored");
 
@@ -334,7 +334,7 @@ async fn revoked_robots_tokens_and_late_reports_are_refused(database: TestDataba
         panic!("{late:?}")
     };
     assert!(fleet.desired(&robot).await.is_err(), "nothing is signed for it");
-    fleet.actions.expire().await.expect("forgets what has ended, but for these");
+    fleet.actions.expire().await.expect("expired tokens are deleted, except these");
     for token in [&came.token, &next] {
         assert_eq!(
             store
@@ -358,7 +358,7 @@ async fn revoked_robots_tokens_and_late_reports_are_refused(database: TestDataba
     assert_eq!(code(fleet.try_enroll(&before, mac(1), None).await), "unauthorized");
     assert_eq!(store.robots().broker_credentials().await.expect("reads"), []);
 
-    let after = fleet.enrolment_token(order()).await;
+    let after = fleet.enrollment_token(order()).await;
     let back = fleet.try_enroll(&after, mac(1), None).await.expect("enrolls");
     assert_eq!(back.robot_id, came.robot_id);
     for token in [&came.token, &next] {

@@ -53,7 +53,7 @@ async fn pull(server: &TestServer, robot: &TestRobot, blob: Digest) -> (Response
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn two_hundred_robots_pull_eight_at_a_time_and_all_get_it() {
+async fn two_hundred_robots_pull_eight_at_a_time_and_all_succeed() {
     let directory = TempDir::new().expect("a directory");
     let limit = |config: &mut taskd::config::Config| config.transfers.all.max = Some(LIMIT as u64);
     let server = Arc::new(TestServer::start_in(directory, limit).await);
@@ -86,7 +86,7 @@ async fn two_hundred_robots_pull_eight_at_a_time_and_all_get_it() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn who_waits_is_told_when_to_come_back_and_only_robots_wait() {
+async fn waiting_robot_is_told_when_to_return_and_nothing_else_waits() {
     let directory = TempDir::new().expect("a directory");
     let server = TestServer::start_in(directory, |config| config.transfers.all.max = Some(1)).await;
     let package = server.push_content("talker", "1.0.0", archive_of(BLOB_BYTES, 7)).await;

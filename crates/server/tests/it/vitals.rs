@@ -93,7 +93,7 @@ async fn vitals_are_requested_from_the_robot() {
     assert_eq!(
         (vitals.at_ms, vitals.cpu_percent),
         (NOW_MS, Some(100.0)),
-        "by our clock, and what can be"
+        "by our clock, within its bounds"
     );
     assert_eq!(server.robot(&robot).await.vitals, Some(vitals));
 }

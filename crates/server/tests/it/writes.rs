@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use futures_util::future::join_all;
 use proptest::prelude::*;
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Phase, TaskReport};
 use task_proto::{Generation, RobotId};
 use taskd::domain::deployment::AssignmentState;
@@ -159,7 +159,7 @@ enum Answered {
 struct Stored {
     generation: Generation,
     last_report: (u64, u64),
-    wanted: Wanted,
+    wanted: TargetState,
     state: AssignmentState,
 }
 
@@ -167,13 +167,13 @@ impl Stored {
     fn order(&mut self, order: TaskOrder) {
         let is_restarted = match order {
             TaskOrder::Restart => true,
-            TaskOrder::Start => self.wanted == Wanted::Stopped || self.state.phase.is_final(),
+            TaskOrder::Start => self.wanted == TargetState::Stopped || self.state.phase.is_final(),
             TaskOrder::Stop | TaskOrder::Remove => false,
         };
         if is_restarted {
-            (self.wanted, self.state) = (Wanted::Running, assigned(self.state.run + 1));
-        } else if order == TaskOrder::Stop && self.wanted == Wanted::Running {
-            self.wanted = Wanted::Stopped;
+            (self.wanted, self.state) = (TargetState::Running, assigned(self.state.run + 1));
+        } else if order == TaskOrder::Stop && self.wanted == TargetState::Running {
+            self.wanted = TargetState::Stopped;
         } else {
             return;
         }
@@ -188,7 +188,7 @@ impl Stored {
     }
 
     /// The columns that a robot's view shows.
-    fn shown(&self) -> (Generation, (u64, u64), Wanted, u64, Phase) {
+    fn shown(&self) -> (Generation, (u64, u64), TargetState, u64, Phase) {
         (self.generation, self.last_report, self.wanted, self.state.run, self.state.phase)
     }
 }
@@ -243,7 +243,7 @@ impl Compared {
         let stored = Stored {
             generation: Generation(1),
             last_report: (0, 0),
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             state: assigned(1),
         };
         Self { fleet, robots, stored: [stored.clone(), stored] }

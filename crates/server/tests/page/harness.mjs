@@ -297,7 +297,7 @@ export async function ros(t) {
   assert.ok(
     home,
     'TASKD_TEST_ROS is not set: run ./scripts/test, ' +
-      'or set it to what `scripts/need ros` prints, without /bin/python',
+      'or set it to the path that `scripts/need ros` prints, without /bin/activate',
   );
   // A port that no participant of the domain uses is the lock: 7400 + 250 n + 249 would be the
   // 120th participant's.

@@ -35,7 +35,7 @@ const [LEFT, RIGHT] = [
 ];
 const [COLUMNS, ROWS] = [80, 30];
 const FRAMES_PER_S = 10;
-/** What took longer, on a busy machine, is played faster. */
+/** A longer recording, as on a busy machine, is played faster. */
 const MAX_DURATION_S = 20;
 const COLOURS = 128;
 const KEY_MS = 35;
@@ -103,7 +103,7 @@ async function story() {
   develop(films, place);
 }
 
-/** The example package with a voice, and with a log of what it says. */
+/** The example package, with a log of its messages. */
 function talker(place) {
   const path = join(place, 'talker');
   cpSync(join(root, 'examples/talker'), path, { recursive: true });
@@ -192,7 +192,7 @@ class Terminal {
   }
 }
 
-/** What a page looked like from its start to its end. */
+/** The pictures of a page from its start to its end. */
 class Film {
   frames = [];
 

@@ -155,7 +155,9 @@ fn read_header(
     };
     let is_masked = second & MASKED != 0;
     if is_masked != (role == Role::Server) {
-        return Err(Violation::new("clients mask what they send, servers do not"));
+        return Err(Violation::new(
+            "the masking is wrong: clients mask their frames, servers do not",
+        ));
     }
     let short = second & !MASKED;
     let length_bytes = match short {
@@ -317,7 +319,7 @@ mod tests {
         input.extend_from_slice(&[0x82, 0x7f, 0x7f, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff]);
         for _ in 0..1000 {
             input.extend_from_slice(&[7; 1000]);
-            let piece = decoder.decode(&mut input).expect("a frame").expect("what there is");
+            let piece = decoder.decode(&mut input).expect("a frame").expect("a piece");
             assert_eq!(piece, Piece::Data([7; 1000][..].into()));
             assert!(input.is_empty());
         }

@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn a_note_about_another_size_or_cut_off_is_none() {
+    fn part_map_of_another_size_or_truncated_is_ignored() {
         let map = PartMap::new(PartLayout::new(100 * PART, PART as u32).expect("a cut"), 30 * PART);
         let note = map.note();
         assert!(PartMap::of_note(&note, 400 * PART).is_none());

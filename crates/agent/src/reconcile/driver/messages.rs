@@ -51,7 +51,7 @@ impl<E: Effects> Driver<E> {
             }
             ServerMessage::StateUnavailable { code, text } => {
                 if self.state_unavailable.as_ref().is_none_or(|known| known.code != code) {
-                    tracing::info!(code, text, "the server sent no state");
+                    tracing::info!(code, text, "the server refused to send the desired state");
                 }
                 self.state_unavailable = Some(Condition { code, text });
             }

@@ -6,7 +6,7 @@ mod hanging;
 mod removed;
 
 use task_proto::api::ReportReply;
-use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, Wanted};
+use task_proto::desired::{BlobRef, Delivery, Inline, PackageRef, TargetState};
 use task_proto::messages::part::PartRange;
 use task_proto::messages::report::{Failure, FailureCode, Phase, Report};
 use task_proto::trust::envelope::{DESIRED_STATE_TYPE, Envelope, SigningKey};
@@ -29,7 +29,7 @@ fn order(version: &str) -> DesiredTask {
         task: name.clone(),
         deployment: DeploymentId::random(),
         package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-        wanted: Wanted::Running,
+        wanted: TargetState::Running,
         run: 1,
         delivery: Delivery::PushPull,
         priority: 0,
@@ -131,7 +131,7 @@ fn has(report: &Report, code: &str) -> bool {
 }
 
 #[tokio::test]
-async fn an_order_runs_and_its_withdrawal_removes_it() {
+async fn order_runs_and_its_withdrawal_removes_it() {
     let bench = Bench::new().await;
     bench.order(1, vec![order("1.0")]).await;
     let report = bench.phase(Phase::Running).await;
@@ -222,7 +222,7 @@ async fn staged_version_waits_after_its_publisher_list_expires() {
 }
 
 #[tokio::test]
-async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
+async fn cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     let bench = Bench::new().await;
     let old = order("1.0");
     let fake = bench.fake.clone();
@@ -246,7 +246,7 @@ async fn a_cancel_interrupts_a_pull_and_leaves_the_old_version_running() {
     bench.end().await;
     let kept = fake.state(|state| state.kept_parts.clone());
     assert!(kept.iter().any(|kept| *kept == [order("2.0").package.content.digest]), "{kept:?}");
-    assert_eq!(kept.last(), Some(&vec![]), "what was gathered of 2.0 is deleted, and 1.0 is there");
+    assert_eq!(kept.last(), Some(&vec![]), "the bytes of 2.0 are deleted, and 1.0 is there");
 }
 
 fn missing(since_ms: u64) -> Health {
@@ -284,7 +284,7 @@ async fn ros_health_makes_a_task_ready_degraded_and_recovered() {
 }
 
 #[tokio::test]
-async fn the_old_version_comes_back_when_the_new_one_does_not_get_ready() {
+async fn old_version_comes_back_when_the_new_one_does_not_get_ready() {
     let bench = Bench::new().await;
     let (old, new) = (order("1.0"), order("2.0"));
     bench.order(1, vec![old.clone()]).await;
@@ -327,7 +327,7 @@ async fn gate_is_asked_before_a_start_and_its_reason_is_reported() {
     bench.fake.state(|state| state.gate = Some(Ok(())));
     bench.phase(Phase::Running).await;
     bench.fake.state(|state| state.gate = Some(Err("busy".to_owned())));
-    bench.order(2, vec![DesiredTask { wanted: Wanted::Stopped, ..order }]).await;
+    bench.order(2, vec![DesiredTask { wanted: TargetState::Stopped, ..order }]).await;
     let report = bench.phase(Phase::Deferred).await;
     assert!(report.tasks[0].active.is_some(), "it runs on");
     bench.fake.state(|state| state.gate = None);
@@ -378,7 +378,7 @@ async fn job_succeeds_after_its_outputs_are_uploaded() {
 }
 
 #[tokio::test]
-async fn a_refused_state_is_named_and_the_old_one_stays() {
+async fn refused_state_is_named_and_the_old_one_stays() {
     let bench = Bench::new().await;
     bench.order(5, vec![order("1.0")]).await;
     bench.phase(Phase::Running).await;
@@ -481,11 +481,7 @@ async fn unwritable_ledger_does_not_block_stops_and_removals() {
     bench.order(3, Vec::new()).await;
     let report = bench.report(|report| report.tasks.is_empty()).await;
     assert!(has(&report, "ledger_unwritable") && bench.fake.state(|state| state.alive.is_empty()));
-    assert_eq!(
-        report.observed_generation,
-        Generation(2),
-        "what a power cut would take was not observed"
-    );
+    assert_eq!(report.observed_generation, Generation(2), "unsynced files were not observed");
     bench.fake.state(|state| state.disk_full = false);
     bench.report(|report| report.observed_generation == Generation(3)).await;
 }

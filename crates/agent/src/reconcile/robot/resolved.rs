@@ -94,9 +94,9 @@ impl Robot {
             .as_ref()
             .map(|e| (e.own.join(", "), e.refused.join(", ")))
             .unwrap_or_default();
-        tracing::info!(own, "settings from the server");
+        tracing::info!(own, "settings from the server in effect");
         if !refused.is_empty() {
-            tracing::warn!(refused, "settings from the server that are not taken");
+            tracing::warn!(refused, "settings from the server are refused");
         }
         self.fetcher.limit(&resolved.config.limits);
         self.graph.limit(resolved.config.limits.log_bytes);

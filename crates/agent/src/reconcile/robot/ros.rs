@@ -182,7 +182,7 @@ mod tests {
         robot.adopt(&stays);
         assert!(
             robot.installations()[0].packages.is_some(),
-            "what was seen of the same files is still true"
+            "the observation of unchanged files is still valid"
         );
         robot.adopt(&RobotSettings {
             underlays: Some(vec![own.to_str().expect("text").parse().expect("valid")]),

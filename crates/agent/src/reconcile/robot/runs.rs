@@ -72,7 +72,7 @@ mod tests {
     use std::collections::BTreeMap;
     use std::os::unix::process::ExitStatusExt as _;
 
-    use task_proto::desired::{BlobRef, DesiredTask, PackageRef, Wanted};
+    use task_proto::desired::{BlobRef, DesiredTask, PackageRef, TargetState};
     use task_proto::packages::manifest::TaskManifest;
     use task_proto::{DeploymentId, Digest};
 
@@ -98,7 +98,7 @@ mod tests {
             task: name.clone(),
             deployment: DeploymentId::random(),
             package: PackageRef { name, version, manifest: blob, config: blob, content: blob },
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run: 1,
             delivery: Default::default(),
             priority: 0,

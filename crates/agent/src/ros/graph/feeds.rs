@@ -340,7 +340,7 @@ mod tests {
     }
 
     #[test]
-    fn a_logger_is_its_nodes() {
+    fn logger_belongs_to_its_node() {
         let mut snapshot = Snapshot::empty(std::time::Instant::now());
         let participant = ParticipantId([1; 12]);
         for name in ["/robot/talker", "/robot/talker/inner", "/other"] {

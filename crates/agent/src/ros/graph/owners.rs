@@ -274,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn the_port_decides_only_on_this_host() {
+    fn port_identifies_the_owner_only_on_this_host() {
         for (locators, complete, expected) in [
             (&["192.168.1.5:7411"][..], true, Some(true)),
             (&["192.168.1.5:7411", "172.17.0.1:7411"], true, Some(true)),
@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_of_this_process_is_found() {
+    fn socket_of_this_process_is_found() {
         let socket = UdpSocket::bind("127.0.0.1:0").expect("socket");
         let address = socket.local_addr().expect("address").to_string();
         let id = ParticipantId([1; 12]);

@@ -127,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_rate_is_that_of_the_window() {
+    fn rate_is_measured_over_the_window() {
         let start = Instant::now();
         let at = |ms| start + Duration::from_millis(ms);
         let mut arrivals = Arrivals::since(start);

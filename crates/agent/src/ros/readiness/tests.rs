@@ -281,7 +281,7 @@ fn undeclared_parameter_is_rejected_after_a_timeout() {
 const RETRY_INTERVAL_MS: u64 = 500;
 
 #[test]
-fn a_failed_transition_is_named_with_the_state_it_led_to() {
+fn failed_transition_is_named_with_the_state_it_led_to() {
     let mut scenario = Scenario::managed(LifecycleState::Inactive);
     scenario.answer(&RequestKind::Transition(Transition::Activate), Answer::Transition(false));
     scenario.answer(&RequestKind::State, Answer::State(LifecycleState::Unconfigured));
@@ -321,7 +321,7 @@ fn lost_transition_answer_leads_to_a_state_query() {
 }
 
 #[test]
-fn a_service_counts_once_its_node_answers() {
+fn service_counts_once_its_node_answers() {
     let promise = Promise { services: names(&["/say"]), ..Promise::default() };
     let mut scenario = Scenario::new(promise, false);
     assert_eq!(missing(&scenario.after(0)).what, "the service `/say` was not offered");

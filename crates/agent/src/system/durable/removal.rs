@@ -113,7 +113,7 @@ mod tests {
     const DEPTH: usize = 20_000;
 
     #[test]
-    fn a_tree_deeper_than_any_path_is_removed() {
+    fn tree_deeper_than_any_path_is_removed() {
         let temp = tempfile::tempdir().expect("a directory");
         let tree = temp.path().join("tree");
         let outside = temp.path().join("outside");

@@ -1,8 +1,8 @@
-//! What the ledger holds of one task: its order, its runs, and what is still to be done. Answers
-//! questions about the record and makes room in it; the plan decides what happens.
+//! The ledger's record of one task: its order, its runs, and its pending work. Answers questions
+//! about the record and makes room in it; it never decides on a step, which the plan does.
 
 use serde::{Deserialize, Serialize};
-use task_proto::desired::{Delivery, DesiredTask, PackageRef, Wanted};
+use task_proto::desired::{Delivery, DesiredTask, PackageRef, TargetState};
 use task_proto::messages::report::{Failure, FailureCode, Phase};
 use task_proto::packages::manifest::TaskKind;
 use task_proto::{DeploymentId, Digest, TaskName};
@@ -139,7 +139,7 @@ impl TaskRecord {
             task,
             deployment: run.deployment.clone(),
             package: run.package.clone(),
-            wanted: Wanted::Running,
+            wanted: TargetState::Running,
             run: run.run,
             delivery: Delivery::default(),
             priority: 0,
@@ -205,7 +205,7 @@ impl TaskRecord {
     /// The phase of the order, and the failure behind it.
     pub fn order_phase(&self) -> (Phase, Option<&Failure>) {
         let active = self.active.as_ref().filter(|active| active.is_for(&self.order));
-        if self.order.wanted == Wanted::Stopped
+        if self.order.wanted == TargetState::Stopped
             && self.active.as_ref().is_none_or(|active| active.process().is_none())
         {
             return (Phase::Stopped, None);

@@ -7,7 +7,7 @@
 //! restart of a process that ended by itself, nor before a stop of a failed process: the robot has
 //! admitted the run, and half of a run does not help the robot.
 
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 
 use super::{Lane, Next, Outcome, PlanInput, Step, StepFailure, change, takes_over};
 use crate::task::ledger::{GateAnswer, GateQuestion, GateRecord, GateStep};
@@ -87,7 +87,7 @@ fn question(s: &PlanInput<'_>) -> Option<GateQuestion> {
         if active.pending_stop().is_some() || !matches!(s.process, ProcessState::Alive { .. }) {
             return None;
         }
-        return match s.desired.is_some_and(|task| task.wanted == Wanted::Running) {
+        return match s.desired.is_some_and(|task| task.wanted == TargetState::Running) {
             false => question_for_active(GateStep::Stop),
             true => takes_over.then(|| question_for_order(GateStep::Switch)),
         };
@@ -106,7 +106,7 @@ fn question(s: &PlanInput<'_>) -> Option<GateQuestion> {
     let starts =
         |active: &&ActiveRun| active.is_waiting() && !active.is_admitted() && !s.permissions.held;
     active.filter(starts)?;
-    (order.wanted == Wanted::Running && s.desired.is_some())
+    (order.wanted == TargetState::Running && s.desired.is_some())
         .then(|| question_for_active(GateStep::Start))?
 }
 

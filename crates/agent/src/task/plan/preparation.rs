@@ -1,7 +1,7 @@
 //! Prepares the ordered version: checked, fetched, unpacked, built, staged. Once the order is over,
 //! prepares the version of another run whose files were changed. Pure, like the plan.
 
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Failure, FailureCode, Phase};
 use task_proto::packages::manifest::TaskKind;
 
@@ -22,7 +22,7 @@ pub fn prepare(s: &PlanInput<'_>) -> Next {
     let restores = s.record.run_to_restore().is_some();
     let (package, preparation) = s.record.to_prepare();
     if s.desired != Some(order)
-        || order.wanted == Wanted::Stopped
+        || order.wanted == TargetState::Stopped
         || !(restores || order_needs_files(s))
         || preparation.phase.is_final()
         || !s.permissions.may_begin
@@ -63,7 +63,7 @@ pub fn prepare(s: &PlanInput<'_>) -> Next {
         return enter_phase(s, Phase::Unmet, Some(failure));
     }
     if !s.prepared.content {
-        // The server pushes only what it has ordered.
+        // The server pushes only ordered packages.
         let is_pushed = order.delivery.is_pushed() && !restores;
         return Next::Act(Step::PullContent { package: package.clone(), is_pushed });
     }

@@ -1,4 +1,4 @@
-//! What the start, the stop and the end of a process mean for the task's record: the run continues,
+//! The effects of a process's start, stop and end on the task's record: the run continues,
 //! is over, or gives way to the run that it replaced. Pure, like the plan.
 
 use task_proto::messages::report::{Failure, FailureCode, Phase};

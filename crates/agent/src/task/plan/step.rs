@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use task_proto::desired::{DesiredTask, PackageRef, Wanted};
+use task_proto::desired::{DesiredTask, PackageRef, TargetState};
 use task_proto::messages::report::Failure;
 use task_proto::{Digest, TaskName};
 
@@ -158,7 +158,7 @@ impl Step {
                     Self::PullContent { is_pushed, .. } => *is_pushed == pushes,
                     _ => true,
                 };
-                task.wanted == Wanted::Running && package == wanted && by_same_way
+                task.wanted == TargetState::Running && package == wanted && by_same_way
             });
         }
         match self {

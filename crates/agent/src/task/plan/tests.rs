@@ -60,8 +60,8 @@ proptest! {
                 let written = serde_json::to_value(record).expect("json");
                 prop_assert_eq!(&serde_json::json!(phase), &written["phase"]);
                 match order.wanted {
-                    Wanted::Stopped => prop_assert!(world.alive.is_empty() && phase == Phase::Stopped),
-                    Wanted::Running => {
+                    TargetState::Stopped => prop_assert!(world.alive.is_empty() && phase == Phase::Stopped),
+                    TargetState::Running => {
                         let active = record.active.as_ref().filter(|active| active.is_for(order));
                         let runs = active.is_some_and(|active| active.process().is_some()) && world.alive.len() == 1;
                         prop_assert!(runs == (phase == Phase::Running), "{phase} {active:?} {:?}", world.alive);
@@ -103,7 +103,7 @@ fn phase(world: &World) -> Phase {
 }
 
 #[test]
-fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
+fn old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
     let mut world = running(Run::default());
     let old = world.alive.clone();
     world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
@@ -115,7 +115,7 @@ fn the_old_version_runs_until_the_new_one_is_staged_and_after_a_cancel() {
 }
 
 #[test]
-fn the_old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
+fn old_version_comes_back_after_a_reboot_while_the_new_one_is_pulled() {
     let mut world = running(Run::default());
     world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     world.apply(WorldEvent::Reboot);
@@ -250,7 +250,7 @@ fn outputs_of_a_run_replaced_before_ready_are_uploaded() {
 }
 
 #[test]
-fn a_service_that_never_gets_ready_fails_with_its_exit_code() {
+fn service_that_never_gets_ready_fails_with_its_exit_code() {
     let mut world = World::new(Run::default());
     world.apply(WorldEvent::Order { deployment: 1, run: 1, stop: false });
     for _ in 0..200 {
@@ -278,7 +278,7 @@ fn bad_switch(world: &mut World) -> String {
 }
 
 #[test]
-fn a_version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() {
+fn version_that_does_not_get_ready_is_stopped_and_the_old_one_started_again() {
     let mut world = running(Run::default());
     bad_switch(&mut world);
     assert_eq!(phase(&world), Phase::Starting);
@@ -329,7 +329,7 @@ fn restored_run_continues_when_ordered_again() {
 }
 
 #[test]
-fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
+fn rollback_survives_a_power_cut_before_and_after_every_step() {
     for cut in 0..12 {
         let mut world = running(Run::default());
         bad_switch(&mut world);
@@ -350,7 +350,7 @@ fn a_rollback_survives_a_power_cut_before_and_after_every_step() {
 }
 
 #[test]
-fn when_the_old_version_fails_after_it_came_back_the_order_has_failed() {
+fn order_fails_when_the_restored_version_fails() {
     let mut world = running(Run::default());
     bad_switch(&mut world);
     for _ in 0..10_000 {
@@ -386,7 +386,7 @@ fn stopped_run_does_not_come_back() {
 }
 
 #[test]
-fn a_first_version_and_a_job_that_do_not_get_ready_have_failed() {
+fn first_version_and_a_job_that_do_not_get_ready_have_failed() {
     let mut world = World::new(Run::default());
     bad_order(&mut world);
     assert_eq!((phase(&world), world.alive.len()), (Phase::Failed, 0));
@@ -403,7 +403,7 @@ fn bad_order(world: &mut World) {
 }
 
 #[test]
-fn a_task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
+fn task_that_stays_degraded_is_started_again_unless_its_policy_is_never() {
     for (restart, again) in
         [(Restart::OnFailure, true), (Restart::Always, true), (Restart::Never, false)]
     {
@@ -490,7 +490,7 @@ fn job_is_stopped_at_its_deadline() {
 }
 
 #[test]
-fn the_gate_allows_a_switch_as_a_whole() {
+fn gate_allows_a_switch_as_a_whole() {
     let mut world = running(Run::default());
     world.gated = true;
     let old = world.alive.clone();
@@ -540,7 +540,7 @@ fn stop_refused_by_the_gate_waits_under_supervision() {
     world.apply(WorldEvent::Wait { ms: 30_000 });
     assert!(
         world.steps.iter().any(|(step, _)| matches!(step, Step::Stop(_))),
-        "what failed is stopped unasked"
+        "a failed run is stopped without an order"
     );
     world.settle();
     assert_eq!((phase(&world), world.alive.len()), (Phase::Stopped, 0));
@@ -559,7 +559,7 @@ fn on_boot_hold_leaves_a_service_down_after_a_reboot() {
 
 #[test]
 fn every_step_of_the_run_lane_has_a_deadline() {
-    let order = order(1, 1, 1, Wanted::Running);
+    let order = order(1, 1, 1, TargetState::Running);
     let stop_timeout_s = 3600;
     let run = ActiveRun::of(
         &order,

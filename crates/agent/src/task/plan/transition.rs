@@ -1,7 +1,7 @@
 //! The changes of a record by a new order, and by the beginning and the end of a step. Pure, like
 //! the plan.
 
-use task_proto::desired::{DesiredTask, Wanted};
+use task_proto::desired::{DesiredTask, TargetState};
 use task_proto::packages::manifest::TaskKind;
 
 use super::{MAX_STEP_BACKOFF_MS, Outcome, Step, gate, preparation, process, upload};
@@ -11,7 +11,7 @@ use crate::task::timing::Moment;
 /// Puts the record under a new order. A live run continues until the new version takes over.
 pub(super) fn adopt_order(record: &mut TaskRecord, order: &DesiredTask, now_ms: u64) {
     let is_down = record.active.as_ref().is_none_or(|active| active.process().is_none());
-    if record.order.wanted == Wanted::Stopped && is_down {
+    if record.order.wanted == TargetState::Stopped && is_down {
         let fallback = record.fallback.clone();
         record.discard_stopped_run(order, now_ms);
         upload::queue_if_replaced(record, fallback, now_ms);

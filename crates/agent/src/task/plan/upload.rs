@@ -3,7 +3,7 @@
 //! The ledger records the end of a run before its files are uploaded, so a job never runs again for
 //! the sake of its files. A job's end is reported once its files are uploaded or given up.
 
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Failure, FailureCode};
 use task_proto::packages::manifest::TaskKind;
 
@@ -47,7 +47,7 @@ pub(super) fn blocks_start(record: &TaskRecord, run: &ActiveRun) -> bool {
 pub(super) fn queue_if_over(record: &mut TaskRecord, run: &ActiveRun, now_ms: u64) {
     let goes_on =
         record.active.as_ref().is_some_and(|active| active.is_same(run) && active.end().is_none());
-    let stopped = record.order.wanted == Wanted::Stopped;
+    let stopped = record.order.wanted == TargetState::Stopped;
     // A replaced run may come back; it is over once the new run is ready.
     if !goes_on || stopped {
         queue(record, run, now_ms);

@@ -237,7 +237,7 @@ mod tests {
         assert_eq!(
             serde_json::from_str::<String>(&line).unwrap(),
             text,
-            "programs read what was meant"
+            "programs read the exact value"
         );
     }
 }

@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_choice_and_its_mechanism_are_the_same_word() {
+    fn choice_and_mechanism_have_the_same_name() {
         for (word, mechanism) in [
             ("adaptive", None),
             ("push-pull", Some(Delivery::PushPull)),

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use super::DeliveryDecision;
 use crate::DeploymentId;
-use crate::desired::{PackageRef, Wanted};
+use crate::desired::{PackageRef, TargetState};
 use crate::messages::report::{Failure, Phase, Progress};
 use crate::packages::manifest::TaskKind;
 
@@ -52,7 +52,7 @@ pub struct PastAssignment {
     /// Whether the task should be running or stopped now, if the assignment is part of the robot's
     /// desired state; absent: no longer, or not yet.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub wanted: Option<Wanted>,
+    pub wanted: Option<TargetState>,
     /// The current or last phase.
     pub phase: Phase,
     /// Progress within the phase.

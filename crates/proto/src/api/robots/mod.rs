@@ -13,7 +13,7 @@ pub use self::enrollment::{
 };
 pub use self::logs::{LogEvent, LogsFrom, LogsQuery, LogsView};
 use super::{DeliveryDecision, MqttConnection};
-use crate::desired::Wanted;
+use crate::desired::TargetState;
 use crate::desired::settings::{EffectiveSettings, RobotSettings};
 use crate::ids::Labels;
 use crate::messages::report::{
@@ -101,7 +101,7 @@ pub struct RobotTask {
     /// The deployment that ordered the task.
     pub deployment: DeploymentId,
     /// Whether the task should run.
-    pub wanted: Wanted,
+    pub wanted: TargetState,
     /// Number of times the task was asked to start.
     pub run: u64,
     /// How the package's bytes travel, and the reason for that choice.

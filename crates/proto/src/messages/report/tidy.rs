@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_failure_from_a_robot_is_cleaned() {
+    fn failure_from_a_robot_is_cleaned() {
         let mut report: Report =
             serde_json::from_str(include_str!("../../../tests/golden/report.json"))
                 .expect("a report");

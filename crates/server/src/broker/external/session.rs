@@ -83,7 +83,7 @@ impl SessionEnd {
             }
             Self::NoEcho => {
                 format!(
-                    "{broker} does not pass on what the server publishes: it needs the ACL of `taskd broker acl`"
+                    "{broker} does not forward the messages of the server: it needs the ACL of `taskd broker acl`"
                 )
             }
             Self::Lost(ConnectionError::Io(error)) => format!("{broker} can't be reached: {error}"),

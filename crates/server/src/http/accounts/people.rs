@@ -34,14 +34,14 @@ pub(in crate::http) async fn me(by: Person) -> Json<Me> {
     Json(Me { name, roles, permissions, scope: scope.selectors().to_vec(), token })
 }
 
-/// Lists the users.
+/// Lists all users, with their roles.
 #[operation(tag = "people")]
 pub(in crate::http) async fn users(State(store): State<Store>) -> Result<Json<UserList>, ApiError> {
     let users = store.users().list().await?;
     Ok(Json(UserList { users: users.into_iter().map(crate::store::User::view).collect() }))
 }
 
-/// Adds a user.
+/// Adds a user with roles.
 #[operation(tag = "people",
     responses((status = 409, description = "`user_exists`: the name is taken.")))]
 pub(in crate::http) async fn add_user(
@@ -159,7 +159,7 @@ pub(in crate::http) async fn create_token(
     Ok(Created(people.create_token(&by, &order).await?))
 }
 
-/// Revokes a token.
+/// Revokes an access token.
 #[operation(tag = "people")]
 pub(in crate::http) async fn revoke_token(
     State(people): State<PersonActions>,

@@ -38,7 +38,7 @@ pub struct PageCookies {
 }
 
 impl PageCookies {
-    /// The `Set-Cookie` header.
+    /// The value of a `Set-Cookie` header.
     pub(super) fn set(self, name: &str, value: &str, attributes: &str, max_age_s: u64) -> String {
         let secure = if self.is_secure { "; Secure" } else { "" };
         format!("{name}={value}; {attributes}; Max-Age={max_age_s}{secure}")

@@ -96,7 +96,7 @@ impl Caller {
             Self::Anyone => None,
             Self::Person(person) => Some(Holder::Person(person.name.clone())),
             Self::Robot(robot) => Some(Holder::Robot(robot.clone())),
-            Self::Enrollment(token) => Some(Holder::Enrolment(token.id())),
+            Self::Enrollment(token) => Some(Holder::Enrollment(token.id())),
         }
     }
 

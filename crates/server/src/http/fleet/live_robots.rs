@@ -1,5 +1,6 @@
-//! The robots as they are now: presence, connections, questions, log lines, vitals and
-//! signed states, all in memory. Changes are announced; nothing is stored.
+//! The robots as they are now: presence, connections, questions, log lines, vitals and signed
+//! states, all in memory. Closes the sessions of a revoked or removed robot. Changes are announced;
+//! nothing is stored.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -120,7 +121,7 @@ impl LiveRobots {
         self.desired_states.forget(robot);
     }
 
-    /// Ends a robot's session and its requests. Its tokens have ended before.
+    /// Closes a robot's MQTT session and its HTTP connections. Its tokens have ended before.
     fn disconnect(&self, robot: &RobotId) {
         self.broker.disconnect(robot);
         self.http_connections.end(robot);

@@ -86,7 +86,7 @@ async fn listed(views: &Views, by: &Person, query: &ListQuery) -> Result<RobotLi
     Ok(RobotList { robots, unknown, next, total })
 }
 
-/// Shows one robot.
+/// Shows one robot with its tasks.
 #[operation(tag = "robots")]
 pub(in crate::http) async fn show(
     State(store): State<Store>,

@@ -130,7 +130,7 @@ pub(in crate::http) async fn create(
     Ok((StatusCode::CREATED, Json(views.deployment(&by, &id, false).await?)).into_response())
 }
 
-/// Cancels a deployment.
+/// Cancels a deployment on its remaining robots.
 #[operation(tag = "deployments",
     responses((status = 409, description = "`nothing_to_cancel`: the deployment has ended on all of its robots.")))]
 pub(in crate::http) async fn cancel(

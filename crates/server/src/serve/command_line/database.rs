@@ -11,9 +11,9 @@ use crate::store::{CopyError, copy_database};
 pub enum DatabaseCommand {
     /// Copy all rows to an empty database, from SQLite to Postgres or back
     ///
-    /// No server may use one of the two. Nothing is visible in TO before everything is copied and
-    /// compared; after an interruption run the command again. A password of Postgres is read from
-    /// PGPASSWORD or ~/.pgpass.
+    /// Stop the servers of both databases first. TO stays empty until all rows are copied and
+    /// compared; after an interruption, run the command again. The password for Postgres is read
+    /// from PGPASSWORD or ~/.pgpass.
     Copy {
         /// URL of the database to copy: sqlite:/DIR/taskd.sqlite or postgres://USER@HOST/NAME
         from: String,

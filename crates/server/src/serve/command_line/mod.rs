@@ -31,7 +31,7 @@ pub struct CommandLine {
 pub enum Command {
     /// Run the server
     Serve(ServeFlags),
-    /// One of the operator's commands.
+    /// One of the operator's commands, of the crate `cli`.
     #[command(flatten)]
     Operator(task_cli::Command),
     /// Copy the database of a stopped server
@@ -67,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_command_line_is_consistent() {
+    fn command_line_is_consistent() {
         CommandLine::describe().debug_assert();
     }
 

@@ -87,7 +87,7 @@ pub enum CopyError {
         table: String,
         source: Error,
     },
-    /// The comparison failed.
+    /// The comparison of source and copy failed.
     #[error("the copy of table {table} differs from its source, so nothing was copied")]
     Different { table: String },
 }

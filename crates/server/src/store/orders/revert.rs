@@ -5,7 +5,7 @@
 use std::collections::BTreeSet;
 
 use sqlx::{AssertSqlSafe, Row as _};
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Failure, Phase, Report};
 use task_proto::{DeploymentId, RobotId};
 
@@ -25,7 +25,7 @@ pub struct Revocable {
     /// The deployment that this one replaced, which becomes desired again.
     pub previous: Option<DeploymentId>,
     desired: bool,
-    wanted: Wanted,
+    wanted: TargetState,
     retained: Option<RetainedTask>,
 }
 
@@ -33,7 +33,7 @@ pub struct Revocable {
 #[derive(Debug, Clone)]
 struct RetainedTask {
     run: u64,
-    wanted: Wanted,
+    wanted: TargetState,
     /// `None`: the phase in which the assignment ends.
     phase: Option<Phase>,
     failure: Option<Failure>,
@@ -123,7 +123,9 @@ impl Assignments<&mut Transaction> {
         )
         .await?;
         // A task that was stopped since stays stopped, whatever version of it comes back.
-        for (wanted, stop) in [(Wanted::Running, ""), (Wanted::Stopped, "wanted = 'stopped', ")] {
+        for (wanted, stop) in
+            [(TargetState::Running, ""), (TargetState::Stopped, "wanted = 'stopped', ")]
+        {
             // The robot's next report gives the phase of the restored assignment; $2 is the phase
             // until then.
             let revive = format!(
@@ -322,6 +324,6 @@ fn as_reported(
             failure: task.failure,
             needs_notice: true,
         },
-        _ => RetainedTask { wanted: Wanted::Stopped, needs_notice: true, ..ordered },
+        _ => RetainedTask { wanted: TargetState::Stopped, needs_notice: true, ..ordered },
     }
 }

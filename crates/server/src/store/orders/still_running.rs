@@ -3,7 +3,7 @@
 //! becomes the desired one again, so that the robot starts nothing anew.
 
 use sqlx::Row as _;
-use task_proto::desired::Wanted;
+use task_proto::desired::TargetState;
 use task_proto::messages::report::{Phase, Report};
 use task_proto::{DeploymentId, RobotId, TaskName};
 
@@ -107,7 +107,8 @@ impl Assignments<&mut Transaction> {
             let report: Report = from_json("robots.report", row.try_get("report")?)?;
             let runs = report.tasks.iter().any(|task_report| {
                 let brought = task_report.active.as_ref().map(|active| &active.deployment);
-                let is_over = task_report.wanted == Wanted::Running && task_report.phase.is_final();
+                let is_over =
+                    task_report.wanted == TargetState::Running && task_report.phase.is_final();
                 task_report.task == *task
                     && task_report.deployment == one.failed
                     && is_over

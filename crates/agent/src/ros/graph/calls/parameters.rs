@@ -184,7 +184,7 @@ impl ParameterValue {
     pub fn fitting(self, current: &Self) -> Self {
         #[expect(
             clippy::cast_precision_loss,
-            reason = "whoever writes such a number for a double means about that"
+            reason = "an integer of this size stands for an approximate double"
         )]
         let double = |integer: i64| integer as f64;
         match (self, current) {
@@ -335,7 +335,7 @@ mod tests {
     }
 
     #[test]
-    fn a_value_takes_the_type_the_node_has() {
+    fn value_takes_the_type_of_the_nodes_parameter() {
         let fitting =
             |value, current| ParameterValue::from_json(&value).expect("a value").fitting(&current);
         assert_eq!(fitting(json!(1), ParameterValue::Double(0.5)), ParameterValue::Double(1.0));

@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn the_form_follows_the_distribution() {
+    fn message_form_follows_the_distribution() {
         for (distro, form) in [
             (Some("foxy"), GidForm::Bytes24),
             (Some("humble"), GidForm::Bytes24),

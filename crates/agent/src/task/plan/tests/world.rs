@@ -151,7 +151,12 @@ pub(super) fn package(number: u8) -> PackageRef {
     }
 }
 
-pub(super) fn order(deployment: u8, package_number: u8, run: u64, wanted: Wanted) -> DesiredTask {
+pub(super) fn order(
+    deployment: u8,
+    package_number: u8,
+    run: u64,
+    wanted: TargetState,
+) -> DesiredTask {
     DesiredTask {
         task: "talker".parse().expect("valid"),
         deployment: format!("d{deployment:016x}").parse().expect("valid"),
@@ -197,7 +202,7 @@ impl World {
     pub(super) fn apply(&mut self, event: WorldEvent) {
         match event {
             WorldEvent::Order { deployment, run, stop } => {
-                let wanted = if stop { Wanted::Stopped } else { Wanted::Running };
+                let wanted = if stop { TargetState::Stopped } else { TargetState::Running };
                 // A deployment is of one package.
                 self.desired = Some(order(deployment, deployment % 2, run, wanted));
             }
@@ -484,7 +489,7 @@ impl World {
                     self.record.as_ref().and_then(|record| record.active.as_ref()),
                     Some(&**run)
                 );
-                let process = run.process().expect("what lives");
+                let process = run.process().expect("a live run");
                 self.alive.retain(|dir| *dir != process.dir);
                 self.ended.push((process.dir.clone(), Some(ExitStatus::Signal(2))));
             }
@@ -494,7 +499,7 @@ impl World {
                 for run in [active, fallback].into_iter().flatten() {
                     assert!(
                         kept.contains(&run.package.manifest.digest),
-                        "prunes what runs or may come back"
+                        "prunes a version that runs or may return"
                     );
                 }
                 self.disk.retain(|(package, _)| kept.contains(&package.manifest.digest));

@@ -109,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_window_is_bounded() {
+    fn outgoing_window_is_bounded() {
         let mut outgoing = Outgoing::default();
         for number in 0..MAX_IN_FLIGHT {
             assert!(outgoing.has_room());

@@ -171,7 +171,7 @@ impl PersonActions {
         password: &str,
         address: IpAddr,
     ) -> Result<User, PersonError> {
-        // Such a password is nobody's, so it costs neither a turn nor a write.
+        // Such a password belongs to no account, so it costs neither a permit nor a write.
         if Passwords::is_too_long(password) {
             return Err(PersonError::SignInRefused);
         }
@@ -210,8 +210,8 @@ impl PersonActions {
     /// Whether the password is right, where the account has recently signed in from the address.
     async fn verify_familiar(&self, attempt: &Attempt<'_>) -> Result<bool, PersonError> {
         let &Attempt { name, password, hash, address, now_ms, .. } = attempt;
-        let turn = self.passwords.turn().await?;
-        let is_right = self.passwords.verify(turn, password, hash).await?;
+        let permit = self.passwords.permit().await?;
+        let is_right = self.passwords.verify(permit, password, hash).await?;
         if is_right {
             self.sign_ins.succeeded(name, address, Familiarity::Familiar, now_ms);
         }
@@ -224,17 +224,17 @@ impl PersonActions {
         attempt: &Attempt<'_>,
     ) -> Result<Result<bool, Blocked>, PersonError> {
         let Attempt { name, digest, password, hash, address, now_ms } = attempt;
-        // A refused attempt neither waits for a turn nor writes.
+        // A refused attempt neither waits for a permit nor writes.
         let stored = self.store.sign_in_failures().get(digest).await?;
         if let Some(blocked) = stored.and_then(|window| window.name_block(*now_ms)) {
             return Ok(Err(blocked));
         }
-        let turn = self.passwords.turn().await?;
-        // Turns are few, and so are these writes and rows.
+        let permit = self.passwords.permit().await?;
+        // Permits are few, and so are these writes and rows.
         if let Err(blocked) = self.count_for_name(digest, *now_ms).await? {
             return Ok(Err(blocked));
         }
-        let is_right = self.passwords.verify(turn, password, *hash).await?;
+        let is_right = self.passwords.verify(permit, password, *hash).await?;
         if is_right {
             let mut write = self.store.begin_without_auth_invalidation().await?;
             if let Some(window) = write.sign_in_failures().get(digest).await? {

@@ -170,7 +170,8 @@ impl RobotActions {
 
     /// Ends all tokens of a robot and those made for the robot, now; its name, its history and its
     /// desired state stay. The same tokens never become valid again, because their holder is in
-    /// doubt: the robot has to be registered anew. The call is idempotent.
+    /// doubt: the robot has to be registered anew. The caller closes its sessions. The call is
+    /// idempotent.
     pub async fn revoke(&self, by: &Person, robot: &RobotId) -> Result<(), RobotError> {
         let now_ms = self.clock.now_ms();
         let mut write = self.store.begin().await?;

@@ -24,6 +24,25 @@ impl InvalidId {
     }
 }
 
+/// Lets serde read and write a type by its text: for `#[serde(try_from = "String", into = "String")]`.
+macro_rules! serde_by_text {
+    ($name:ident, $error:ident) => {
+        impl TryFrom<String> for $name {
+            type Error = $error;
+            fn try_from(text: String) -> Result<Self, $error> {
+                text.parse()
+            }
+        }
+
+        impl From<$name> for String {
+            fn from(value: $name) -> String {
+                value.to_string()
+            }
+        }
+    };
+}
+pub(crate) use serde_by_text;
+
 /// Declares a text identifier: a newtype over `String` that only `FromStr` (and so serde) can make.
 macro_rules! text_id {
     (
@@ -368,18 +387,7 @@ impl FromStr for MacAddress {
     }
 }
 
-impl TryFrom<String> for MacAddress {
-    type Error = InvalidId;
-    fn try_from(text: String) -> Result<Self, InvalidId> {
-        text.parse()
-    }
-}
-
-impl From<MacAddress> for String {
-    fn from(mac: MacAddress) -> String {
-        mac.to_string()
-    }
-}
+serde_by_text!(MacAddress, InvalidId);
 
 impl fmt::Display for MacAddress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

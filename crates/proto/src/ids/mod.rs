@@ -5,6 +5,7 @@ pub mod digest;
 mod id;
 pub mod selector;
 
+pub(crate) use id::serde_by_text;
 pub use id::{
     AbsolutePath, DeploymentId, Generation, GraphName, InstanceId, InvalidId, LabelKey, LabelValue,
     Labels, MacAddress, OutputPath, RepositoryName, RequestId, RobotId, RobotName, Tag, TaskName,

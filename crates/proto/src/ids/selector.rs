@@ -175,18 +175,7 @@ impl FromStr for Selector {
     }
 }
 
-impl TryFrom<String> for Selector {
-    type Error = InvalidSelector;
-    fn try_from(text: String) -> Result<Self, InvalidSelector> {
-        text.parse()
-    }
-}
-
-impl From<Selector> for String {
-    fn from(selector: Selector) -> String {
-        selector.0.text
-    }
-}
+super::serde_by_text!(Selector, InvalidSelector);
 
 impl fmt::Display for Selector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

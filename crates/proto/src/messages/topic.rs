@@ -147,18 +147,7 @@ impl FromStr for TopicPrefix {
     }
 }
 
-impl TryFrom<String> for TopicPrefix {
-    type Error = InvalidPrefix;
-    fn try_from(text: String) -> Result<Self, InvalidPrefix> {
-        text.parse()
-    }
-}
-
-impl From<TopicPrefix> for String {
-    fn from(prefix: TopicPrefix) -> String {
-        prefix.0
-    }
-}
+crate::ids::serde_by_text!(TopicPrefix, InvalidPrefix);
 
 impl fmt::Display for TopicPrefix {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -48,18 +48,7 @@ impl FromStr for CaPin {
     }
 }
 
-impl TryFrom<String> for CaPin {
-    type Error = InvalidPin;
-    fn try_from(text: String) -> Result<Self, InvalidPin> {
-        text.parse()
-    }
-}
-
-impl From<CaPin> for String {
-    fn from(pin: CaPin) -> String {
-        pin.to_string()
-    }
-}
+crate::ids::serde_by_text!(CaPin, InvalidPin);
 
 impl fmt::Display for CaPin {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

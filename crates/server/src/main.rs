@@ -10,7 +10,7 @@ use task_proto::line::SingleLineWriter;
 use taskd::config::{Config, ConfigError, ServeFlags};
 use taskd::net::open_files;
 use taskd::serve::Server;
-use taskd::serve::command_line::{Command, CommandLine, check_server};
+use taskd::serve::command_line::{BlobsCommandError, Command, CommandLine, check_server};
 use taskd::serve::log_limits::LogLimits;
 use taskd::system::clock::Clock;
 use tokio::signal::unix::{Signal, SignalKind, signal};
@@ -54,6 +54,14 @@ fn main() -> ExitCode {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => report_error(&error.into()),
         },
+        Command::Blobs(command) => {
+            make_files_private();
+            match runtime.block_on(command.run()) {
+                Ok(()) => ExitCode::SUCCESS,
+                Err(BlobsCommandError::Config(error)) => report_error(&error.into()),
+                Err(error) => report_error(&error.into()),
+            }
+        }
         Command::Operator(command) => runtime.block_on(task_cli::run(
             &connection,
             command,
@@ -65,9 +73,13 @@ fn main() -> ExitCode {
     code
 }
 
-async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
-    // All files of the server are private, including those that SQLite makes beside its database.
+/// All files of the server are private, including those that SQLite makes beside its database.
+fn make_files_private() {
     umask(Mode::from_bits_truncate(0o077));
+}
+
+async fn serve(flags: &ServeFlags) -> anyhow::Result<ExitCode> {
+    make_files_private();
     let filter = EnvFilter::try_from_env("TASKD_LOG")
         .unwrap_or_else(|_| EnvFilter::new("info,sqlx=warn,rumqttd=error"));
     let (limits, has_colours) = (LogLimits::default(), std::io::stderr().is_terminal());

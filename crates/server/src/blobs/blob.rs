@@ -24,7 +24,7 @@ use crate::config::BlobRead;
 /// Bytes per read when a range is loaded into the page cache.
 const READ_AHEAD_BYTES: usize = 64 * 1024;
 /// The suffix of a file that no longer holds its blob.
-const DAMAGED: &str = "damaged";
+pub(super) const DAMAGED: &str = "damaged";
 
 /// A readable blob. It stays readable while this value lives, even if the blob is deleted.
 #[derive(Clone)]
@@ -51,7 +51,14 @@ pub enum BytesConsumer {
 
 impl Blob {
     pub(super) fn open(digest: Digest, store: &Arc<Shared>) -> io::Result<Self> {
-        let file = File::open(store.path(digest))?;
+        Self::of(digest, Arc::new(File::open(store.path(digest))?), store)
+    }
+
+    /// The blob in a file that is complete and never changes any more.
+    pub(super) fn of(digest: Digest, file: Arc<File>, store: &Arc<Shared>) -> io::Result<Self> {
+        if let Some(common) = &store.common {
+            common.cache.record_use(digest, &file);
+        }
         let size = file.metadata()?.len();
         let mapped = match store.settings.reading {
             // An empty file can't be mapped.
@@ -60,14 +67,30 @@ impl Blob {
                 // deleting it leaves the mapping intact. Should the disk or a person take bytes
                 // away, this process never touches them: the mapping is given to sockets alone,
                 // where the kernel gets an error in place of a signal.
-                let mapping = unsafe { memmap2::Mmap::map(&file) }?;
+                let mapping = unsafe { memmap2::Mmap::map(&*file) }?;
                 Some(Bytes::from_owner(mapping))
             }
             BlobRead::Mmap | BlobRead::Pread => None,
         };
         let quoted_digest = format!("\"{digest}\"").into();
         let (disk, store) = (store.disk.clone(), Arc::downgrade(store));
-        Ok(Self { digest, size, quoted_digest, file: Arc::new(file), mapped, disk, store })
+        Ok(Self { digest, size, quoted_digest, file, mapped, disk, store })
+    }
+
+    /// A blob whose file is still growing to `size`. Only bytes that are there may be read. A
+    /// failure starts no check of the file.
+    pub(super) fn growing(
+        digest: Digest,
+        size: u64,
+        file: Arc<File>,
+        disk: Arc<Semaphore>,
+    ) -> Self {
+        let quoted_digest = format!("\"{digest}\"").into();
+        Self { digest, size, quoted_digest, file, mapped: None, disk, store: Weak::new() }
+    }
+
+    pub(super) fn file(&self) -> Arc<File> {
+        self.file.clone()
     }
 
     pub fn digest(&self) -> Digest {
@@ -182,6 +205,9 @@ impl Blob {
         tokio::spawn(async move {
             let file = store.path(digest);
             let checked = on_disk(move || quarantine_if_damaged(digest, &file)).await;
+            if let (Ok(true), Some(common)) = (&checked, &store.common) {
+                common.cache.forget_damaged(digest);
+            }
             store.close(digest);
             store.checked.lock().unwrap_or_else(PoisonError::into_inner).remove(&digest);
             match checked {
@@ -249,7 +275,7 @@ mod tests {
         let data = tempfile::tempdir().expect("a directory");
         let blobs = Blobs::open(data.path(), BlobSettings::default()).expect("opened");
         let content = Bytes::from(vec![7; 1 << 20]);
-        let digest = blobs.put(Algorithm::Sha256, content.clone()).await.expect("stored");
+        let digest = blobs.put(Algorithm::Sha256, content.clone(), 0).await.expect("stored");
         let blob = blobs.get(digest).await.expect("read").expect("there");
         let (slice, whole) = (blob.slice(0..content.len() as u64).await, blob.read().await);
         File::create(blobs.path(digest)).expect("truncated");

@@ -18,6 +18,9 @@ const MAX_AT_ONCE: usize = 256;
 /// The shortest and longest time between two collections.
 const INTERVAL: [Duration; 2] = [Duration::from_secs(1), Duration::from_secs(600)];
 
+/// The time between two searches for objects that hold no blob.
+const ORPHAN_INTERVAL: Duration = Duration::from_secs(7 * 24 * 60 * 60);
+
 /// Grace time of blobs that a robot has dropped, unless the usual grace is shorter: the robot
 /// brings back more.
 const DROPPED_GRACE: Duration = Duration::from_secs(3600);
@@ -90,6 +93,10 @@ pub async fn collect(
     dropped.retain(|digest| !needed.contains(digest));
     let removed = remove(store, blobs, &old, before(grace)).await?
         + remove(store, blobs, &dropped, before(grace.min(DROPPED_GRACE))).await?;
+    let orphans = blobs.remove_orphans(now_ms, ORPHAN_INTERVAL).await?;
+    if orphans > 0 {
+        tracing::info!(orphans, "deleted objects of blobs.store that held no blob");
+    }
     Ok(Collected { uploads, blobs: removed })
 }
 
@@ -103,6 +110,10 @@ async fn remove(
 ) -> Result<usize, CollectError> {
     let mut removed = 0;
     for candidates in candidates.chunks(MAX_AT_ONCE) {
+        if let Some(common) = &blobs.shared.common {
+            removed += blobs.remove_from_common_store(common, candidates, before_ms).await?;
+            continue;
+        }
         let collection = blobs.begin_collection().await;
         let mut untouched = Vec::with_capacity(candidates.len());
         for &digest in candidates {

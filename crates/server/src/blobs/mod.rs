@@ -1,14 +1,24 @@
-//! Owns the bytes of packages on disk, under the digest they hash to; it never changes a blob that
-//! is whole.
+//! Owns the bytes of packages, under the digest they hash to; it never changes a blob that is
+//! whole.
 //!
 //! A blob lies in `blobs/<algorithm>/<hex>`. We rename it into place when it is complete, verified
 //! and synced. The blob store knows no references: [`collector`] decides which blobs may be
 //! deleted. A blob's modification time records the last request by a pusher; it never says anything
 //! about the content.
+//!
+//! If servers have a common store ([`CommonStore`]), a blob is an object there and a row of the
+//! database, and files in `blob-cache` are local copies, which may go at any time.
 
 mod blob;
 mod body;
+mod cache;
 pub mod collector;
+mod common_store;
+mod content;
+mod error;
+mod fetch;
+mod local_move;
+mod objects;
 mod upload;
 
 use std::collections::{HashSet, VecDeque};
@@ -21,12 +31,19 @@ use std::time::{Duration, SystemTime};
 use bytes::Bytes;
 use task_proto::Digest;
 use task_proto::ids::digest::Algorithm;
-use task_proto::size::format_bytes;
 use task_proto::time::millis;
 use tokio::sync::{OwnedRwLockReadGuard, OwnedRwLockWriteGuard, RwLock, Semaphore};
 
 pub use blob::{Blob, BytesConsumer};
 pub use body::BlobBody;
+use cache::{Cache, Room};
+pub use common_store::{CommonStore, CommonStoreError};
+pub use content::Content;
+pub use error::BlobError;
+use error::common_store_error;
+pub use fetch::Arrival;
+use fetch::Fetches;
+pub use local_move::{MoveError, Moved, move_to_common_store};
 use upload::Uploads;
 pub use upload::{InvalidUploadId, UploadId};
 
@@ -53,6 +70,8 @@ pub struct BlobSettings {
     /// Free disk space that people's uploads leave for the database and everything else, in bytes.
     /// Robots' uploads leave twice as much.
     pub reserve_bytes: u64,
+    /// The most bytes of local copies, if the blobs lie in a common store.
+    pub max_cache_bytes: u64,
 }
 
 impl Default for BlobSettings {
@@ -64,86 +83,7 @@ impl Default for BlobSettings {
             max_open_blobs: 64,
             max_robot_bytes: 40 << 30,
             reserve_bytes: 0,
-        }
-    }
-}
-
-/// An error of the blob store.
-#[derive(Debug, thiserror::Error)]
-pub enum BlobError {
-    /// There is no such unfinished upload.
-    #[error("no such upload: it was finished, cancelled or dropped")]
-    UploadUnknown,
-    /// Another request writes to the same upload.
-    #[error("another request is writing to this upload")]
-    UploadBusy,
-    /// [`BlobSettings::max_uploads`] is reached and no upload can be evicted; or a robot has
-    /// reached its share.
-    #[error("too many unfinished uploads, the limit is {max}; finish or cancel one")]
-    TooManyUploads { max: usize },
-    /// A chunk does not begin at the upload's offset.
-    #[error("the chunk begins at byte {given}, but the upload is at byte {offset}")]
-    OutOfOrder {
-        /// Where the chunk begins.
-        given: u64,
-        offset: u64,
-    },
-    /// The blob exceeds the size limit.
-    #[error("the blob is larger than this server's limit of {max} bytes")]
-    TooLarge { max: u64 },
-    /// The robot exceeds its share of the disk.
-    #[error(
-        "this robot's outputs take {stored_bytes} bytes of disk space, the limit is {max}: older outputs are deleted within hours (robots.output_bytes)"
-    )]
-    RobotQuotaExceeded {
-        max: u64,
-        /// Bytes stored for the robot, including unfinished uploads.
-        stored_bytes: u64,
-    },
-    /// The bytes do not hash to the announced digest.
-    #[error("the content's digest is {actual}, not {expected}")]
-    WrongDigest {
-        expected: Box<Digest>,
-        /// The digest of the received bytes.
-        actual: Box<Digest>,
-    },
-    /// The body broke off: the sender went away or fell silent.
-    #[error("the request body ended early")]
-    Interrupted(#[source] Box<dyn std::error::Error + Send + Sync>),
-    /// The disk is full.
-    #[error("the server's disk is full")]
-    DiskFull,
-    /// The upload would use the reserved part of the disk.
-    #[error(
-        "the server's disk is nearly full: the last {} are reserved for the database and robots' reports \
-         (disk_reserve)", format_bytes(*reserve)
-    )]
-    DiskReserved {
-        /// The reserved disk space, in bytes.
-        reserve: u64,
-    },
-    /// A file operation failed.
-    #[error("the blob store can't {action} {path}")]
-    Disk { action: &'static str, path: PathBuf, source: io::Error },
-}
-
-impl BlobError {
-    /// Whether the error means that there is no room for the bytes.
-    fn is_out_of_space(&self) -> bool {
-        matches!(
-            self,
-            Self::DiskFull
-                | Self::DiskReserved { .. }
-                | Self::RobotQuotaExceeded { .. }
-                | Self::TooLarge { .. }
-        )
-    }
-
-    fn disk(action: &'static str, path: &Path) -> impl FnOnce(io::Error) -> Self {
-        let path = path.to_owned();
-        move |source| match source.kind() {
-            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::DiskFull,
-            _ => Self::Disk { action, path, source },
+            max_cache_bytes: 50 << 30,
         }
     }
 }
@@ -155,7 +95,9 @@ pub struct Blobs {
 }
 
 struct Shared {
+    /// The directory of blobs, or of local copies.
     directory: PathBuf,
+    common: Option<Common>,
     settings: BlobSettings,
     uploads: Uploads,
     /// Recently opened blobs, the latest first: opening and mapping a small blob costs more than
@@ -165,6 +107,13 @@ struct Shared {
     checked: Mutex<HashSet<Digest>>,
     disk: Arc<Semaphore>,
     collection: Arc<RwLock<()>>,
+}
+
+/// The parts that only a common store needs.
+struct Common {
+    store: CommonStore,
+    cache: Cache,
+    fetches: Fetches,
 }
 
 /// While this guard lives, no blob is collected: a caller that found a blob present can rely on it.
@@ -180,16 +129,44 @@ pub struct CollectionGuard {
 impl Blobs {
     /// Opens the store in `data`, and creates the directories `blobs` and `uploads` there.
     pub fn open(data: &Path, settings: BlobSettings) -> Result<Self, BlobError> {
-        let directory = data.join("blobs");
+        let directory = local_directory(data);
         for algorithm in Algorithm::ALL {
             let directory = directory.join(algorithm.as_str());
             fs::create_dir_all(&directory).map_err(BlobError::disk("create", &directory))?;
         }
+        Self::open_in(data, settings, directory, None)
+    }
+
+    /// Opens the store whose blobs lie in a common store, with local copies in `data`. Refused
+    /// while blobs of a server without a common store are in `data`.
+    pub fn open_with(
+        data: &Path,
+        settings: BlobSettings,
+        store: CommonStore,
+    ) -> Result<Self, BlobError> {
+        let directory = local_directory(data);
+        let left = blob_files(&directory).map_err(BlobError::disk("list", &directory))?;
+        if !left.is_empty() {
+            return Err(BlobError::NotMoved { count: left.len(), directory });
+        }
+        let directory = cache_directory(data);
+        let cache = Cache::open(directory.clone(), settings.max_cache_bytes)?;
+        let common = Common { store, cache, fetches: Fetches::default() };
+        Self::open_in(data, settings, directory, Some(common))
+    }
+
+    fn open_in(
+        data: &Path,
+        settings: BlobSettings,
+        directory: PathBuf,
+        common: Option<Common>,
+    ) -> Result<Self, BlobError> {
         let uploads = Uploads::open(data.join("uploads"), settings)?;
         let open = Mutex::new(VecDeque::with_capacity(settings.max_open_blobs));
         let disk = Arc::new(Semaphore::new(DISK_READS));
         let shared = Shared {
             directory,
+            common,
             settings,
             uploads,
             open,
@@ -216,46 +193,70 @@ impl Blobs {
         CollectionGuard { _guard: Arc::clone(&self.shared.collection).write_owned().await }
     }
 
-    /// The blob; `None` if the store does not have it.
-    pub async fn get(&self, digest: Digest) -> Result<Option<Blob>, BlobError> {
-        if let Some(blob) = self.shared.find_open(digest) {
-            return Ok(Some(blob));
-        }
-        let shared = self.shared.clone();
-        let opened = on_disk(move || match Blob::open(digest, &shared) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
-            opened => opened.map(Some).map_err(BlobError::disk("open", &shared.path(digest))),
-        });
-        Ok(opened.await?.map(|blob| self.shared.keep_open(blob)))
+    /// The servers' common store, if the blobs lie there.
+    pub fn common_store(&self) -> Option<&CommonStore> {
+        self.shared.common.as_ref().map(|common| &common.store)
     }
 
-    /// Stores small bytes from memory, and returns their digest.
-    pub async fn put(&self, algorithm: Algorithm, bytes: Bytes) -> Result<Digest, BlobError> {
-        let digest = algorithm.digest(&bytes);
+    /// Stores small bytes from memory, as of a pusher's request, and returns their digest.
+    pub async fn put(
+        &self,
+        algorithm: Algorithm,
+        bytes: Bytes,
+        now_ms: u64,
+    ) -> Result<Digest, BlobError> {
+        let (digest, size) = (algorithm.digest(&bytes), bytes.len() as u64);
         let partial = self.shared.uploads.unused_path();
-        let target = self.path(digest);
-        on_disk(move || {
+        let file = partial.clone();
+        let written = on_disk(move || {
             let write = || {
-                let mut file = File::create_new(&partial)?;
+                let mut file = File::create_new(&file)?;
                 file.write_all(&bytes)?;
                 file.sync_all()
             };
-            let stored = write()
-                .map_err(BlobError::disk("write", &partial))
-                .and_then(|()| move_into_place(&partial, &target));
-            if stored.is_err() {
-                // Best effort: the next start removes a file that remains.
-                let _ = fs::remove_file(&partial);
-            }
-            stored
-        })
-        .await?;
-        Ok(digest)
+            write().map_err(BlobError::disk("write", &file))
+        });
+        let stored = match written.await {
+            Ok(()) => self.store_file(digest, &partial, size, now_ms).await,
+            failed => failed,
+        };
+        if stored.is_err() {
+            // Best effort: the next start removes a file that remains.
+            let _ = fs::remove_file(&partial);
+        }
+        stored.map(|()| digest)
     }
 
-    /// Updates the blob's modification time, because a pusher relies on the blob; false if it is
-    /// absent.
+    /// Makes a verified and synced file the blob, as of a pusher's request. The file is moved; it
+    /// stays in its place if the common store fails.
+    async fn store_file(
+        &self,
+        digest: Digest,
+        file: &Path,
+        bytes: u64,
+        now_ms: u64,
+    ) -> Result<(), BlobError> {
+        let Some(common) = &self.shared.common else {
+            let (file, target) = (file.to_owned(), self.path(digest));
+            on_disk(move || move_into_place(&file, &target)).await?;
+            return self.touch(digest, now_ms).await.map(drop);
+        };
+        common.store.put(digest, file, bytes, now_ms).await?;
+        let room = self.shared.make_room(&common.cache, bytes).await;
+        if let Err(error) = common.cache.adopt(room, file, digest) {
+            // The blob is stored: only the local copy is missing.
+            tracing::warn!(%error, %digest, "a pushed blob is not kept as a local copy");
+            let _ = fs::remove_file(file);
+        }
+        Ok(())
+    }
+
+    /// Records that a pusher relies on the blob, by its modification time or its row; false if it
+    /// is absent.
     pub async fn touch(&self, digest: Digest, now_ms: u64) -> Result<bool, BlobError> {
+        if let Some(common) = &self.shared.common {
+            return common.store.touch(digest, now_ms).await;
+        }
         let path = self.path(digest);
         on_disk(move || {
             let modified = SystemTime::UNIX_EPOCH + Duration::from_millis(now_ms);
@@ -270,33 +271,30 @@ impl Blobs {
 
     /// The blobs last touched before `before_ms`.
     pub async fn untouched_since(&self, before_ms: u64) -> Result<Vec<Digest>, BlobError> {
+        if let Some(common) = &self.shared.common {
+            return common.store.untouched_since(before_ms).await;
+        }
         let directory = self.shared.directory.clone();
         on_disk(move || {
-            let mut found = Vec::new();
-            let mut list = |algorithm: Algorithm| {
-                for entry in fs::read_dir(directory.join(algorithm.as_str()))? {
-                    let entry = entry?;
-                    let name = entry.file_name();
-                    let named =
-                        name.to_str().map(|hex| format!("{}:{hex}", algorithm.as_str()).parse());
-                    let Some(Ok(digest)) = named else { continue };
+            let list = || {
+                let mut found = Vec::new();
+                for (digest, entry) in blob_files(&directory)? {
                     if modified_ms(&entry.metadata()?)? < before_ms {
                         found.push(digest);
                     }
                 }
-                Ok(())
+                Ok(found)
             };
-            Algorithm::ALL
-                .into_iter()
-                .try_for_each(&mut list)
-                .map_err(BlobError::disk("list", &directory))?;
-            Ok(found)
+            list().map_err(BlobError::disk("list", &directory))
         })
         .await
     }
 
     /// The total size of all blobs, in bytes.
     pub async fn used_bytes(&self) -> Result<u64, BlobError> {
+        if let Some(common) = &self.shared.common {
+            return common.store.used_bytes().await;
+        }
         let directory = self.shared.directory.clone();
         on_disk(move || {
             let sum = |algorithm: Algorithm| {
@@ -353,12 +351,78 @@ impl Blobs {
         Ok(())
     }
 
+    /// Deletes those of `candidates` that nothing needs and no pusher asked for since `before_ms`
+    /// from the common store, and returns their number.
+    async fn remove_from_common_store(
+        &self,
+        common: &Common,
+        candidates: &[Digest],
+        before_ms: u64,
+    ) -> Result<usize, BlobError> {
+        let removed = common.store.remove_unneeded(candidates, before_ms).await?;
+        for &digest in &removed {
+            self.shared.close(digest);
+            if let Err(error) = common.cache.forget(digest) {
+                tracing::warn!(%error, %digest, "the copy of a deleted blob can't be removed");
+            }
+        }
+        Ok(removed.len())
+    }
+
+    /// Searches the common store for objects without a blob, if the last search was a while ago.
+    /// Returns the number of those that were deleted.
+    async fn remove_orphans(&self, now_ms: u64, interval: Duration) -> Result<usize, BlobError> {
+        let Some(common) = &self.shared.common else { return Ok(0) };
+        let now = SystemTime::UNIX_EPOCH + Duration::from_millis(now_ms);
+        let failed = BlobError::disk("inspect", &self.shared.directory);
+        let swept_at = common.cache.swept_at().map_err(failed)?;
+        let is_due = swept_at.is_none_or(|at| now.duration_since(at).is_ok_and(|t| t >= interval));
+        if !is_due {
+            return Ok(0);
+        }
+        let removed = common.store.remove_orphans(now_ms).await?;
+        let failed = BlobError::disk("write", &self.shared.directory);
+        common.cache.record_sweep(now).map_err(failed)?;
+        Ok(removed)
+    }
+
     fn path(&self, digest: Digest) -> PathBuf {
         self.shared.path(digest)
     }
 }
 
 impl Shared {
+    /// Takes room in the cache for a copy. Copies that are not in use make room for it; if all are
+    /// in use, the cache is larger for a while.
+    async fn make_room<'c>(self: &Arc<Self>, cache: &'c Cache, bytes: u64) -> Room<'c> {
+        let (room, is_full) = cache.take_room(bytes);
+        if is_full {
+            let shared = self.clone();
+            let evicted = on_disk(move || {
+                let Some(common) = &shared.common else { return Ok(()) };
+                let evicted = common.cache.evict(|digest| shared.close_unused(digest));
+                evicted.map_err(BlobError::disk("make room in", &shared.directory))
+            });
+            if let Err(error) = evicted.await {
+                let error = &error as &dyn std::error::Error;
+                tracing::warn!(error, "local copies of blobs can't be removed");
+            }
+        }
+        room
+    }
+
+    /// Closes the blob if nobody reads it. False if the blob is in use.
+    fn close_unused(&self, digest: Digest) -> bool {
+        let Some(common) = &self.common else { return false };
+        let mut open = self.open_blobs();
+        let kept = open.iter().filter(|blob| blob.digest == digest).count();
+        if common.cache.users(digest) > kept {
+            return false;
+        }
+        open.retain(|blob| blob.digest != digest);
+        true
+    }
+
     fn path(&self, digest: Digest) -> PathBuf {
         self.directory.join(digest.algorithm().as_str()).join(digest.hex())
     }
@@ -391,6 +455,36 @@ impl Shared {
     fn open_blobs(&self) -> MutexGuard<'_, VecDeque<Blob>> {
         self.open.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+/// Where blobs lie in a data directory without a common store.
+fn local_directory(data: &Path) -> PathBuf {
+    data.join("blobs")
+}
+
+/// Where local copies lie in a data directory with a common store.
+fn cache_directory(data: &Path) -> PathBuf {
+    data.join("blob-cache")
+}
+
+/// The files below `directory` that are named after a digest.
+fn blob_files(directory: &Path) -> io::Result<Vec<(Digest, fs::DirEntry)>> {
+    let mut found = Vec::new();
+    for algorithm in Algorithm::ALL {
+        let entries = match fs::read_dir(directory.join(algorithm.as_str())) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            entries => entries?,
+        };
+        for entry in entries {
+            let entry = entry?;
+            let name = entry.file_name();
+            let digest = name.to_str().map(|hex| format!("{}:{hex}", algorithm.as_str()).parse());
+            if let Some(Ok(digest)) = digest {
+                found.push((digest, entry));
+            }
+        }
+    }
+    Ok(found)
 }
 
 /// Runs disk work on a blocking thread.
@@ -431,7 +525,7 @@ mod tests {
         let data = tempfile::tempdir().expect("a directory");
         let blobs = Blobs::open(data.path(), BlobSettings::default()).expect("opened");
         let digest =
-            blobs.put(Algorithm::Sha256, Bytes::from_static(b"content")).await.expect("stored");
+            blobs.put(Algorithm::Sha256, Bytes::from_static(b"content"), 0).await.expect("stored");
         let readers: Vec<_> = (0..64)
             .map(|_| {
                 tokio::spawn({

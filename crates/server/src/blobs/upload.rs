@@ -23,7 +23,7 @@ use task_proto::packages::output::owner;
 use task_proto::{Digest, RepositoryName, RobotId};
 use tokio::sync::OwnedMutexGuard;
 
-use super::{BlobError, BlobSettings, Blobs, modified_ms, move_into_place, on_disk};
+use super::{BlobError, BlobSettings, Blobs, modified_ms, on_disk};
 use crate::system::data_directory::disk_space;
 
 /// Bytes of a body that are gathered before one hash and one write.
@@ -148,8 +148,8 @@ impl Upload {
         fs::remove_file(&self.path).map_err(BlobError::disk("delete", &self.path))
     }
 
-    fn finish(&mut self, expected: Digest, target: &Path) -> Result<u64, BlobError> {
-        self.ended = true;
+    /// Checks that the bytes hash to `expected`, and syncs them.
+    fn verify(&self, expected: Digest) -> Result<(), BlobError> {
         // A write that failed half way may have left bytes beyond the offset.
         self.file.set_len(self.offset).map_err(BlobError::disk("truncate", &self.path))?;
         let unreadable = BlobError::disk("read", &self.path);
@@ -170,9 +170,7 @@ impl Upload {
                 actual: actual.into(),
             });
         }
-        self.file.sync_all().map_err(BlobError::disk("sync", &self.path))?;
-        move_into_place(&self.path, target)?;
-        Ok(self.offset)
+        self.file.sync_all().map_err(BlobError::disk("sync", &self.path))
     }
 }
 
@@ -439,27 +437,38 @@ impl Blobs {
         }
     }
 
-    /// Makes the upload a blob if it hashes to `expected`, and drops it otherwise. Returns the
-    /// blob's size.
+    /// Makes the upload a blob if it hashes to `expected`, as of a pusher's request, and drops it
+    /// otherwise. If the common store fails, the upload stays, so that the caller can try again.
+    /// Returns the blob's size.
     pub async fn finish_upload(
         &self,
         repository: &RepositoryName,
         id: &UploadId,
         expected: Digest,
+        now_ms: u64,
     ) -> Result<u64, BlobError> {
         let mut upload = self.lock_upload(repository, id)?;
-        let target = self.path(expected);
-        let finished = on_disk(move || {
-            let finished = upload.finish(expected, &target);
-            if finished.is_err() {
-                // Best effort: the next start removes a file that remains.
-                let _ = fs::remove_file(&upload.path);
-            }
-            finished
+        upload.ended = true;
+        let verified = on_disk(move || {
+            let verified = upload.verify(expected);
+            Ok((upload, verified))
         });
-        let finished = finished.await;
-        self.shared.uploads.active().remove(id);
-        finished
+        let (mut upload, verified) = verified.await?;
+        let (path, bytes) = (upload.path.clone(), upload.offset);
+        let stored = match verified {
+            Ok(()) => self.store_file(expected, &path, bytes, now_ms).await,
+            wrong => wrong,
+        };
+        if stored.as_ref().is_err_and(BlobError::is_store_unavailable) {
+            upload.ended = false;
+        } else {
+            if stored.is_err() {
+                // Best effort: the next start removes a file that remains.
+                let _ = fs::remove_file(&path);
+            }
+            self.shared.uploads.active().remove(id);
+        }
+        stored.map(|()| bytes)
     }
 
     pub async fn cancel_upload(
@@ -601,7 +610,7 @@ mod tests {
             8
         );
         let (right, wrong) = (Digest::of(b"somemore"), Digest::of(b"something"));
-        assert_eq!(blobs.finish_upload(&repository, &id, right).await.expect("it is whole"), 8);
+        assert_eq!(blobs.finish_upload(&repository, &id, right, 0).await.expect("it is whole"), 8);
         assert!(blobs.get(right).await.expect("read").is_some());
 
         // Bytes that a power cut left wrong never become a blob.
@@ -622,7 +631,7 @@ mod tests {
         }
         fs::write(uploads.join(file_name(&id, &repository)), "somethinh").expect("written");
         let blobs = Blobs::open(directory.path(), settings).expect("opens");
-        let refused = blobs.finish_upload(&repository, &id, wrong).await;
+        let refused = blobs.finish_upload(&repository, &id, wrong, 0).await;
         assert!(matches!(refused, Err(BlobError::WrongDigest { .. })), "{refused:?}");
     }
 

@@ -25,6 +25,7 @@ pub use self::oidc::{OidcSettings, RoleRule, private_url};
 use self::settings::{SETTINGS, Setting};
 pub use self::tables::{PersonRates, SiteLimits, TransferLimits};
 pub use self::tls::TlsSettings;
+use crate::domain::blob_store_url::BlobStoreUrl;
 use crate::domain::broker_url::{BrokerUrl, BrokerUrls};
 use crate::domain::database_url;
 use crate::domain::delivery::{Rule, Rules};
@@ -70,6 +71,11 @@ pub struct Config {
     pub presence_timeout: Duration,
     /// How blobs are read.
     pub blob_read: BlobRead,
+    /// `[blobs]`: the servers' common store of blobs; absent: the data directory.
+    pub blob_store: Option<BlobStoreUrl>,
+    /// Maximum bytes of the local copies of blobs that lie in the common store; absent: 50 GB, or
+    /// less on a small disk.
+    pub blob_cache_bytes: Option<u64>,
     /// Retention of an unfinished upload or an unreferenced blob.
     pub blob_grace: Duration,
     /// Maximum concurrent HTTP connections; more wait in the listener's backlog.
@@ -233,6 +239,12 @@ pub enum ConfigError {
          or --allow-plaintext"
     )]
     PlaintextBroker { address: String },
+    /// The bytes of packages would cross the network unencrypted.
+    #[error(
+        "blobs.store: unencrypted connections to other machines ({host}) are refused; use an https:// endpoint, one on \
+         this machine, or --allow-plaintext"
+    )]
+    PlaintextBlobStore { host: String },
     /// A certificate without its key, or the other way round.
     #[error("{given}: {missing} is missing")]
     IncompleteCertificate {
@@ -291,6 +303,8 @@ impl Config {
             public_mqtt_port: None,
             presence_timeout: Duration::from_secs(90),
             blob_read: BlobRead::Mmap,
+            blob_store: None,
+            blob_cache_bytes: None,
             blob_grace: DAY,
             max_http_connections: 20_000,
             max_mqtt_connections: 20_000,
@@ -357,6 +371,12 @@ impl Config {
         if brokers.len() > 1 && (self.public_mqtt_host.is_some() || self.public_mqtt_port.is_some())
         {
             return Err(ConfigError::PublicAddressWithSeveralBrokers);
+        }
+        if let Some(BlobStoreUrl::S3(s3)) = &self.blob_store
+            && !self.allow_plaintext
+            && let Some(host) = s3.plaintext_host()
+        {
+            return Err(ConfigError::PlaintextBlobStore { host: host.to_owned() });
         }
         match (&self.tls.certificate, &self.tls.key) {
             (Some(_), None) => Err(ConfigError::IncompleteCertificate {

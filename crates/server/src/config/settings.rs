@@ -198,6 +198,23 @@ pub(super) const SETTINGS: &[Setting] = &[
         },
     },
     Setting {
+        name: "blobs-store",
+        value_name: "URL",
+        help: "s3://BUCKET?endpoint=https://HOST&region=NAME or file:///DIR for the bytes of packages and outputs, which \
+               several servers then share; an S3 key is read from AWS_* variables or from a file named by \
+               &credentials=FILE; see docs/server.md [default: the data directory]",
+        set: |config, text| parsed(text).map(|store| config.blob_store = Some(store)),
+    },
+    Setting {
+        name: "blobs-cache-bytes",
+        value_name: "SIZE",
+        help: "Maximum size of the local copies of blobs that lie in --blobs-store [default: 50 GB, at most a quarter \
+               of the disk]",
+        set: |config, text| {
+            size_within(text, 1 << 20, 1 << 50).map(|bytes| config.blob_cache_bytes = Some(bytes))
+        },
+    },
+    Setting {
         name: "blob-grace",
         value_name: "TIME",
         help: "Retention of unfinished uploads and unreferenced blobs [default: 1d]",

@@ -1,6 +1,7 @@
-//! The tables of the configuration file: `[delivery]` with the operator's rules, `[transfers]` with
-//! the limits of each site, `[robots]` and `[people]` with rate limits, `[oidc]`, `[tls]`. A key
-//! with a single value is an ordinary setting; the rest is read here. Every error names its key.
+//! The tables of the configuration file: `[blobs]`, `[delivery]` with the operator's rules,
+//! `[transfers]` with the limits of each site, `[robots]` and `[people]` with rate limits, `[oidc]`,
+//! `[tls]`. A key with a single value is an ordinary setting; the rest is read here. Every error
+//! names its key.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -66,7 +67,10 @@ impl SiteLimits {
 
 /// Whether the file may have a table of this name.
 pub(super) fn is_known(name: &str) -> bool {
-    matches!(name, "delivery" | "enrolment" | "oidc" | "people" | "robots" | "tls" | "transfers")
+    matches!(
+        name,
+        "blobs" | "delivery" | "enrolment" | "oidc" | "people" | "robots" | "tls" | "transfers"
+    )
 }
 
 impl Config {

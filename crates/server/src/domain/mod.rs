@@ -1,6 +1,7 @@
 //! Owns the pure rules and values of the fleet; it never does I/O, never waits and never reads a
 //! clock.
 
+pub mod blob_store_url;
 pub mod broker_url;
 pub mod database_url;
 pub mod delivery;

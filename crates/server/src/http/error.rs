@@ -167,6 +167,11 @@ impl From<BlobError> for ApiError {
             BlobError::DiskFull | BlobError::DiskReserved { .. } => {
                 Self { message: error.to_string(), ..Self::disk_full() }
             }
+            error if error.is_store_unavailable() => {
+                tracing::warn!(error = &error as &dyn std::error::Error, "blobs.store failed");
+                Self::unavailable(error.to_string())
+            }
+            BlobError::Database(error) => error.into(),
             error => Self::internal(&error),
         }
     }

@@ -4,6 +4,7 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
 use task_proto::desired::{
@@ -23,6 +24,8 @@ use crate::system::clock::Clock;
 const BATCH: usize = 64;
 /// Maximum cached blobs while many robots are notified: usually all robots wait for the same ones.
 const MAX_CACHED_BLOBS: usize = 32;
+/// Time limit for an inline blob, which may first have to come from a common store.
+const READ_TIMEOUT: Duration = Duration::from_secs(2);
 /// Overhead of a blob in a message besides its base64: its digest, quotes, colon and comma.
 const INLINE_OVERHEAD_BYTES: usize = 80;
 
@@ -76,10 +79,16 @@ impl Downlink {
         if blob.size > MAX_DESIRED_NOTICE_BYTES as u64 || cache.contains_key(&blob.digest) {
             return;
         }
-        let read = match self.blobs.get(blob.digest).await {
-            Ok(Some(found)) => found.read().await.map(Some),
-            Ok(None) => Ok(None),
-            Err(error) => Err(error),
+        let read = async {
+            match self.blobs.get(blob.digest).await? {
+                Some(found) => found.read().await.map(Some),
+                None => Ok(None),
+            }
+        };
+        // A common store that does not answer must not keep other robots waiting.
+        let Ok(read) = tokio::time::timeout(READ_TIMEOUT, read).await else {
+            tracing::warn!(digest = %blob.digest, "an inline blob does not come; robots pull it");
+            return;
         };
         match read {
             Ok(Some(bytes)) => {

@@ -1,6 +1,7 @@
 //! Owns the command line of `taskd`, and the start and stop of the server's parts in an order that
 //! loses nothing; it never decides what a part could decide.
 
+mod blobs;
 pub mod command_line;
 pub mod database;
 mod jobs;
@@ -24,13 +25,14 @@ use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use self::blobs::open_blobs;
 use self::database::{Database, FirstOperator, check_periodically};
 use self::jobs::{
     advance_rollouts, announce_silent_robots, announce_violations, expire_assignments, sample_load,
 };
 use crate::auth::oidc::{OidcSetupError, Provider};
 use crate::blobs::collector;
-use crate::blobs::{BlobError, BlobSettings, Blobs};
+use crate::blobs::{BlobError, CommonStoreError};
 use crate::broker::{
     Broker, BrokerConfig, BrokerError, ExternalConfig, Gatekeeper, Health, Inbox, Limits,
 };
@@ -67,7 +69,7 @@ use crate::orders::feed::{self, FeedSource};
 use crate::orders::report_writer::ReportWriter;
 use crate::store::{ServerIdentity, Store, StoreError, sqlite_url};
 use crate::system::clock::Clock;
-use crate::system::data_directory::{DataDirectory, DataError, disk_space};
+use crate::system::data_directory::{DataDirectory, DataError};
 use crate::system::host::host_name;
 
 /// Time limit for running requests at a stop; the whole stop must take less than ten seconds.
@@ -80,12 +82,6 @@ const WRITER_TIMEOUT: Duration = Duration::from_secs(3);
 const DATABASE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time limit of a proxy's header and of the TLS handshake before an HTTP request, each.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Default disk reserve that people must leave free: this share of the disk, up to an absolute
-/// maximum in bytes.
-const RESERVE_SHARE: u64 = 40;
-const MAX_RESERVE_BYTES: u64 = 1 << 30;
-/// Default upper bound of one robot's stored outputs, as a share of the disk.
-const ROBOT_SHARE: u64 = 8;
 
 /// The reason why the server did not start.
 #[derive(Debug, thiserror::Error)]
@@ -102,6 +98,14 @@ pub enum ServeError {
     /// The blob store can't be used.
     #[error("the blob store can't be opened")]
     Blobs(#[from] BlobError),
+    /// The servers' common store of blobs can't be used.
+    #[error(transparent)]
+    CommonStore(#[from] CommonStoreError),
+    /// Without the setting, all packages would be missing.
+    #[error(
+        "blobs.store is not set, but the blobs of this database lie in a common store: set blobs.store as before"
+    )]
+    NoCommonStore,
     /// MQTT can't be served.
     #[error(transparent)]
     Broker(#[from] BrokerError),
@@ -164,7 +168,7 @@ impl Server {
         let listening = standby::wait(&config, &data, &store, tls.as_ref()).await?;
         let database = open_database(store, &data, presence.clone(), clock.clone()).await?;
         let (store, unusable) = (database.store().clone(), database.unusable());
-        let blobs = Blobs::open(data.path(), blob_settings(&config))?;
+        let blobs = open_blobs(&config, &data, &store).await?;
         let (http, http_address) = listening.map_or_else(|| listen_for_http(config.http), Ok)?;
 
         let changes = Changes::new();
@@ -476,6 +480,7 @@ async fn start_readiness(tasks: &TaskTracker, app: &App) {
         store: app.store.clone(),
         broker: app.broker.clone(),
         disk: DiskProbe::new(app.data.clone()),
+        blobs: app.blobs.common_store().cloned(),
     };
     check.check().await;
     tasks.spawn(check.run(app.stop.clone()));
@@ -548,22 +553,6 @@ fn tls_settings(config: &Config) -> TlsSettings {
     let mut settings = config.tls.clone();
     settings.names.extend(config.public_mqtt_host.clone());
     settings
-}
-
-fn blob_settings(config: &Config) -> BlobSettings {
-    let defaults = BlobSettings::default();
-    let disk_bytes = disk_space(&config.data).map_or(u64::MAX, |(_, total)| total);
-    BlobSettings {
-        reading: config.blob_read,
-        max_blob_bytes: config.max_blob_bytes,
-        max_robot_bytes: config
-            .max_robot_bytes
-            .unwrap_or(defaults.max_robot_bytes.min(disk_bytes / ROBOT_SHARE)),
-        reserve_bytes: config
-            .disk_reserve
-            .unwrap_or(MAX_RESERVE_BYTES.min(disk_bytes / RESERVE_SHARE)),
-        ..defaults
-    }
 }
 
 fn http_limits(config: &Config) -> listener::Limits {

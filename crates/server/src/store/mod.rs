@@ -68,6 +68,7 @@ pub use registry::packages::{NewManifest, PutManifest, Reference, StoredManifest
 pub use registry::publishers::SignedDocument;
 pub use registry::referrers::ReferrersPage;
 pub use registry::robot_blobs::disk_usage;
+pub use registry::stored_blobs::StoredBlob;
 pub use timelines::{HistoryPage, HistoryQuery};
 
 use crate::domain::database_url::{is_postgres, without_password};

@@ -68,6 +68,8 @@ repositories! {
     tags: Tags;
     /// Blobs in the registry's repositories. Their bytes are elsewhere.
     blobs: Blobs;
+    /// Objects of the servers' common store, by the blob that each of them holds.
+    stored_blobs: StoredBlobs;
     /// Disk usage of the blobs that robots have uploaded.
     robot_blobs: RobotBlobs;
     /// Task packages and their users.

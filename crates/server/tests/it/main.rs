@@ -13,6 +13,8 @@ mod bulk;
 mod cli;
 mod cli_people;
 mod commands;
+mod common_store;
+mod common_store_servers;
 mod completions;
 mod corruption;
 mod damaged_blobs;

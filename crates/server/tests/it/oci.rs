@@ -13,11 +13,25 @@ use taskd::http::registry::Registry;
 use taskd::store::{NewManifest, PutManifest, StoredManifest};
 
 use crate::database::{TestDatabase, on_both_databases};
-use crate::registry::{GRACE, NOW_MS, TestRegistry, header, image, operator, refusal, refused};
+use crate::registry::{
+    GRACE, NOW_MS, TestRegistry, header, image, on_both_stores, operator, refusal, refused,
+};
 
 on_both_databases!(referrers_come_in_pages);
 
-#[tokio::test]
+on_both_stores! {
+    registry_refuses_requests_without_a_token, robot_reads_only_blobs_of_its_packages,
+    blob_reads_and_ranges_agree_for_mmap_and_pread, unsupported_digest_algorithms_are_not_found,
+    sha512_push_is_stored_under_its_digest, path_that_is_not_utf8_is_an_invalid_name,
+    chunks_out_of_order_are_refused, wrong_bytes_and_cancelled_uploads_leave_nothing,
+    upload_limits_are_enforced, concurrent_pushes_of_one_blob_store_it_once,
+    blob_mount_succeeds_or_starts_an_upload,
+    manifest_is_stored_byte_for_byte_under_digest_and_tag,
+    invalid_manifest_is_refused_with_a_reason, manifest_with_a_page_type_is_served_as_bytes,
+    concurrent_pushes_to_one_tag_leave_one_manifest, tags_are_listed_in_pages,
+    referrers_are_listed_by_subject_and_type, annotations_of_referrers_are_bounded,
+}
+
 async fn registry_refuses_requests_without_a_token() {
     let registry = TestRegistry::start_with(BlobSettings::default(), None).await;
     for path in ["/v2/", "/v2/a/tags/list", "/v2/a/manifests/x", "/v2/nonsense"] {
@@ -31,7 +45,6 @@ async fn registry_refuses_requests_without_a_token() {
     }
 }
 
-#[tokio::test]
 async fn robot_reads_only_blobs_of_its_packages() {
     let robot =
         TestRegistry::start_with(BlobSettings::default(), Some(Caller::Robot(RobotId::random())))
@@ -55,7 +68,6 @@ async fn robot_reads_only_blobs_of_its_packages() {
     }
 }
 
-#[tokio::test]
 async fn blob_reads_and_ranges_agree_for_mmap_and_pread() {
     let bytes: Vec<u8> = (0..1_000_000_u32).flat_map(u32::to_le_bytes).collect();
     for reading in [BlobRead::Mmap, BlobRead::Pread] {
@@ -113,7 +125,6 @@ async fn blob_reads_and_ranges_agree_for_mmap_and_pread() {
     }
 }
 
-#[tokio::test]
 async fn unsupported_digest_algorithms_are_not_found() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
@@ -141,7 +152,6 @@ async fn unsupported_digest_algorithms_are_not_found() {
     }
 }
 
-#[tokio::test]
 async fn sha512_push_is_stored_under_its_digest() {
     let registry = TestRegistry::start().await;
     let [config, layer] = [&b"{}"[..], &vec![7; 3_000_000]].map(|bytes| {
@@ -198,7 +208,6 @@ async fn sha512_push_is_stored_under_its_digest() {
     assert_eq!(left.count(), 0);
 }
 
-#[tokio::test]
 async fn path_that_is_not_utf8_is_an_invalid_name() {
     let registry = TestRegistry::start().await;
     for path in ["/v2/x/manifests/%FF", "/v2/%FF/tags/list"] {
@@ -206,7 +215,6 @@ async fn path_that_is_not_utf8_is_an_invalid_name() {
     }
 }
 
-#[tokio::test]
 async fn chunks_out_of_order_are_refused() {
     let registry = TestRegistry::start().await;
     let upload = registry.begin("a").await;
@@ -249,7 +257,6 @@ async fn chunks_out_of_order_are_refused() {
     assert_eq!(registry.status(Method::GET, &upload).await, StatusCode::NOT_FOUND);
 }
 
-#[tokio::test]
 async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
     let registry = TestRegistry::start().await;
     let digest = Digest::of(b"announced");
@@ -275,7 +282,6 @@ async fn wrong_bytes_and_cancelled_uploads_leave_nothing() {
     assert_eq!(uploads.count(), 0);
 }
 
-#[tokio::test]
 async fn upload_limits_are_enforced() {
     let settings = BlobSettings { max_blob_bytes: 1000, max_uploads: 1, ..BlobSettings::default() };
     let registry = TestRegistry::start_with(settings, Some(operator())).await;
@@ -324,7 +330,6 @@ async fn upload_limits_are_enforced() {
     assert_eq!(refusal(large.send().await.expect("an answer")).await, refused(413, "SIZE_INVALID"));
 }
 
-#[tokio::test]
 async fn concurrent_pushes_of_one_blob_store_it_once() {
     let registry = TestRegistry::start().await;
     let bytes = vec![7; 300_000];
@@ -334,7 +339,6 @@ async fn concurrent_pushes_of_one_blob_store_it_once() {
     assert!(answer.bytes().await.expect("a body") == bytes);
 }
 
-#[tokio::test]
 async fn blob_mount_succeeds_or_starts_an_upload() {
     let registry = TestRegistry::start().await;
     let digest = registry.push_blob("from", b"x").await.digest;
@@ -365,7 +369,6 @@ async fn blob_mount_succeeds_or_starts_an_upload() {
     );
 }
 
-#[tokio::test]
 async fn manifest_is_stored_byte_for_byte_under_digest_and_tag() {
     let registry = TestRegistry::start().await;
     let digest = registry.push_image("a/b", "v1").await;
@@ -390,7 +393,6 @@ async fn manifest_is_stored_byte_for_byte_under_digest_and_tag() {
     }
 }
 
-#[tokio::test]
 async fn invalid_manifest_is_refused_with_a_reason() {
     let registry = TestRegistry::start().await;
     let config = registry.push_blob("a", b"{}").await;
@@ -438,12 +440,11 @@ async fn invalid_manifest_is_refused_with_a_reason() {
     assert_eq!(foreign.status(), StatusCode::CREATED);
 }
 
-#[tokio::test]
 async fn manifest_with_a_page_type_is_served_as_bytes() {
     let registry = TestRegistry::start().await;
     let Registry { store, blobs, .. } = &registry.registry;
     let page = "<script>fetch('/api/v1/users')</script>";
-    let digest = blobs.put(Algorithm::Sha256, page.into()).await.expect("stored");
+    let digest = blobs.put(Algorithm::Sha256, page.into(), 0).await.expect("stored");
     let new = NewManifest {
         manifest: StoredManifest {
             digest,
@@ -467,7 +468,6 @@ async fn manifest_with_a_page_type_is_served_as_bytes() {
     assert_eq!(answer.text().await.expect("text"), page);
 }
 
-#[tokio::test]
 async fn concurrent_pushes_to_one_tag_leave_one_manifest() {
     let registry = TestRegistry::start().await;
     let images = [registry.push_image("a", "one").await, registry.push_image("a", "two").await];
@@ -498,7 +498,6 @@ fn following(answer: &Response) -> Option<String> {
     Some(path.to_owned())
 }
 
-#[tokio::test]
 async fn tags_are_listed_in_pages() {
     let registry = TestRegistry::start().await;
     assert_eq!(refusal(registry.get("/v2/a/tags/list").await).await, refused(404, "NAME_UNKNOWN"));
@@ -527,7 +526,6 @@ async fn tags_are_listed_in_pages() {
     );
 }
 
-#[tokio::test]
 async fn referrers_are_listed_by_subject_and_type() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;
@@ -635,7 +633,6 @@ async fn referrers_come_in_pages(database: TestDatabase) {
     }
 }
 
-#[tokio::test]
 async fn annotations_of_referrers_are_bounded() {
     let registry = TestRegistry::start().await;
     let blob = registry.push_blob("a", b"{}").await;

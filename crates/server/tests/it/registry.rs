@@ -1,5 +1,6 @@
 //! A registry over a real listener, and a client with full control over its requests.
 
+use std::path::Path;
 use std::sync::LazyLock;
 use std::time::Duration;
 
@@ -15,8 +16,9 @@ use task_proto::packages::oci::MANIFEST_TYPE;
 use task_proto::trust::token::{Token, TokenKind};
 
 use taskd::blobs::collector::{self, Collected};
-use taskd::blobs::{BlobSettings, Blobs};
+use taskd::blobs::{BlobSettings, Blobs, CommonStore};
 use taskd::config::TransferLimits;
+use taskd::domain::blob_store_url::BlobStoreUrl;
 use taskd::domain::person::Person;
 use taskd::http::auth::Caller;
 use taskd::http::connection::drain::drain_unread;
@@ -60,7 +62,7 @@ impl TestRegistry {
         settings: BlobSettings,
         caller: Option<Caller>,
     ) -> Self {
-        let blobs = Blobs::open(data.path(), settings).expect("a blob store");
+        let blobs = open_blobs(&store, data.path(), settings).await;
         store.tokens().create_first(&OPERATOR, NOW_MS).await.expect("stored");
         let site_label = "site".parse().expect("a label's key");
         let transfers = Transfers::new(&TransferLimits::default(), site_label);
@@ -132,6 +134,45 @@ impl TestRegistry {
             .await
             .expect("collected")
     }
+}
+
+tokio::task_local! {
+    /// Whether the test's registries keep their blobs in a common store.
+    static HAS_COMMON_STORE: ();
+}
+
+/// Runs a test whose registries keep their blobs in a common store, without local copies.
+pub async fn with_common_store(test: impl Future<Output = ()>) {
+    HAS_COMMON_STORE.scope((), test).await;
+}
+
+/// Runs each test with blobs in the data directory, and with blobs in a common store.
+macro_rules! on_both_stores {
+    ($($test:ident),* $(,)?) => {
+        mod data_directory {
+            $(#[tokio::test] async fn $test() {
+                super::$test().await;
+            })*
+        }
+        mod common_store {
+            $(#[tokio::test] async fn $test() {
+                crate::registry::with_common_store(super::$test()).await;
+            })*
+        }
+    };
+}
+pub(crate) use on_both_stores;
+
+async fn open_blobs(store: &Store, data: &Path, settings: BlobSettings) -> Blobs {
+    if HAS_COMMON_STORE.try_with(|()| ()).is_err() {
+        return Blobs::open(data, settings).expect("a blob store");
+    }
+    let directory = data.join("common");
+    std::fs::create_dir(&directory).expect("made");
+    let url = BlobStoreUrl::Directory(directory);
+    let common = CommonStore::open(store.clone(), &url).await.expect("a common store");
+    let settings = BlobSettings { max_cache_bytes: 0, ..settings };
+    Blobs::open_with(data, settings, common).expect("a blob store")
 }
 
 /// Serves a registry to one caller and says where.

@@ -212,6 +212,17 @@ async fn readiness(checkup: &mut Checkup, client: &Client) -> bool {
             }
         }
     }
+    // Only a server with a common store of packages reports it.
+    match body.get("blobs").and_then(Value::as_str) {
+        Some("ok") => checkup.good("blobs", "the common store answers"),
+        Some(problem) => checkup.bad(
+            "blobs",
+            problem,
+            "start the store or mount the directory of blobs.store; until then pushes are refused, and robots get \
+             packages that the server has a copy of",
+        ),
+        None => {}
+    }
     false
 }
 

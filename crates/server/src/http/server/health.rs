@@ -20,7 +20,8 @@ pub(in crate::http) async fn healthz() -> Json<Value> {
 }
 
 /// Reports whether database, broker and disk passed their last check, a few seconds ago, and names
-/// the problems.
+/// the problems. With a common store of blobs, `blobs` says whether that store answers; without its
+/// answer the server is ready nevertheless.
 #[operation(tag = "server",
     responses((status = 200, description = "All components are healthy.", body = Value,
             example = json!({ "status": "ready", "database": "ok", "broker": "ok", "disk": "ok" })),
@@ -31,7 +32,8 @@ pub(in crate::http) async fn readyz(
 ) -> Response {
     let verdicts = readiness.verdicts();
     let is_stopping = readiness.is_draining() || stop.is_cancelled();
-    let is_healthy = verdicts.values().all(Option::is_none);
+    let is_healthy =
+        verdicts.iter().all(|(component, problem)| problem.is_none() || !component.is_vital());
     let is_ready = is_healthy && !is_stopping;
     let status = match (is_stopping, is_healthy) {
         (true, _) => "stopping",

@@ -12,6 +12,7 @@ use tokio::task::JoinHandle;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 
+use crate::blobs::CommonStore;
 use crate::broker::{Broker, Health};
 use crate::store::Store;
 use crate::system::data_directory::disk_space;
@@ -34,6 +35,8 @@ pub enum Component {
     Broker,
     /// Healthy if the data directory is writable.
     Disk,
+    /// Healthy if the common store of blobs answers; only known if there is one.
+    Blobs,
 }
 
 impl Component {
@@ -43,7 +46,14 @@ impl Component {
             Self::Database => "database",
             Self::Broker => "broker",
             Self::Disk => "disk",
+            Self::Blobs => "blobs",
         }
+    }
+
+    /// Whether the server is of no use without this component. Without the common store of blobs,
+    /// which all servers would miss at once, it still takes reports and orders.
+    pub const fn is_vital(self) -> bool {
+        !matches!(self, Self::Blobs)
     }
 }
 
@@ -82,20 +92,32 @@ impl Readiness {
     }
 }
 
-/// The job that checks database, broker and disk.
+/// The job that checks database, broker, disk and the common store of blobs.
 pub struct ReadinessCheck {
     pub readiness: Readiness,
     pub store: Store,
     pub broker: Broker,
     /// The probe of the data directory.
     pub disk: DiskProbe,
+    /// The common store of blobs, if there is one.
+    pub blobs: Option<CommonStore>,
 }
 
 impl ReadinessCheck {
     /// Checks all components once.
     pub async fn check(&mut self) {
-        let (database, disk) =
-            tokio::join!(timeout(CHECK_TIMEOUT, self.store.ping()), self.disk.problem());
+        let common = self.blobs.clone();
+        let blobs = async move {
+            match common {
+                Some(store) => Some(store.problem().await),
+                None => None,
+            }
+        };
+        let (database, disk, blobs) =
+            tokio::join!(timeout(CHECK_TIMEOUT, self.store.ping()), self.disk.problem(), blobs);
+        if let Some(problem) = blobs {
+            self.readiness.set(Component::Blobs, problem);
+        }
         self.readiness.set(
             Component::Database,
             match database {

@@ -1,6 +1,7 @@
 //! The command line of `taskd` as a whole: `serve` beside the operator's commands, the checks of the
-//! server that they need, and the command about the database, the only one that it runs.
+//! server that they need, and the commands about the database and the blobs of a stopped server.
 
+mod blobs;
 mod database;
 mod doctor;
 
@@ -10,6 +11,7 @@ use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{CommandFactory as _, FromArgMatches as _, Parser, Subcommand};
 
+pub use self::blobs::{BlobsCommand, BlobsCommandError};
 pub use self::database::DatabaseCommand;
 pub use self::doctor::check_server;
 use crate::config::ServeFlags;
@@ -37,6 +39,9 @@ pub enum Command {
     /// Copy the database of a stopped server
     #[command(subcommand)]
     Database(DatabaseCommand),
+    /// Move the packages of a stopped server to a common store
+    #[command(subcommand)]
+    Blobs(BlobsCommand),
 }
 
 impl CommandLine {

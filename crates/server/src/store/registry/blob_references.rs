@@ -10,7 +10,7 @@ use task_proto::desired::{BlobRef, PackageRef};
 
 use crate::store::repositories::Blobs;
 use crate::store::rows::{groups, id, values};
-use crate::store::{Store, StoreError};
+use crate::store::{Store, StoreError, Transaction};
 
 impl Blobs<&Store> {
     /// Every blob that is needed now. More blobs may be needed by the time the caller has the
@@ -34,6 +34,23 @@ impl Blobs<&Store> {
         self,
         candidates: Vec<Digest>,
     ) -> Result<Vec<Digest>, StoreError> {
+        let unreferenced = self.unreferenced(candidates).await?;
+        if unreferenced.is_empty() {
+            return Ok(unreferenced);
+        }
+        let mut write = self.0.begin().await?;
+        for digest in &unreferenced {
+            write.blobs().unlink_everywhere(digest).await?;
+        }
+        write.commit().await?;
+        Ok(unreferenced)
+    }
+
+    /// Those of `candidates` that are unneeded now.
+    pub(in crate::store) async fn unreferenced(
+        self,
+        candidates: Vec<Digest>,
+    ) -> Result<Vec<Digest>, StoreError> {
         if candidates.is_empty() {
             return Ok(candidates);
         }
@@ -52,25 +69,25 @@ impl Blobs<&Store> {
                 referenced.insert(id("manifests.digest", text)?);
             }
         }
-        let unreferenced: Vec<Digest> =
-            candidates.into_iter().filter(|digest| !referenced.contains(digest)).collect();
-        if unreferenced.is_empty() {
-            return Ok(unreferenced);
-        }
-        let mut write = self.0.begin().await?;
-        for digest in &unreferenced {
-            let query = sqlx::query("DELETE FROM repository_blobs WHERE digest = $1")
-                .bind(digest.to_string());
-            query.execute(write.connection()).await?;
-            write.robot_blobs().uncount(digest).await?;
-        }
-        write.commit().await?;
-        Ok(unreferenced)
+        Ok(candidates.into_iter().filter(|digest| !referenced.contains(digest)).collect())
     }
 
     async fn in_use(self) -> Result<Vec<Digest>, StoreError> {
         let packages = self.0.deployments().packages_in_use().await?;
         Ok(packages.iter().flat_map(blobs_of).map(|blob| blob.digest).collect())
+    }
+}
+
+impl Blobs<&mut Transaction> {
+    /// Removes the blob from all repositories, and from the disk usage of robots.
+    pub(in crate::store) async fn unlink_everywhere(
+        &mut self,
+        digest: &Digest,
+    ) -> Result<(), StoreError> {
+        let query =
+            sqlx::query("DELETE FROM repository_blobs WHERE digest = $1").bind(digest.to_string());
+        query.execute(self.0.connection()).await?;
+        self.0.robot_blobs().uncount(digest).await
     }
 }
 

@@ -7,3 +7,4 @@ pub(super) mod packages;
 pub(super) mod publishers;
 pub(super) mod referrers;
 pub(super) mod robot_blobs;
+pub(super) mod stored_blobs;

@@ -16,7 +16,7 @@ use task_proto::desired::BlobRef;
 use task_proto::{Digest, RepositoryName, RobotId};
 
 use super::{Answer, OciError, Registry, empty};
-use crate::blobs::{Blob, BytesConsumer};
+use crate::blobs::{Blob, BytesConsumer, Content};
 use crate::domain::person::Person;
 use crate::http::connection::listener::Unencrypted;
 use crate::http::registry::packages::in_use_message;
@@ -51,7 +51,9 @@ pub(super) async fn head_before_push(
     if !registry.store.blobs().has(Some(repository), &digest).await? {
         return Err(OciError::blob_unknown());
     }
-    registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+    if !registry.blobs.touch(digest, registry.clock.now_ms()).await? {
+        return Err(OciError::blob_unknown());
+    }
     read(registry, digest, request).await
 }
 
@@ -97,9 +99,13 @@ pub(super) async fn delete(
 }
 
 async fn read(registry: &Registry, digest: Digest, request: &Parts) -> Answer {
-    let blob = registry.blobs.get(digest).await?.ok_or_else(OciError::blob_unknown)?;
     let content_type = HeaderValue::from_static("application/octet-stream");
-    serve(&blob, request, content_type, caching(request))
+    let content = match request.method {
+        Method::HEAD => registry.blobs.describe(digest).await?,
+        _ => registry.blobs.content(digest).await?,
+    };
+    let content = content.ok_or_else(OciError::blob_unknown)?;
+    serve(&content, request, content_type, caching(request))
 }
 
 /// Cache policy for immutable content. A caller with a cookie shares the browser with the next
@@ -113,14 +119,14 @@ pub(super) fn caching(request: &Parts) -> HeaderValue {
     })
 }
 
-/// Answers with the part of a blob that the request's headers ask for.
+/// Answers with the part of the content that the request's headers ask for.
 pub(super) fn serve(
-    blob: &Blob,
+    content: &Content,
     request: &Parts,
     content_type: HeaderValue,
     cache: HeaderValue,
 ) -> Answer {
-    let quoted = blob.quoted_digest();
+    let (quoted, size) = (content.quoted_digest(), content.size());
     let digest = header_value(quoted.slice(1..quoted.len() - 1))?;
     let etag = header_value(quoted.clone())?;
     let common = [
@@ -135,10 +141,10 @@ pub(super) fn serve(
         *response.status_mut() = StatusCode::NOT_MODIFIED;
         response
     } else {
-        let (status, range) = match requested_range(headers, &etag, blob.size()) {
-            RequestedRange::Whole => (StatusCode::OK, 0..blob.size()),
+        let (status, range) = match requested_range(headers, &etag, size) {
+            RequestedRange::Whole => (StatusCode::OK, 0..size),
             RequestedRange::Part(range) => (StatusCode::PARTIAL_CONTENT, range),
-            RequestedRange::Unsatisfiable => return unsatisfiable(blob),
+            RequestedRange::Unsatisfiable => return unsatisfiable(size),
         };
         let length = range.end - range.start;
         let is_head = request.method == Method::HEAD;
@@ -147,13 +153,14 @@ pub(super) fn serve(
         } else {
             BytesConsumer::Process
         };
-        let content_range = (status == StatusCode::PARTIAL_CONTENT).then(|| {
-            format!("bytes {}-{}/{}", range.start, range.end.saturating_sub(1), blob.size())
-        });
-        let mut response = response_with_capacity(if is_head {
-            Body::empty()
-        } else {
-            Body::new(blob.body(range, reader))
+        let content_range = (status == StatusCode::PARTIAL_CONTENT)
+            .then(|| format!("bytes {}-{}/{size}", range.start, range.end.saturating_sub(1)));
+        let mut response = response_with_capacity(match content {
+            Content::Local(blob) if !is_head => Body::new(blob.body(range, reader)),
+            Content::Arriving(arrival) if !is_head => {
+                Body::from_stream(arrival.clone().content(range))
+            }
+            Content::Local(_) | Content::Arriving(_) | Content::Elsewhere { .. } => Body::empty(),
         });
         *response.status_mut() = status;
         if let Some(content_range) = content_range {
@@ -179,11 +186,11 @@ fn header_value(text: impl Into<Bytes>) -> Result<HeaderValue, OciError> {
     HeaderValue::from_maybe_shared(text.into()).map_err(|_| OciError::blob_unknown())
 }
 
-fn unsatisfiable(blob: &Blob) -> Answer {
+fn unsatisfiable(size: u64) -> Answer {
     use axum::response::IntoResponse as _;
-    let message = format!("the content has {} bytes", blob.size());
+    let message = format!("the content has {size} bytes");
     let mut response = OciError::range_invalid(message).into_response();
-    response.headers_mut().insert(CONTENT_RANGE, header_value(format!("bytes */{}", blob.size()))?);
+    response.headers_mut().insert(CONTENT_RANGE, header_value(format!("bytes */{size}"))?);
     Ok(response)
 }
 

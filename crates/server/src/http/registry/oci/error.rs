@@ -20,6 +20,12 @@ const COLLECTION_S: u64 = 300;
 /// Our own code for a corrupt database, for which the specification has none.
 const CORRUPT: &str = "DATABASE_CORRUPT";
 
+/// Our own code for a part of the server that can't be reached.
+const UNAVAILABLE: &str = "UNAVAILABLE";
+
+/// Seconds until a retry is useful when the common store of blobs does not answer.
+const STORE_RETRY_S: u64 = 5;
+
 /// An error answer of the registry.
 #[derive(Debug)]
 pub struct OciError {
@@ -191,7 +197,7 @@ impl From<Fault> for OciError {
         let ApiError { status, message, retry_after_s, .. } = fault.into();
         let (code, retry_after_s) = match fault {
             Fault::Corrupt => (CORRUPT, Some(retry_after_s)),
-            Fault::Unreachable | Fault::Busy => ("UNAVAILABLE", Some(retry_after_s)),
+            Fault::Unreachable | Fault::Busy => (UNAVAILABLE, Some(retry_after_s)),
             Fault::Full => ("DENIED", None),
         };
         Self { retry_after_s, ..Self::new(status, code, message) }
@@ -231,7 +237,17 @@ impl From<BlobError> for OciError {
             BlobError::DiskFull | BlobError::DiskReserved { .. } => {
                 Self::new(StatusCode::INSUFFICIENT_STORAGE, "DENIED", message)
             }
-            BlobError::Disk { .. } => Self::internal(&error),
+            _ if error.is_store_unavailable() => {
+                tracing::warn!(error = &error as &dyn std::error::Error, "blobs.store failed");
+                let answer = Self::new(StatusCode::SERVICE_UNAVAILABLE, UNAVAILABLE, message);
+                Self { retry_after_s: Some(STORE_RETRY_S), ..answer }
+            }
+            BlobError::Database(error) => error.into(),
+            BlobError::Disk { .. }
+            | BlobError::CommonStore { .. }
+            | BlobError::OtherStore
+            | BlobError::Fetch(_)
+            | BlobError::NotMoved { .. } => Self::internal(&error),
         }
     }
 }

@@ -20,7 +20,7 @@ use super::blobs::{REVALIDATED, caching, check_blob, deletion_answer, serve};
 use super::parsed::{ParsedManifest, is_json};
 use super::uploads::stored_bytes;
 use super::{Answer, OciError, Registry, empty, is_reserved, signed};
-use crate::blobs::Blob;
+use crate::blobs::{Blob, Content};
 use crate::domain::person::Person;
 use crate::http::registry::packages::in_use_message;
 use crate::orders::changes::Change;
@@ -64,7 +64,7 @@ pub(super) async fn get(
         Reference::Digest(_) => caching(request),
         Reference::Tag(_) => HeaderValue::from_static(REVALIDATED),
     };
-    serve(&blob, request, content_type, cache)
+    serve(&Content::Local(blob), request, content_type, cache)
 }
 
 /// The target and the author of a push.
@@ -164,8 +164,7 @@ pub(super) async fn push(
     // Counted before the bytes are stored, so that a client that disconnects in between is counted
     // as well.
     registry.store.robot_blobs().count(repository, &manifest).await?;
-    registry.blobs.put(digest.algorithm(), bytes).await?;
-    registry.blobs.touch(digest, now_ms).await?;
+    registry.blobs.put(digest.algorithm(), bytes, now_ms).await?;
     let new = NewManifest {
         manifest: StoredManifest { digest, size: manifest.size, media_type: parsed.media_type },
         artifact_type: parsed.artifact_type,

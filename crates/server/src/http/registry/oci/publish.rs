@@ -80,5 +80,10 @@ where
         let _ = upload.cancel().await;
         return Err(error.into());
     }
-    upload.complete(blob.digest).await.map(drop)
+    let completed = upload.complete(blob.digest).await;
+    if completed.is_err() {
+        // As above.
+        let _ = upload.cancel().await;
+    }
+    completed.map(drop)
 }

@@ -66,7 +66,13 @@ pub(super) async fn begin(
             let _ = upload.cancel().await;
             return Err(error.into());
         }
-        return upload.complete(digest).await;
+        let completed = upload.complete(digest).await;
+        if completed.is_err() {
+            // The caller does not know the upload's id, so it can't finish the upload later. As
+            // above.
+            let _ = upload.cancel().await;
+        }
+        return completed;
     }
     start_upload(registry, repository).await?.accepted(StatusCode::ACCEPTED, 0)
 }
@@ -149,8 +155,8 @@ impl Upload<'_> {
                 registry.blobs.cancel_upload(&repository, &id).await?;
                 return Err(full.into());
             }
-            let size = registry.blobs.finish_upload(&repository, &id, digest).await?;
-            registry.blobs.touch(digest, registry.clock.now_ms()).await?;
+            let now_ms = registry.clock.now_ms();
+            let size = registry.blobs.finish_upload(&repository, &id, digest, now_ms).await?;
             registry.store.blobs().link(&repository, &BlobRef { digest, size }).await?;
             Ok::<_, OciError>(())
         });
@@ -189,7 +195,7 @@ async fn mount(
     {
         return Ok(false);
     }
-    let Some(blob) = registry.blobs.get(digest).await? else { return Ok(false) };
+    let Some(blob) = registry.blobs.describe(digest).await? else { return Ok(false) };
     registry.store.blobs().link(repository, &BlobRef { digest, size: blob.size() }).await?;
     Ok(true)
 }

@@ -137,18 +137,23 @@ impl Blobs {
         Self::open_in(data, settings, directory, None)
     }
 
-    /// Opens the store whose blobs lie in a common store, with local copies in `data`. Refused
-    /// while blobs of a server without a common store are in `data`.
+    /// Fails if blobs of a server without a common store are in `data`: with such a store they would
+    /// be out of reach.
+    pub fn check_moved(data: &Path) -> Result<(), BlobError> {
+        let directory = local_directory(data);
+        let left = blob_files(&directory).map_err(BlobError::disk("list", &directory))?;
+        match left.len() {
+            0 => Ok(()),
+            count => Err(BlobError::NotMoved { count, directory }),
+        }
+    }
+
+    /// Opens the store whose blobs lie in a common store, with local copies in `data`.
     pub fn open_with(
         data: &Path,
         settings: BlobSettings,
         store: CommonStore,
     ) -> Result<Self, BlobError> {
-        let directory = local_directory(data);
-        let left = blob_files(&directory).map_err(BlobError::disk("list", &directory))?;
-        if !left.is_empty() {
-            return Err(BlobError::NotMoved { count: left.len(), directory });
-        }
         let directory = cache_directory(data);
         let cache = Cache::open(directory.clone(), settings.max_cache_bytes)?;
         let common = Common { store, cache, fetches: Fetches::default() };

@@ -26,12 +26,12 @@ pub(super) async fn open_blobs(
     let settings = blob_settings(config);
     match &config.blob_store {
         Some(url) => {
+            // Before the store is named in the database, so that a refused start changes nothing.
+            Blobs::check_moved(data.path())?;
             let common = open_common_store(store, url).await?;
             Ok(Blobs::open_with(data.path(), settings, common)?)
         }
-        None if store.stored_blobs().store_name().await?.is_some() => {
-            Err(ServeError::NoCommonStore)
-        }
+        None if store.stored_blobs().has_any().await? => Err(ServeError::NoCommonStore),
         None => Ok(Blobs::open(data.path(), settings)?),
     }
 }

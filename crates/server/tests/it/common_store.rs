@@ -263,7 +263,7 @@ on_all_stores! {
 async fn blob_of_one_server_is_read_at_another(database: TestDatabase, objects: Objects) {
     let (one, other) =
         (Node::start(&database, &objects).await, Node::start(&database, &objects).await);
-    for length in [0, 1, MB, 20 * MB + 4] {
+    for length in [0, 4, MB, 20 * MB + 4] {
         let bytes = content(1, length);
         let digest = one.put(&bytes).await;
         assert_eq!(fs::read(one.copy(digest)).expect("a copy"), bytes);

@@ -125,7 +125,12 @@ async fn server_whose_blobs_lie_elsewhere_does_not_start() {
     let text = refusal(&directory, Some(&objects)).await;
     assert!(text.contains("3 blobs lie in ") && text.contains("taskd blobs move"), "{text}");
 
+    // The refused start has changed nothing.
+    let local = TestServer::start_in(directory, |_| {}).await;
+    local.stop().await;
+
     let common = server(TempDir::new().expect("a directory"), &objects).await;
+    common.push("talker", "1.0").await;
     let directory = common.stop().await;
     let text = refusal(&directory, None).await;
     assert!(text.starts_with("blobs.store is not set"), "{text}");
